@@ -1,0 +1,388 @@
+"""Factorizations as graphs: is a guide rich enough for its model, and what do both look like.
+
+The exact posterior of a latent, given what the guide has drawn before it and all that is given, depends on
+its Markov boundary among them, found by d-separation in the generative graph unrolled over time (Pearl, 1988;
+by the moral-graph criterion of Lauritzen, Dawid, Larsen and Leimer, 1990). A guide that cannot read all of it
+pays in the bound, however large its networks are.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterable, Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import networkx as nx
+import numpy as np
+
+from .notation import ALL, Factor, Factorization, Node, Parent, Relation, check_pair, unrolled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from rich.table import Table
+
+__all__ = ["Audit", "analytic_kl", "audit", "draw_dag", "markov_boundary"]
+
+Edge = tuple[Node, Node]
+
+
+# ----------------------------------------------------------------------------------------------- d-separation
+
+
+def markov_boundary(dag: nx.DiGraph, node: Node, given: AbstractSet[Node]) -> set[Node]:
+    """The smallest part of ``given`` that makes ``node`` independent of the rest of ``given``.
+
+    u is in it exactly when node and u are not d-separated by the others. What is not given is integrated out.
+
+    Args:
+        dag: directed acyclic graph, edges from parent to child.
+        node: a node that is not in given.
+        given: nodes whose values are known.
+    """
+    kept: set[Node] = set()
+    frontier = [node, *given]
+    while frontier:
+        current = frontier.pop()
+        if current not in kept:
+            kept.add(current)
+            frontier.extend(dag.predecessors(current))
+    # In the moral graph of these a child and its parents, a family, are neighbours; given nodes stop a path.
+    boundary: set[Node] = set()
+    walked, families = {node}, set()
+    frontier = [node]
+    while frontier:
+        current = frontier.pop()
+        for child in (current, *dag.successors(current)):
+            if child in kept and child not in families:
+                families.add(child)
+                family = {child, *dag.predecessors(child)}
+                boundary |= family & given
+                frontier.extend(family - given - walked)
+                walked |= family - given
+    return boundary
+
+
+def analytic_kl(generative: Factorization, inference: Factorization) -> dict[str, bool]:
+    """For which latents the bound may use the analytic KL(q(z_t | ...) || p(z_t | ...)).
+
+    That form holds the parents of z_t in the model fixed while it averages over z_t, so it is right exactly
+    where no such parent is a descendant of z_t in the guide. A backward guide q(z_t | z_{>t}, ...) for
+    p(z_t | z_{t-1}) draws z_{t-1} from z_t: the analytic form would be biased, and the log-ratio has to be
+    averaged instead.
+
+    Returns:
+        {latent: True where the analytic form is unbiased}, in the order in which the guide draws them.
+    """
+    relations = _relations(generative, inference)
+    T = 3 + sum(relation.lag for relation in relations)
+    model, guide = generative.dag(T), inference.dag(T)
+    latents = [name for block in inference.blocks for name in block.names]
+    return {
+        latent: all(
+            nx.descendants(guide, node).isdisjoint(model.predecessors(node))
+            for node in guide
+            if node[0] == latent
+        )
+        for latent in latents
+    }
+
+
+def _relations(*factorizations: Factorization) -> list[Relation]:
+    parents = (p for f in factorizations for factor in f.factors for p in factor.parents)
+    return [parent.relation for parent in parents if parent.relation is not None]
+
+
+# ------------------------------------------------------------------------------------------------------ audit
+
+
+@dataclass(frozen=True)
+class Audit:
+    """What a guide reads, against what the exact posterior depends on.
+
+    Args:
+        generative: the model.
+        inference: the guide.
+        observed: names of the observed variables.
+        missing_parents: for each latent, what the exact posterior depends on and the guide factor cannot see.
+            The bound cannot be tight.
+        redundant_parents: for each latent, what the guide factor reads though the latent is independent of it
+            given the rest of what that factor reads. Harmless: nothing is lost by dropping it.
+    """
+
+    generative: Factorization
+    inference: Factorization
+    observed: tuple[str, ...]
+    missing_parents: dict[str, tuple[Parent, ...]] = field(repr=False)
+    redundant_parents: dict[str, tuple[Parent, ...]] = field(repr=False)
+
+    @property
+    def missing(self) -> dict[str, tuple[str, ...]]:
+        """{latent: relations as text}, such as ``{"z": ("z_{<t}",)}``; only latents that miss something."""
+        return _terms(self.missing_parents)
+
+    @property
+    def redundant(self) -> dict[str, tuple[str, ...]]:
+        """{latent: relations as text}; only latents whose factor reads something redundant."""
+        return _terms(self.redundant_parents)
+
+    @property
+    def exact(self) -> bool:
+        """True if nothing is missing: with a rich enough family the bound can reach the evidence."""
+        return not self.missing
+
+    @property
+    def rows(self) -> list[tuple[str, str, str]]:
+        """(guide factor, missing, redundant) as text, in the order in which the guide draws."""
+        names = [name for block in self.inference.blocks for name in block.names]
+        return [
+            (
+                str(self.inference.factor(name)),
+                ", ".join(self.missing.get(name, ())) or "-",
+                ", ".join(self.redundant.get(name, ())) or "-",
+            )
+            for name in names
+        ]
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        if self.exact:
+            return "exact: the guide reads everything the posterior depends on"
+        return (
+            "not exact: the guide misses what the posterior depends on, so the bound stays below the evidence"
+        )
+
+    def table(self) -> Table:
+        """A rich table with one row per guide factor."""
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(title=f"audit: {'exact' if self.exact else 'not exact'}", title_justify="left")
+        for name in HEADER:
+            table.add_column(name)
+        for factor, missing, redundant in self.rows:
+            table.add_row(factor, Text(missing, style="" if missing == "-" else "red"), redundant)
+        return table
+
+    def __str__(self) -> str:
+        rows = [HEADER, *self.rows]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
+        ]
+        return "\n".join(line.rstrip() for line in [*lines, self.verdict])
+
+    def _repr_html_(self) -> str:
+        head = "".join(f"<th>{cell}</th>" for cell in HEADER)
+        body = "".join(f"<tr>{''.join(f'<td>{html.escape(c)}</td>' for c in row)}</tr>" for row in self.rows)
+        return f"<table><caption>{self.verdict}</caption><tr>{head}</tr>{body}</table>"
+
+    def draw(self, T: int = 3, ax: Axes | None = None) -> Axes:
+        """Draws the guide over T steps: missing arrows dashed red, redundant ones dotted grey."""
+        dag = self.inference.dag(T, self.observed)
+        redundant = self._edges(self.redundant_parents, T)
+        missing = self._edges(self.missing_parents, T)
+        unread = {source for source, _ in missing} - set(dag)
+        for name, t in sorted(unread, key=lambda node: node[1] or 0):
+            dag.add_node((name, t), kind="data" if name in self.observed else "context")
+        return draw_dag(dag, ax=ax, missing=missing, redundant=redundant)
+
+    def _edges(self, parents: dict[str, tuple[Parent, ...]], T: int) -> list[Edge]:
+        factors = [Factor("q", name, self.inference.local(name), reads) for name, reads in parents.items()]
+        return [edge for factor in factors for edge in factor.edges(T)]
+
+
+HEADER = ("guide factor", "missing", "redundant")
+
+
+def _terms(parents: dict[str, tuple[Parent, ...]]) -> dict[str, tuple[str, ...]]:
+    return {
+        latent: tuple(t for parent in reads for t in parent.terms)
+        for latent, reads in parents.items()
+        if reads
+    }
+
+
+def audit(
+    generative: Factorization | str,
+    inference: Factorization | str,
+    steps: int = 5,
+    observed: Iterable[str] = ("x",),
+) -> Audit:
+    """Compares what each factor of a guide reads with what the exact posterior factor depends on.
+
+    The exact factor is p(latent | latents the guide has drawn before, all data and context); a variable that
+    the guide draws at all steps at once counts as drawn forward in time. Relations are read off ``steps``
+    inner steps of the unrolled graphs, away from the first and the last, where there is no past or no future
+    to depend on; steps is widened where a relation reaches further. A pattern that is periodic in time (a lag
+    of 2 without one of 1) is listed as far as seen.
+
+    Args:
+        generative: p, a factorization or its text.
+        inference: q.
+        steps: number of inner steps compared.
+        observed: names of the observed variables.
+
+    Raises:
+        ValueError: the two do not fit each other (see :func:`dvae.notation.check_pair`).
+
+    >>> audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})").missing
+    {'z': ('z_{t-1}',)}
+    """
+    generative = Factorization.parse(generative) if isinstance(generative, str) else generative
+    inference = Factorization.parse(inference) if isinstance(inference, str) else inference
+    latents, data, context = check_pair(generative, inference, observed)
+    lag = max((relation.lag for relation in _relations(generative, inference)), default=0)
+    width, margin = max(steps, 2 * lag + 3), 2 * lag + 2
+    T = width + 2 * margin
+    local = {name: (inference if name in inference.context else generative).local(name) for name in context}
+    local |= {name: generative.local(name) for name in (*data, *latents)}
+
+    def nodes(name: str) -> list[Node]:
+        return unrolled(name, local[name], T)
+
+    model, guide = generative.dag(T), inference.dag(T)
+    given = {node for name in (*data, *context) for node in nodes(name)}
+    model.add_nodes_from(given)
+    guide.add_nodes_from(given)
+    needs, uses = {}, {}
+    for block in inference.blocks:
+        steps_of = zip(*(nodes(name)[:: block.direction or 1] for name in block.names), strict=True)
+        for node in (node for step in steps_of for node in step):
+            needs[node] = markov_boundary(model, node, given)
+            uses[node] = markov_boundary(model, node, set(guide.predecessors(node)))
+            given.add(node)
+
+    def inner(edges: Mapping[Node, Iterable[Node]], child: str, parent: str) -> np.ndarray:
+        """The arrows between the inner steps, as a bool array (width or 1, width or 1)."""
+        rows, columns = (nodes(name)[margin : margin + width] or nodes(name) for name in (child, parent))
+        return np.array([[column in edges[row] for column in columns] for row in rows])
+
+    missing: dict[str, tuple[Parent, ...]] = {}
+    redundant: dict[str, tuple[Parent, ...]] = {}
+    for child in latents:
+        for name in local:
+            in_time = local[child] and local[name]
+            reads = inner(guide.pred, child, name)
+            lacking = _by_offset(inner(needs, child, name) & ~reads, in_time)
+            # An offset used anywhere is not redundant: near the edges of a chain any reading may be idle.
+            unused = _by_offset(reads, in_time) & ~_by_offset(inner(uses, child, name), in_time)
+            for found, offsets in ((missing, lacking), (redundant, unused)):
+                if offsets.any():
+                    relation = (_relation(offsets) if in_time else ALL) if local[name] else None
+                    found[child] = (*found.get(child, ()), Parent(name, local[name], relation))
+    return Audit(generative, inference, data, missing, redundant)
+
+
+def _by_offset(arrows: np.ndarray, in_time: bool) -> np.ndarray:
+    """Whether there is any arrow at each offset s - t = -(W-1), ..., W-1; (1,) any at all if not in_time."""
+    if not in_time:
+        return np.array([arrows.any()])
+    width = len(arrows)
+    return np.array([arrows.diagonal(offset).any() for offset in range(1 - width, width)])
+
+
+def _relation(offsets: np.ndarray) -> Relation:
+    """The smallest relation with these offsets; one that reaches the last offset in view has no end."""
+    far = len(offsets) // 2
+    steps = [int(step) - far for step in np.flatnonzero(offsets)]
+    return Relation.of((-math.inf if k == -far else k, math.inf if k == far else k) for k in steps)
+
+
+# ---------------------------------------------------------------------------------------------------- drawing
+
+RADIUS = 0.3
+EDGE: dict[str, Any] = {"color": "0.35", "linestyle": "-", "linewidth": 0.9}
+MISSING: dict[str, Any] = {"color": "#c0392b", "linestyle": "--", "linewidth": 1.3}
+REDUNDANT: dict[str, Any] = {"color": "0.6", "linestyle": ":", "linewidth": 1.2}
+
+
+def draw_dag(
+    dag: nx.DiGraph, ax: Axes | None = None, missing: Iterable[Edge] = (), redundant: Iterable[Edge] = ()
+) -> Axes:
+    """Draws an unrolled graph: time left to right, latents open, data shaded, context squares.
+
+    Args:
+        dag: nodes (name, t), (name, None) with attribute ``kind``, as :meth:`Factorization.dag` makes them.
+        ax: matplotlib axes; a new figure if None.
+        missing: arrows to add, dashed red.
+        redundant: arrows of the graph to show dotted grey.
+    """
+    import matplotlib.pyplot as plt
+    from matplotlib.patches import Circle, FancyArrowPatch, Patch, Rectangle
+
+    place = _layout(dag)
+    if ax is None:
+        right, down = max(x for x, _ in place.values()), -min(y for _, y in place.values())
+        _, ax = plt.subplots(figsize=(0.85 * right + 1.2, 0.85 * down + 1.4), layout="constrained")
+    patches: dict[Node, Patch] = {}
+    for node, (x, y) in place.items():
+        kind = dag.nodes[node].get("kind", "latent")
+        corner, side = (x - RADIUS, y - RADIUS), 2 * RADIUS
+        shape = Rectangle(corner, side, side) if kind == "context" else Circle((x, y), RADIUS)
+        shape.set(facecolor="0.85" if kind == "data" else "white", edgecolor="black", zorder=3)
+        patches[node] = ax.add_patch(shape)
+        name, t = node
+        symbol = name if len(name) == 1 else rf"\mathrm{{{name}}}".replace("_", r"\_")
+        ax.text(x, y, f"${symbol}_{{{t}}}$" if t else f"${symbol}$", ha="center", va="center", zorder=4)
+    dotted = set(redundant)
+    arrows = [(edge, REDUNDANT if edge in dotted else EDGE) for edge in dag.edges]
+    for (source, target), style in arrows + [(edge, MISSING) for edge in missing]:
+        bend = _bend(source, target, place)
+        ax.add_patch(
+            FancyArrowPatch(
+                place[source],
+                place[target],
+                patchA=patches[source],
+                patchB=patches[target],
+                shrinkA=0,
+                shrinkB=0,
+                arrowstyle="-|>",
+                mutation_scale=9,
+                connectionstyle=f"arc3,rad={bend}",
+                zorder=2,
+                **style,
+            )
+        )
+    ax.set_aspect("equal")
+    ax.autoscale_view()
+    ax.margins(0.05)
+    ax.axis("off")
+    return ax
+
+
+def _layout(dag: nx.DiGraph) -> dict[Node, tuple[float, float]]:
+    """Static nodes on top, then a row per local variable, data last; shifted rows part their arrows."""
+    T = max((t for _, t in dag if t is not None), default=1)
+    static = [node for node in dag if node[1] is None]
+    last = {name for name, t in dag if dag.nodes[name, t].get("kind") == "data"}
+    names = sorted(dict.fromkeys(name for name, t in dag if t is not None), key=lambda name: name in last)
+    place = {}
+    for i, node in enumerate(static):
+        place[node] = (1.7 * (T + 1) * (i + 1) / (len(static) + 1), 0.0)
+    for row, name in enumerate(names, start=bool(static)):
+        for t in range(1, T + 1):
+            place[name, t] = (1.7 * t + 0.3 * (row % 3 - 1), -1.6 * row)
+    return place
+
+
+def _bend(source: Node, target: Node, place: dict[Node, tuple[float, float]]) -> float:
+    """The least curvature with which an arrow passes no other node; outwards along the first and last row."""
+    start, end = np.array(place[source]), np.array(place[target])
+    others = np.array([xy for node, xy in place.items() if node not in (source, target)]).reshape(-1, 2)
+    (dx, dy), along = end - start, np.linspace(0, 1, 60)[:, None]
+    lowest = min(y for _, y in place.values()) == start[1]
+    outwards = (1 if lowest else -1) * np.sign(dx) if dy == 0 else 1
+    least = 0.3 if dy == 0 and abs(dx) > 2 else 0.0
+
+    def clearance(bend: float) -> float:
+        # matplotlib's arc3: a quadratic Bezier curve whose control point lies off the middle.
+        control = (start + end) / 2 + bend * np.array([dy, -dx])
+        curve = (1 - along) ** 2 * start + 2 * along * (1 - along) * control + along**2 * end
+        return float(np.linalg.norm(curve[:, None] - others, axis=-1).min(initial=math.inf))
+
+    bends = [float(side * size) for size in np.arange(least, 0.8, 0.05) for side in (outwards, -outwards)]
+    return next((bend for bend in bends if clearance(bend) > 1.5 * RADIUS), max(bends, key=clearance))

@@ -1,0 +1,788 @@
+r"""Equations as a paper writes them, parsed into factorizations: who reads whom, and at which time steps.
+
+    p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)
+
+The notation follows Girin, Leglaive, Bie, Diard, Hueber and Alameda-Pineda, *Dynamical variational
+autoencoders: a comprehensive review* (arXiv 2008.12595).
+
+    factorization := factor+            factor := ("p"|"q") "(" variable [ "|" parent ("," parent)* ] ")"
+    variable := name | name "_t"        one per sequence (static) | one per time step (local)
+    parent   := name | name "_" relation
+    relation := t | {t-k} | {t+k} | {<t} | {<=t} | {>t} | {>=t} | {a:b} | {1:T} | {a name given in masks}
+                where a is 1, t, t-k or t+k and b is T, t, t-k or t+k
+
+LaTeX spellings (\mid, \leq, \geq, \prod_t) are understood. A parent without a factor of its own is *context*:
+given, never drawn.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
+
+import networkx as nx
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["Block", "Factor", "Factorization", "NotationError", "Parent", "Relation", "check_pair"]
+
+Interval = tuple[float, float]
+Node = tuple[str, int | None]
+MaskFunction = Callable[[int], np.ndarray]
+
+KNOWN_RELATIONS = "t, {t-1}, {t+1}, {t-k}, {t-a:t+b}, {<t}, {<=t}, {>t}, {>=t}, {1:t}, {t:T}, {1:T}"
+RESERVED = {"lengths": "the number of valid steps", "mask": "which entries are observed"}
+
+
+class NotationError(ValueError):
+    """An equation that cannot be read; the message shows the text with a caret under the column."""
+
+
+# -------------------------------------------------------------------------------------------------- relations
+
+
+@dataclass(frozen=True)
+class Relation:
+    """Which steps s of a parent the child at step t may read: offsets s - t, or a mask of the user's own.
+
+    Relations compose: ``a | b`` (either), ``a & b`` (both), ``~a`` (the other steps).
+
+    Args:
+        name: as it stands in an equation, such as ``"{<t}"``.
+        intervals: sorted disjoint intervals of offsets s - t, both ends included and possibly infinite:
+            ``{t-1}`` is ``((-1, -1),)``, ``{<t}`` is ``((-inf, -1),)``. None for a mask of the user's own.
+        function: for a mask of the user's own, T -> bool array (T, T), rows t, columns s. (1, T) means the
+            same row for every t, and is the only shape a static child can have.
+
+    >>> str(Relation.parse("<t") | Relation.parse("t"))
+    '{<=t}'
+    """
+
+    name: str
+    intervals: tuple[Interval, ...] | None
+    function: MaskFunction | None = None
+
+    @classmethod
+    def of(cls, intervals: Iterable[Interval]) -> Relation:
+        """The relation with these offset intervals, merged, sorted and named."""
+        merged: list[Interval] = []
+        for low, high in sorted(intervals):
+            if merged and low <= merged[-1][1] + 1:
+                merged[-1] = (merged[-1][0], max(merged[-1][1], high))
+            else:
+                merged.append((low, high))
+        return cls(" | ".join(_interval_name(*i) for i in merged) or "{}", tuple(merged))
+
+    @classmethod
+    def custom(cls, name: str, function: MaskFunction) -> Relation:
+        """A mask of the user's own: function(T) -> bool array (T, T), shown as ``{name}``."""
+        return cls("{" + name + "}", None, function)
+
+    @classmethod
+    def parse(cls, text: str) -> Relation:
+        """The relation of a subscript, given without braces; ValueError for one the grammar lacks."""
+        for sign, spelling in {"<=": r"\\leq?", ">=": r"\\geq?", "<": r"\\lt", ">": r"\\gt"}.items():
+            text = re.sub(rf"(?:{spelling})(?![a-z])", sign, text)
+        text = re.sub(r"\s|\\[,;:! ]", "", text.replace("≤", "<=").replace("≥", ">="))
+        if single := re.fullmatch(r"t([+-]\d+)?", text):
+            offset = int(single[1] or 0)
+            return cls.of([(offset, offset)])
+        if side := re.fullmatch(r"(<=?|>=?)t([+-]\d+)?", text):
+            offset, strict = int(side[2] or 0), len(side[1]) == 1
+            past = side[1][0] == "<"
+            return cls.of([(-math.inf, offset - strict) if past else (offset + strict, math.inf)])
+        if span := re.fullmatch(r"(?:1|t([+-]\d+)?):(?:T|t([+-]\d+)?)", text):
+            low, high = text.split(":")
+            interval = (
+                -math.inf if low == "1" else int(span[1] or 0),
+                math.inf if high == "T" else int(span[2] or 0),
+            )
+            if interval[0] > interval[1]:
+                raise ValueError(
+                    f"the range {{{text}}} is empty; write the earlier step first: {{{high}:{low}}}"
+                )
+            return cls.of([interval])
+        raise ValueError(
+            f"unknown relation {{{text}}}; known are {KNOWN_RELATIONS}, and any name given in masks="
+        )
+
+    @property
+    def parts(self) -> tuple[Relation, ...]:
+        """The relations, each writable as one subscript, whose union this is."""
+        if self.intervals is not None:
+            return tuple(Relation.of([interval]) for interval in self.intervals)
+        if isinstance(self.function, _Composed) and self.function.operation is np.logical_or:
+            return tuple(part for operand in self.function.operands for part in operand.parts)
+        return (self,)
+
+    @property
+    def pointwise(self) -> bool:
+        """True where it reads a fixed number of steps, as t, {t-1} and {t-2:t} do; False for custom masks."""
+        ends = [end for interval in self.intervals or [(0, math.inf)] for end in interval]
+        return all(map(math.isfinite, ends))
+
+    @property
+    def lag(self) -> int:
+        """The largest finite distance in its definition: 1 for {<t} and {t+1}, 3 for {t-3:t}, 0 for {1:T}."""
+        if self.intervals is not None:
+            return max((int(abs(end)) for i in self.intervals for end in i if math.isfinite(end)), default=0)
+        t, s = np.nonzero(self._square(8))
+        distance = np.abs(s - t).max(initial=0)
+        return int(distance) if distance < 7 else 1
+
+    @property
+    def directions(self) -> frozenset[int]:
+        """Where it reads: -1 the past, 0 the same step, +1 the future; for custom masks, at T = 2, ..., 8."""
+        if self.intervals is not None:
+            reads = {-1: (-math.inf, -1), 0: (0, 0), 1: (1, math.inf)}
+            return frozenset(k for k, side in reads.items() if (self & Relation.of([side])).intervals)
+        offsets = [np.subtract(*np.nonzero(self._square(T).T)) for T in range(2, 9)]
+        return frozenset(int(sign) for sign in np.sign(np.concatenate(offsets)))
+
+    def mask(self, T: int) -> np.ndarray:
+        """Bool array (T, T): M[t, s] is True where the child at t may read the parent at s (counted from 0).
+
+        Raises:
+            ValueError: a custom function returns anything but a bool array (T, T) or (1, T).
+        """
+        if self.intervals is not None:
+            offset = np.arange(T)[None, :] - np.arange(T)[:, None]
+            return np.any(
+                [(low <= offset) & (offset <= high) for low, high in self.intervals or [(1, 0)]], axis=0
+            )
+        assert self.function is not None
+        mask = np.asarray(self.function(T))
+        if mask.dtype != bool or mask.shape not in ((T, T), (1, T)):
+            raise ValueError(
+                f"the mask {self.name} at T={T} is {mask.dtype} {mask.shape}; expected a bool array "
+                f"({T}, {T}) with rows t and columns s (or (1, {T}): the same row for every t)"
+            )
+        return mask
+
+    def _square(self, T: int) -> np.ndarray:
+        return np.broadcast_to(self.mask(T), (T, T))
+
+    def __or__(self, other: Relation) -> Relation:
+        if self.intervals is not None and other.intervals is not None:
+            return Relation.of(self.intervals + other.intervals)
+        return Relation(f"{self.name} | {other.name}", None, _Composed(np.logical_or, (self, other)))
+
+    def __and__(self, other: Relation) -> Relation:
+        if self.intervals is not None and other.intervals is not None:
+            pairs = [(max(a, c), min(b, d)) for a, b in self.intervals for c, d in other.intervals]
+            return Relation.of((low, high) for low, high in pairs if low <= high)
+        return Relation(f"{{{self.name} & {other.name}}}", None, _Composed(np.logical_and, (self, other)))
+
+    def __invert__(self) -> Relation:
+        if self.intervals is not None:
+            starts = [-math.inf, *(high + 1 for _, high in self.intervals)]
+            ends = [*(low - 1 for low, _ in self.intervals), math.inf]
+            gaps = zip(starts, ends, strict=True)
+            return Relation.of(
+                (low, high) for low, high in gaps if low <= high and math.inf not in (low, -high)
+            )
+        return Relation(f"{{~{self.name}}}", None, _Composed(np.logical_not, (self,)))
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True)
+class _Composed:
+    """Custom masks under a logical operation; a value, so that relations built the same way are equal."""
+
+    operation: Any
+    operands: tuple[Relation, ...]
+
+    def __call__(self, T: int) -> np.ndarray:
+        return self.operation(*(operand.mask(T) for operand in self.operands))
+
+
+def _interval_name(low: float, high: float) -> str:
+    def step(offset: float) -> str:
+        return f"t{int(offset):+d}" if offset else "t"
+
+    if low == -math.inf and high == math.inf:
+        return "{1:T}"
+    if low == -math.inf:
+        return "{<t}" if high == -1 else "{<=" + step(high) + "}"
+    if high == math.inf:
+        return "{>t}" if low == 1 else "{>=" + step(low) + "}"
+    return "{" + (step(low) if low == high else f"{step(low)}:{step(high)}") + "}"
+
+
+PAST, NOW, FUTURE = Relation.parse("<t"), Relation.parse("t"), Relation.parse(">t")
+ALL = Relation.parse("1:T")
+
+
+# ---------------------------------------------------------------------------------------- parents and factors
+
+
+@dataclass(frozen=True)
+class Parent:
+    """A variable that a factor reads: local with a relation in time, or static with none."""
+
+    name: str
+    local: bool
+    relation: Relation | None = None
+
+    @property
+    def pieces(self) -> tuple[tuple[str, str | None], ...]:
+        """(name, subscript) as written, such as ``(("x", "<t"), ("x", ">t"))``; None if static."""
+        if self.relation is None:
+            return ((self.name, None),)
+        return tuple((self.name, part.name[1:-1]) for part in self.relation.parts)
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """The pieces as text: ``("x_{<t}", "x_{>t}")``."""
+        return tuple(_plain(*piece) for piece in self.pieces)
+
+    def __str__(self) -> str:
+        return ", ".join(self.terms)
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One conditional distribution of a factorization; prints as ``p(z_t | z_{t-1}, w)``."""
+
+    kind: Literal["p", "q"]
+    child: str
+    local: bool
+    parents: tuple[Parent, ...] = ()
+
+    def parent(self, name: str) -> Parent | None:
+        """The parent of that name, or None where the factor does not read it."""
+        return next((parent for parent in self.parents if parent.name == name), None)
+
+    def mask(self, parent: str, T: int) -> np.ndarray:
+        """Which steps of a parent each step reads, (T or 1, T or 1); see :meth:`Factorization.mask`."""
+        reads = self.parent(parent)
+        if reads is None:
+            raise ValueError(f"{self} does not read {parent}")
+        rows, columns = T if self.local else 1, T if reads.local else 1
+        if reads.relation is None or (reads.relation == ALL and not self.local):
+            return np.ones((rows, columns), dtype=bool)
+        mask = reads.relation.mask(T)
+        if not self.local and len(mask) != 1:
+            raise ValueError(
+                f"the mask {reads.relation} of {self} is {mask.shape} at T={T}, but {self.child} is static: "
+                f"expected a bool array (1, {T})"
+            )
+        return np.broadcast_to(mask, (rows, columns)).copy()
+
+    def edges(self, T: int) -> list[tuple[Node, Node]]:
+        """The arrows (parent, child) of the graph unrolled over T steps; see :meth:`Factorization.dag`."""
+        return [
+            (unrolled(parent.name, parent.local, T)[s], unrolled(self.child, self.local, T)[t])
+            for parent in self.parents
+            for t, s in np.argwhere(self.mask(parent.name, T)).tolist()
+        ]
+
+    def render(self, variable: Callable[[str, str | None], str], bar: str = " | ") -> str:
+        """The factor as text, each variable written by ``variable(name, subscript)``."""
+        child = variable(self.child, "t" if self.local else None)
+        given = ", ".join(variable(*piece) for parent in self.parents for piece in parent.pieces)
+        return f"{self.kind}({child}{bar + given if given else ''})"
+
+    def __str__(self) -> str:
+        return self.render(_plain)
+
+
+@dataclass(frozen=True)
+class Block:
+    """Variables that are drawn together.
+
+    Args:
+        names: in the order in which they are drawn within a step.
+        direction: 0 all steps at once (always a single variable); +1 step by step forward in time, -1
+            backward.
+    """
+
+    names: tuple[str, ...]
+    direction: Literal[-1, 0, 1]
+
+
+def _plain(name: str, subscript: str | None) -> str:
+    if subscript is None:
+        return name
+    return f"{name}_t" if subscript == "t" else f"{name}_{{{subscript}}}"
+
+
+def _latex(name: str, subscript: str | None) -> str:
+    def symbol(word: str) -> str:
+        return word if len(word) == 1 else r"\mathrm{" + word.replace("_", r"\_") + "}"
+
+    if subscript is None:
+        return symbol(name)
+    below = symbol(subscript) if subscript.isidentifier() else subscript
+    return f"{symbol(name)}_{{{below}}}".replace("<=", r"\leq ").replace(">=", r"\geq ")
+
+
+def _html(name: str, subscript: str | None) -> str:
+    below = "" if subscript is None else subscript.replace("<=", "≤").replace(">=", "≥").replace("-", "−")
+    return f"<i>{html.escape(name)}</i>" + (f"<sub>{html.escape(below)}</sub>" if below else "")
+
+
+# --------------------------------------------------------------------------------------------- factorizations
+
+
+@dataclass(frozen=True)
+class Factorization:
+    """A joint distribution over sequences, as a product of conditional distributions.
+
+    Made by :meth:`parse`. Construction checks that it can be drawn: a variable that reads what is drawn after
+    it is refused, with the cycle. The order in which factors are written matters only as a tie-break.
+
+    >>> print(Factorization.parse("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)"))
+    p(x_{1:T}, z_{1:T}, w) = p(w) ∏_t p(z_t | z_{t-1}, w) p(x_t | z_t)
+
+    Raises:
+        ValueError: a cycle, both time directions in one loop, or a bad custom mask.
+    """
+
+    kind: Literal["p", "q"]
+    factors: tuple[Factor, ...]
+
+    def __post_init__(self) -> None:
+        for factor in self.factors:
+            for parent in factor.parents:
+                factor.mask(parent.name, 2)
+        _ = self.blocks
+
+    @classmethod
+    def parse(cls, text: str, masks: Mapping[str, Relation | MaskFunction] | None = None) -> Factorization:
+        """Reads equations such as ``"p(z_t | z_{t-1}) p(x_t | z_t)"``.
+
+        Args:
+            text: the factors, all p or all q.
+            masks: relations of the user's own: ``masks={"band": function}`` gives ``z_{band}`` its meaning,
+                where function(T) is a bool array (T, T), rows t, columns s; or a Relation.
+
+        Raises:
+            NotationError: the text cannot be read; the message shows the column.
+            ValueError: it can be read but not drawn (see the class).
+        """
+        return cls(*_Reader(text, masks or {}).factorization())
+
+    # what there is -----------------------------------------------------------------------------------------
+
+    @cached_property
+    def variables(self) -> tuple[str, ...]:
+        """Names with a factor, in written order."""
+        return tuple(factor.child for factor in self.factors)
+
+    @cached_property
+    def context(self) -> tuple[str, ...]:
+        """Names that are read but have no factor, in order of appearance. A guide's include the data."""
+        parents = (parent.name for factor in self.factors for parent in factor.parents)
+        return tuple(name for name in dict.fromkeys(parents) if name not in self.variables)
+
+    def factor(self, name: str) -> Factor:
+        """The factor of a variable; ValueError where it has none."""
+        for factor in self.factors:
+            if factor.child == name:
+                return factor
+        raise ValueError(
+            f"no factor for {name!r} in {self.text!r}; there are factors for {_names(self.variables)}"
+        )
+
+    def local(self, name: str) -> bool:
+        """True for a variable with one value per time step, False for one per sequence."""
+        if name not in self._locality:
+            raise ValueError(f"no variable {name!r} in {self.text!r}; there are {_names(self._locality)}")
+        return self._locality[name]
+
+    @cached_property
+    def _locality(self) -> dict[str, bool]:
+        parents = {parent.name: parent.local for factor in self.factors for parent in factor.parents}
+        return {factor.child: factor.local for factor in self.factors} | parents
+
+    @property
+    def masks(self) -> dict[str, MaskFunction]:
+        """The custom masks in use: ``Factorization.parse(f.text, masks=f.masks) == f``."""
+        relations = (parent.relation for factor in self.factors for parent in factor.parents)
+        parts = (part for relation in relations if relation is not None for part in relation.parts)
+        return {part.name[1:-1]: part.function for part in parts if part.function is not None}
+
+    def mask(self, child: str, parent: str, T: int) -> np.ndarray:
+        """Which steps of the parent (columns) each step of the child (rows) may read.
+
+        Returns:
+            Bool array (T or 1, T or 1): T for a local variable, 1 for a static one, so a local child of a
+            local parent has (T, T), of a static parent (T, 1), and a static child of a local parent (1, T).
+            All False where the child does not read that variable.
+        """
+        factor = self.factor(child)
+        if factor.parent(parent) is None:
+            return np.zeros((T if factor.local else 1, T if self.local(parent) else 1), dtype=bool)
+        return factor.mask(parent, T)
+
+    # how it is drawn ---------------------------------------------------------------------------------------
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """Blocks of variables in an order in which they can be drawn; written order breaks ties.
+
+        A block is a strongly connected set of variables (v leads to u if u reads v at any step): drawn in one
+        loop over time, or all steps at once for a variable that does not feed back into itself.
+        """
+        reads = nx.DiGraph()
+        reads.add_nodes_from(self.variables)
+        reads.add_edges_from((p.name, f.child) for f in self.factors for p in f.parents if p.name in reads)
+        components = nx.condensation(reads)
+        first = {c: min(map(self.variables.index, components.nodes[c]["members"])) for c in components}
+        order = nx.lexicographical_topological_sort(components, key=first.__getitem__)
+        return tuple(self._block(components.nodes[c]["members"]) for c in order)
+
+    def _block(self, members: set[str]) -> Block:
+        reads = [(f, p) for f in self.factors if f.child in members for p in f.parents if p.name in members]
+        if not reads:
+            return Block(tuple(members), 0)
+        where: dict[tuple[str, str], frozenset[int]] = {}
+        for factor, parent in reads:
+            if parent.relation is None or not factor.local:
+                raise self._undrawable(factor, parent, f"{parent.name} is drawn from {factor.child}")
+            where[factor.child, parent.name] = parent.relation.directions
+        seen = frozenset().union(*where.values())
+        # A generative model runs forward, so that it can forecast; only a guide may run backward in time.
+        direction: Literal[-1, 1] = -1 if self.kind == "q" and 1 in seen and -1 not in seen else 1
+        for factor, parent in reads:
+            if direction in where[factor.child, parent.name]:
+                why = "a generative model is drawn forward in time"
+                if self.kind == "q":
+                    past = next(f"{f.child}_t reads {p}" for f, p in reads if -1 in where[f.child, p.name])
+                    why = f"{past}, and one loop over time cannot run both forward and backward"
+                raise self._undrawable(factor, parent, why, direction)
+        now = nx.DiGraph()
+        now.add_nodes_from(members)
+        now.add_edges_from((p.name, f.child) for f, p in reads if 0 in where[f.child, p.name])
+        try:
+            names = tuple(nx.lexicographical_topological_sort(now, key=self.variables.index))
+        except nx.NetworkXUnfeasible:
+            factor, parent = self._blame(now)
+            late = f"drawn after {factor.child}_t" if parent.name != factor.child else "what it draws"
+            raise self._undrawable(factor, parent, f"{parent.name}_t is {late}", direction) from None
+        return Block(names, direction)
+
+    def _blame(self, now: nx.DiGraph) -> tuple[Factor, Parent]:
+        """One read of a cycle within a step: a variable's own, else a range such as {<=t}, else the first."""
+        cycle = set(next(nx.simple_cycles(now)))
+        reads = [(f, p) for f in self.factors for p in f.parents if {f.child, p.name} <= cycle]
+        reads = [(f, p) for f, p in reads if now.has_edge(p.name, f.child)]
+        return min(reads, key=lambda read: (read[0].child != read[1].name, read[1].relation == NOW))
+
+    def _undrawable(self, factor: Factor, parent: Parent, why: str, direction: int = 0) -> ValueError:
+        """The refusal: factor, parent, reason, shortest cycle and, for a local parent, the likely meaning."""
+        message = f"{factor} reads {parent}, but {why}"
+        if cycle := self._cycle(factor.child, parent.name):
+            message += f" (cycle {' -> '.join(_node(*node) for node in cycle)})"
+        if parent.relation is not None and direction:
+            drawn = PAST if direction > 0 else FUTURE
+            meant = parent.relation & drawn
+            if not meant.intervals:
+                meant = Relation.of([(-direction, -direction)]) if parent.relation.pointwise else drawn
+            message += f"; did you mean {Parent(parent.name, True, meant)}?"
+        return ValueError(message)
+
+    def _cycle(self, child: str, parent: str) -> list[Node]:
+        """The shortest cycle through child reading parent in the unrolled graph, from step 2; or []."""
+        lags = [p.relation.lag for f in self.factors for p in f.parents if p.relation is not None]
+        dag = self.dag(3 + max(lags, default=0))
+        found: list[list[Node]] = []
+        for source, target in dag.edges:
+            if source[0] == parent and target[0] == child and nx.has_path(dag, target, source):
+                found.append([source, *nx.shortest_path(dag, target, source)])
+        return min(found, key=lambda path: (len(path), abs((path[0][1] or 2) - 2)), default=[])
+
+    def dag(self, T: int, observed: Iterable[str] = ("x",)) -> nx.DiGraph:
+        """The graph unrolled over T steps, edges from parent to child.
+
+        Returns:
+            networkx.DiGraph with nodes (name, t), t = 1, ..., T, and (name, None) for static variables. The
+            node attribute ``kind`` is "data" for observed variables, "latent" for others with a factor, else
+            "context".
+        """
+        dag, observed = nx.DiGraph(), tuple(observed)
+        for name in (*self.context, *self.variables):
+            kind = "latent" if name in self.variables else "context"
+            dag.add_nodes_from(unrolled(name, self.local(name), T), kind="data" if name in observed else kind)
+        for factor in self.factors:
+            dag.add_edges_from(factor.edges(T))
+        return dag
+
+    # how it looks ------------------------------------------------------------------------------------------
+
+    @property
+    def text(self) -> str:
+        """The factors in written order and canonical spelling; :meth:`parse` reads it back."""
+        return " ".join(map(str, self.factors))
+
+    def _joint(self, variable: Callable[[str, str | None], str], bar: str, product: str) -> str:
+        def whole(names: Iterable[str]) -> str:
+            return ", ".join(variable(name, "1:T" if self.local(name) else None) for name in names)
+
+        drawn = [name for block in self.blocks for name in block.names]
+        given = bar + whole(self.context) if self.context else ""
+        static = [f.render(variable, bar) for f in self.factors if not f.local]
+        local = [f.render(variable, bar) for f in self.factors if f.local]
+        right = " ".join([*static, *([product] if local else []), *local])
+        return f"{self.kind}({whole(reversed(drawn))}{given}) = {right}"
+
+    def __str__(self) -> str:
+        return self._joint(_plain, " | ", "∏_t")
+
+    def _repr_latex_(self) -> str:
+        return "$$" + self._joint(_latex, r" \mid ", r"\prod_{t=1}^{T}") + "$$"
+
+    def _repr_html_(self) -> str:
+        return f"<span>{self._joint(_html, ' | ', '∏<sub><i>t</i></sub>')}</span>"
+
+    def draw(self, T: int = 3, ax: Axes | None = None, observed: Iterable[str] = ("x",)) -> Axes:
+        """Draws the graphical model unrolled over T steps, time left to right.
+
+        Latents are open circles, data shaded, context squares. Returns the matplotlib axes.
+        """
+        from dvae.graph import draw_dag
+
+        return draw_dag(self.dag(T, observed), ax=ax)
+
+
+def unrolled(name: str, local: bool, T: int) -> list[Node]:
+    """The nodes of a variable over T steps."""
+    return [(name, t) for t in range(1, T + 1)] if local else [(name, None)]
+
+
+def _node(name: str, t: int | None) -> str:
+    return name if t is None else f"{name}_{t}"
+
+
+def _names(names: Iterable[str]) -> str:
+    return ", ".join(names) or "none"
+
+
+# ---------------------------------------------------------------------------------------------------- reading
+
+
+class _Reader:
+    """A recursive-descent reader of the grammar above, which knows its column."""
+
+    SPACE = re.compile(r"(?:\s|\\[,;:! ]|\\q?quad)*")
+    BETWEEN = re.compile(r"(?:\s|\\[,;:! ]|\\q?quad|[*·,]|\\cdot|(?:∏|\\prod)(?:_\{t(?:=1\}\^\{?T)?\}|_t)?)*")
+    NAME = re.compile(r"[^\W\d_]\w*")
+
+    def __init__(self, text: str, masks: Mapping[str, Relation | MaskFunction]) -> None:
+        self.text, self.at = text, 0
+        self.masks = {name: self.custom(name, mask) for name, mask in masks.items()}
+        self.local: dict[str, bool] = {}
+
+    @staticmethod
+    def custom(name: str, mask: Relation | MaskFunction) -> Relation:
+        if not isinstance(mask, Relation):
+            return Relation.custom(name, mask)
+        return mask if mask.intervals else Relation.custom(name, mask.mask)
+
+    def fail(self, message: str, at: int | None = None) -> NoReturn:
+        at = self.at if at is None else at
+        start = self.text.rfind("\n", 0, at) + 1
+        line = self.text[start:].split("\n", 1)[0]
+        raise NotationError(f"{message}\n    {line}\n    {' ' * (at - start)}^")
+
+    def take(self, pattern: str | re.Pattern[str]) -> re.Match[str] | None:
+        """Skips spaces, then matches the pattern and moves behind it; None where it is not there."""
+        space = self.SPACE.match(self.text, self.at)
+        self.at = space.end() if space else self.at
+        match = re.compile(pattern).match(self.text, self.at)
+        if match:
+            self.at = match.end()
+        return match
+
+    def factorization(self) -> tuple[Literal["p", "q"], tuple[Factor, ...]]:
+        factors: list[Factor] = []
+        while self.take(self.BETWEEN) and self.at < len(self.text):
+            start = self.at
+            factor = self.factor()
+            if factors and factor.kind != factors[0].kind:
+                self.fail(
+                    "p and q in one factorization; write the generative model and the guide apart", start
+                )
+            if any(factor.child == other.child for other in factors):
+                self.fail(f"a second factor for {factor.child}; each variable has one", start)
+            factors.append(factor)
+        if not factors:
+            self.fail('no factors; expected for instance "p(z_t | z_{t-1}) p(x_t | z_t)"')
+        return factors[0].kind, tuple(factors)
+
+    def factor(self) -> Factor:
+        head = self.take(r"([pq])(?:_\{?\\?\w+\}?)?\s*(?:\\left)?\(")
+        if head is None:
+            self.fail("expected a factor: p(...) or q(...)")
+        kind: Literal["p", "q"] = "p" if head[1] == "p" else "q"
+        start = self.at
+        child = self.variable()
+        if child.relation not in (None, NOW):
+            self.fail(f"a factor is for one step: write {kind}({child.name}_t | ...), not {child}", start)
+        parents: dict[str, Parent] = {}
+        if self.take(r"\||\\mid(?![a-z])|\\vert(?![a-z])"):
+            while True:
+                self.take("")
+                start = self.at
+                parent = self.variable()
+                if (
+                    not child.local
+                    and parent.relation is not None
+                    and not self.readable_by_static(parent.relation)
+                ):
+                    self.fail(
+                        f"{child.name} has one value per sequence and so no t that {parent} could refer to; "
+                        f"it can read {parent.name}_{{1:T}}",
+                        start,
+                    )
+                if (before := parents.get(parent.name)) and before.relation and parent.relation:
+                    parent = Parent(parent.name, True, before.relation | parent.relation)
+                parents[parent.name] = parent
+                if not self.take(","):
+                    break
+        if not self.take(r"(?:\\right)?\)"):
+            self.fail(
+                'expected "," or ")"' if parents else 'expected "|" or ")" after the one variable of a factor'
+            )
+        return Factor(kind, child.name, child.local, tuple(parents.values()))
+
+    @staticmethod
+    def readable_by_static(relation: Relation) -> bool:
+        return relation == ALL or relation.intervals is None
+
+    def variable(self) -> Parent:
+        name = self.take(self.NAME)
+        if name is None:
+            self.fail("expected a variable: a name, or a name with a subscript such as z_t or z_{t-1}")
+        start, word, relation = name.start(), name[0], None
+        if word.endswith("_") and self.text[self.at : self.at + 1] == "{":
+            word, relation = word[:-1], self.relation()
+        elif word.endswith("_t"):
+            word, relation = word[:-2], NOW
+            if shift := self.take(r"[+-]\s*\d+|[:<>=]"):
+                self.fail(
+                    f"braces are missing: write {word}_{{t{shift[0]}}}"
+                    if shift[0][0] in "+-"
+                    else f"braces are missing: write {word}_{{...}}",
+                    start,
+                )
+        elif word.endswith("_"):
+            self.fail(f"a subscript needs braces: write {word}{{<t}}, {word}{{t-1}} or {word}t")
+        elif subscript := re.search(r"_(\d+|T)$", word):
+            stem = word[: subscript.start()]
+            self.fail(
+                f"{word} names one step; write {stem}_{{1:T}} for all steps, or {stem}{subscript[1]} if it "
+                "is a variable of its own",
+                start,
+            )
+        if word in RESERVED:
+            self.fail(f"{word!r} is the batch's entry for {RESERVED[word]}; choose another name", start)
+        local = relation is not None
+        if self.local.setdefault(word, local) != local:
+            was, now = ("per step", "per sequence") if self.local[word] else ("per sequence", "per step")
+            self.fail(
+                f"{word} was one value {was} before and is one {now} here; write {word}_t, {word}_{{1:T}}, "
+                f"... throughout, or {word} throughout",
+                start,
+            )
+        return Parent(word, local, relation)
+
+    def relation(self) -> Relation:
+        opening = self.at
+        closing = self.text.find("}", opening)
+        if closing < 0:
+            self.fail('"{" without "}"', opening)
+        inside, self.at = self.text[opening + 1 : closing], closing + 1
+        if inside.strip() in self.masks:
+            return self.masks[inside.strip()]
+        try:
+            return Relation.parse(inside)
+        except ValueError as error:
+            given = f" ({', '.join(self.masks)} here)" if self.masks else ""
+            self.fail(f"{error}{given if 'unknown' in str(error) else ''}", opening)
+
+
+# -------------------------------------------------------------------------------------------- model and guide
+
+
+def check_pair(
+    generative: Factorization,
+    inference: Factorization,
+    observed: Iterable[str] = ("x",),
+    sizes: Mapping[str, int] | None = None,
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Checks that a guide fits a generative model.
+
+    Args:
+        generative: p over latents and observed variables.
+        inference: q over the latents, given the data.
+        observed: names of the observed variables.
+        sizes: dimension of every variable, context included; not checked if None.
+
+    Returns:
+        Names (latents, observed, context): latents in the order in which the guide draws them.
+
+    Raises:
+        ValueError: naming what does not fit, and what to write.
+    """
+    observed = tuple(observed)
+    if generative.kind != "p" or inference.kind != "q":
+        raise ValueError(
+            "expected p(...) for the generative model and q(...) for the guide, got "
+            f"{generative.text!r} and {inference.text!r}"
+        )
+    latents = tuple(name for name in generative.variables if name not in observed)
+    for name in observed:
+        if name not in generative.variables:
+            raise ValueError(
+                f"the observed {name} has no factor in {generative.text!r}; add p({name}_t | ...)"
+            )
+    for name in inference.variables:
+        if name in observed:
+            raise ValueError(
+                f"{inference.factor(name)}: {name} is observed, and a guide draws latents given what is "
+                "observed; remove this factor"
+            )
+        if name not in latents:
+            raise ValueError(
+                f"{inference.factor(name)}: no latent {name} in {generative.text!r}; remove this factor, "
+                f"or add {_head('p', name, inference.local(name))} to the generative model"
+            )
+    for name in latents:
+        if name not in inference.variables:
+            add = _head("q", name, generative.local(name))
+            raise ValueError(
+                f"the latent {name} has no factor in the guide; add {add}, or name {name} as observed"
+            )
+    everything = dict.fromkeys((*generative.variables, *generative.context, *inference.context))
+    for name in everything:
+        locality = {f.kind: f.local(name) for f in (generative, inference) if name in f.variables + f.context}
+        if len(set(locality.values())) > 1:
+            has = {kind: "per step" if local else "per sequence" for kind, local in locality.items()}
+            raise ValueError(
+                f"{name} has one value {has['p']} in the generative model and one {has['q']} in the guide"
+            )
+    context = tuple(name for name in everything if name not in generative.variables)
+    if sizes is not None:
+        if missing := [name for name in everything if name not in sizes]:
+            what = " (no factor, so read as context)" if set(missing) <= set(context) else ""
+            raise ValueError(f"sizes missing for {_names(missing)}{what}; needed are {_names(everything)}")
+        if unknown := [name for name in sizes if name not in everything]:
+            raise ValueError(
+                f"sizes given for {_names(unknown)}, not in the equations, which have {_names(everything)}"
+            )
+    return tuple(name for block in inference.blocks for name in block.names), observed, context
+
+
+def _head(kind: str, name: str, local: bool) -> str:
+    return f"{kind}({name}{'_t' if local else ''} | ...)"

@@ -1,0 +1,77 @@
+"""Random factorizations for property tests, as hypothesis strategies."""
+
+from __future__ import annotations
+
+from hypothesis import strategies as st
+
+PAST = ("{t-1}", "{t-2}", "{<t}", "{t-2:t-1}")
+NOW = ("t", "{<=t}", "{t-1:t}")
+ANY = (*PAST, *NOW, "{t+1}", "{>t}", "{>=t}", "{1:T}")
+BACKWARD = {
+    "{t-1}": "{t+1}",
+    "{t-2}": "{t+2}",
+    "{<t}": "{>t}",
+    "{t-2:t-1}": "{t+1:t+2}",
+    "{<=t}": "{>=t}",
+    "{t-1:t}": "{t:t+1}",
+}
+
+
+@st.composite
+def factorizations(
+    draw: st.DrawFn, max_locals: int = 2, static: bool = True, backward: bool = True
+) -> tuple[str, str]:
+    """Pairs (generative, inference) of equations, always valid together.
+
+    Variables are the observed x, the local latents z and (with two) u, and perhaps a static latent w. Factors
+    are written in random order, so not always in one in which they can be drawn.
+
+    Args:
+        max_locals: 1 or 2 local latents at most.
+        static: allow the static latent w.
+        backward: allow guides that run backward in time.
+
+    Example::
+
+        @given(factorizations())
+        def test_bound(pair):
+            generative, inference = map(dvae.Factorization.parse, pair)
+    """
+    latents = draw(st.sampled_from([("z",), ("z", "u")][:max_locals]))
+    shared = ["w"] if static and draw(st.booleans()) else []
+
+    order = draw(st.permutations([*latents, "x"]))
+    # Either all locals share one loop over time, or each reads the earlier ones at any step and its own past.
+    layered = draw(st.booleans())
+    generative = ["p(w)"] if shared else []
+    for i, child in enumerate(order):
+        reads = {}
+        for j, parent in enumerate(order):
+            earlier, later = (ANY, ()) if layered else (PAST + NOW, PAST)
+            allowed = earlier if j < i else PAST if j == i else later
+            if allowed and draw(st.booleans()):
+                reads[parent] = draw(st.sampled_from(allowed))
+        generative.append(_factor("p", child, reads, [name for name in shared if draw(st.booleans())]))
+
+    flip = BACKWARD if backward and draw(st.booleans()) else {}
+    static_first = draw(st.booleans())
+    order = draw(st.permutations(latents))
+    inference = []
+    for i, child in enumerate(order):
+        reads = {"x": draw(st.sampled_from(ANY))} if draw(st.booleans()) else {}
+        for j, parent in enumerate(order):
+            if draw(st.booleans()):
+                relation = draw(st.sampled_from(PAST + NOW if j < i else PAST))
+                reads[parent] = flip.get(relation, relation)
+        visible = [name for name in shared if static_first and draw(st.booleans())]
+        inference.append(_factor("q", child, reads, visible))
+    if shared:
+        whole = ["x"] if static_first else ["x", *latents]
+        given = [f"{name}_{{1:T}}" for name in whole if draw(st.booleans())]
+        inference.append(f"q(w | {', '.join(given)})" if given else "q(w)")
+    return " ".join(draw(st.permutations(generative))), " ".join(draw(st.permutations(inference)))
+
+
+def _factor(kind: str, child: str, reads: dict[str, str], static: list[str]) -> str:
+    parents = [f"{name}_{relation}" for name, relation in reads.items()] + static
+    return f"{kind}({child}_t{' | ' if parents else ''}{', '.join(parents)})"
