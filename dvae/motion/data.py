@@ -1,0 +1,218 @@
+"""Motion clips and sets of clips, checked when they are made.
+
+A clip is (frames, joints, 3) float32 in metres. Clip names may repeat between splits (the CMU benchmark has a
+`walking_1` in both), so whatever points at a clip does so by (split, name).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+
+from .skeleton import Skeleton
+
+SMALLEST, TALLEST = 0.3, 3.0
+"""Metres between which a body's largest extent must lie: room for a child, too narrow for another unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """One recording.
+
+    Args:
+        split: what the archive files it under: "train" and "test", or a subject.
+        name: its name, unique within the split.
+        positions: (F, J, 3) in metres, global.
+        labels: what is known about it, as text.
+        truth: what a simulator knows about it, as arrays; real clips have none.
+    """
+
+    split: str
+    name: str
+    positions: np.ndarray
+    labels: Mapping[str, str] = field(default_factory=dict)
+    truth: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """(split, name)."""
+        return self.split, self.name
+
+    @property
+    def frames(self) -> int:
+        """Number of frames F."""
+        return len(self.positions)
+
+
+def defect(clip: Clip, skeleton: Skeleton) -> str | None:
+    """Why a clip cannot be used with a skeleton, in a sentence that names the clip; None when it can."""
+    where, positions = f"clip {clip.split}/{clip.name}", clip.positions
+    if positions.dtype.kind not in "fiu":
+        return f"{where} holds {positions.dtype}, expected numbers"
+    if positions.ndim != 3 or positions.shape[2] != 3:
+        return f"{where} has shape {positions.shape}, expected (frames, joints, 3)"
+    if positions.shape[1] != skeleton.joints:
+        return f"{where} has {positions.shape[1]} joints, skeleton {skeleton.name!r} has {skeleton.joints}"
+    if not len(positions):
+        return f"{where} has no frames"
+    bad = ~np.isfinite(positions).all(axis=2)
+    if bad.any():
+        frame, joint = np.argwhere(bad)[0]
+        return (
+            f"{where} has NaN or infinite positions: {bad.sum()} joint positions in "
+            f"{bad.any(axis=1).sum()} of {clip.frames} frames, first {skeleton.names[joint]} at frame {frame}"
+        )
+    extent = float(np.median(np.ptp(positions.astype(np.float64), axis=1).max(axis=1)))
+    if not SMALLEST <= extent <= TALLEST:
+        unit = "millimetres" if extent >= 300 else "centimetres" if extent >= 30 else "another unit"
+        return (
+            f"{where} shows a person of {extent:.4g} m (median over frames of the body's largest extent, "
+            f"expected {SMALLEST} to {TALLEST} m): it looks like {unit}; convert the positions to metres"
+        )
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSet:
+    """Clips of one skeleton.
+
+    Iterating gives the clips, `motion["train", "walking_1"]` one of them.
+
+    Args:
+        clips: the clips; copied as float32.
+        skeleton: the tree that all of them have.
+        name: what to call the set.
+        skipped: clips that were left out on reading, as (split, name, reason).
+
+    Raises:
+        ValueError: a clip has NaN, wrong joints, a wrong shape or implausible units, two clips share a key,
+            or there is no clip.
+    """
+
+    clips: Sequence[Clip]
+    skeleton: Skeleton
+    name: str = ""
+    skipped: Sequence[tuple[str, str, str]] = ()
+
+    def __post_init__(self) -> None:
+        for clip in self.clips:
+            reason = defect(clip, self.skeleton)
+            if reason:
+                raise ValueError(f"{self.name or 'motion set'}: {reason}")
+        if not self.clips:
+            dropped = (
+                f"; {len(self.skipped)} were skipped, the first: {self.skipped[0][2]}" if self.skipped else ""
+            )
+            raise ValueError(f"{self.name or 'motion set'}: no clips{dropped}")
+        twice = [key for key, count in Counter(clip.key for clip in self.clips).items() if count > 1]
+        if twice:
+            raise ValueError(f"{self.name or 'motion set'}: clip {'/'.join(twice[0])} is there twice")
+        single = tuple(
+            Clip(
+                clip.split,
+                clip.name,
+                np.array(clip.positions, np.float32, order="C"),
+                clip.labels,
+                clip.truth,
+            )
+            for clip in self.clips
+        )
+        object.__setattr__(self, "clips", single)
+        object.__setattr__(self, "_index", {clip.key: clip for clip in single})
+
+    @classmethod
+    def usable(cls, clips: Iterable[Clip], skeleton: Skeleton, name: str = "") -> MotionSet:
+        """The set of those clips that have no defect; the others are listed in `skipped` with the reason."""
+        reasons = [(clip, defect(clip, skeleton)) for clip in clips]
+        skipped = [(clip.split, clip.name, reason) for clip, reason in reasons if reason]
+        return cls([clip for clip, reason in reasons if not reason], skeleton, name, skipped)
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __iter__(self) -> Iterator[Clip]:
+        return iter(self.clips)
+
+    def __getitem__(self, key: tuple[str, str]) -> Clip:
+        index: dict[tuple[str, str], Clip] = self.__dict__["_index"]
+        try:
+            return index[key]
+        except (KeyError, TypeError):
+            raise KeyError(f"no clip {key!r} in {self.name!r}; keys are (split, clip name)") from None
+
+    @property
+    def splits(self) -> list[str]:
+        """The splits, in order of appearance."""
+        return list(dict.fromkeys(clip.split for clip in self.clips))
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the content: skeleton, and every clip's key, shape and bytes, in order."""
+        digest = hashlib.sha256(repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up)).encode())
+        for clip in self.clips:
+            digest.update(repr((*clip.key, clip.positions.shape)).encode())
+            digest.update(clip.positions.astype("<f4", copy=False).tobytes())
+        return digest.hexdigest()
+
+    def summary(self) -> list[dict[str, str | int | float]]:
+        """One row per split: clips, frames, minutes, shortest and longest clip in frames, clips skipped."""
+        skipped = Counter(split for split, _, _ in self.skipped)
+        rows: list[dict[str, str | int | float]] = []
+        for split in self.splits:
+            frames = [clip.frames for clip in self.clips if clip.split == split]
+            rows.append(
+                {
+                    "split": split,
+                    "clips": len(frames),
+                    "frames": sum(frames),
+                    "minutes": round(sum(frames) / self.skeleton.fps / 60, 1),
+                    "shortest": min(frames),
+                    "longest": max(frames),
+                    "skipped": skipped[split],
+                }
+            )
+        return rows
+
+    def info(self) -> RenderableType:
+        """What `dvae data info` prints: splits, skeleton, how rigid the bones are, and the labels."""
+        splits = Table(title=self.name or None, title_justify="left")
+        rows = self.summary()
+        for column in rows[0]:
+            splits.add_column(column, justify="left" if column == "split" else "right")
+        for row in rows:
+            splits.add_row(
+                *(f"{value:,}" if isinstance(value, int) else str(value) for value in row.values())
+            )
+
+        bones = [self.skeleton.bone_lengths(clip.positions.astype(np.float64)) for clip in self.clips]
+        variation = [lengths.std(axis=0) / np.maximum(lengths.mean(axis=0), 1e-9) for lengths in bones]
+        worst = int(np.argmax([v.max() for v in variation]))
+        bone = self.skeleton.names[self.skeleton.edges[int(np.argmax(variation[worst]))][1]]
+        extent = np.median(
+            [np.median(np.ptp(clip.positions, axis=1)[:, self.skeleton.vertical]) for clip in self]
+        )
+
+        facts = Table.grid(padding=(0, 2))
+        facts.add_row(
+            "skeleton", f"{self.skeleton.name}: {self.skeleton.joints} joints, {self.skeleton.up} up"
+        )
+        facts.add_row("frames per second", f"{self.skeleton.fps:g}")
+        facts.add_row("vertical extent", f"{extent:.2f} m (median)")
+        facts.add_row(
+            "bone lengths",
+            f"vary by at most {variation[worst].max():.2%} within a clip (sd / mean; {bone} in "
+            f"{'/'.join(self.clips[worst].key)})",
+        )
+        facts.add_row("fingerprint", self.fingerprint()[:16])
+        for label in dict.fromkeys(name for clip in self.clips for name in clip.labels):
+            counts = Counter(clip.labels[label] for clip in self.clips if label in clip.labels)
+            if len(counts) <= 24:
+                facts.add_row(label, ", ".join(f"{value} {count}" for value, count in counts.most_common()))
+        for split, name, reason in self.skipped[:10]:
+            facts.add_row("skipped", f"{split}/{name}: {reason}")
+        return Group(splits, facts)

@@ -1,0 +1,355 @@
+"""Protocols: how motion is cut into windows, and which windows are for training, validation and test.
+
+Sources of the presets: DLow (Yuan and Kitani 2020) and GSPS (Mao, Liu and Salzmann 2021) for Human3.6M and
+HumanEva-I, TrajeVAE (Kania et al. 2021), and the data's own README for bandai2 and cmu8.
+
+Decisions, where papers and code differ:
+
+* A window may start at every frame from 0 to F - T *inclusive*. The public code of DLow and GSPS draws and
+  lists starts below F - T, so it never uses a clip's last frame and drops clips of exactly T frames.
+* Validation clips are every k-th training clip in file order, chosen by clip (windows of a clip overlap) and
+  before clips that are too short are left out, so that they are the same clips for every window length. In
+  bandai2 neighbouring takes are near copies and all validation takes have seen styles: validation there is no
+  substitute for the test.
+* References that remember the training data (nearest neighbours) should remember all of it:
+  `"train+validation"`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from dataclasses import astuple, dataclass
+from math import pi
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from .data import Clip, MotionSet
+from .skeleton import rotate_about_up
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How windows are cut, represented and divided.
+
+    Args:
+        name: what to call it in results.
+        observed, predicted: frames before and after the present; a window is both.
+        fps: frames per second the numbers of frames refer to.
+        train_stride, test_stride: frames between the starts of listed training and test windows.
+        root: "drop": every frame relative to its own pelvis, which is then left out, D = 3 (J - 1).
+            "relative": relative to the pelvis of the window's first frame, D = 3 J; global motion is kept.
+        multimodal_threshold: metres; test windows whose last observed poses are closer are each other's
+            futures.
+        split_by: "split", or the label, by which clips are assigned.
+        train, test: its values that mean training and test.
+        validation: the part of the training clips held out.
+        sampling: how training windows are drawn. "clip": uniform clip, uniform start. "length": every window
+            alike. "subject": uniform split of the archive (a subject, in Human3.6M), then clip, then start.
+        heading: turn every window about the up axis so that the last observed frame has heading zero.
+        rotate: turn every drawn window about the up axis by a uniform angle.
+
+    Raises:
+        ValueError: a number of frames or a stride is below 1, or heading and rotate contradict each other.
+    """
+
+    name: str
+    observed: int
+    predicted: int
+    fps: float
+    train_stride: int
+    test_stride: int
+    root: Literal["drop", "relative"] = "drop"
+    multimodal_threshold: float = 0.5
+    split_by: str = "split"
+    train: tuple[str, ...] = ("train",)
+    test: tuple[str, ...] = ("test",)
+    validation: float = 0.1
+    sampling: Literal["clip", "length", "subject"] = "clip"
+    heading: bool = False
+    rotate: bool = False
+
+    def __post_init__(self) -> None:
+        for field in ("observed", "predicted", "train_stride", "test_stride"):
+            if getattr(self, field) < 1:
+                raise ValueError(
+                    f"protocol {self.name}: {field} is {getattr(self, field)}, expected 1 or more"
+                )
+        for field, choices in (("root", ("drop", "relative")), ("sampling", ("clip", "length", "subject"))):
+            if getattr(self, field) not in choices:
+                raise ValueError(
+                    f"protocol {self.name}: {field} is {getattr(self, field)!r}, "
+                    f"expected {' or '.join(choices)}"
+                )
+        if not 0 <= self.validation < 1:
+            raise ValueError(
+                f"protocol {self.name}: validation is {self.validation}, expected a part from 0 to below 1"
+            )
+        if self.heading and self.rotate:
+            raise ValueError(
+                f"protocol {self.name}: heading fixes the direction that rotate would draw; choose one"
+            )
+
+    @property
+    def length(self) -> int:
+        """Frames in a window, T."""
+        return self.observed + self.predicted
+
+
+_HUMAN36M: dict[str, Any] = {
+    "train": ("S1", "S5", "S6", "S7", "S8"),
+    "test": ("S9", "S11"),
+    "sampling": "subject",
+}
+_STYLES: dict[str, Any] = {"split_by": "file_group", "train": ("A", "B"), "test": ("C",)}
+
+PROTOCOLS = {
+    protocol.name: protocol
+    for protocol in (
+        Protocol("h36m", 25, 100, 50, train_stride=20, test_stride=25, **_HUMAN36M),
+        Protocol(
+            "humaneva",
+            *(15, 60, 60),
+            train_stride=15,
+            test_stride=15,
+            train=("Train/S1", "Train/S2", "Train/S3"),
+            test=("Validate/S1", "Validate/S2", "Validate/S3"),
+            sampling="subject",
+        ),
+        Protocol(
+            "trajevae", 1, 100, 50, train_stride=25, test_stride=25, root="relative", rotate=True, **_HUMAN36M
+        ),
+        Protocol("bandai2-by-style", 15, 60, 30, train_stride=5, test_stride=15, **_STYLES),
+        Protocol("bandai2-by-take", 15, 60, 30, train_stride=5, test_stride=15),
+        Protocol("cmu8", 15, 60, 30, train_stride=5, test_stride=15),
+        Protocol("simulated", 15, 60, 30, train_stride=5, test_stride=15),
+    )
+}
+"""The presets by name. In `bandai2-by-style` all clips of groups A and B train, all of C test, whatever the
+file's own split; this reading gives the reference figures of the data's README."""
+
+
+def windows(motion: MotionSet, protocol: Protocol, split: str, length: int | None = None) -> Windows:
+    """The windows of a split.
+
+    Args:
+        motion: the clips.
+        protocol: how to cut them.
+        split: "train", "validation", "test", or "train+validation".
+        length: frames in a window, when it should differ from the protocol's observed + predicted.
+
+    Raises:
+        ValueError: the frame rates differ, the split has no clip, no clip is long enough, or a clip lacks the
+            label by which the protocol splits.
+    """
+    if motion.skeleton.fps != protocol.fps:
+        raise ValueError(
+            f"protocol {protocol.name} counts frames at {protocol.fps:g} a second, {motion.name!r} has "
+            f"{motion.skeleton.fps:g}: choose another protocol or make one with dataclasses.replace"
+        )
+    parts = _divide(motion, protocol)
+    unknown = [name for name in split.split("+") if name not in parts]
+    if unknown:
+        raise ValueError(f"no split {unknown[0]!r}: expected train, validation, test or train+validation")
+    chosen = {clip.key for name in split.split("+") for clip in parts[name]}
+    return Windows(
+        [clip for clip in motion if clip.key in chosen], motion, protocol, split, length or protocol.length
+    )
+
+
+def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
+    def value(clip: Clip) -> str:
+        if protocol.split_by == "split":
+            return clip.split
+        if protocol.split_by not in clip.labels:
+            raise ValueError(
+                f"protocol {protocol.name} splits by the label {protocol.split_by!r}, which clip "
+                f"{'/'.join(clip.key)} lacks: is labels.csv beside the file?"
+            )
+        return clip.labels[protocol.split_by]
+
+    values = [(clip, value(clip)) for clip in motion]
+    train = [clip for clip, found in values if found in protocol.train]
+    test = [clip for clip, found in values if found in protocol.test]
+    if not train and not test:
+        found = ", ".join(dict.fromkeys(found for _, found in values))
+        raise ValueError(
+            f"protocol {protocol.name} wants {protocol.split_by} {'/'.join(protocol.train)} for training and "
+            f"{'/'.join(protocol.test)} for test; {motion.name!r} has {found}"
+        )
+    held_out = round(len(train) * protocol.validation)
+    if protocol.validation and len(train) > 1:
+        held_out = max(held_out, 1)
+    middle_of_each_block = {int((block + 0.5) * len(train) / held_out) for block in range(held_out)}
+    return {
+        "train": [clip for i, clip in enumerate(train) if i not in middle_of_each_block],
+        "validation": [clip for i, clip in enumerate(train) if i in middle_of_each_block],
+        "test": test,
+    }
+
+
+class Windows:
+    """Windows of T frames cut from clips, as tensors (…, T, D) in metres.
+
+    Made by `windows`. `sample` draws windows, `all` lists them every few frames.
+
+    Attributes:
+        protocol, skeleton, split: what they were made from.
+        length: frames in a window, T.
+        clips: the clips that are long enough.
+        skipped: (split, clip, frames) of those that are not.
+    """
+
+    def __init__(
+        self, clips: list[Clip], motion: MotionSet, protocol: Protocol, split: str, length: int
+    ) -> None:
+        if length < 1 or (protocol.heading and length < protocol.observed):
+            raise ValueError(
+                f"windows of {length} frames: expected at least {protocol.observed} (the observed frames)"
+            )
+        self.protocol, self.skeleton, self.split, self.length = protocol, motion.skeleton, split, length
+        self.clips = [clip for clip in clips if clip.frames >= length]
+        self.skipped = [(*clip.key, clip.frames) for clip in clips if clip.frames < length]
+        if not self.clips:
+            longest = max((clip.frames for clip in clips), default=0)
+            raise ValueError(
+                f"{split} split of {motion.name!r} has no window of {length} frames: {len(clips)} clips, "
+                f"the longest of {longest} frames"
+            )
+        if protocol.heading:
+            self.skeleton.heading(
+                torch.zeros(self.skeleton.joints, 3)
+            )  # says now if the skeleton has no sides
+
+        self._frames = torch.cat([torch.from_numpy(clip.positions) for clip in self.clips])
+        frames = torch.tensor([clip.frames for clip in self.clips])
+        self._first = frames.cumsum(0) - frames
+        self._starts = frames - length + 1
+        self._weights = self._draw_weights().cumsum(0)
+
+    def _draw_weights(self) -> Tensor:
+        if self.protocol.sampling == "length":
+            return self._starts.double()
+        if self.protocol.sampling == "clip":
+            return torch.ones(len(self.clips), dtype=torch.float64)
+        clips_of = Counter(clip.split for clip in self.clips)
+        return torch.tensor([1 / clips_of[clip.split] for clip in self.clips], dtype=torch.float64)
+
+    @property
+    def stride(self) -> int:
+        """Frames between listed windows, the protocol's; validation windows are listed like test windows."""
+        return self.protocol.train_stride if self.split.startswith("train") else self.protocol.test_stride
+
+    @property
+    def keys(self) -> list[tuple[str, str, int]]:
+        """(split, clip, first frame) of the windows that `all()` lists."""
+        return self.index(self.stride)
+
+    def index(self, stride: int) -> list[tuple[str, str, int]]:
+        """(split, clip, first frame) of the windows that `all(stride)` lists."""
+        clips, starts = self._list(stride)
+        return [(*self.clips[c].key, s) for c, s in zip(clips.tolist(), starts.tolist(), strict=True)]
+
+    def __len__(self) -> int:
+        return len(self._list(self.stride)[0])
+
+    def __repr__(self) -> str:
+        return (
+            f"Windows({self.protocol.name} {self.split}: {len(self)} of {self.length} frames from "
+            f"{len(self.clips)} clips, {len(self.skipped)} too short)"
+        )
+
+    @property
+    def size(self) -> int:
+        """Numbers per frame, D."""
+        return 3 * (self.skeleton.joints - (self.protocol.root == "drop"))
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw windows with replacement, as the protocol's `sampling` says: {"x": (B, T, D)} float32.
+
+        The same generator state gives the same windows.
+        """
+        which, where, turn = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
+        clips = torch.searchsorted(self._weights, which * self._weights[-1], right=True)
+        starts = (where * self._starts[clips]).long()
+        x = self._cut(clips, starts)
+        if self.protocol.rotate:
+            joints = x.unflatten(-1, (-1, 3))
+            angle = (2 * pi * turn).float()[:, None, None]
+            x = rotate_about_up(joints, angle, self.skeleton.up).flatten(-2)
+        return {"x": x}
+
+    def all(self, stride: int | None = None) -> dict[str, Tensor]:
+        """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32."""
+        clips, starts = self._list(stride or self.stride)
+        x = torch.empty(len(clips), self.length, self.size)
+        for block in torch.arange(len(clips)).split(
+            512
+        ):  # so that memory holds the windows little more than once
+            x[block] = self._cut(clips[block], starts[block])
+        return {"x": x}
+
+    def labels(self, name: str) -> list[str]:
+        """The label of every listed window's clip; empty text where a clip lacks it.
+
+        Raises:
+            KeyError: no clip has such a label.
+        """
+        if not any(name in clip.labels for clip in self.clips):
+            known = sorted({label for clip in self.clips for label in clip.labels})
+            raise KeyError(f"no label {name!r}; there are {', '.join(known) or 'none'}")
+        return [self.clips[c].labels.get(name, "") for c in self._list(self.stride)[0].tolist()]
+
+    def positions(self, x: Tensor) -> Tensor:
+        """Joint positions (..., T, J, 3) of frames (..., T, D), for drawing and bone lengths.
+
+        A root that was dropped is put back at the origin.
+        """
+        if x.shape[-1] != self.size:
+            raise ValueError(
+                f"frames have {x.shape[-1]} numbers, expected {self.size}: {self.skeleton.joints} joints, "
+                f"root {self.protocol.root}"
+            )
+        joints = x.unflatten(-1, (-1, 3))
+        if self.protocol.root == "relative":
+            return joints
+        root = self.skeleton.root
+        return torch.cat(
+            [joints[..., :root, :], torch.zeros_like(joints[..., :1, :]), joints[..., root:, :]], -2
+        )
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the protocol, the skeleton, the listed windows and the data they are cut from."""
+        digest = hashlib.sha256(repr((astuple(self.protocol), self.split, self.length)).encode())
+        digest.update(
+            repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up, self.keys)).encode()
+        )
+        digest.update(self._frames.numpy().astype("<f4", copy=False).tobytes())
+        return digest.hexdigest()
+
+    def _list(self, stride: int) -> tuple[Tensor, Tensor]:
+        """Clip index and first frame of every listed window."""
+        if stride < 1:
+            raise ValueError(f"stride is {stride}, expected 1 or more")
+        counts = (self._starts + stride - 1) // stride
+        clips = torch.repeat_interleave(counts)
+        return clips, stride * (torch.arange(len(clips)) - (counts.cumsum(0) - counts)[clips])
+
+    def _cut(self, clips: Tensor, starts: Tensor) -> Tensor:
+        """(B,), (B,) -> (B, T, D): one gather, then the protocol's representation."""
+        frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
+        joints = self._frames[frames]
+        root = self.skeleton.root
+        if self.protocol.heading:
+            heading = self.skeleton.heading(joints[:, self.protocol.observed - 1])[:, None, None]
+        if self.protocol.root == "drop":
+            joints = joints - joints[:, :, root : root + 1]
+            joints = torch.cat([joints[:, :, :root], joints[:, :, root + 1 :]], 2)
+        else:
+            joints = joints - joints[:, :1, root : root + 1]
+        if self.protocol.heading:
+            joints = rotate_about_up(joints, -heading, self.skeleton.up)
+        return joints.flatten(-2)

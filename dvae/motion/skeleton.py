@@ -1,0 +1,267 @@
+"""Skeletons: which joints there are, how they hang together, and which way is up.
+
+Positions are metres, (..., joints, 3), right-handed: with y up, a person facing +z has their left side
+towards +x. The presets' trees are those of Human3.6M (17 of its 32 joints) and HumanEva-I (15 joints) as the
+motion prediction papers use them (Mao, Liu and Salzmann 2021, GSPS).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from math import pi
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A tree of joints.
+
+    Args:
+        names: joint names, all different.
+        parents: index of each joint's parent, -1 for the root; in any order.
+        left, right: indices of the joints on the body's left and right side.
+        up: the vertical axis, "y" or "z".
+        fps: frames per second of the motion recorded on this skeleton.
+        name: what to call it.
+        lengths: reference bone lengths in metres in the order of `edges`; empty where people differ.
+
+    Raises:
+        ValueError: the joints do not form one tree, names repeat, or a side names a joint that is not there.
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    left: tuple[int, ...] = ()
+    right: tuple[int, ...] = ()
+    up: str = "y"
+    fps: float = 30.0
+    name: str = ""
+    lengths: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for field in ("names", "parents", "left", "right", "lengths"):
+            object.__setattr__(self, field, tuple(getattr(self, field)))
+        joints = len(self.names)
+        if len(self.parents) != joints:
+            raise ValueError(f"skeleton {self.name!r}: {joints} names but {len(self.parents)} parents")
+        repeated = sorted({name for name in self.names if self.names.count(name) > 1})
+        if repeated:
+            raise ValueError(f"skeleton {self.name!r}: joint names repeat: {', '.join(repeated)}")
+        roots = [self.names[j] for j, parent in enumerate(self.parents) if parent == -1]
+        if len(roots) != 1:
+            found = ", ".join(roots) or "none"
+            raise ValueError(f"skeleton {self.name!r}: expected one root (parent -1), found {found}")
+        for joint, parent in enumerate(self.parents):
+            if not -1 <= parent < joints:
+                raise ValueError(
+                    f"skeleton {self.name!r}: the parent of {self.names[joint]} is joint {parent}, "
+                    f"but joints go from 0 to {joints - 1}"
+                )
+        for joint in range(joints):
+            self._path_to_root(joint)
+        for side in ("left", "right"):
+            strangers = [j for j in getattr(self, side) if not 0 <= j < joints]
+            if strangers:
+                raise ValueError(f"skeleton {self.name!r}: {side} names joints {strangers} of {joints}")
+        if self.up not in ("y", "z"):
+            raise ValueError(f"skeleton {self.name!r}: up axis is {self.up!r}, expected 'y' or 'z'")
+        if not self.fps > 0:
+            raise ValueError(f"skeleton {self.name!r}: {self.fps} frames per second, expected more than 0")
+        if self.lengths and len(self.lengths) != joints - 1:
+            raise ValueError(
+                f"skeleton {self.name!r}: {len(self.lengths)} bone lengths for {joints - 1} bones"
+            )
+
+    def _path_to_root(self, joint: int) -> list[int]:
+        path = [joint]
+        while self.parents[path[-1]] != -1:
+            path.append(self.parents[path[-1]])
+            if len(path) > len(self.names):
+                raise ValueError(f"skeleton {self.name!r}: {self.names[joint]} hangs on a cycle of joints")
+        return path
+
+    @property
+    def joints(self) -> int:
+        """Number of joints J."""
+        return len(self.names)
+
+    @property
+    def root(self) -> int:
+        """Index of the root joint, the pelvis."""
+        return self.parents.index(-1)
+
+    @property
+    def edges(self) -> list[tuple[int, int]]:
+        """The bones as (parent, child), in the order of the children."""
+        return [(parent, joint) for joint, parent in enumerate(self.parents) if parent != -1]
+
+    @property
+    def order(self) -> list[int]:
+        """The joints, every parent before its children."""
+        return sorted(range(self.joints), key=lambda joint: len(self._path_to_root(joint)))
+
+    @property
+    def vertical(self) -> int:
+        """Index of the up axis in a position's three coordinates."""
+        return "xyz".index(self.up)
+
+    def bone_lengths(self, positions: Any) -> Any:
+        """Bone lengths in metres: positions (..., J, 3), numpy or torch -> (..., J - 1), as in `edges`."""
+        if positions.shape[-2:] != (self.joints, 3):
+            raise ValueError(
+                f"positions have shape {tuple(positions.shape)}, expected (..., {self.joints}, 3) for "
+                f"skeleton {self.name!r}"
+            )
+        parents, children = (list(ends) for ends in zip(*self.edges, strict=True))
+        return ((positions[..., children, :] - positions[..., parents, :]) ** 2).sum(-1) ** 0.5
+
+    def heading(self, positions: Tensor) -> Tensor:
+        """Angle about the up axis, in radians, from which a person faces.
+
+        The left-right axis is the sum over hips and shoulders: the joints where a left chain leaves the
+        trunk, less those where a right chain does. Zero is the left side towards +x: facing +z where y is up,
+        -y where z is up.
+
+        Args:
+            positions: (..., J, 3).
+
+        Returns:
+            (...,); `rotate_about_up(positions, -heading, up)` turns everybody to heading zero.
+
+        Raises:
+            ValueError: the skeleton does not say what is left and right.
+        """
+        left = [joint for joint in self.left if self.parents[joint] not in self.left]
+        right = [joint for joint in self.right if self.parents[joint] not in self.right]
+        if not left or not right:
+            raise ValueError(
+                f"skeleton {self.name!r} has no left and right joints, so nobody's heading is known"
+            )
+        across = positions[..., left, :].sum(-2) - positions[..., right, :].sum(-2)
+        first, second = (self.vertical + 1) % 3, (self.vertical + 2) % 3
+        towards_x = 0.0 if first == 0 else pi / 2
+        return torch.atan2(across[..., second], across[..., first]) - towards_x
+
+    @classmethod
+    def from_json(cls, path: str | Path) -> Skeleton:
+        """Read a skeleton file as `to_json` writes it.
+
+        Raises:
+            ValueError: the file is no JSON object or lacks joint_names or parents.
+        """
+        try:
+            fields = json.loads(Path(path).read_text(encoding="utf-8"))
+            names, parents = fields["joint_names"], fields["parents"]
+        except (UnicodeDecodeError, json.JSONDecodeError, TypeError, KeyError) as error:
+            raise ValueError(
+                f"{path}: expected JSON with joint_names and parents ({type(error).__name__}: {error})"
+            ) from error
+        lengths = fields.get("bone_lengths_m", ())
+        if lengths:  # the file has one entry per joint, and a zero for the root
+            lengths = [length for length, parent in zip(lengths, parents, strict=True) if parent != -1]
+        return cls(
+            names=names,
+            parents=parents,
+            left=fields.get("joints_left", ()),
+            right=fields.get("joints_right", ()),
+            up=fields.get("up_axis", "y"),
+            fps=fields.get("fps", 30.0),
+            name=fields.get("name", Path(path).parent.name),
+            lengths=lengths,
+        )
+
+    def to_json(self, path: str | Path) -> None:
+        """Write the skeleton as a JSON file that people can read."""
+        fields: dict[str, object] = {
+            "name": self.name,
+            "joint_names": self.names,
+            "parents": self.parents,
+            "joints_left": self.left,
+            "joints_right": self.right,
+            "units": "m",
+            "up_axis": self.up,
+            "fps": self.fps,
+        }
+        if self.lengths:
+            lengths = iter(self.lengths)
+            fields["bone_lengths_m"] = [0.0 if parent == -1 else next(lengths) for parent in self.parents]
+        Path(path).write_text(json.dumps(fields, indent=2) + "\n", encoding="utf-8")
+
+
+def rotate_about_up(positions: Tensor, angle: Tensor, up: str) -> Tensor:
+    """Rotate positions (..., 3) about the up axis by angles in radians that broadcast against (...)."""
+    vertical = "xyz".index(up)
+    first, second = (vertical + 1) % 3, (vertical + 2) % 3
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    rotated = positions.clone()
+    rotated[..., first] = cos * positions[..., first] - sin * positions[..., second]
+    rotated[..., second] = sin * positions[..., first] + cos * positions[..., second]
+    return rotated
+
+
+HUMAN36M = Skeleton(
+    names=(
+        "Pelvis",
+        "RHip",
+        "RKnee",
+        "RFoot",
+        "LHip",
+        "LKnee",
+        "LFoot",
+        "Spine",
+        "Thorax",
+        "Neck",
+        "Head",
+        "LShoulder",
+        "LElbow",
+        "LWrist",
+        "RShoulder",
+        "RElbow",
+        "RWrist",
+    ),
+    parents=(-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 9, 8, 11, 12, 8, 14, 15),
+    left=(4, 5, 6, 11, 12, 13),
+    right=(1, 2, 3, 14, 15, 16),
+    up="z",
+    fps=50.0,
+    name="human36m",
+)
+"""The 17 joints of Human3.6M that the papers keep, as in VideoPose3D's archive: z up, 50 Hz."""
+
+HUMAN36M_KEPT = (0, 1, 2, 3, 6, 7, 8, 12, 13, 14, 15, 17, 18, 19, 25, 26, 27)
+"""Which of the archive's 32 joints these are: `load(path, skeleton=HUMAN36M, joints=HUMAN36M_KEPT)`."""
+
+HUMANEVA = Skeleton(
+    names=(
+        "Pelvis",
+        "Thorax",
+        "LShoulder",
+        "LElbow",
+        "LWrist",
+        "RShoulder",
+        "RElbow",
+        "RWrist",
+        "LHip",
+        "LKnee",
+        "LAnkle",
+        "RHip",
+        "RKnee",
+        "RAnkle",
+        "Head",
+    ),
+    parents=(-1, 0, 1, 2, 3, 1, 5, 6, 0, 8, 9, 0, 11, 12, 1),
+    left=(2, 3, 4, 8, 9, 10),
+    right=(5, 6, 7, 11, 12, 13),
+    up="z",
+    fps=60.0,
+    name="humaneva",
+)
+"""HumanEva-I's 15 joints: z up, 60 Hz."""
+
+WALKER = Skeleton(HUMAN36M.names, HUMAN36M.parents, HUMAN36M.left, HUMAN36M.right, "y", 30.0, "walker")
+"""The simulator's skeleton: Human3.6M's tree, y up, 30 Hz."""
