@@ -82,9 +82,7 @@ def analytic_kl(generative: Factorization, inference: Factorization) -> dict[str
     latents = [name for block in inference.blocks for name in block.names]
     return {
         latent: all(
-            nx.descendants(guide, node).isdisjoint(model.predecessors(node))
-            for node in guide
-            if node[0] == latent
+            nx.descendants(guide, node).isdisjoint(model.predecessors(node)) for node in guide if node[0] == latent
         )
         for latent in latents
     }
@@ -151,9 +149,7 @@ class Audit:
         """One sentence."""
         if self.exact:
             return "exact: the guide reads everything the posterior depends on"
-        return (
-            "not exact: the guide misses what the posterior depends on, so the bound stays below the evidence"
-        )
+        return "not exact: the guide misses what the posterior depends on, so the bound stays below the evidence"
 
     def table(self) -> Table:
         """A rich table with one row per guide factor."""
@@ -170,9 +166,7 @@ class Audit:
     def __str__(self) -> str:
         rows = [HEADER, *self.rows]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
-        ]
+        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
         return "\n".join(line.rstrip() for line in [*lines, self.verdict])
 
     def _repr_html_(self) -> str:
@@ -199,11 +193,7 @@ HEADER = ("guide factor", "missing", "redundant")
 
 
 def _terms(parents: dict[str, tuple[Parent, ...]]) -> dict[str, tuple[str, ...]]:
-    return {
-        latent: tuple(t for parent in reads for t in parent.terms)
-        for latent, reads in parents.items()
-        if reads
-    }
+    return {latent: tuple(t for parent in reads for t in parent.terms) for latent, reads in parents.items() if reads}
 
 
 def audit(

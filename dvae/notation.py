@@ -105,13 +105,9 @@ class Relation:
                 math.inf if high == "T" else int(span[2] or 0),
             )
             if interval[0] > interval[1]:
-                raise ValueError(
-                    f"the range {{{text}}} is empty; write the earlier step first: {{{high}:{low}}}"
-                )
+                raise ValueError(f"the range {{{text}}} is empty; write the earlier step first: {{{high}:{low}}}")
             return cls.of([interval])
-        raise ValueError(
-            f"unknown relation {{{text}}}; known are {KNOWN_RELATIONS}, and any name given in masks="
-        )
+        raise ValueError(f"unknown relation {{{text}}}; known are {KNOWN_RELATIONS}, and any name given in masks=")
 
     @property
     def parts(self) -> tuple[Relation, ...]:
@@ -154,9 +150,7 @@ class Relation:
         """
         if self.intervals is not None:
             offset = np.arange(T)[None, :] - np.arange(T)[:, None]
-            return np.any(
-                [(low <= offset) & (offset <= high) for low, high in self.intervals or [(1, 0)]], axis=0
-            )
+            return np.any([(low <= offset) & (offset <= high) for low, high in self.intervals or [(1, 0)]], axis=0)
         assert self.function is not None
         mask = np.asarray(self.function(T))
         if mask.dtype != bool or mask.shape not in ((T, T), (1, T)):
@@ -185,9 +179,7 @@ class Relation:
             starts = [-math.inf, *(high + 1 for _, high in self.intervals)]
             ends = [*(low - 1 for low, _ in self.intervals), math.inf]
             gaps = zip(starts, ends, strict=True)
-            return Relation.of(
-                (low, high) for low, high in gaps if low <= high and math.inf not in (low, -high)
-            )
+            return Relation.of((low, high) for low, high in gaps if low <= high and math.inf not in (low, -high))
         return Relation(f"{{~{self.name}}}", None, _Composed(np.logical_not, (self,)))
 
     def __str__(self) -> str:
@@ -390,9 +382,7 @@ class Factorization:
         for factor in self.factors:
             if factor.child == name:
                 return factor
-        raise ValueError(
-            f"no factor for {name!r} in {self.text!r}; there are factors for {_names(self.variables)}"
-        )
+        raise ValueError(f"no factor for {name!r} in {self.text!r}; there are factors for {_names(self.variables)}")
 
     def local(self, name: str) -> bool:
         """True for a variable with one value per time step, False for one per sequence."""
@@ -610,9 +600,7 @@ class _Reader:
             start = self.at
             factor = self.factor()
             if factors and factor.kind != factors[0].kind:
-                self.fail(
-                    "p and q in one factorization; write the generative model and the guide apart", start
-                )
+                self.fail("p and q in one factorization; write the generative model and the guide apart", start)
             if any(factor.child == other.child for other in factors):
                 self.fail(f"a second factor for {factor.child}; each variable has one", start)
             factors.append(factor)
@@ -635,11 +623,7 @@ class _Reader:
                 self.take("")
                 start = self.at
                 parent = self.variable()
-                if (
-                    not child.local
-                    and parent.relation is not None
-                    and not self.readable_by_static(parent.relation)
-                ):
+                if not child.local and parent.relation is not None and not self.readable_by_static(parent.relation):
                     self.fail(
                         f"{child.name} has one value per sequence and so no t that {parent} could refer to; "
                         f"it can read {parent.name}_{{1:T}}",
@@ -651,9 +635,7 @@ class _Reader:
                 if not self.take(","):
                     break
         if not self.take(r"(?:\\right)?\)"):
-            self.fail(
-                'expected "," or ")"' if parents else 'expected "|" or ")" after the one variable of a factor'
-            )
+            self.fail('expected "," or ")"' if parents else 'expected "|" or ")" after the one variable of a factor')
         return Factor(kind, child.name, child.local, tuple(parents.values()))
 
     @staticmethod
@@ -744,9 +726,7 @@ def check_pair(
     latents = tuple(name for name in generative.variables if name not in observed)
     for name in observed:
         if name not in generative.variables:
-            raise ValueError(
-                f"the observed {name} has no factor in {generative.text!r}; add p({name}_t | ...)"
-            )
+            raise ValueError(f"the observed {name} has no factor in {generative.text!r}; add p({name}_t | ...)")
     for name in inference.variables:
         if name in observed:
             raise ValueError(
@@ -761,17 +741,13 @@ def check_pair(
     for name in latents:
         if name not in inference.variables:
             add = _head("q", name, generative.local(name))
-            raise ValueError(
-                f"the latent {name} has no factor in the guide; add {add}, or name {name} as observed"
-            )
+            raise ValueError(f"the latent {name} has no factor in the guide; add {add}, or name {name} as observed")
     everything = dict.fromkeys((*generative.variables, *generative.context, *inference.context))
     for name in everything:
         locality = {f.kind: f.local(name) for f in (generative, inference) if name in f.variables + f.context}
         if len(set(locality.values())) > 1:
             has = {kind: "per step" if local else "per sequence" for kind, local in locality.items()}
-            raise ValueError(
-                f"{name} has one value {has['p']} in the generative model and one {has['q']} in the guide"
-            )
+            raise ValueError(f"{name} has one value {has['p']} in the generative model and one {has['q']} in the guide")
     context = tuple(name for name in everything if name not in generative.variables)
     if sizes is not None:
         if missing := [name for name in everything if name not in sizes]:

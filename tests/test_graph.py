@@ -198,9 +198,7 @@ def arrows(ax):
     return [patch for patch in ax.patches if isinstance(patch, FancyArrowPatch)]
 
 
-@pytest.mark.parametrize(
-    "text", [HIT_DVAE, SRNN, "p(u_t | u_{<t}) p(z_t | z_{<t}, u_t) p(x_t | x_{<t}, z_t)"]
-)
+@pytest.mark.parametrize("text", [HIT_DVAE, SRNN, "p(u_t | u_{<t}) p(z_t | z_{<t}, u_t) p(x_t | x_{<t}, z_t)"])
 def test_no_arrow_hides_behind_a_node(ax, text):
     f = Factorization.parse(text)
     assert f.draw(4, ax=ax) is ax

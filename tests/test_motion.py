@@ -66,9 +66,7 @@ class TestSkeleton:
         assert len(skeleton.left) == len(skeleton.right)
         for left, right in zip(skeleton.left, skeleton.right, strict=True):
             assert skeleton.names[left][1:] == skeleton.names[right][1:]
-        assert [skeleton.order.index(p) < skeleton.order.index(c) for p, c in skeleton.edges].count(
-            False
-        ) == 0
+        assert [skeleton.order.index(p) < skeleton.order.index(c) for p, c in skeleton.edges].count(False) == 0
 
     def test_human36m_is_the_tree_of_the_papers(self):
         assert (HUMAN36M.joints, HUMANEVA.joints, len(HUMAN36M_KEPT)) == (17, 15, 17)
@@ -278,9 +276,7 @@ class TestArchive:
         ],
         ids=["system", "eval", "object", "allocation", "codec", "dtype"],
     )
-    def test_hostile_pickles_are_refused_by_name_and_not_run(
-        self, tmp_path, monkeypatch, hostile, named, protocol
-    ):
+    def test_hostile_pickles_are_refused_by_name_and_not_run(self, tmp_path, monkeypatch, hostile, named, protocol):
         monkeypatch.chdir(tmp_path)
         nested = {**self.nested(), "test": {"walk": hostile}}
         path = archive(tmp_path / "a.npz", pickle.dumps(nested, protocol))
@@ -440,9 +436,7 @@ class TestWindows:
             placed = cut.positions(cut.all()["x"])
             assert placed.shape == (len(cut), 7, 17, 3)
             assert (placed[:, 0, 0] == 0).all()
-            truth = np.stack(
-                [WALKER.bone_lengths(motion()[s, n].positions[t : t + 7]) for s, n, t in cut.keys]
-            )
+            truth = np.stack([WALKER.bone_lengths(motion()[s, n].positions[t : t + 7]) for s, n, t in cut.keys])
             np.testing.assert_allclose(WALKER.bone_lengths(placed).numpy(), truth, atol=1e-6)
         with pytest.raises(ValueError, match="frames have 50 numbers, expected 51"):
             cut.positions(torch.zeros(3, 50))
@@ -485,9 +479,7 @@ class TestWindows:
         plain, faced = (windows(turned, replace(TINY, root=root, heading=h), "test") for h in (False, True))
         before, after = (cut.positions(cut.all()["x"].double()) for cut in (plain, faced))
         heading = turned.skeleton.heading
-        torch.testing.assert_close(
-            heading(after[:, 2]).abs(), torch.zeros(len(after)).double(), atol=1e-5, rtol=0
-        )
+        torch.testing.assert_close(heading(after[:, 2]).abs(), torch.zeros(len(after)).double(), atol=1e-5, rtol=0)
         angle = -heading(before[:, 2])[:, None, None]
         torch.testing.assert_close(rotate_about_up(before, angle, up), after, atol=1e-6, rtol=0)
 
@@ -495,9 +487,7 @@ class TestWindows:
         plain = windows(motion(), TINY, "train")
         turning = windows(motion(), replace(TINY, rotate=True), "train")
         assert torch.equal(plain.all()["x"], turning.all()["x"])
-        straight, turned = (
-            cut.sample(200, torch.Generator().manual_seed(2))["x"] for cut in (plain, turning)
-        )
+        straight, turned = (cut.sample(200, torch.Generator().manual_seed(2))["x"] for cut in (plain, turning))
         lengths = [WALKER.bone_lengths(plain.positions(x)) for x in (straight, turned)]
         torch.testing.assert_close(*lengths, atol=1e-5, rtol=1e-5)
         headings = [WALKER.heading(plain.positions(x)[:, 0].double()) for x in (straight, turned)]
@@ -545,9 +535,7 @@ class TestWindows:
             windows(motion(), PROTOCOLS["h36m"], "train")
         with pytest.raises(ValueError, match="expected train, validation, test"):
             windows(motion(), TINY, "tests")
-        with pytest.raises(
-            ValueError, match="wants split S1 for training and S2 for test; 'people' has train, test"
-        ):
+        with pytest.raises(ValueError, match="wants split S1 for training and S2 for test; 'people' has train, test"):
             windows(motion(), replace(TINY, train=("S1",), test=("S2",)), "train")
         with pytest.raises(ValueError, match="stride is -1"):
             windows(motion(), TINY, "test").all(-1)
@@ -589,9 +577,7 @@ class TestRealData:
     pytestmark = needs_data
 
     def test_counts_are_those_of_the_readme(self, bandai, cmu):
-        rows = [
-            (r["split"], r["clips"], r["frames"], r["minutes"]) for m in (cmu, bandai) for r in m.summary()
-        ]
+        rows = [(r["split"], r["clips"], r["frames"], r["minutes"]) for m in (cmu, bandai) for r in m.summary()]
         assert rows == [
             ("train", 72, 13_451, 7.5),
             ("test", 24, 3_528, 2.0),
@@ -626,10 +612,7 @@ class TestRealData:
         step = max(1, len(test) // 150)  # part of the windows: the full figure takes seconds
         nearest = torch.cdist(past[::step, -1], train[:, 14]).topk(50, largest=False).indices
         errors = torch.stack(
-            [
-                torch.linalg.vector_norm(train[i, 15:] - y, dim=-1)
-                for i, y in zip(nearest, future[::step], strict=True)
-            ]
+            [torch.linalg.vector_norm(train[i, 15:] - y, dim=-1) for i, y in zip(nearest, future[::step], strict=True)]
         )
         best = torch.stack([errors.mean(-1).amin(1), errors[..., -1].amin(1)])
         spread = best.std(1) / best.shape[1] ** 0.5

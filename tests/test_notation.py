@@ -220,9 +220,7 @@ def test_the_caret_stands_under_its_own_line():
 
 def test_masks_have_one_row_or_column_for_static_ends():
     f = parse("q(w | x_{1:T}) q(v | w) q(z_t | z_{t-1}, x_{>=t}, w)")
-    shapes = {
-        (c, p): f.mask(c, p, 5).shape for c, p in [("z", "z"), ("z", "w"), ("w", "x"), ("v", "w"), ("v", "z")]
-    }
+    shapes = {(c, p): f.mask(c, p, 5).shape for c, p in [("z", "z"), ("z", "w"), ("w", "x"), ("v", "w"), ("v", "z")]}
     expected = {
         ("z", "z"): (5, 5),
         ("z", "w"): (5, 1),
@@ -260,9 +258,7 @@ def test_a_composed_relation_can_be_given_a_name():
 def test_a_static_variable_may_read_some_steps_only():
     f = parse("q(w | x_{first})", first=lambda T: np.arange(T)[None] < 3)
     assert f.mask("w", "x", 5).tolist() == [[True, True, True, False, False]]
-    with pytest.raises(
-        ValueError, match=r"mask \{band\} of q\(w \| x_\{band\}\) is \(2, 2\) .* w is static.*\(1, 2\)"
-    ):
+    with pytest.raises(ValueError, match=r"mask \{band\} of q\(w \| x_\{band\}\) is \(2, 2\) .* w is static.*\(1, 2\)"):
         parse("q(w | x_{band})", band=band)
 
 

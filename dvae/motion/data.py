@@ -106,9 +106,7 @@ class MotionSet:
             if reason:
                 raise ValueError(f"{self.name or 'motion set'}: {reason}")
         if not self.clips:
-            dropped = (
-                f"; {len(self.skipped)} were skipped, the first: {self.skipped[0][2]}" if self.skipped else ""
-            )
+            dropped = f"; {len(self.skipped)} were skipped, the first: {self.skipped[0][2]}" if self.skipped else ""
             raise ValueError(f"{self.name or 'motion set'}: no clips{dropped}")
         twice = [key for key, count in Counter(clip.key for clip in self.clips).items() if count > 1]
         if twice:
@@ -185,22 +183,16 @@ class MotionSet:
         for column in rows[0]:
             splits.add_column(column, justify="left" if column == "split" else "right")
         for row in rows:
-            splits.add_row(
-                *(f"{value:,}" if isinstance(value, int) else str(value) for value in row.values())
-            )
+            splits.add_row(*(f"{value:,}" if isinstance(value, int) else str(value) for value in row.values()))
 
         bones = [self.skeleton.bone_lengths(clip.positions.astype(np.float64)) for clip in self.clips]
         variation = [lengths.std(axis=0) / np.maximum(lengths.mean(axis=0), 1e-9) for lengths in bones]
         worst = int(np.argmax([v.max() for v in variation]))
         bone = self.skeleton.names[self.skeleton.edges[int(np.argmax(variation[worst]))][1]]
-        extent = np.median(
-            [np.median(np.ptp(clip.positions, axis=1)[:, self.skeleton.vertical]) for clip in self]
-        )
+        extent = np.median([np.median(np.ptp(clip.positions, axis=1)[:, self.skeleton.vertical]) for clip in self])
 
         facts = Table.grid(padding=(0, 2))
-        facts.add_row(
-            "skeleton", f"{self.skeleton.name}: {self.skeleton.joints} joints, {self.skeleton.up} up"
-        )
+        facts.add_row("skeleton", f"{self.skeleton.name}: {self.skeleton.joints} joints, {self.skeleton.up} up")
         facts.add_row("frames per second", f"{self.skeleton.fps:g}")
         facts.add_row("vertical extent", f"{extent:.2f} m (median)")
         facts.add_row(

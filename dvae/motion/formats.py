@@ -93,9 +93,7 @@ def save(path: str | Path, motion: MotionSet) -> None:
     columns = list(dict.fromkeys(name for clip in motion for name in clip.labels))
     if columns:
         with path.with_name("labels.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(
-                file, ["split", "clip", *(c for c in columns if c not in ("split", "clip"))]
-            )
+            writer = csv.DictWriter(file, ["split", "clip", *(c for c in columns if c not in ("split", "clip"))])
             writer.writeheader()
             writer.writerows({**clip.labels, "split": clip.split, "clip": clip.name} for clip in motion)
 
@@ -121,9 +119,7 @@ def _read_labels(path: Path, labels: Path | None) -> dict[tuple[str | None, str]
     with file.open(newline="", encoding="utf-8") as lines:
         reader = csv.DictReader(lines)
         if "clip" not in (reader.fieldnames or ()):
-            raise ValueError(
-                f"{file}: expected a column named clip, found {', '.join(reader.fieldnames or ())}"
-            )
+            raise ValueError(f"{file}: expected a column named clip, found {', '.join(reader.fieldnames or ())}")
         return {(row.get("split"), row["clip"]): {k: v or "" for k, v in row.items() if k} for row in reader}
 
 
@@ -138,16 +134,12 @@ class _Member(NamedTuple):
 
     def array(self) -> np.ndarray:
         if self.dtype.hasobject:
-            raise ValueError(
-                f"{self.name} holds pickled objects, which only a member called positions_3d may"
-            )
+            raise ValueError(f"{self.name} holds pickled objects, which only a member called positions_3d may")
         if prod(self.shape) * self.dtype.itemsize != len(self.content):
             raise ValueError(
                 f"{self.name} declares shape {self.shape} of {self.dtype}, holds {len(self.content)} bytes"
             )
-        return np.frombuffer(self.content, self.dtype).reshape(
-            self.shape, order="F" if self.fortran_order else "C"
-        )
+        return np.frombuffer(self.content, self.dtype).reshape(self.shape, order="F" if self.fortran_order else "C")
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Member:
@@ -155,9 +147,7 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Member:
         raise ValueError(
             f"{info.filename} would unpack to {info.file_size:,} bytes, at most {LARGEST_MEMBER:,} are read"
         )
-    file = io.BytesIO(
-        archive.read(info)
-    )  # whole, so that the zip's checksum is verified before anything is believed
+    file = io.BytesIO(archive.read(info))  # whole, so that the zip's checksum is verified before anything is believed
     version = npy.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"{info.filename} has npy version {version}, expected (1, 0) or (2, 0)")
@@ -191,9 +181,7 @@ def _nested_clips(member: _Member) -> list[tuple[str, str, np.ndarray]]:
             "dictionary (shape () and dtype object)"
         )
     nested = _DataUnpickler(io.BytesIO(member.content), encoding="latin1").load_data()
-    if (
-        isinstance(nested, np.ndarray) and nested.shape == ()
-    ):  # numpy pickles the 0-dimensional array, not its item
+    if isinstance(nested, np.ndarray) and nested.shape == ():  # numpy pickles the 0-dimensional array, not its item
         nested = nested.item()
     if not isinstance(nested, dict) or not all(isinstance(clips, dict) for clips in nested.values()):
         raise ValueError("positions_3d is no dictionary of dictionaries (split -> clip -> positions)")
@@ -201,9 +189,7 @@ def _nested_clips(member: _Member) -> list[tuple[str, str, np.ndarray]]:
     for split, clips in nested.items():
         for name, positions in clips.items():
             if not isinstance(positions, np.ndarray):
-                raise ValueError(
-                    f"clip {split}/{name} is a {type(positions).__name__}, expected a numpy array"
-                )
+                raise ValueError(f"clip {split}/{name} is a {type(positions).__name__}, expected a numpy array")
             found.append((str(split), str(name), positions))
     return found
 
@@ -247,9 +233,7 @@ class _DataUnpickler(pickle.Unpickler):
             raise ValueError(f"damaged pickle ({type(error).__name__}: {error})") from error
 
     def _reconstruct(self, subtype: object, shape: tuple[int, ...], code: str | bytes) -> np.ndarray:
-        if subtype is not self._array_type or shape != (
-            0,
-        ):  # numpy starts every array empty and fills it afterwards
+        if subtype is not self._array_type or shape != (0,):  # numpy starts every array empty and fills it afterwards
             raise _Refused(f"refused an array declared with shape {shape} before its content")
         return np.ndarray((0,), self._dtype(code if isinstance(code, str) else code.decode("latin1")))
 

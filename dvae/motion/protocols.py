@@ -74,23 +74,18 @@ class Protocol:
     def __post_init__(self) -> None:
         for field in ("observed", "predicted", "train_stride", "test_stride"):
             if getattr(self, field) < 1:
-                raise ValueError(
-                    f"protocol {self.name}: {field} is {getattr(self, field)}, expected 1 or more"
-                )
+                raise ValueError(f"protocol {self.name}: {field} is {getattr(self, field)}, expected 1 or more")
         for field, choices in (("root", ("drop", "relative")), ("sampling", ("clip", "length", "subject"))):
             if getattr(self, field) not in choices:
                 raise ValueError(
-                    f"protocol {self.name}: {field} is {getattr(self, field)!r}, "
-                    f"expected {' or '.join(choices)}"
+                    f"protocol {self.name}: {field} is {getattr(self, field)!r}, expected {' or '.join(choices)}"
                 )
         if not 0 <= self.validation < 1:
             raise ValueError(
                 f"protocol {self.name}: validation is {self.validation}, expected a part from 0 to below 1"
             )
         if self.heading and self.rotate:
-            raise ValueError(
-                f"protocol {self.name}: heading fixes the direction that rotate would draw; choose one"
-            )
+            raise ValueError(f"protocol {self.name}: heading fixes the direction that rotate would draw; choose one")
 
     @property
     def length(self) -> int:
@@ -118,9 +113,7 @@ PROTOCOLS = {
             test=("Validate/S1", "Validate/S2", "Validate/S3"),
             sampling="subject",
         ),
-        Protocol(
-            "trajevae", 1, 100, 50, train_stride=25, test_stride=25, root="relative", rotate=True, **_HUMAN36M
-        ),
+        Protocol("trajevae", 1, 100, 50, train_stride=25, test_stride=25, root="relative", rotate=True, **_HUMAN36M),
         Protocol("bandai2-by-style", 15, 60, 30, train_stride=5, test_stride=15, **_STYLES),
         Protocol("bandai2-by-take", 15, 60, 30, train_stride=5, test_stride=15),
         Protocol("cmu8", 15, 60, 30, train_stride=5, test_stride=15),
@@ -154,9 +147,7 @@ def windows(motion: MotionSet, protocol: Protocol, split: str, length: int | Non
     if unknown:
         raise ValueError(f"no split {unknown[0]!r}: expected train, validation, test or train+validation")
     chosen = {clip.key for name in split.split("+") for clip in parts[name]}
-    return Windows(
-        [clip for clip in motion if clip.key in chosen], motion, protocol, split, length or protocol.length
-    )
+    return Windows([clip for clip in motion if clip.key in chosen], motion, protocol, split, length or protocol.length)
 
 
 def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
@@ -202,13 +193,9 @@ class Windows:
         skipped: (split, clip, frames) of those that are not.
     """
 
-    def __init__(
-        self, clips: list[Clip], motion: MotionSet, protocol: Protocol, split: str, length: int
-    ) -> None:
+    def __init__(self, clips: list[Clip], motion: MotionSet, protocol: Protocol, split: str, length: int) -> None:
         if length < 1 or (protocol.heading and length < protocol.observed):
-            raise ValueError(
-                f"windows of {length} frames: expected at least {protocol.observed} (the observed frames)"
-            )
+            raise ValueError(f"windows of {length} frames: expected at least {protocol.observed} (the observed frames)")
         self.protocol, self.skeleton, self.split, self.length = protocol, motion.skeleton, split, length
         self.clips = [clip for clip in clips if clip.frames >= length]
         self.skipped = [(*clip.key, clip.frames) for clip in clips if clip.frames < length]
@@ -219,9 +206,7 @@ class Windows:
                 f"the longest of {longest} frames"
             )
         if protocol.heading:
-            self.skeleton.heading(
-                torch.zeros(self.skeleton.joints, 3)
-            )  # says now if the skeleton has no sides
+            self.skeleton.heading(torch.zeros(self.skeleton.joints, 3))  # says now if the skeleton has no sides
 
         self._frames = torch.cat([torch.from_numpy(clip.positions) for clip in self.clips])
         frames = torch.tensor([clip.frames for clip in self.clips])
@@ -285,9 +270,7 @@ class Windows:
         """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32."""
         clips, starts = self._list(stride or self.stride)
         x = torch.empty(len(clips), self.length, self.size)
-        for block in torch.arange(len(clips)).split(
-            512
-        ):  # so that memory holds the windows little more than once
+        for block in torch.arange(len(clips)).split(512):  # so that memory holds the windows little more than once
             x[block] = self._cut(clips[block], starts[block])
         return {"x": x}
 
@@ -316,17 +299,13 @@ class Windows:
         if self.protocol.root == "relative":
             return joints
         root = self.skeleton.root
-        return torch.cat(
-            [joints[..., :root, :], torch.zeros_like(joints[..., :1, :]), joints[..., root:, :]], -2
-        )
+        return torch.cat([joints[..., :root, :], torch.zeros_like(joints[..., :1, :]), joints[..., root:, :]], -2)
 
     @property
     def fingerprint(self) -> str:
         """SHA-256 of the protocol, the skeleton, the listed windows and the data they are cut from."""
         digest = hashlib.sha256(repr((astuple(self.protocol), self.split, self.length)).encode())
-        digest.update(
-            repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up, self.keys)).encode()
-        )
+        digest.update(repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up, self.keys)).encode())
         digest.update(self._frames.numpy().astype("<f4", copy=False).tobytes())
         return digest.hexdigest()
 

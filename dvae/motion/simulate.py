@@ -115,9 +115,7 @@ def _morphology(random: np.random.Generator, clips: int) -> np.ndarray:
         rest[_J[name]] = offset
     part = np.zeros(WALKER.joints, int)  # 0 trunk and head, 1 legs, 2 arms, 3 widths
     for name, joint in _J.items():
-        part[joint] = (
-            1 if "Knee" in name or "Foot" in name else 2 if "Elbow" in name or "Wrist" in name else 0
-        )
+        part[joint] = 1 if "Knee" in name or "Foot" in name else 2 if "Elbow" in name or "Wrist" in name else 0
         part[joint] = 3 if "Hip" in name or "Shoulder" in name else part[joint]
     size = np.exp(0.07 * random.standard_normal((clips, 1)))
     proportions = np.exp(0.05 * random.standard_normal((clips, 4)))
@@ -202,9 +200,7 @@ def _angles(
     _, stride, lift, swing, bend, lean, wave_hertz = (style[:, k : k + 1] for k in range(style.shape[1]))
     walk, turn = _of(weights, "walk"), _of(weights, "turn")
     drift = [_drift(random, clips, frames) for _ in range(4)]
-    wave = np.sin(
-        2 * np.pi * wave_hertz * np.arange(frames) / WALKER.fps + random.uniform(0, 2 * np.pi, (clips, 1))
-    )
+    wave = np.sin(2 * np.pi * wave_hertz * np.arange(frames) / WALKER.fps + random.uniform(0, 2 * np.pi, (clips, 1)))
     raised = random.uniform(2.0, 2.7, (clips, 1))
 
     sway = 0.05 * walk * np.sin(phase)
@@ -250,9 +246,7 @@ def _kinematics(offsets: np.ndarray, rotations: dict[str, list[tuple[str, np.nda
         frame = np.broadcast_to(np.eye(3), (clips, frames, 3, 3))
         if parent != -1:
             frame = globally[parent]
-            positions[:, :, joint] = positions[:, :, parent] + np.einsum(
-                "nfij,nj->nfi", frame, offsets[:, joint]
-            )
+            positions[:, :, joint] = positions[:, :, parent] + np.einsum("nfij,nj->nfi", frame, offsets[:, joint])
         for axis, angle in rotations.get(WALKER.names[joint], []):
             frame = frame @ _rotation(axis, angle)
         globally[joint] = frame

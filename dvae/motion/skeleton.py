@@ -73,9 +73,7 @@ class Skeleton:
         if not self.fps > 0:
             raise ValueError(f"skeleton {self.name!r}: {self.fps} frames per second, expected more than 0")
         if self.lengths and len(self.lengths) != joints - 1:
-            raise ValueError(
-                f"skeleton {self.name!r}: {len(self.lengths)} bone lengths for {joints - 1} bones"
-            )
+            raise ValueError(f"skeleton {self.name!r}: {len(self.lengths)} bone lengths for {joints - 1} bones")
 
     def _path_to_root(self, joint: int) -> list[int]:
         path = [joint]
@@ -139,9 +137,7 @@ class Skeleton:
         left = [joint for joint in self.left if self.parents[joint] not in self.left]
         right = [joint for joint in self.right if self.parents[joint] not in self.right]
         if not left or not right:
-            raise ValueError(
-                f"skeleton {self.name!r} has no left and right joints, so nobody's heading is known"
-            )
+            raise ValueError(f"skeleton {self.name!r} has no left and right joints, so nobody's heading is known")
         across = positions[..., left, :].sum(-2) - positions[..., right, :].sum(-2)
         first, second = (self.vertical + 1) % 3, (self.vertical + 2) % 3
         towards_x = 0.0 if first == 0 else pi / 2

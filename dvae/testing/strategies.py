@@ -18,9 +18,7 @@ BACKWARD = {
 
 
 @st.composite
-def factorizations(
-    draw: st.DrawFn, max_locals: int = 2, static: bool = True, backward: bool = True
-) -> tuple[str, str]:
+def factorizations(draw: st.DrawFn, max_locals: int = 2, static: bool = True, backward: bool = True) -> tuple[str, str]:
     """Pairs (generative, inference) of equations, always valid together.
 
     Variables are the observed x, the local latents z and (with two) u, and perhaps a static latent w. Factors

@@ -1,0 +1,39 @@
+# make demo    simulated people: fit two methods, print the table, save demo/futures.png
+# make test    lint, types, tests
+# make bench   the benchmarks
+# Each makes the environment in .venv when it is missing or out of date.
+
+PYTHON := python3
+BIN := .venv/bin
+
+# One thread: the models are small, and on cores that others use too, two threads wait for each other many times longer.
+export OMP_NUM_THREADS := 1
+
+.PHONY: venv demo test bench clean
+
+venv: .venv/installed
+
+.venv/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "Python 3.11 or newer is needed; choose one with: make PYTHON=python3.12"; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' || \
+		{ echo "Python lacks venv; on Debian and Ubuntu: apt install python3-venv"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install -q -c constraints.txt torch==2.13.0  # first, or another build may come along
+	$(BIN)/python -m pip install -q -c constraints.txt -e ".[dev]"
+	touch $@
+
+demo: venv
+	$(BIN)/python docs/demo.py
+
+test: venv
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy -p dvae
+	$(BIN)/pytest -n 2
+
+bench: venv
+	set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file; done
+
+clean:
+	rm -rf .venv build dist *.egg-info demo runs .pytest_cache .mypy_cache .ruff_cache .hypothesis

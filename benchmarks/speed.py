@@ -1,0 +1,162 @@
+"""Speed, as ratios within one run: `python benchmarks/speed.py`, or `make bench`.
+
+    program   the Pyro training step of an SRNN against the same computation written by hand in torch
+    cache     generation with caches against recomputing the prefix at every step, Attention
+    linear    seconds of a training step over T, Recurrent: the exponent of a power law
+    srnn      a whole SRNN training step (forward, backward, Adam) at the layer sizes of the public implementation,
+              in units of one 2048 x 2048 x 2048 float32 product; the public implementation takes .75
+
+Times are the least of several repetitions, the two sides of a ratio alternating, so that what else the machine does
+counts least.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pyro
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+import dvae
+from dvae.distributions.chain import GaussianChain
+from dvae.networks.base import shift
+
+BATCH, STEPS, SIZE = 32, 125, 48
+
+
+def seconds(*actions: Callable[[], object], repeat: int = 15) -> list[float]:
+    """The least time of each action, taken in turns."""
+    best = [math.inf] * len(actions)
+    for action in actions:
+        action()
+    for _ in range(repeat):
+        for i, action in enumerate(actions):
+            start = time.perf_counter()
+            action()
+            best[i] = min(best[i], time.perf_counter() - start)
+    return best
+
+
+def training_step(model: nn.Module, loss: Callable[[], Tensor]) -> Callable[[], None]:
+    optimizer = torch.optim.Adam(model.parameters(), fused=True)
+
+    def step() -> None:
+        optimizer.zero_grad()
+        loss().backward()
+        optimizer.step()
+
+    return step
+
+
+class ByHand(nn.Module):
+    """The SRNN of `models/srnn.py` as a page of torch, with nothing but what one training step needs."""
+
+    def __init__(self, x: int, z: int, width: int = 64):
+        super().__init__()
+        self.x_past, self.x_future = nn.Linear(x, width), nn.Linear(x, width)
+        self.past, self.future = (nn.LSTM(width, width, batch_first=True) for _ in range(2))
+        self.prior, self.prior_out = nn.Linear(width + z, 32), nn.Linear(32, 2 * z)
+        self.guide, self.guide_out = nn.Linear(2 * width + z, 32), nn.Linear(32, 2 * z)
+        self.decoder, self.decoder_out = nn.Linear(width + z, 64), nn.Linear(64, 2 * x)
+        self.z = z
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.past(torch.tanh(self.x_past(shift(x, -1))))[0]
+        g = self.future(torch.tanh(self.x_future(x)).flip(1))[0].flip(1)
+        fixed, recurrent = self.guide.weight.split([2 * h.shape[-1], self.z], dim=1)
+        base = functional.linear(torch.cat([h, g], -1), fixed, self.guide.bias)
+        noise = torch.randn(x.shape[1], x.shape[0], self.z)
+        z, loc, scale = GaussianChain.apply(
+            base.transpose(0, 1), noise, 1e-3, "tanh", recurrent, self.guide_out.weight, self.guide_out.bias
+        )
+        z, loc, scale = (v.transpose(0, 1) for v in (z, loc, scale))
+        before, raw = self.prior_out(torch.tanh(self.prior(torch.cat([h, shift(z, -1)], -1)))).chunk(2, -1)
+        prior_scale = functional.softplus(raw) + 1e-3
+        ratio, distance = (scale / prior_scale) ** 2, ((loc - before) / prior_scale) ** 2
+        kl = 0.5 * (ratio + distance - 1 - ratio.log()).sum()
+        mean, raw = self.decoder_out(torch.tanh(self.decoder(torch.cat([h, z], -1)))).chunk(2, -1)
+        deviation = functional.softplus(raw) + 1e-3
+        log_likelihood = -(((x - mean) ** 2) / (2 * deviation**2) + deviation.log() + 0.5 * math.log(2 * math.pi)).sum()
+        return (kl - log_likelihood) / x.shape[:2].numel()
+
+
+def program(x: Tensor) -> float:
+    """Pyro step over hand-written step."""
+    model = dvae.method("srnn", latent=10).build({"x": SIZE})
+    by_hand = ByHand(SIZE, 10)
+    elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
+    ours = training_step(model, lambda: evidence(elbo.terms(model, x), 0))
+    theirs = training_step(by_hand, lambda: by_hand(x))
+    a, b = seconds(ours, theirs)
+    return a / b
+
+
+def cache(length: int = 100, samples: int = 50) -> float:
+    """Time of recomputing over time of caching, for the same free run."""
+    model = dvae.method("hit-dvae").build({"x": SIZE}).eval()
+    parts = model.generator
+
+    @torch.no_grad()
+    def recomputing() -> None:
+        w = torch.randn(samples, model.sizes["w"])
+        values = {"z": torch.zeros(samples, 0, model.sizes["z"]), "x": torch.zeros(samples, 0, SIZE)}
+        for t in range(length):
+            for name in ("z", "x"):
+                parents = {"w": w} | {k: functional.pad(v, (0, 0, 0, t + 1 - v.shape[1])) for k, v in values.items()}
+                loc, scale = (p[:, t] for p in parts[name](parents, samples, t + 1))
+                value = loc + scale * torch.randn_like(loc)
+                values[name] = torch.cat([values[name], value[:, None]], dim=1)
+
+    a, b = seconds(recomputing, lambda: model.sample(samples, length), repeat=3)
+    return a / b
+
+
+def linear() -> float:
+    """Exponent of T in the time of a training step."""
+    model = dvae.method("srnn").build({"x": SIZE})
+    elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
+    lengths = [125, 250, 500, 1000]
+    data = [torch.randn(8, length, SIZE) for length in lengths]
+    times = seconds(*(training_step(model, lambda x=x: evidence(elbo.terms(model, x), 0)) for x in data), repeat=5)
+    return math.log(times[-1] / times[0]) / math.log(lengths[-1] / lengths[0])
+
+
+def srnn(x: Tensor) -> float:
+    """SRNN step over one matrix product."""
+    model = dvae.method("srnn", latent=10).build({"x": SIZE})
+    elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
+    square = torch.randn(2048, 2048)
+    a, b = seconds(training_step(model, lambda: evidence(elbo.terms(model, x), 0)), lambda: square @ square)
+    return a / b
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--out", type=Path, help="write the ratios as JSON")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    torch.manual_seed(0)
+    pyro.enable_validation(False)
+    x = torch.randn(BATCH, STEPS, SIZE)
+    rows = {
+        "program": (program(x), "at most 1.15"),
+        "cache": (cache(), "at least 8"),
+        "linear": (linear(), "about 1"),
+        "srnn": (srnn(x), "at most .45"),
+    }
+    for name, (ratio, target) in rows.items():
+        print(f"{name:10s} {ratio:6.2f}   {target}")
+    if options.out:
+        options.out.write_text(json.dumps({name: ratio for name, (ratio, _) in rows.items()}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

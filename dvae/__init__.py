@@ -1,0 +1,55 @@
+"""Dynamical variational autoencoders from their factorizations, on torch and Pyro.
+
+>>> import dvae
+>>> model = dvae.DynamicalVAE(
+...     generative="p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)",
+...     inference="q(w | x_{1:T}) q(z_t | x_{1:T}, w)",
+...     sizes={"w": 32, "z": 16, "x": 48},
+...     network=dvae.networks.Attention(width=64, heads=4),
+... )
+>>> dvae.audit(model.generative, model.inference).missing
+{'z': ('z_{<t}',)}
+"""
+
+import pyro
+
+# Without it a second model silently receives the first one's parameters from Pyro's global store.
+pyro.settings.set(module_local_params=True)
+
+from . import heads, motion, networks, priors  # noqa: E402
+from .graph import Audit, audit  # noqa: E402
+from .inference.bounds import SequenceELBO, Terms, importance_bound  # noqa: E402
+from .inference.evaluate import Evaluation, evaluate  # noqa: E402
+from .inference.fit import Fit, Training, fit  # noqa: E402
+from .inference.objectives import Evidence  # noqa: E402
+from .model import DynamicalVAE  # noqa: E402
+from .models import method, methods  # noqa: E402
+from .models.runs import load  # noqa: E402
+from .notation import Factorization  # noqa: E402
+from .oracle import Oracle, price, twin  # noqa: E402
+
+__all__ = [
+    "Audit",
+    "DynamicalVAE",
+    "Evaluation",
+    "Evidence",
+    "Factorization",
+    "Fit",
+    "Oracle",
+    "SequenceELBO",
+    "Terms",
+    "Training",
+    "audit",
+    "evaluate",
+    "fit",
+    "heads",
+    "importance_bound",
+    "load",
+    "method",
+    "methods",
+    "motion",
+    "networks",
+    "price",
+    "priors",
+    "twin",
+]

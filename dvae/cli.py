@@ -1,0 +1,415 @@
+"""The command line: list and show methods, fit and resume runs, evaluate them, forecast, look into data.
+
+Exit codes: 0 done, 1 failed, 2 wrong arguments, 130 after Ctrl-C, 143 after SIGTERM. A fit that a signal
+stopped can be resumed.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from . import motion
+from .graph import audit
+from .inference.checkpoints import Run
+from .inference.evaluate import evaluate as evaluate_models
+from .inference.fit import Fit, Interrupted, Training
+from .models import method as method_by_name
+from .models import methods, runs
+from .models.method import Method
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    MethodChoice = Method
+    ProtocolName = str
+else:
+    ProtocolName = tyro.extras.literal_type_from_choices(motion.PROTOCOLS)
+    MethodChoice = tyro.extras.subcommand_type_from_defaults(
+        {name: kind() for name, kind in methods().items()},
+        descriptions={name: kind.source for name, kind in methods().items()},
+        prefix_names=False,
+    )
+
+# Both keep to the width of the terminal; a file or a pipe gets lines as long as they need to be.
+OUT = Console(width=None if sys.stdout.isatty() else 200)
+ERROR = Console(stderr=True, soft_wrap=True, highlight=False)
+
+
+class UsageError(ValueError):
+    """Arguments that do not fit together."""
+
+
+app = tyro.extras.SubcommandApp()
+data_app = tyro.extras.SubcommandApp()
+
+
+@app.command(name="list")
+def list_methods() -> None:
+    """List the methods: their equations and where they come from."""
+    table = Table(show_lines=True)
+    for column in ("method", "equations", "source"):
+        table.add_column(column)
+    for name, kind in methods().items():
+        equations = f"{kind.generative}\n{kind.inference}" if hasattr(kind, "generative") else "--p and --q"
+        table.add_row(name, equations, kind.source)
+    OUT.print(table, highlight=False)
+
+
+@app.command
+def show(
+    method: Annotated[str | None, tyro.conf.Positional] = None,
+    generative: str | None = None,
+    inference: str | None = None,
+    steps: int = 4,
+    out: Path | None = None,
+) -> None:
+    """Show two equations: the joint distributions, the audit of the guide, and the graph.
+
+    Args:
+        method: name of a method, or give two equations instead.
+        generative: the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)".
+        inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})".
+        steps: time steps in the figure.
+        out: save the unrolled graphs of model and guide to this file (png, pdf, svg).
+    """
+    if method is not None and (generative or inference):
+        raise UsageError("give the name of a method or two equations, not both")
+    if method is not None:
+        with _arguments():
+            kind = method_by_name(method)
+        if not hasattr(kind, "generative"):
+            raise UsageError(f"{method} has no equations of its own; give --generative and --inference")
+        generative, inference = kind.generative, kind.inference
+    if not generative or not inference:
+        raise UsageError("give the name of a method, or both --generative and --inference")
+    with _arguments():
+        found = audit(generative, inference)
+    OUT.print(f"{found.generative}\n{found.inference}", highlight=False, markup=False, soft_wrap=True)
+    OUT.print(found.table())
+    OUT.print(found.verdict)
+    if out is not None:
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(2 * (0.85 * steps + 1.6), 4.2), layout="constrained")
+        model, guide = figure.subplots(1, 2)
+        found.generative.draw(steps, ax=model).set_title("model")
+        title = "guide" if found.exact else "guide (dashed: what the exact posterior also reads)"
+        found.draw(steps, ax=guide).set_title(title)
+        _save_figure(figure, out)
+
+
+@app.command(help="Fit a method, or equations of your own, to motion data.")
+def fit(
+    method: MethodChoice,
+    out: Path,
+    data: str = runs.SIMULATED,
+    protocol: ProtocolName | None = None,
+    skip_bad: bool = False,
+    steps: int = Training.steps,
+    batch_size: int = Training.batch_size,
+    learning_rate: float = 1e-3,
+    optimizer: Literal["adam", "adamw", "sgd"] = Training.optimizer,
+    validate_every: int = Training.validate_every,
+    patience: int | None = Training.patience,
+    seed: int = Training.seed,
+    accelerator: str = Training.accelerator,
+    devices: int = Training.devices,
+    precision: Literal["32-true", "64-true", "bf16-mixed", "bf16-true"] = Training.precision,
+) -> None:
+    """Fit a method, or equations of your own, to motion data.
+
+    Options may stand before or after the method; `dvae fit METHOD --help` lists those of a method.
+
+    Args:
+        method: what to fit.
+        out: the run directory.
+        data: a motion file, or "simulated".
+        protocol: how windows are cut, by default as suits the skeleton.
+        skip_bad: leave out clips that cannot be used instead of refusing the file.
+        steps: optimiser steps.
+        batch_size: windows in a batch.
+        learning_rate: step size of the optimiser.
+        optimizer: which optimiser.
+        validate_every: steps from one validation and checkpoint to the next.
+        patience: validations without a better bound after which to stop.
+        seed: of initial weights, batches and draws.
+        accelerator: where to compute: auto, cpu, cuda or mps.
+        devices: number of devices.
+        precision: of the computation.
+    """
+    if Run(out).exists:
+        raise ValueError(f"{out} already holds a run; continue it with: dvae resume {out}, or choose another directory")
+    with _arguments():
+        method.build({"x": 1})  # wrong equations and options are found before the data are read
+        training = Training(
+            steps=steps,
+            batch_size=batch_size,
+            learning_rate=learning_rate,
+            optimizer=optimizer,
+            validate_every=validate_every,
+            patience=patience,
+            seed=seed,
+            accelerator=accelerator,
+            devices=devices,
+            precision=precision,
+        )
+    result = runs.fit(method, runs.Data.open(data, protocol, skip_bad), out, training)
+    _report(result)
+
+
+@app.command
+def resume(run: Annotated[Path, tyro.conf.Positional], data: str | None = None, steps: int | None = None) -> None:
+    """Continue a run from its last checkpoint.
+
+    Args:
+        run: the run directory.
+        data: where the data lie now, if the path in the run no longer leads there.
+        steps: optimiser steps in all, to make the run longer.
+    """
+    _report(runs.resume(run, data, **({} if steps is None else {"steps": steps})))
+
+
+@app.command(help="Score runs on test windows.")
+def evaluate(
+    run: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    data: str | None = None,
+    samples: int = 50,
+    bound_particles: int = 0,
+    seed: int = 0,
+    batch_size: int = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Score runs on the test windows of their protocol, beside zero velocity and nearest neighbours.
+
+    Prints the table, and writes it with all that it rests on to evaluation.json in each run, or to --out.
+
+    Args:
+        run: run directories, fitted on the same data under the same protocol.
+        data: where the data lie now, if the path in the runs no longer leads there.
+        samples: forecasts of each window, K.
+        bound_particles: particles of the importance-weighted bound; 0 leaves it out.
+        seed: of the draws.
+        batch_size: windows forecast at once.
+        out: file to write instead of evaluation.json in each run.
+        figure: save the scores as dots with error bars.
+    """
+    if not run:
+        raise UsageError("give at least one run directory")
+    loaded = [runs.load(path, data) for path in run]
+    first, windows = loaded[0], loaded[0].data.windows("test")
+    for other in loaded[1:]:
+        if other.data.windows("test").fingerprint != windows.fingerprint:
+            raise ValueError(
+                f"{other.path} has other test windows ({other.data.path}, {other.data.protocol.name}) than "
+                f"{first.path} ({first.data.path}, {first.data.protocol.name}); evaluate them apart"
+            )
+    names = _names(loaded)
+    result = evaluate_models(
+        {name: each.model for name, each in zip(names, loaded, strict=True)},
+        windows,
+        samples=samples,
+        seed=seed,
+        batch_size=batch_size,
+        bound_particles=bound_particles,
+        training_windows=first.data.windows("train+validation"),
+        configs={name: Run(each.path).config for name, each in zip(names, loaded, strict=True)},
+    )
+    OUT.print(result.table())
+    for path in [out] if out is not None else [each.path / "evaluation.json" for each in loaded]:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        result.save(path)
+        ERROR.print(f"wrote {path}")
+    if figure is not None:
+        _save_figure(result.plot(), figure)
+
+
+@app.command(help="Forecast the test windows, or those of one clip, many times each.")
+def forecast(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    clip: str | None = None,
+    horizon: int | None = None,
+    samples: int = 10,
+    seed: int = 0,
+    data: str | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Forecast the test windows, or those of one clip, many times each.
+
+    The npz holds, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
+    (windows, frames, joints, 3), and `split`, `clip` and `start` of each window.
+
+    Args:
+        run: the run directory.
+        out: the npz file to write.
+        clip: name of a clip, or split/name where the name is not unique; of any split.
+        horizon: frames to forecast; by default those of the protocol.
+        samples: forecasts of each window.
+        seed: of the draws.
+        data: where the data lie now, if the path in the run no longer leads there.
+        figure: save a figure of the first window's futures.
+    """
+    if samples < 1 or (horizon is not None and horizon < 1):
+        raise UsageError(f"samples and horizon are at least 1, got {samples} and {horizon}")
+    loaded = runs.load(run, data)
+    protocol = loaded.data.protocol
+    if clip is None:
+        windows = loaded.data.windows("test")
+    else:
+        chosen = motion.MotionSet([_clip(loaded.data.motion, clip)], loaded.data.motion.skeleton, loaded.data.path)
+        anywhere = replace(protocol, split_by="split", test=tuple(chosen.splits), train=())
+        windows = motion.windows(chosen, anywhere, "test")
+    x = windows.all()["x"]
+    past, future = x[:, : protocol.observed], x[:, protocol.observed :]
+    horizon = horizon or protocol.predicted
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        parts = [loaded.model.forecast({"x": part}, horizon, samples)["x"] for part in past.split(64)]
+    forecasts = windows.positions(torch.cat(parts, dim=1))
+    observed, truth = windows.positions(past), windows.positions(future[:, :horizon])
+    split, name, start = zip(*windows.keys, strict=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with out.open("wb") as file:  # an open file: numpy would append .npz to a name
+        np.savez_compressed(
+            file,
+            forecasts=forecasts.numpy(),
+            observed=observed.numpy(),
+            truth=truth.numpy(),
+            split=np.array(split),
+            clip=np.array(name),
+            start=np.array(start),
+        )
+    ERROR.print(f"wrote {out}: {samples} futures of {horizon} frames for each of {len(x)} windows")
+    if figure is not None:
+        from matplotlib.figure import Figure
+
+        from .motion.plot import futures
+
+        known = truth[0] if truth.shape[1] == horizon else None
+        drawing = Figure(figsize=(9, 2.6), layout="constrained")
+        axes = futures(windows.skeleton, observed[0], forecasts[:, 0], known, ax=drawing.subplots())
+        axes.set_title(f"{split[0]}/{name[0]} from frame {start[0]}: {samples} futures", fontsize=9)
+        _save_figure(drawing, figure)
+
+
+@data_app.command(name="info")
+def data_info(
+    file: Annotated[str, tyro.conf.Positional] = runs.SIMULATED,
+    skip_bad: bool = False,
+) -> None:
+    """Say what a motion file holds: splits, clips, skeleton, how rigid its bones are, labels.
+
+    Args:
+        file: an npz file, or "simulated".
+        skip_bad: leave out clips that cannot be used, and list them, instead of refusing the file.
+    """
+    clips = motion.simulate() if file == runs.SIMULATED else motion.load(file, skip_bad=skip_bad)
+    OUT.print(clips.info())
+
+
+app.command(data_app, name="data", help="Look into motion files.")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    Args:
+        arguments: those of the process by default.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in given
+    given = [argument for argument in given if argument != "--debug"]
+    warnings.showwarning = _note
+    try:
+        app.cli(
+            prog="dvae",
+            description="Dynamical variational autoencoders from their factorizations. "
+            "With --debug, a failure shows its traceback.",
+            args=given,
+            config=(tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitArgPrefixes),
+        )
+        return 0
+    except SystemExit as stop:  # tyro, after --help or wrong arguments
+        return stop.code if isinstance(stop.code, int) else 2
+    except Interrupted as stop:
+        ERROR.print(f"interrupted after step {stop.fit.step}; resume with: dvae resume {stop.fit.run}")
+        return 128 + stop.signal
+    except KeyboardInterrupt:
+        ERROR.print("interrupted")
+        return 130
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        expected = isinstance(error, ValueError | OSError | RuntimeError | FloatingPointError)
+        hint = "" if expected or debug else " (this looks like a bug: --debug shows the traceback)"
+        ERROR.print("[bold red]error:[/bold red] ", end="")
+        ERROR.print((str(error) or type(error).__name__) + hint, markup=False)
+        return 2 if isinstance(error, UsageError) else 1
+
+
+def _note(message: Warning | str, *_: object, **__: object) -> None:
+    """A warning as a user of the command line reads it, without the place in the code."""
+    ERROR.print(f"note: {message}", markup=False)
+
+
+@contextmanager
+def _arguments() -> Iterator[None]:
+    """What is refused within it is an argument."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def _report(result: Fit) -> None:
+    best = (
+        ""
+        if result.best_bound is None
+        else f", best bound {result.best_bound:.3f} nats a frame at step {result.best_step}"
+    )
+    OUT.print(f"{result.status} at step {result.step}{best}", highlight=False, soft_wrap=True)
+    OUT.print(f"score it with: dvae evaluate {result.run}", highlight=False, soft_wrap=True)
+
+
+def _names(loaded: Sequence[runs.Loaded]) -> list[str]:
+    """Names of methods, of run directories where methods repeat, and whole paths where these repeat too."""
+    candidates = ([run.method.name for run in loaded], [run.path.name for run in loaded])
+    paths = [str(run.path) for run in loaded]
+    if len(set(paths)) < len(paths):
+        raise UsageError(f"a run is named twice: {Counter(paths).most_common(1)[0][0]}")
+    return next((names for names in candidates if len(set(names)) == len(names)), paths)
+
+
+def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
+    found = [clip for clip in clips if name in (clip.name, f"{clip.split}/{clip.name}")]
+    if not found:
+        raise ValueError(f"no clip {name!r} in {clips.name}; `dvae data info` tells what is there")
+    if len(found) > 1:
+        keys = " or ".join("/".join(clip.key) for clip in found)
+        raise ValueError(f"{name!r} is the name of {len(found)} clips; say {keys}")
+    return found[0]
+
+
+def _save_figure(figure: Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)
+    ERROR.print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

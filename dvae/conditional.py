@@ -1,0 +1,99 @@
+"""One factor of a factorization as a module: a network on the parents, a head on its features."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torch import Tensor, nn
+
+from .distributions.chain import DERIVATIVES, GaussianChain
+from .heads import Head, HeadSpec, NormalHead, Parameters, StandardNormal
+from .networks.base import Input, Network, NetworkSpec, at, shift
+from .notation import Factor
+
+CONSTANT = "1"
+"""What the network of a guide's factor without parents reads."""
+
+
+class Conditional(nn.Module):
+    """p(child | parents) or q(child | parents).
+
+    Args:
+        factor: the factor. Without parents a generative one is N(0, I); a guide's has the network read a constant.
+        sizes: dimension of every variable.
+        network, head: descriptions of the two parts.
+        generative: p rather than q.
+    """
+
+    def __init__(
+        self, factor: Factor, sizes: Mapping[str, int], network: NetworkSpec, head: HeadSpec, generative: bool
+    ):
+        super().__init__()
+        self.factor = factor
+        self.size = sizes[factor.child]
+        self.network: Network | None = None
+        inputs = [Input(p.name, sizes[p.name], p.relation if p.local else None) for p in factor.parents]
+        if inputs or not generative:
+            self.network = network.build(inputs or [Input(CONSTANT, 1)], factor.local, self.size)
+            self.head: Head = head.build(self.network.features, self.size)
+        else:
+            self.head = StandardNormal(self.size)
+        self.parents = [parent.name for parent in factor.parents]
+        if self.head.residual and not self._reads_previous():
+            raise ValueError(
+                f"{factor} has a residual head, which adds {factor.child}_{{t-1}}, but it does not read that; "
+                f"add {factor.child}_{{t-1}} or {factor.child}_{{<t}} to its parents, or use residual=False"
+            )
+
+    def _reads_previous(self) -> bool:
+        own = [parent for parent in self.factor.parents if parent.name == self.factor.child]
+        return bool(own) and own[0].relation is not None and bool(own[0].relation.mask(2)[1, 0])
+
+    def forward(
+        self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None
+    ) -> Parameters:
+        """The head's parameters at all steps, (B, T, D), or (B, D) for a static child."""
+        if self.network is None:
+            shape = (batch, length, 1) if self.factor.local else (batch, 1)
+            return self.head(next(self.head.buffers()).new_ones(shape))
+        features = self.network(self._read(parents, batch), length, lengths)
+        previous = shift(parents[self.factor.child], -1) if self.head.residual else None
+        return self.head(features, previous)
+
+    def _read(self, values: Mapping[str, Tensor], batch: int) -> dict[str, Tensor]:
+        """The parents among `values`, or a constant in place of none."""
+        if not self.parents:
+            return {CONSTANT: next(self.parameters()).new_ones(batch, 1)}
+        return {name: values[name] for name in self.parents if name in values}
+
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """The state before a loop that draws those of the parents that are not `given`."""
+        if self.network is None:
+            return tuple(p.unbind(1) for p in self(given, batch, length))
+        return self.network.start(self._read(given, batch), batch, length, lengths)
+
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Parameters, Any]:
+        """The head's parameters (B, D) at step t, and the next state."""
+        if self.network is None:
+            return tuple(p[t] for p in state), state
+        features, state = self.network.step(state, t, drawn)
+        previous = None
+        if self.head.residual:
+            previous = at(drawn[self.factor.child], t - 1, features, self.size)
+        return self.head(features, previous, t), state
+
+    def chain(self, state: Any, direction: int, noise: Tensor) -> tuple[Tensor, Parameters] | None:
+        """Draws (B, T, D) and their parameters by one fused loop, where the factor is a Gaussian chain; else None."""
+        form = None if self.network is None else self.network.chain(state)
+        if form is None or form.lag != -direction or form.join.kind not in DERIVATIVES:
+            return None
+        if not isinstance(self.head, NormalHead) or self.head.residual:
+            return None
+        layers = [p for layer in (*form.join.rest, self.head.out) for p in layer.parameters()]
+        in_order = [tensor.transpose(0, 1) for tensor in (form.hoisted.base, noise)]
+        if direction < 0:
+            in_order = [tensor.flip(0) for tensor in in_order]
+        out = GaussianChain.apply(*in_order, self.head.min_scale, form.join.kind, form.hoisted.weights[0], *layers)
+        value, *parameters = ((tensor.flip(0) if direction < 0 else tensor).transpose(0, 1) for tensor in out)
+        return value, tuple(parameters)

@@ -1,0 +1,5 @@
+"""Distributions of sequences."""
+
+from .sequence import Sequence
+
+__all__ = ["Sequence"]

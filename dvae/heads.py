@@ -1,0 +1,218 @@
+"""Heads: features to the distribution of one variable.
+
+A head turns features (..., H) into the parameters of an elementwise distribution over (..., D). The parameters are
+plain tensors, so that a loop over time handles no distribution objects.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import pyro.distributions as dist
+import torch
+from pyro.distributions.torch_distribution import TorchDistribution
+from torch import Tensor, nn
+from torch.nn import functional
+
+Parameters = tuple[Tensor, ...]
+
+
+class Head(nn.Module):
+    """Features to the parameters of a distribution whose first parameter is its location.
+
+    Args:
+        residual: the location is an offset from the variable's own previous value.
+    """
+
+    def __init__(self, residual: bool = False):
+        super().__init__()
+        self.residual = residual
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """Parameters (..., D) from features and the variable's own previous value, where the head is residual.
+
+        Args:
+            features: (B, T, H) at all steps, or (B, H) of a static variable or at step `t`.
+            previous: (B, T, D) or (B, D).
+            t: the step, in a loop over time.
+        """
+        raise NotImplementedError
+
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        """The elementwise distribution over (..., D)."""
+        loc, scale = parameters
+        return dist.Normal(loc, scale, validate_args=False)
+
+    def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
+        """Noise for all steps at once; `draw` turns it into values."""
+        return torch.randn(*shape, dtype=like.dtype, device=like.device)
+
+    def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
+        """Reparameterised values (..., D)."""
+        loc, scale = parameters
+        return torch.addcmul(loc, scale, noise)
+
+
+class HeadSpec(Protocol):
+    """A description of a head: a frozen dataclass that `build`s one."""
+
+    def build(self, features: int, size: int) -> Head:
+        """The head from features H to a variable of dimension D."""
+        ...
+
+
+@dataclass(frozen=True)
+class Normal:
+    """A diagonal normal whose location and scale are both read from the features.
+
+    Args:
+        min_scale: the scale stays above it; a likelihood whose scale can vanish has no maximum.
+        residual: the location is an offset from the variable's own previous value.
+    """
+
+    min_scale: float = 1e-3
+    residual: bool = False
+
+    def build(self, features: int, size: int) -> Head:
+        """The head from features H to a variable of dimension D."""
+        return NormalHead(self, features, size)
+
+
+class NormalHead(Head):
+    """See `Normal`."""
+
+    def __init__(self, spec: Normal, features: int, size: int):
+        super().__init__(spec.residual)
+        self.min_scale = spec.min_scale
+        self.out = nn.Linear(features, 2 * size)
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Head.forward`."""
+        loc, raw = self.out(features).chunk(2, dim=-1)
+        return loc if previous is None else loc + previous, functional.softplus(raw) + self.min_scale
+
+
+@dataclass(frozen=True)
+class FixedNormal:
+    """A normal whose scale does not depend on the parents.
+
+    Args:
+        scale: standard deviation, the initial one where it is learned.
+        learned: one learned scale per dimension.
+        project: a linear layer from features to location; False takes the features themselves.
+        steps: with `learned`, one scale per time step too, for up to so many steps.
+        residual: the location is an offset from the variable's own previous value.
+    """
+
+    scale: float = 1.0
+    learned: bool = False
+    project: bool = True
+    steps: int = 0
+    residual: bool = False
+
+    def build(self, features: int, size: int) -> Head:
+        """The head from features H to a variable of dimension D."""
+        if self.scale <= 0:
+            raise ValueError(f"FixedNormal's scale is positive, got {self.scale}")
+        if not self.project and features != size:
+            raise ValueError(f"a head without projection takes {size} features, but the network gives {features}")
+        return FixedNormalHead(self, features, size)
+
+
+class FixedNormalHead(Head):
+    """See `FixedNormal`."""
+
+    def __init__(self, spec: FixedNormal, features: int, size: int):
+        super().__init__(spec.residual)
+        self.out: nn.Module = nn.Linear(features, size) if spec.project else nn.Identity()
+        shape = (spec.steps, size) if spec.steps else (size,)
+        log_scale = torch.full(shape, math.log(spec.scale))
+        if spec.learned:
+            self.log_scale = nn.Parameter(log_scale)
+        else:
+            self.register_buffer("log_scale", log_scale)
+        self.steps = spec.steps
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Head.forward`."""
+        loc = self.out(features)
+        scale = self.log_scale.exp()
+        if self.steps:
+            needed = loc.shape[1] if t is None else t + 1
+            if needed > self.steps:
+                raise ValueError(
+                    f"FixedNormal(steps={self.steps}) was given {needed} steps; build it with steps={needed}"
+                )
+            scale = scale[: loc.shape[1]] if t is None else scale[t]
+        return loc if previous is None else loc + previous, scale.expand_as(loc)
+
+
+@dataclass(frozen=True)
+class StudentT:
+    """A Student t, for observations with outliers.
+
+    Args:
+        df: degrees of freedom, the initial ones; learned, one per dimension, and kept above 2.
+        min_scale: the scale stays above it.
+        residual: the location is an offset from the variable's own previous value.
+    """
+
+    df: float = 5.0
+    min_scale: float = 1e-3
+    residual: bool = False
+
+    def build(self, features: int, size: int) -> Head:
+        """The head from features H to a variable of dimension D."""
+        if self.df <= 2:
+            raise ValueError(f"StudentT needs df > 2, where the variance is finite; got {self.df}")
+        return StudentTHead(self, features, size)
+
+
+class StudentTHead(Head):
+    """See `StudentT`."""
+
+    def __init__(self, spec: StudentT, features: int, size: int):
+        super().__init__(spec.residual)
+        self.min_scale = spec.min_scale
+        self.out = nn.Linear(features, 2 * size)
+        self.raw_df = nn.Parameter(torch.full((size,), math.log(math.expm1(spec.df - 2))))
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Head.forward`."""
+        loc, raw = self.out(features).chunk(2, dim=-1)
+        loc = loc if previous is None else loc + previous
+        df = functional.softplus(self.raw_df) + 2
+        return loc, functional.softplus(raw) + self.min_scale, df.expand_as(loc)
+
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        """See `Head.distribution`."""
+        loc, scale, df = parameters
+        return dist.StudentT(df, loc, scale, validate_args=False)
+
+    def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
+        """Reparameterised values (..., D): the normal noise over the root of a gamma draw."""
+        loc, scale, df = parameters
+        gamma = torch._standard_gamma(0.5 * df)
+        return loc + scale * noise * torch.rsqrt(2 * gamma / df)
+
+
+class StandardNormal(Head):
+    """N(0, I), the prior of a variable without parents; it reads no features."""
+
+    zero: Tensor
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.size = size
+        self.register_buffer("zero", torch.zeros(size), persistent=False)
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Head.forward`; only the shape of the features is read."""
+        loc = self.zero.expand(*features.shape[:-1], self.size)
+        return loc, torch.ones_like(loc)
+
+
+__all__ = ["FixedNormal", "Head", "HeadSpec", "Normal", "StandardNormal", "StudentT"]

@@ -1,0 +1,420 @@
+"""DynamicalVAE: two factorizations and their networks as a Pyro model and guide.
+
+There is one sample site per variable, whatever the number of steps: `w` with event (D,), `z` and `x` with event (T, D),
+inside the plate "sequences". Everything else (free running, forecasts, reconstruction, scoring) is this one program
+with different things known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from typing import Any
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor, nn
+
+from .conditional import Conditional
+from .heads import HeadSpec, Normal
+from .networks import NetworkSpec, Recurrent
+from .networks.base import valid_steps
+from .notation import Factorization, check_pair
+from .priors import Prior
+from .rollout import Rollout, SelfFeeding
+
+Batch = Tensor | Mapping[str, Tensor]
+MaskFunction = Callable[[int], Any]
+
+
+class DynamicalVAE(nn.Module):
+    """A generative model and a guide from their equations.
+
+    Args:
+        generative: such as "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", as text or a `Factorization`.
+        inference: such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)".
+        sizes: dimension of every variable, context included.
+        network: description of the networks, or a mapping from factors to descriptions. Its keys are "p(x)" for one
+            factor, "p" for all generative ones, "q" for the guide's, and "default".
+        heads: the same for the heads; `heads.Normal()` where nothing is said.
+        priors: static latent to its prior, in place of N(0, I).
+        observed: names of the data variables; every other variable with a generative factor is a latent.
+        masks: relations of one's own, name to function of T (see `Factorization.parse`).
+
+    Raises:
+        ValueError: equations that cannot be read or do not fit together; sizes missing or unknown.
+
+    Example:
+        >>> model = DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})", {"z": 2, "x": 3})
+        >>> model.sample(5, length=10)["x"].shape
+        torch.Size([5, 10, 3])
+    """
+
+    def __init__(
+        self,
+        generative: str | Factorization,
+        inference: str | Factorization,
+        sizes: Mapping[str, int],
+        network: NetworkSpec | Mapping[str, NetworkSpec] | None = None,
+        heads: HeadSpec | Mapping[str, HeadSpec] | None = None,
+        priors: Mapping[str, Prior] | None = None,
+        observed: tuple[str, ...] = ("x",),
+        masks: Mapping[str, MaskFunction] | None = None,
+    ):
+        super().__init__()
+        self.generative = _factorization(generative, masks)
+        self.inference = _factorization(inference, masks)
+        self.sizes = dict(sizes)
+        self.latents, self.observed, self.context = check_pair(self.generative, self.inference, observed, sizes)
+        for name, size in self.sizes.items():
+            if size < 1:
+                raise ValueError(f"the size of {name} is {size}; sizes are positive")
+        self.networks = _by_factor(network, Recurrent(), "network")
+        self.heads = _by_factor(heads, Normal(), "head")
+        keys = {f"{f.kind}({f.child})" for f in (*self.generative.factors, *self.inference.factors)}
+        for key in {*self.networks, *self.heads} - keys - {"p", "q", "default"}:
+            raise ValueError(f"no factor {key!r}; keys are {', '.join(sorted(keys))}, 'p', 'q' and 'default'")
+        self.generator: Any = self._conditionals(self.generative)
+        self.encoder: Any = self._conditionals(self.inference)
+        self.priors = nn.ModuleDict(dict(priors or {}))
+        for name in self.priors:
+            factor = self.generative.factor(name)
+            if factor.local or factor.parents:
+                raise ValueError(
+                    f"a prior replaces a factor p({name}) of a static latent without parents, not {factor}"
+                )
+
+    def _conditionals(self, factorization: Factorization) -> Any:
+        def pick(table: Mapping[str, Any], kind: str, child: str) -> Any:
+            return table.get(f"{kind}({child})", table.get(kind, table["default"]))
+
+        return nn.ModuleDict(
+            {
+                factor.child: Conditional(
+                    factor,
+                    self.sizes,
+                    pick(self.networks, factor.kind, factor.child),
+                    pick(self.heads, factor.kind, factor.child),
+                    generative=factor.kind == "p",
+                )
+                for factor in factorization.factors
+            }
+        )
+
+    # The Pyro program ----------------------------------------------------------------------------------------------
+
+    def model(
+        self,
+        batch: Batch | None = None,
+        *,
+        length: int | None = None,
+        size: int = 1,
+        prefix: Mapping[str, Tensor] | None = None,
+        mean_emission: bool = False,
+        self_feeding: SelfFeeding | float | None = None,
+    ) -> dict[str, Tensor]:
+        """The generative program p. Teacher-forced where the data are given, free where they are not.
+
+        Args:
+            batch: the data (B, T, D), or a mapping from variable names to tensors (context too), with optional
+                "lengths" (B,) of a ragged batch and "mask", True where an entry of the data was observed: (B, T, D),
+                or a mapping of these by name.
+            length: T. Beyond the length of the data, the data are a prefix from which the program continues.
+            size: B, where the batch does not tell.
+            prefix: name to the first values (B, O, D) of a latent.
+            mean_emission: a free run sets the data variables to their means and does not draw them.
+            self_feeding: scheduled sampling of the data's history; a probability, or `SelfFeeding`.
+
+        Returns:
+            Name to value of every variable.
+        """
+        rollout = self._rollout(self.generative, self.generator, batch, length, size)
+        rollout.prefix = {**rollout.prefix, **(prefix or {})}
+        rollout.mean_emission = mean_emission
+        rollout.feeding = SelfFeeding(self_feeding) if isinstance(self_feeding, int | float) else self_feeding
+        with pyro.plate("sequences", rollout.batch, dim=-1):
+            for block in self.generative.blocks:
+                for name in block.names:
+                    law = self.priors[name](rollout.batch) if name in self.priors else rollout.law(name)
+                    data = rollout.values.get(name)
+                    rollout.know(name, pyro.sample(name, law, obs=data, infer=_note(self.generative)))
+        return dict(rollout.values)
+
+    def guide(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
+        """The inference program q, with the arguments of `model`.
+
+        Returns:
+            Name to value of every latent.
+        """
+        rollout = self._rollout(self.inference, self.encoder, batch, None, 1)
+        for name in self.observed:
+            if name not in rollout.values and any(name in c.parents for c in self.encoder.values()):
+                raise ValueError(
+                    f"the guide reads {name}, but the batch holds {', '.join(rollout.values) or 'nothing'}"
+                )
+        with pyro.plate("sequences", rollout.batch, dim=-1):
+            for name in self.latents:
+                rollout.know(name, pyro.sample(name, rollout.law(name), infer=_note(self.inference)))
+        return {name: rollout.values[name] for name in self.latents}
+
+    def forward(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
+        """`model`, so that the module itself is the Pyro model of `elbo(model, model.guide)`."""
+        return self.model(batch, **options)
+
+    def reference(self, batch: Batch) -> None:
+        """The generative program as one reads it: a loop over time with one site per variable and step.
+
+        Sites are "z_1", "x_1", "z_2", ... as in the equations. Each factor is given noise in place of every value that
+        is not drawn yet, so that a network that reads what it should not changes the result. Slow; for tests.
+        """
+        rollout = self._rollout(self.generative, self.generator, batch, None, 1)
+        known = {name: value for name, value in rollout.values.items() if name not in self.observed}
+        size, length = rollout.batch, rollout.length
+
+        def law(name: str, sofar: Mapping[str, list[Tensor]]) -> Any:
+            conditional = self.generator[name]
+            parents = dict(known)
+            for other, values in sofar.items():
+                later = torch.randn(size, length - len(values), self.sizes[other]).to(_like(self))
+                parents[other] = torch.cat([torch.stack(values, 1), later], 1) if values else later
+            return conditional.head, conditional(parents, size, length)
+
+        with pyro.plate("sequences", size, dim=-1):
+            for block in self.generative.blocks:
+                if not self.generative.local(block.names[0]):
+                    (name,) = block.names
+                    head, parameters = law(name, {})
+                    prior = (
+                        self.priors[name](size) if name in self.priors else head.distribution(parameters).to_event(1)
+                    )
+                    known[name] = pyro.sample(name, prior)
+                    continue
+                sofar: dict[str, list[Tensor]] = {name: [] for name in block.names}
+                for t in pyro.markov(range(length), history=length):
+                    for name in block.names:
+                        head, parameters = law(name, sofar)
+                        at_t = head.distribution(tuple(p[:, t] for p in parameters)).to_event(1)
+                        data = rollout.values[name][:, t] if name in self.observed else None
+                        sofar[name].append(pyro.sample(f"{name}_{t + 1}", at_t, obs=data))
+                known |= {name: torch.stack(values, 1) for name, values in sofar.items()}
+
+    # What is done with it ------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def sample(self, n: int = 1, length: int | None = None, batch: Batch | None = None) -> dict[str, Tensor]:
+        """Free runs from the prior.
+
+        Args:
+            n: how many; ignored where the batch (of context) tells.
+            length: T.
+            batch: context.
+
+        Returns:
+            Name to draws (n, T, D), or (n, D) of a static latent.
+        """
+        with self._evaluating():
+            return self.model(batch, length=length, size=n)
+
+    @torch.no_grad()
+    def forecast(
+        self, batch: Batch, horizon: int, samples: int = 1, *, draw_emission: bool = False
+    ) -> dict[str, Tensor]:
+        """Continues observed sequences: latents of the past from the guide, then the model runs free.
+
+        Args:
+            batch: the observed data (B, O, D), or a mapping; local context must reach over O + horizon steps.
+            horizon: H, the number of steps to continue.
+            samples: S, continuations of each sequence.
+            draw_emission: draw the data from their distribution instead of taking its mean, as the papers of human
+                motion do. Predictive densities need the draws.
+
+        Returns:
+            Name to (S, B, H, D) for the data, (S, B, O + H, D) for local and (S, B, D) for static latents.
+
+        Raises:
+            ValueError: a ragged batch, or a local context that ends before the horizon.
+        """
+        data = self._mapping(batch)
+        if "lengths" in data:
+            raise ValueError(
+                "forecast continues sequences of one length; cut the batch to it, or forecast them in turn"
+            )
+        if horizon < 1 or samples < 1:
+            raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
+        past = data[self.observed[0]].shape[1]
+        data = {name: _repeat(value, samples) for name, value in data.items()}
+        seen = {
+            name: value[:, :past] if name in self.context and value.dim() == 3 else value
+            for name, value in data.items()
+        }
+        with self._evaluating():
+            latents = self.guide(seen)
+            statics = {name: value for name, value in latents.items() if not self.generative.local(name)}
+            program = poutine.condition(self.model, data=statics) if statics else self.model
+            prefix = {name: value for name, value in latents.items() if name not in statics}
+            out = program(data, length=past + horizon, prefix=prefix, mean_emission=not draw_emission)
+        out = {name: out[name].unflatten(0, (samples, -1)) for name in (*self.observed, *self.latents)}
+        return {name: value[:, :, past:] if name in self.observed else value for name, value in out.items()}
+
+    @torch.no_grad()
+    def reconstruct(self, batch: Batch, samples: int = 1) -> dict[str, Tensor]:
+        """Means of the data given latents from the guide, teacher-forced; missing entries are filled in so.
+
+        Returns:
+            Name to (S, B, T, D) for every data variable.
+        """
+        data = {name: _repeat(value, samples) for name, value in self._mapping(batch).items()}
+        with self._evaluating():
+            latents = self.guide(data)
+            rollout = self._rollout(self.generative, self.generator, data, None, 1)
+            rollout.values.update(latents)
+            means = {name: rollout.evaluate(name, rollout.values[name]).mean for name in self.observed}
+        return {name: mean.unflatten(0, (samples, -1)) for name, mean in means.items()}
+
+    @torch.no_grad()
+    def log_joint(self, batch: Batch, latents: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint."""
+        trace = poutine.trace(poutine.condition(self.model, data=dict(latents))).get_trace(batch)
+        trace.compute_log_prob(site_filter=lambda name, site: name in self.generative.variables)
+        return {name: trace.nodes[name]["log_prob"] for name in self.generative.variables}
+
+    # Reading a batch -----------------------------------------------------------------------------------------------
+
+    def _evaluating(self) -> Any:
+        return _Evaluating(self) if self.training else nullcontext()
+
+    def _mapping(self, batch: Batch | None) -> dict[str, Any]:
+        if batch is None:
+            return {}
+        if isinstance(batch, Tensor):
+            if len(self.observed) > 1:
+                raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
+            return {self.observed[0]: batch}
+        unknown = [name for name in batch if name not in (*self.sizes, "lengths", "mask")]
+        if unknown:
+            raise ValueError(
+                f"the batch holds {', '.join(unknown)}; expected some of {', '.join(self.sizes)}, 'lengths', 'mask'"
+            )
+        return dict(batch)
+
+    def _rollout(
+        self,
+        factorization: Factorization,
+        conditionals: Any,
+        batch: Batch | None,
+        length: int | None,
+        size: int,
+    ) -> Rollout:
+        values = self._mapping(batch)
+        lengths, mask = values.pop("lengths", None), values.pop("mask", None)
+        masks = mask if isinstance(mask, Mapping) else {} if mask is None else {self.observed[0]: mask}
+        for name, value in values.items():
+            self._check(name, value)
+        local = {name: v for name, v in values.items() if v.dim() == 3}
+        sizes = {v.shape[0] for v in values.values()} or {size}
+        if len(sizes) > 1:
+            raise ValueError(f"the batch holds different numbers of sequences: {_shapes(values)}")
+        steps = {v.shape[1] for v in local.values()}
+        if length is None:
+            if not steps:
+                raise ValueError("neither a batch nor length= tells how many steps to run; pass length=")
+            length = max(steps)
+            if len(steps) > 1:
+                raise ValueError(f"the batch holds different numbers of steps: {_shapes(local)}")
+        if length < 1:
+            raise ValueError(f"length is at least 1, got {length}")
+        prefix = {name: v for name, v in local.items() if v.shape[1] < length}
+        if not steps <= set(range(1, length + 1)) or not set(prefix) <= set(self.observed):
+            raise ValueError(
+                f"expected {length} steps (fewer of data to continue), but the batch holds {_shapes(local)}"
+            )
+        for name, seen in masks.items():
+            if name not in self.observed or name not in values:
+                raise ValueError(
+                    f"there is a mask of {name}, but the batch holds no data of that name: {_shapes(values)}"
+                )
+            if seen.shape != values[name].shape or seen.dtype != torch.bool:
+                raise ValueError(
+                    f"the mask of {name} is {seen.dtype} {tuple(seen.shape)}; expected bool "
+                    f"{tuple(values[name].shape)}, True where an entry was observed"
+                )
+            values[name] = values[name].masked_fill(~seen, 0)
+        if lengths is not None:
+            if lengths.shape != (next(iter(sizes)),) or lengths.min() < 1 or lengths.max() > length:
+                raise ValueError(f"lengths must be (B,) numbers between 1 and {length}, got {lengths.tolist()}")
+            valid = valid_steps(lengths, length)[..., None]
+            values |= {name: v.masked_fill(~valid, 0) for name, v in values.items() if v.dim() == 3}
+        for name, value in values.items():
+            if not torch.isfinite(value.sum()):  # one pass; a NaN or infinity survives the sum
+                raise ValueError(
+                    f"{name} holds values that are not finite; where entries are missing, set 'mask' False in the batch"
+                )
+        return Rollout(
+            factorization=factorization,
+            conditionals=conditionals,
+            batch=next(iter(sizes)),
+            length=length,
+            values={name: v for name, v in values.items() if name not in prefix},
+            data=frozenset(self.observed),
+            lengths=lengths,
+            observed=masks,
+            prefix=prefix,
+        )
+
+    def _check(self, name: str, value: Tensor) -> None:
+        local = self.generative.local(name) if name not in self.context else None
+        if local is None:
+            factorization = self.generative if name in self.generative.context else self.inference
+            local = factorization.local(name)
+        expected = f"(B, {'T, ' if local else ''}{self.sizes[name]})"
+        if value.dim() != (3 if local else 2) or value.shape[-1] != self.sizes[name]:
+            raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {expected}")
+        if value.dim() == 3 and value.shape[1] == 0:
+            raise ValueError(f"{name} has no steps: shape {tuple(value.shape)}")
+        if not value.is_floating_point():
+            raise ValueError(f"{name} is {value.dtype}, expected floating point {expected}")
+
+
+class _Evaluating:
+    """eval() for the length of a block."""
+
+    def __init__(self, module: nn.Module):
+        self.module = module
+
+    def __enter__(self) -> None:
+        self.module.eval()
+
+    def __exit__(self, *_: object) -> None:
+        self.module.train()
+
+
+def _factorization(equations: str | Factorization, masks: Mapping[str, MaskFunction] | None) -> Factorization:
+    return equations if isinstance(equations, Factorization) else Factorization.parse(equations, masks=masks or {})
+
+
+def _note(factorization: Factorization) -> Any:
+    """What a site says of its program: bounds decide from it where a KL term may be analytic."""
+    return {"program": factorization}
+
+
+def _by_factor(given: Any, default: Any, what: str) -> dict[str, Any]:
+    table = dict(given) if isinstance(given, Mapping) else {} if given is None else {"default": given}
+    for key, spec in table.items():
+        if not hasattr(spec, "build"):
+            raise ValueError(f"the {what} of {key!r} is {spec!r}; expected a description such as {default!r}")
+    return {"default": default, **table}
+
+
+def _repeat(value: Any, samples: int) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _repeat(v, samples) for name, v in value.items()}
+    return value.repeat(samples, *[1] * (value.dim() - 1))
+
+
+def _shapes(values: Mapping[str, Tensor]) -> str:
+    return ", ".join(f"{name} {tuple(value.shape)}" for name, value in values.items())
+
+
+def _like(module: nn.Module) -> Tensor:
+    return next(module.parameters())

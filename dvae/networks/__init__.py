@@ -1,0 +1,9 @@
+"""Networks: parents to features under the masks of a factorization."""
+
+from .attention import Attention
+from .base import Input, Network, NetworkSpec
+from .dense import Dense
+from .linear import Linear
+from .recurrent import Recurrent
+
+__all__ = ["Attention", "Dense", "Input", "Linear", "Network", "NetworkSpec", "Recurrent"]

@@ -1,0 +1,269 @@
+"""Attention: masked cross-attention, from the current step to what it may see (Vaswani et al., 2017, arXiv 1706.03762).
+
+Distances enter as linear biases (Press et al., 2022, arXiv 2108.12409) rather than as absolute positions, so that a
+model runs beyond the length it was trained on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from .base import ACTIVATIONS, Hoisted, Input, Join, Network, at, valid_steps
+from .dense import part
+
+
+@dataclass(frozen=True)
+class Attention:
+    """Pointwise parents form the query; parents read over a range are keys and values under their mask.
+
+    A learned start token is always visible, because a first step has no past. The nearest visible frame of each range
+    joins the query, which otherwise could not tell where in a motion it is.
+
+    Args:
+        width: of queries, keys and values.
+        heads: number of attention heads; divides the width.
+        layers: cross-attention layers over the same keys.
+        feedforward: width of the perceptron after each attention; 0 for four times the width.
+        activation: of the perceptrons.
+    """
+
+    width: int = 64
+    heads: int = 4
+    layers: int = 1
+    feedforward: int = 0
+    activation: str = "gelu"
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> AttentionNetwork:
+        """The network of a factor with these parents."""
+        if self.width % self.heads:
+            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
+        return AttentionNetwork(self, inputs, local)
+
+
+class Layer(nn.Module):
+    """One cross-attention and its perceptron, both residual with normalisation before them."""
+
+    def __init__(self, spec: Attention):
+        super().__init__()
+        self.heads = spec.heads
+        inner = spec.feedforward or 4 * spec.width
+        self.norm_query = nn.LayerNorm(spec.width)
+        self.query = nn.Linear(spec.width, spec.width)
+        self.keys_values = nn.Linear(spec.width, 2 * spec.width)
+        self.out = nn.Linear(spec.width, spec.width)
+        self.perceptron = nn.Sequential(
+            nn.LayerNorm(spec.width),
+            nn.Linear(spec.width, inner),
+            ACTIVATIONS[spec.activation](),
+            nn.Linear(inner, spec.width),
+        )
+
+    def project(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """Keys and values (B, heads, S, W / heads) of tokens (B, S, W)."""
+        keys, values = self.keys_values(tokens).unflatten(-1, (2 * self.heads, -1)).transpose(1, 2).chunk(2, dim=1)
+        return keys, values
+
+    def forward(self, stream: Tensor, keys: Tensor, values: Tensor, bias: Tensor) -> Tensor:
+        """The stream (B, T, W) after attending under the additive bias, broadcastable to (B, heads, T, S)."""
+        query = self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        seen = functional.scaled_dot_product_attention(query, keys, values, attn_mask=bias)
+        stream = stream + self.out(seen.transpose(1, 2).flatten(2))
+        return stream + self.perceptron(stream)
+
+
+class AttentionNetwork(Network):
+    """See `Attention`."""
+
+    slopes: Tensor
+    layers: Any
+
+    def __init__(self, spec: Attention, inputs: Sequence[Input], local: bool):
+        super().__init__(inputs, local, spec.width)
+        self.heads = spec.heads
+        self.points: list[tuple[Input, int | None]] = []
+        self.ranged: list[Input] = []
+        for parent in self.inputs:
+            lags = parent.lags
+            if parent.relation is None:
+                self.points.append((parent, None))
+            elif local and lags is not None and len(lags) == 1:
+                self.points.append((parent, lags[0]))
+            else:
+                self.ranged.append(parent)
+                if local and parent.relation.intervals is not None:
+                    nearest = min(
+                        (max(low, min(high, 0)) for low, high in parent.relation.intervals),
+                        key=lambda lag: (abs(lag), lag),
+                    )
+                    self.points.append((parent, int(nearest)))
+        if self.ranged:
+            self.start_token = nn.Parameter(torch.randn(spec.width) / math.sqrt(spec.width))
+        self.embed = nn.ModuleDict({p.name: nn.Linear(p.size, spec.width) for p in self.ranged})
+        sizes = [parent.size for parent, _ in self.points]
+        self.point = Join(sizes, (spec.width, spec.width), spec.activation) if sizes else None
+        self.origin = nn.Parameter(torch.randn(spec.width) / math.sqrt(spec.width))
+        self.layers = nn.ModuleList(Layer(spec) for _ in range(spec.layers if self.ranged else 0))
+        self.norm = nn.LayerNorm(spec.width)
+        slopes = torch.tensor([2.0 ** (-8 * (h + 1) / spec.heads) for h in range(spec.heads)])
+        self.register_buffer("slopes", slopes, persistent=False)
+
+    def bias(self, parent: Input, length: int) -> Tensor:
+        """(heads, T, T) or (1, 1, T) for a static child: minus slope times distance where visible, else -inf."""
+        assert parent.relation is not None
+        mask = torch.as_tensor(parent.relation.mask(length), device=self.slopes.device)
+        if not self.local:
+            return self.slopes.new_zeros(1, 1, length).masked_fill(~mask[:1], -math.inf)
+        steps = torch.arange(length, device=self.slopes.device, dtype=self.slopes.dtype)
+        distance = (steps[:, None] - steps[None, :]).abs()
+        return (-self.slopes[:, None, None] * distance).masked_fill(~mask, -math.inf)
+
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """See `Network.forward`."""
+        batch = next(iter(parents.values())).shape[0]
+        stream = self.queries(parents, batch, length)
+        if self.ranged:
+            tokens, bias = self.tokens(self.ranged, parents, batch, length, lengths)
+            for layer in self.layers:
+                stream = layer(stream, *layer.project(tokens), bias)
+        stream = self.norm(stream)
+        return stream if self.local else stream[:, 0]
+
+    def queries(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
+        """(B, T, W), or (B, 1, W) for a static child."""
+        stream = self.origin.expand(batch, length if self.local else 1, -1)
+        if self.point is None:
+            return stream
+        joined = self.point([part(parents[parent.name], lag) for parent, lag in self.points])
+        return stream + (joined if joined.dim() == 3 else joined[:, None])
+
+    def tokens(
+        self,
+        parents: Sequence[Input],
+        values: Mapping[str, Tensor],
+        batch: int,
+        length: int,
+        lengths: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Tokens (B, 1 + T * parents, W), the start token first, and their bias to every step."""
+        tokens = [self.start_token.expand(batch, 1, -1)]
+        biases = [self.slopes.new_zeros(1, length if self.local else 1, 1)]
+        for parent in parents:
+            tokens.append(self.embed[parent.name](values[parent.name]))
+            biases.append(self.bias(parent, length))
+        rows = max(b.shape[0] for b in biases)
+        bias = torch.cat([b.expand(rows, -1, -1) for b in biases], dim=-1)[None]
+        if lengths is not None:
+            hidden = ~valid_steps(lengths, length)
+            seen = hidden.new_zeros(batch, 1)
+            hidden = torch.cat([seen] + [hidden] * len(parents), dim=1)
+            bias = bias.masked_fill(hidden[:, None, None, :], -math.inf)
+        return torch.cat(tokens, dim=1), bias
+
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """See `Network.start`."""
+        known = {i: part(given[p.name], lag) for i, (p, lag) in enumerate(self.points) if p.name in given}
+        queries = self.point.hoist(known, batch, length) if self.point is not None else None
+        fixed = [p for p in self.ranged if p.name in given]
+        live = [p for p in self.ranged if p.name not in given]
+        tokens = bias = self.origin.new_zeros(())
+        if self.ranged:
+            tokens, bias = self.tokens(fixed, given, batch, length, lengths)
+        masks = {p.name: p.relation.mask(length).tolist() for p in live if p.relation is not None}
+        caches = [Cache(layer.project(tokens), room=length * len(live)) for layer in self.layers]
+        return Attending(
+            queries=queries,
+            points=[entry for i, entry in enumerate(self.points) if i not in known],
+            bias=bias,
+            batch=batch,
+            live=live,
+            rows=torch.cat([self.bias(p, length) for p in live], dim=-1) if live else bias,
+            length=length,
+            masks=masks,
+            caches=caches,
+            lengths=lengths,
+        )
+
+    def step(self, state: Attending, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        """See `Network.step`."""
+        stream = self.origin.expand(state.batch, -1)
+        if state.queries is not None and self.point is not None:
+            parts = [at(drawn[p.name], t + lag, stream, p.size) for p, lag in state.points if lag is not None]
+            stream = stream + self.point.add(state.queries, t, parts)
+        stream = stream[:, None]
+        if self.layers:
+            fresh = []
+            for i, parent in enumerate(state.live):
+                for s, visible in enumerate(state.masks[parent.name][t]):
+                    if visible and (column := i * state.length + s) not in state.seen:
+                        state.seen[column] = s
+                        fresh.append(self.embed[parent.name](drawn[parent.name][s]))
+            if fresh:
+                tokens = torch.stack(fresh, dim=1)
+                for layer, cache in zip(self.layers, state.caches, strict=True):
+                    cache.append(*layer.project(tokens))
+            bias = state.row(t)
+            for layer, cache in zip(self.layers, state.caches, strict=True):
+                stream = layer(stream, cache.keys, cache.values, bias)
+        return self.norm(stream[:, 0]), state
+
+
+class Cache:
+    """Keys and values seen so far, (B, heads, S, W / heads). Written in place where no gradient is wanted."""
+
+    def __init__(self, tokens: tuple[Tensor, Tensor], room: int):
+        keys, values = tokens
+        self.size = keys.shape[2]
+        self.keys, self.values = keys, values
+        self.buffers: tuple[Tensor, ...] | None = None
+        if not torch.is_grad_enabled() and room:
+            self.buffers = tuple(functional.pad(old, (0, 0, 0, room)) for old in (keys, values))
+
+    def append(self, keys: Tensor, values: Tensor) -> None:
+        """Add the keys and values of new tokens."""
+        if self.buffers is None:
+            self.keys, self.values = torch.cat([self.keys, keys], 2), torch.cat([self.values, values], 2)
+            return
+        end = self.size + keys.shape[2]
+        for buffer, new in zip(self.buffers, (keys, values), strict=True):
+            buffer[:, :, self.size : end] = new
+        self.size = end
+        self.keys, self.values = (buffer[:, :, :end] for buffer in self.buffers)
+
+
+@dataclass
+class Attending:
+    """What an `AttentionNetwork` keeps between steps."""
+
+    queries: Hoisted | None
+    points: list[tuple[Input, int | None]]
+    bias: Tensor
+    batch: int
+    live: list[Input]
+    rows: Tensor
+    """Biases (heads, T, parents * T) of the live tokens."""
+    length: int
+    masks: dict[str, list[list[bool]]]
+    caches: list[Cache]
+    lengths: Tensor | None
+    seen: dict[int, int] = field(default_factory=dict)
+    """Column of `rows` and step of every live token, in the order of the cache."""
+
+    def row(self, t: int) -> Tensor:
+        """The bias of step t to every token in the cache, broadcastable to (B, heads, 1, S)."""
+        fixed = self.bias[:, :, t : t + 1]
+        if not self.seen:
+            return fixed
+        columns = torch.tensor(list(self.seen), device=self.rows.device)
+        live = self.rows[None, :, t : t + 1].index_select(-1, columns)
+        if self.lengths is not None:
+            steps = torch.tensor(list(self.seen.values()), device=self.rows.device)
+            live = live.masked_fill((steps >= self.lengths[:, None])[:, None, None], -math.inf)
+        shape = torch.broadcast_shapes(fixed.shape[:3], live.shape[:3])
+        return torch.cat([fixed.expand(*shape, -1), live.expand(*shape, -1)], dim=-1)

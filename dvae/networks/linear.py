@@ -1,0 +1,94 @@
+"""Linear: the affine-Gaussian network, whose models have a known evidence (see `dvae.oracle`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from .base import Input, Network, at
+
+
+@dataclass(frozen=True)
+class Linear:
+    """features_t = b_t + sum over parents and their visible steps s of W_ts v_s, in the child's own dimension.
+
+    The weights vary with t and s, so that a guide of this kind can hold the exact posterior of a linear-Gaussian model.
+
+    Args:
+        steps: the longest sequence.
+        scale: standard deviation of the initial weights.
+    """
+
+    steps: int = 16
+    scale: float = 0.3
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> LinearNetwork:
+        """The network of a factor with these parents."""
+        return LinearNetwork(self, inputs, local, size)
+
+
+class LinearNetwork(Network):
+    """See `Linear`. Weights are (T, S, H, D): T is 1 for a static child, S is 1 for a static parent."""
+
+    def __init__(self, spec: Linear, inputs: Sequence[Input], local: bool, size: int):
+        super().__init__(inputs, local, size)
+        self.steps = spec.steps
+        rows = spec.steps if local else 1
+        self.bias = nn.Parameter(spec.scale * torch.randn(rows, size))
+        self.weights = nn.ParameterDict()
+        for parent in self.inputs:
+            columns = 1 if parent.relation is None else spec.steps
+            self.weights[parent.name] = nn.Parameter(spec.scale * torch.randn(rows, columns, size, parent.size))
+
+    def mask(self, name: str, length: int) -> Tensor:
+        """(T or 1, S or 1) True where the parent is read; a custom mask may depend on the length."""
+        relation = next(parent.relation for parent in self.inputs if parent.name == name)
+        if relation is None:
+            return torch.ones(1, 1, dtype=torch.bool)
+        return torch.as_tensor(relation.mask(length)[: length if self.local else 1])
+
+    def weight(self, name: str, length: int) -> Tensor:
+        """Masked weights (T or 1, S or 1, H, D) for sequences of `length` steps."""
+        if length > self.steps:
+            raise ValueError(f"Linear(steps={self.steps}) was given {length} steps; build it with steps={length}")
+        weight = self.weights[name][:length, :length]
+        return weight * self.mask(name, length)[:, :, None, None].to(weight.device)
+
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """See `Network.forward`."""
+        features: Tensor = self.bias[:length]
+        for parent in self.inputs:
+            values = parents[parent.name]
+            values = values[:, None] if parent.relation is None else values
+            features = features + torch.einsum("tshd,bsd->bth", self.weight(parent.name, length), values)
+        if not self.inputs:
+            raise ValueError("Linear needs at least one parent; leave a factor without parents to its prior")
+        return features if self.local else features[:, 0]
+
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """See `Network.start`."""
+        base: Tensor = self.bias[:length].expand(batch, -1, -1)
+        live = {}
+        for parent in self.inputs:
+            weight = self.weight(parent.name, length)
+            if parent.name in given:
+                values = given[parent.name]
+                values = values[:, None] if parent.relation is None else values
+                base = base + torch.einsum("tshd,bsd->bth", weight, values)
+            else:
+                live[parent.name] = (weight, self.mask(parent.name, length).tolist())
+        return base.unbind(1), live
+
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        """See `Network.step`."""
+        base, live = state
+        features = base[t]
+        for name, (weight, mask) in live.items():
+            for s, visible in enumerate(mask[t]):
+                if visible:
+                    features = features + at(drawn[name], s, features, weight.shape[-1]) @ weight[t, s].t()
+        return features, state

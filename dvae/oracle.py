@@ -1,0 +1,230 @@
+"""The oracle: linear-Gaussian models, whose evidence and whose every bound are known exactly.
+
+With `networks.Linear` and normals of fixed scale, any factorization is one dense joint normal. Then log p(x), the exact
+posterior, and the evidence lower bound of any linear guide are closed forms; so is the expected gap between bound and
+evidence, over data from the model. Minimised over guides, that gap is what the guide's factorization costs: the price
+of its dropped arrows, in nats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from .heads import FixedNormal, FixedNormalHead, StandardNormal
+from .model import DynamicalVAE
+from .networks.linear import Linear, LinearNetwork
+from .notation import Factorization
+
+
+def twin(
+    generative: str | Factorization,
+    inference: str | Factorization,
+    sizes: Mapping[str, int],
+    steps: int,
+    seed: int = 0,
+    observed: tuple[str, ...] = ("x",),
+    scale: float = 0.3,
+) -> DynamicalVAE:
+    """The linear-Gaussian model of a pair of factorizations, with random weights, in double precision.
+
+    Args:
+        generative, inference, sizes, observed: as of `DynamicalVAE`.
+        steps: T, the number of time steps.
+        seed: of the weights.
+        scale: standard deviation of the weights.
+    """
+    equations = [f if isinstance(f, Factorization) else Factorization.parse(f) for f in (generative, inference)]
+    heads = {
+        f"{factor.kind}({factor.child})": FixedNormal(
+            scale=0.7, learned=True, project=False, steps=steps if factor.local else 0
+        )
+        for equation in equations
+        for factor in equation.factors
+    }
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        p, q = equations
+        return DynamicalVAE(p, q, sizes, Linear(steps, scale), heads, observed=observed).double()
+
+
+@dataclass(frozen=True)
+class _System:
+    """v = W v + U d + b + diag(s) e for stacked variables v, stacked data d and standard normal e."""
+
+    weights: Tensor
+    data_weights: Tensor
+    bias: Tensor
+    scale: Tensor
+
+
+class Oracle:
+    """Exact quantities of a linear-Gaussian model and its guide.
+
+    Args:
+        model: a `twin`, or any `DynamicalVAE` of Linear networks with fixed scales and without projections.
+        steps: T.
+
+    Raises:
+        ValueError: a model that is not linear-Gaussian, or has context.
+    """
+
+    def __init__(self, model: DynamicalVAE, steps: int):
+        if model.context:
+            raise ValueError(f"the oracle knows no law of the context {', '.join(model.context)}")
+        if len(model.priors):
+            raise ValueError("the oracle knows normal priors only")
+        self.model, self.steps = model, steps
+
+    def _size(self, name: str) -> int:
+        return self.model.sizes[name] * (self.steps if self.model.generative.local(name) else 1)
+
+    def _system(self, conditionals: Mapping[str, Any], names: tuple[str, ...], data: tuple[str, ...]) -> _System:
+        def block(child: str, parent: str) -> Tensor:
+            network = conditionals[child].network
+            if network is None or parent not in network.weights:
+                return torch.zeros(self._size(child), self._size(parent), dtype=torch.float64)
+            weight = network.weight(parent, self.steps)
+            return weight.transpose(1, 2).reshape(self._size(child), self._size(parent))
+
+        def stack(parents: tuple[str, ...]) -> Tensor:
+            rows = [torch.cat([block(c, p) for p in parents], dim=1) for c in names] if parents else []
+            return torch.cat(rows) if rows else torch.zeros(sum(map(self._size, names)), 0, dtype=torch.float64)
+
+        biases, scales = [], []
+        for name in names:
+            conditional = conditionals[name]
+            head = conditional.head
+            if not isinstance(head, StandardNormal) and not (
+                isinstance(conditional.network, LinearNetwork)
+                and isinstance(head, FixedNormalHead)
+                and isinstance(head.out, nn.Identity)
+                and not head.residual
+            ):
+                raise ValueError(
+                    f"{conditional.factor} is not linear-Gaussian: the oracle needs networks.Linear with "
+                    "heads.FixedNormal(project=False), as dvae.oracle.twin builds"
+                )
+            zeros = {
+                parent: torch.zeros(1, self._size(parent), dtype=torch.float64).unflatten(
+                    1, (self.steps, -1) if self.model.generative.local(parent) else (-1,)
+                )
+                for parent in conditional.parents
+            }
+            location, scale = conditional(zeros, 1, self.steps)
+            biases.append(location.flatten())
+            scales.append(scale.flatten())
+        return _System(stack(names), stack(data), torch.cat(biases), torch.cat(scales))
+
+    def _joint(self) -> tuple[Tensor, Tensor]:
+        """Mean and precision of (latents, data) under the model, both stacked variable by variable."""
+        system = self._system(self.model.generator, (*self.model.latents, *self.model.observed), ())
+        rest = torch.eye(len(system.bias), dtype=torch.float64) - system.weights
+        white = rest / system.scale[:, None]
+        return torch.linalg.solve(rest, system.bias), white.t() @ white
+
+    def _guide(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Gain on the data, offset, and a root R of the covariance R R' of q(latents | data)."""
+        system = self._system(self.model.encoder, self.model.latents, self.model.observed)
+        rest = torch.eye(len(system.bias), dtype=torch.float64) - system.weights
+        right = torch.cat([system.data_weights, system.bias[:, None], torch.diag(system.scale)], dim=1)
+        solved = torch.linalg.solve(rest, right)
+        data = system.data_weights.shape[1]
+        return solved[:, :data], solved[:, data], solved[:, data + 1 :]
+
+    def _stack(self, values: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
+        return torch.cat([values[name].flatten(1) for name in names], dim=1)
+
+    def evidence(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
+        """log p(x), (B,), of data (B, T, D)."""
+        data = self._stack(self.model._mapping(x), self.model.observed)
+        mean, precision = self._joint()
+        start = len(mean) - data.shape[1]
+        covariance = torch.linalg.inv(precision)[start:, start:]
+        return torch.distributions.MultivariateNormal(mean[start:], covariance).log_prob(data)
+
+    def posterior(self, x: Tensor | Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Mean (B, N) and covariance (N, N) of the latents, stacked in the guide's order, given data (B, T, D)."""
+        data = self._stack(self.model._mapping(x), self.model.observed)
+        mean, precision = self._joint()
+        n = len(mean) - data.shape[1]
+        gain = -torch.linalg.solve(precision[:n, :n], precision[:n, n:])
+        return mean[:n] + (data - mean[n:]) @ gain.t(), torch.linalg.inv(precision[:n, :n])
+
+    def bound(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
+        """The exact evidence lower bound of the model's guide, (B,): no draws are taken."""
+        gain, offset, root = self._guide()
+        mean, _ = self.posterior(x)
+        data = self._stack(self.model._mapping(x), self.model.observed)
+        n = len(mean.t())
+        precision = self._joint()[1][:n, :n]
+        difference = data @ gain.t() + offset - mean
+        spread = (root.t() @ precision * root.t()).sum()
+        log_volume = torch.linalg.slogdet(precision)[1] + 2 * torch.linalg.slogdet(root)[1]
+        distance = torch.einsum("bi,ij,bj->b", difference, precision, difference)
+        return self.evidence(x) - 0.5 * (spread + distance - n - log_volume)
+
+    def gap(self) -> Tensor:
+        """The expected evidence minus bound, in nats a sequence, over data drawn from the model."""
+        gain, offset, root = self._guide()
+        mean, precision = self._joint()
+        n = len(offset)
+        within, across = precision[:n, :n], precision[:n, n:]
+        exact_gain = -torch.linalg.solve(within, across)
+        slope = gain - exact_gain
+        shift = gain @ mean[n:] + offset - mean[:n]
+        covariance = torch.linalg.inv(precision)[n:, n:]
+        spread = (root.t() @ within * root.t()).sum()
+        log_volume = torch.linalg.slogdet(within)[1] + 2 * torch.linalg.slogdet(root)[1]
+        distance = shift @ within @ shift + (slope.t() @ within @ slope * covariance).sum()
+        return 0.5 * (spread + distance - n - log_volume)
+
+    def fit_guide(self, iterations: int = 2000) -> float:
+        """Fits the guide to the model's exact gap by L-BFGS and returns what is left of it, in nats a sequence."""
+        parameters = list(self.model.encoder.parameters())
+        optimiser = torch.optim.LBFGS(
+            parameters,
+            max_iter=iterations,
+            history_size=50,
+            tolerance_grad=1e-10,
+            tolerance_change=1e-14,
+            line_search_fn="strong_wolfe",
+        )
+
+        def closure() -> Tensor:
+            optimiser.zero_grad()
+            gap = self.gap()
+            gap.backward(inputs=parameters)
+            return gap
+
+        optimiser.step(closure)
+        return float(self.gap().detach())
+
+
+def price(
+    generative: str | Factorization,
+    inference: str | Factorization,
+    sizes: Mapping[str, int],
+    steps: int = 5,
+    seeds: int = 5,
+    observed: tuple[str, ...] = ("x",),
+) -> Tensor:
+    """What a guide's factorization costs: the smallest expected gap in nats a sequence, (seeds,).
+
+    Each seed is a linear-Gaussian model with random weights, and the best guide of this factorization for it. A guide
+    that holds the posterior's dependencies costs nothing where latents have one dimension; with more, what is left is
+    the price of its diagonal covariance.
+
+    Args:
+        generative, inference, sizes, observed: as of `DynamicalVAE`.
+        steps: T.
+        seeds: number of random models.
+    """
+    gaps = [
+        Oracle(twin(generative, inference, sizes, steps, seed, observed), steps).fit_guide() for seed in range(seeds)
+    ]
+    return torch.tensor(gaps, dtype=torch.float64)

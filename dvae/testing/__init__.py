@@ -1,0 +1,5 @@
+"""Tests for models of one's own; needs pytest. `strategies` draws random factorizations, with hypothesis."""
+
+from .contract import FactorizationContract
+
+__all__ = ["FactorizationContract"]

@@ -1,0 +1,198 @@
+"""FactorizationContract: what every model of two factorizations keeps, as tests to subclass.
+
+    class TestMine(dvae.testing.FactorizationContract):
+        def build(self, size):
+            return dvae.DynamicalVAE(generative, inference, sizes={"z": size, "x": size}, network=MyNetwork())
+
+pytest collects the subclass and runs every law below on the model, in double precision and on random data.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import pytest
+import torch
+from pyro import poutine
+from pyro.infer import Trace_ELBO
+from torch import Tensor
+
+from ..conditional import Conditional
+from ..graph import audit
+from ..inference.bounds import SequenceELBO
+from ..model import DynamicalVAE
+from ..oracle import Oracle, twin
+
+
+class FactorizationContract:
+    """Laws of a `DynamicalVAE`: subclass it, with a name that pytest collects, and say what to `build`.
+
+    Attributes:
+        batch: B, sequences in a test.
+        steps: T, time steps in a test.
+        tolerance: of log densities that two ways of running the program must agree on, in nats.
+        still: parameters that need not learn from every batch, by name.
+    """
+
+    batch = 3
+    steps = 5
+    tolerance = 1e-8
+    still: frozenset[str] = frozenset()
+
+    def build(self, size: int) -> DynamicalVAE:
+        """The model under test, small.
+
+        Args:
+            size: D of the data and, where they are free, of the other variables.
+        """
+        raise NotImplementedError("a FactorizationContract is subclassed: def build(self, size) returns the model")
+
+    def test_networks_read_the_declared_parents_and_nothing_else(self) -> None:
+        """Parameters at t have a Jacobian of exactly zero to a parent at s wherever the mask is False."""
+        model = self._model()
+        values = self._values(model)
+        for conditional in (*model.generator.values(), *model.encoder.values()):
+            for name in conditional.parents:
+                shown = torch.as_tensor(conditional.factor.mask(name, self.steps))
+                read = self._reads(conditional, values, name)
+                shown = shown.expand_as(read)
+                assert not (read & ~shown).any(), f"{conditional.factor} reads {name} where its mask hides it:\n{read}"
+                assert (read | ~shown).all(), f"{conditional.factor} does not read {name} where it may:\n{read}"
+
+    def test_scoring_agrees_with_drawing(self) -> None:
+        """A free run's log joint, step by step, is that of the same values teacher-forced; the guide's too."""
+        model = self._model()
+        data = self._data(model)
+        context = {name: data[name] for name in model.context}
+        free, drawn = _run(model.model, context, length=self.steps, size=self.batch)
+        scored = {**context, **{name: free[name] for name in model.observed}}
+        self._close(drawn, model.log_joint(scored, {name: free[name] for name in model.latents}))
+        latents, drawn = _run(model.guide, data)
+        self._close(drawn, _run(poutine.condition(model.guide, data=latents), data)[1])
+
+    def test_the_log_joint_is_that_of_the_per_step_program(self) -> None:
+        """One site per variable scores as a loop over time with one site per step."""
+        model = self._model()
+        data = self._data(model)
+        latents, _ = _run(model.guide, data)
+        sites = {name: value for name, value in latents.items() if value.dim() == 2}
+        sites |= {
+            f"{name}_{t + 1}": value[:, t]
+            for name, value in latents.items()
+            if value.dim() == 3
+            for t in range(self.steps)
+        }
+        _, logs = _run(poutine.condition(model.reference, data=sites), data)
+        vectorised = torch.stack(list(model.log_joint(data, latents).values())).sum(0)
+        self._close({"joint": torch.stack(list(logs.values())).sum(0)}, {"joint": vectorised})
+
+    def test_every_size_may_be_one(self) -> None:
+        """One sequence, one step, one dimension."""
+        model = self._model(1)
+        data = self._data(model, 1, 2)
+        observed = {name: v[:, :1] if name in model.observed else v for name, v in data.items()}
+        one = {name: v[:, :1] if v.dim() == 3 else v for name, v in data.items()}
+        terms = SequenceELBO().terms(model, one)
+        assert terms.bound.shape == (1,)
+        assert torch.isfinite(terms.bound).all()
+        assert all(torch.isfinite(value).all() for value in model.forecast(observed, 1).values())
+
+    def test_padding_changes_nothing(self) -> None:
+        """Every sequence of a ragged batch scores as it does alone, whatever stands at the padded steps."""
+        model = self._model()
+        lengths = torch.arange(self.batch) % self.steps + 1
+        data = self._data(model)
+        padding = (torch.arange(self.steps) >= lengths[:, None])[..., None]
+        ragged = {name: v.masked_fill(padding, torch.nan) if v.dim() == 3 else v for name, v in data.items()}
+        ragged["lengths"] = lengths
+        latents, guide_logs = _run(model.guide, ragged)
+        logs = model.log_joint(ragged, latents)
+        for i, n in enumerate(lengths.tolist()):
+            alone, drawn = (
+                {name: v[i : i + 1, :n] if v.dim() == 3 else v[i : i + 1] for name, v in values.items()}
+                for values in (data, latents)
+            )
+            self._close({name: log[i : i + 1] for name, log in logs.items()}, model.log_joint(alone, drawn))
+            guided = _run(poutine.condition(model.guide, data=drawn), alone)[1]
+            self._close({name: log[i : i + 1] for name, log in guide_logs.items()}, guided)
+
+    def test_every_parameter_learns(self) -> None:
+        """The loss has a gradient in every parameter of model and guide."""
+        model = self._model()
+        Trace_ELBO().differentiable_loss(model.model, model.guide, self._data(model)).backward()
+        flat = {name for name, p in model.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0}
+        assert not flat - self.still, f"no gradient reaches {', '.join(sorted(flat - self.still))}"
+
+    def test_a_loaded_model_gives_the_same_seeded_draws(self) -> None:
+        """The state_dict holds all there is to a model."""
+        model, other = self._model(), self._model()
+        other.load_state_dict(copy.deepcopy(model.state_dict()))
+        data = self._data(model)
+        for run in (lambda m: m.guide(data), lambda m: m.reconstruct(data)):
+            torch.manual_seed(1)
+            expected = run(model)
+            torch.manual_seed(1)
+            assert all(torch.equal(value, expected[name]) for name, value in run(other).items())
+
+    def test_its_linear_gaussian_twin_is_bounded_by_the_evidence_and_tight_where_the_audit_says_so(self) -> None:
+        """The same equations with known evidence: the best guide's gap is zero if and only if it is exact."""
+        model = self._model()
+        if model.context:
+            pytest.skip("the evidence given context is not known")
+        sizes = dict.fromkeys(model.sizes, 1)  # where a diagonal covariance is no restriction
+        pair = twin(model.generative, model.inference, sizes, self.steps, observed=model.observed)
+        oracle = Oracle(pair, self.steps)
+        data = {name: pair.sample(self.batch, self.steps)[name] for name in model.observed}
+        assert (oracle.bound(data) <= oracle.evidence(data) + 1e-9).all()
+        gap = oracle.fit_guide()
+        exact = audit(model.generative, model.inference, observed=model.observed).exact
+        assert (gap < 1e-6) == exact, f"the audit says exact: {exact}, but the best guide's gap is {gap:.2g} nats"
+
+    # ---------------------------------------------------------------------------------------------- what they use
+
+    def _model(self, size: int = 2) -> DynamicalVAE:
+        return self.build(size).double().eval()
+
+    def _values(self, model: DynamicalVAE) -> dict[str, Tensor]:
+        """A value of every variable, for one sequence."""
+        shapes = {name: (1, self.steps, d) if self._local(model, name) else (1, d) for name, d in model.sizes.items()}
+        return {name: torch.randn(shape, dtype=torch.float64) for name, shape in shapes.items()}
+
+    def _data(self, model: DynamicalVAE, batch: int = 0, steps: int = 0) -> dict[str, Tensor]:
+        batch, steps = batch or self.batch, steps or self.steps
+        return {
+            name: torch.randn(batch, *([steps] * self._local(model, name)), model.sizes[name], dtype=torch.float64)
+            for name in (*model.observed, *model.context)
+        }
+
+    def _local(self, model: DynamicalVAE, name: str) -> bool:
+        generative = name in model.generative.variables or name in model.generative.context
+        return (model.generative if generative else model.inference).local(name)
+
+    def _reads(self, conditional: Conditional, values: Mapping[str, Tensor], name: str) -> Tensor:
+        """(T or 1, S or 1) True where the parameters depend on the parent."""
+
+        def parameters(value: Tensor) -> Tensor:
+            out = torch.cat(conditional({**values, name: value}, 1, self.steps), dim=-1)
+            mixed = out @ torch.linspace(1.0, 2.0, out.shape[-1], dtype=out.dtype)  # one number a step is enough
+            return mixed.flatten()
+
+        jacobian = torch.autograd.functional.jacobian(parameters, values[name])  # (T, 1, S, D) or (T, 1, D)
+        return (jacobian != 0).any(-1).reshape(len(jacobian), -1)
+
+    def _close(self, got: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+        assert got.keys() == expected.keys()
+        for name, value in expected.items():
+            difference = (got[name] - value).abs().max().item()
+            assert difference <= self.tolerance, f"{name} differs by {difference:.3g} nats between two ways of scoring"
+
+
+@torch.no_grad()
+def _run(program: Callable[..., Any], *args: Any, **kwargs: Any) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Values and log densities (B,) of a program's sites."""
+    trace = poutine.trace(program).get_trace(*args, **kwargs)
+    trace.compute_log_prob()
+    sites = {n: s for n, s in trace.nodes.items() if s["type"] == "sample" and n != "sequences"}
+    return {n: s["value"] for n, s in sites.items()}, {n: s["log_prob"] for n, s in sites.items()}

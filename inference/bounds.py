@@ -1,0 +1,302 @@
+"""Bounds on the log evidence, as terms per sequence.
+
+`SequenceELBO` is the evidence lower bound with analytic KL terms wherever these are right; `importance_bound` the
+importance-weighted one (Burda et al., 2016, arXiv 1509.00519) with the Pareto diagnosis of its weights (Vehtari et al.,
+2024, arXiv 1507.02646).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from pyro import poutine
+from pyro.distributions import Unit
+from pyro.infer import ELBO
+from torch import Tensor
+from torch.distributions import kl_divergence
+
+from ..distributions import Sequence
+from ..graph import analytic_kl
+from ..model import Batch, DynamicalVAE
+from ..networks.base import computing_once
+from ..rollout import Rollout
+
+
+@dataclass
+class Terms:
+    """What a bound is made of, per sequence and in nats.
+
+    Args:
+        log_likelihood: data variable to (B,).
+        kl: latent to (B,); summed over the steps of a local one.
+        energies: penalty (a `pyro.factor` site) to (B,), positive where it costs.
+        frames: (B,) number of valid steps.
+        steps: local variable to (B, T): its log-likelihood or KL by step, 0 at padding.
+    """
+
+    log_likelihood: dict[str, Tensor]
+    kl: dict[str, Tensor]
+    energies: dict[str, Tensor]
+    frames: Tensor
+    steps: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def bound(self) -> Tensor:
+        """(B,) the unweighted evidence lower bound; energies are not part of it."""
+        return sum(self.log_likelihood.values()) - sum(self.kl.values(), torch.zeros_like(self.frames))
+
+    @property
+    def per_frame(self) -> Tensor:
+        """(B,) the bound in nats per frame."""
+        return self.bound / self.frames
+
+
+class SequenceELBO(ELBO):
+    """The evidence lower bound of a sequence model.
+
+    A Pyro ELBO, to be used as any other; `terms` gives it by variable and sequence. The KL of a latent is analytic per
+    step where none of its generative parents is its descendant in the guide, and both conditionals are normal; else it
+    is the log-ratio at the draw, which is unbiased for every guide. (For a backward guide the analytic form is wrong:
+    it treats parents as fixed that move with the latent.)
+
+    It takes traces as `TraceMeanField_ELBO` does and agrees with it where that is right, but evaluates every
+    conditional once, where that would do so for the trace's own log probability too.
+
+    Args:
+        num_particles: draws from the guide to average over.
+    """
+
+    def __init__(self, num_particles: int = 1):
+        super().__init__(num_particles=num_particles)
+
+    def terms(
+        self, model: Callable[..., Any], batch: Batch, guide: Callable[..., Any] | None = None, **options: Any
+    ) -> Terms:
+        """The bound's terms, averaged over the particles.
+
+        Args:
+            model: a `DynamicalVAE`, or a Pyro model that wraps its program.
+            batch: see `DynamicalVAE.model`.
+            guide: the model's own, if not given.
+            options: of the program, such as `self_feeding`.
+
+        Raises:
+            ValueError: sites that are scaled or missing in guide or model.
+        """
+        guide = guide or model.guide  # type: ignore[attr-defined]
+        draws = [self._terms(model, guide, (batch,), options) for _ in range(self.num_particles)]
+        return draws[0] if len(draws) == 1 else _mean(draws)
+
+    def differentiable_loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> Tensor:
+        """Minus the bound plus the energies, summed over the batch."""
+        draws = [self._terms(model, guide, args, kwargs) for _ in range(self.num_particles)]
+        return sum(sum(t.energies.values()) - t.bound for t in draws).sum() / self.num_particles  # type: ignore[return-value, union-attr]
+
+    def loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> float:
+        """`differentiable_loss` as a number."""
+        with torch.no_grad():
+            return self.differentiable_loss(model, guide, *args, **kwargs).item()
+
+    def loss_and_grads(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> float:
+        """`differentiable_loss` as a number, its gradient left in the parameters."""
+        loss = self.differentiable_loss(model, guide, *args, **kwargs)
+        loss.backward()
+        return loss.item()
+
+    def _get_trace(self, model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Trace, poutine.Trace]:
+        return _traces(model, guide, args, kwargs)
+
+    def _terms(self, model: Any, guide: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Terms:
+        with computing_once():
+            return self._evaluate(model, guide, args, kwargs)
+
+    def _evaluate(self, model: Any, guide: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Terms:
+        model_sites, guide_sites = map(_sites, self._get_trace(model, guide, args, kwargs))
+        for name in guide_sites:
+            if name not in model_sites:
+                raise ValueError(f"the latent {name} is in the guide but not in the model")
+        closed = _closed_forms(model_sites, guide_sites)
+        terms = Terms({}, {}, {}, torch.empty(0))
+        for name, site in model_sites.items():
+            fn, value = site["fn"], site["value"]
+            if isinstance(fn, Sequence):
+                terms.frames = _frames(fn.rollout)
+            if isinstance(fn, Unit):
+                terms.energies[name] = -fn.log_prob(value)
+            elif name in guide_sites:
+                _record(terms, terms.kl, name, _kl(fn, guide_sites[name]["fn"], value, name in closed))
+            elif site["is_observed"]:
+                _record(terms, terms.log_likelihood, name, _log_prob(fn, value))
+            else:
+                raise ValueError(f"the latent {name} is in the model but not in the guide")
+        return terms
+
+
+def _traces(model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Trace, poutine.Trace]:
+    drawn = poutine.trace(guide).get_trace(*args, **kwargs)
+    return poutine.trace(poutine.replay(model, trace=drawn)).get_trace(*args, **kwargs), drawn
+
+
+def _sites(trace: Any) -> dict[str, dict[str, Any]]:
+    sites = {
+        name: site
+        for name, site in trace.nodes.items()
+        if site["type"] == "sample" and not poutine.util.site_is_subsample(site)
+    }
+    for name, site in sites.items():
+        if site["scale"] != 1.0 or site["mask"] is not None:
+            raise ValueError(
+                f"the site {name} is scaled or masked by a handler; weights belong to the objective "
+                "(Evidence(kl_weight=...)), and missing entries to the batch ('mask'), so that the bound stays a bound"
+            )
+    return sites
+
+
+def _log_prob(fn: Any, value: Tensor) -> Tensor:
+    """(B, T) of a local variable, (B,) of a static one."""
+    if not isinstance(fn, Sequence):
+        return fn.log_prob(value)
+    return _over_entries(fn.elementwise(value).log_prob(value), fn)
+
+
+def _over_entries(entries: Tensor, fn: Sequence) -> Tensor:
+    mask = fn.rollout.mask(fn.name)
+    # where, not a product: an entry that does not count may be infinite
+    return (entries if mask is None else torch.where(mask, entries, 0.0)).sum(-1)
+
+
+def _closed_forms(model_sites: Mapping[str, Any], guide_sites: Mapping[str, Any]) -> set[str]:
+    """The latents whose KL term may be analytic; none for programs whose factorizations are not known."""
+    # In a replayed model the latents' sites carry the guide's notes; those of the data carry its own.
+    sites = ([site for site in model_sites.values() if site["is_observed"]], guide_sites.values())
+    pair = [next((s["infer"]["program"] for s in group if "program" in s["infer"]), None) for group in sites]
+    return set() if None in pair else {name for name, right in _analytic(*pair).items() if right}
+
+
+_analytic = functools.lru_cache(maxsize=256)(analytic_kl)
+
+
+def _kl(p: Any, q: Any, value: Tensor, closed: bool) -> Tensor:
+    """(B, T) or (B,): the divergence of q from p where a closed form is right and known, else the log-ratio."""
+    if closed:
+        try:
+            if isinstance(p, Sequence) and isinstance(q, Sequence):
+                return _over_entries(kl_divergence(q.elementwise(value), p.elementwise(value)), p)
+            return kl_divergence(q, p)
+        except NotImplementedError:  # no closed form for this pair of families
+            pass
+    ours, theirs = _log_prob(q, value), _log_prob(p, value)
+    if ours.dim() != theirs.dim():  # a guide of the user's own, whose density has no steps
+        ours, theirs = (part.sum(-1) if part.dim() == 2 else part for part in (ours, theirs))
+    return ours - theirs
+
+
+def _record(terms: Terms, table: dict[str, Tensor], name: str, value: Tensor) -> None:
+    if value.dim() == 2:
+        terms.steps[name] = value
+        value = value.sum(-1)
+    table[name] = value
+
+
+def _frames(rollout: Rollout) -> Tensor:
+    some = next(iter(rollout.values.values()))
+    if rollout.lengths is None:
+        return some.new_full((rollout.batch,), float(rollout.length))
+    return rollout.lengths.to(some.dtype)
+
+
+def _mean(draws: list[Terms]) -> Terms:
+    def average(table: str) -> dict[str, Tensor]:
+        return {
+            name: torch.stack([getattr(draw, table)[name] for draw in draws]).mean(0)
+            for name in getattr(draws[0], table)
+        }
+
+    return Terms(average("log_likelihood"), average("kl"), average("energies"), draws[0].frames, average("steps"))
+
+
+@dataclass(frozen=True)
+class ImportanceBound:
+    """The importance-weighted bound of every sequence and what it says of the guide.
+
+    Args:
+        bound: (B,) log mean of the weights, in nats.
+        khat: (B,) Pareto shape of their tail. Above 0.7 the guide misses so much of the posterior that the bound is
+            unreliable at this number of particles.
+        particles: K.
+    """
+
+    bound: Tensor
+    khat: Tensor
+    particles: int
+
+
+@torch.no_grad()
+def importance_bound(
+    model: DynamicalVAE, batch: Batch, particles: int = 100, *, chunk: int = 4096, **options: Any
+) -> ImportanceBound:
+    """The importance-weighted bound: log of the mean over particles of p(x, z) / q(z | x), per sequence.
+
+    Its mean rises with the number of particles, from the evidence lower bound at 1 to the log evidence. With fewer than
+    25 particles the tail shape is not estimated (nan).
+
+    Args:
+        model: the model with its guide.
+        batch: see `DynamicalVAE.model`.
+        particles: K.
+        chunk: sequences times particles to hold at once.
+        options: of the program.
+
+    Returns:
+        Bound and tail shape, (B,) each.
+    """
+    if particles < 1:
+        raise ValueError(f"particles is at least 1, got {particles}")
+    data = model._mapping(batch)
+    size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
+    weights: list[Tensor] = []
+    at_once = max(1, min(particles, chunk // size))
+    with model._evaluating():
+        for first in range(0, particles, at_once):
+            count = min(at_once, particles - first)
+            log_weights = _log_weights(model, _repeat(data, count), options)
+            weights.append(log_weights.unflatten(0, (count, size)))
+    log_weights = torch.cat(weights)
+    return ImportanceBound(
+        bound=torch.logsumexp(log_weights, 0) - math.log(particles),
+        khat=_khat(log_weights),
+        particles=particles,
+    )
+
+
+def _repeat(value: Any, count: int) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _repeat(v, count) for name, v in value.items()}
+    return value.repeat(count, *[1] * (value.dim() - 1))
+
+
+def _log_weights(model: DynamicalVAE, batch: Batch, options: Mapping[str, Any]) -> Tensor:
+    joint, sites = map(_sites, _traces(model, model.guide, (batch,), options))
+
+    def total(table: Mapping[str, Mapping[str, Any]]) -> Tensor:
+        parts = (_log_prob(s["fn"], s["value"]) for s in table.values() if not isinstance(s["fn"], Unit))
+        return sum(part.sum(-1) if part.dim() == 2 else part for part in parts)  # type: ignore[return-value]
+
+    return total(joint) - total(sites)
+
+
+def _khat(log_weights: Tensor) -> Tensor:
+    """(B,) Pareto tail shape of weights (K, B)."""
+    if log_weights.shape[0] < 25:
+        return log_weights.new_full(log_weights.shape[1:], math.nan)
+    from arviz_stats.base import array_stats  # over a second to import
+
+    # psislw is made for leave-one-out: it takes log likelihoods, whose negatives are the log weights.
+    _, khat = array_stats.psislw(-log_weights.double().cpu().numpy(), axis=0)
+    return torch.as_tensor(np.asarray(khat), dtype=log_weights.dtype, device=log_weights.device)

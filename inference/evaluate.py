@@ -1,0 +1,663 @@
+"""Evaluation on held-out windows: what a model forecasts, and how well it explains.
+
+Two programs are scored and never mixed. *Free-running*: the model sees the observed frames, forecasts K
+futures on its own, and the futures are compared with the true one (`dvae.inference.metrics`).
+*Teacher-forced*: the model reads every frame of the window, and its bound on log p(x_{1:T}) is reported in
+nats per frame. The errors of the motion papers are energies, not likelihoods; the bound is one.
+
+Every evaluation carries two reference rows that any method should beat: zero velocity (the last pose
+repeated) and nearest neighbours (the futures of the K training windows with the closest last poses). All rows
+score the same windows, and windows of one clip overlap, so standard errors are clustered by clip and
+`Evaluation.difference` is paired.
+"""
+
+import dataclasses
+import hashlib
+import io
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import matplotlib.figure
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from torch import Tensor, nn
+
+from . import metrics
+from .bounds import SequenceELBO, importance_bound
+
+__all__ = [
+    "METRICS",
+    "ArrayWindows",
+    "Evaluation",
+    "Metric",
+    "Row",
+    "Score",
+    "evaluate",
+    "nearest_neighbours",
+    "zero_velocity",
+]
+
+Batch = dict[str, Tensor]
+Forecaster = Callable[[Batch, int, int], Tensor]  # observed batch, horizon, samples -> (K, B, H, D)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a score is to be read: unit, program, and the direction that is better ("" for neither)."""
+
+    unit: str
+    program: str
+    better: str = "lower"
+
+
+METRICS: dict[str, Metric] = {
+    "APD": Metric("m", "free-running", "higher"),
+    **{
+        name: Metric("m", "free-running")
+        for name in ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm", "energy score")
+    },
+    "variogram score": Metric("m", "free-running"),
+    "bone-length error": Metric("relative", "free-running"),
+    "ELBO": Metric("nats/frame", "teacher-forced", "higher"),
+    "importance bound": Metric("nats/frame", "teacher-forced", "higher"),
+    "k-hat": Metric("", "teacher-forced"),
+}
+
+_PAIRED = {
+    "ADE": metrics.average_displacement_error,
+    "FDE": metrics.final_displacement_error,
+    "ADEm": metrics.median_average_displacement_error,
+    "FDEm": metrics.median_final_displacement_error,
+    "energy score": metrics.energy_score,
+    "variogram score": metrics.variogram_score,
+}
+_MULTIMODAL = {
+    "MMADE": metrics.multimodal_average_displacement_error,
+    "MMFDE": metrics.multimodal_final_displacement_error,
+    "MMADEm": metrics.median_multimodal_average_displacement_error,
+    "MMFDEm": metrics.median_multimodal_final_displacement_error,
+}
+
+
+@dataclass(frozen=True)
+class Score:
+    """Mean over windows and its standard error, clustered by clip (NaN where there is a single clip)."""
+
+    mean: float
+    standard_error: float
+
+    def __str__(self) -> str:
+        # Three decimals as in the papers, a fourth where the error needs it.
+        if math.isnan(self.mean):
+            return "–"
+        if not self.standard_error > 0:
+            return f"{self.mean:.3f}"
+        decimals = 4 if self.standard_error < 0.001 else 3
+        return f"{self.mean:.{decimals}f} ± {self.standard_error:.{decimals}f}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method: its number of samples, what it is, and each metric's mean over each clip's windows."""
+
+    samples: int
+    clip_means: dict[str, tuple[float, ...]]
+    equations: dict[str, str] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of several methods on the same windows, with all that is needed to say what was measured.
+
+    Indexing gives the scores of a method: `evaluation["srnn"]["ADE"].mean`.
+
+    Attributes:
+        rows: `{method: Row}`.
+        clips: `{"split/clip": number of its windows}`, in the order of `Row.clip_means`.
+        data: fingerprint, windows, frames and coordinates of a window, joints where there is a skeleton.
+        protocol: the fields of the windows' protocol.
+        samples: K, the number of forecasts asked of every method.
+        emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it.
+        bound_particles: particles of the importance bound, 0 where it was not computed.
+        seed: the seed of every method's draws.
+    """
+
+    rows: dict[str, Row]
+    clips: dict[str, int]
+    data: dict[str, Any]
+    protocol: dict[str, Any]
+    samples: int
+    emission: str
+    bound_particles: int
+    seed: int
+
+    def __getitem__(self, method: str) -> dict[str, Score]:
+        return {name: self._score(np.array(means)) for name, means in self._row(method).clip_means.items()}
+
+    def difference(self, first: str, second: str, metric: str) -> Score:
+        """Paired difference of two methods in a metric, first minus second, with its standard error.
+
+        Raises:
+            KeyError: a method that was not evaluated, or a metric that one of the two lacks.
+        """
+        means = []
+        for method in (first, second):
+            row = self._row(method)
+            if metric not in row.clip_means:
+                raise KeyError(f"{method!r} has no score {metric!r}; it has {', '.join(row.clip_means)}")
+            means.append(np.array(row.clip_means[metric]))
+        return self._score(means[0] - means[1])
+
+    def table(self) -> Table:
+        """Metrics down, methods across: mean ± standard error, the two programs apart."""
+        arrow = {"lower": " ↓", "higher": " ↑", "": ""}
+        table = Table(title=self._title(), caption="mean ± standard error over windows, clustered by clip")
+        table.add_column("", no_wrap=True)  # on a narrow terminal the numbers wrap, never the names
+        for method, row in self.rows.items():
+            table.add_column(f"{method}\nK = {row.samples}", justify="right")
+        scores = {method: self[method] for method in self.rows}
+        for program in ("free-running", "teacher-forced"):
+            names = [name for name in self.metrics if _reading(name).program == program]
+            if names:
+                table.add_section()
+                table.add_row(f"[bold]{program}[/bold]")
+            for name in names:
+                reading = _reading(name)
+                unit = f" [dim]({reading.unit})[/dim]" if reading.unit else ""
+                values = (str(row[name]) if name in row else "–" for row in scores.values())
+                table.add_row(name + arrow[reading.better] + unit, *values)
+        return table
+
+    @property
+    def metrics(self) -> list[str]:
+        """Names of all metrics that at least one method has, in the order of the table."""
+        found = {name for row in self.rows.values() for name in row.clip_means}
+        return [name for name in METRICS if name in found] + sorted(found - set(METRICS))
+
+    def plot(self, metrics: Sequence[str] | None = None) -> matplotlib.figure.Figure:
+        """One panel per metric, one dot per method with a bar of one standard error to each side."""
+        names = self.metrics if metrics is None else list(metrics)
+        columns = min(4, len(names))
+        rows = math.ceil(len(names) / columns)
+        height = 0.7 + 0.22 * len(self.rows)
+        figure = matplotlib.figure.Figure(figsize=(2 + 2.2 * columns, height * rows), layout="constrained")
+        panels = list(figure.subplots(rows, columns, sharey=True, squeeze=False).flat)
+        scores = {method: self[method] for method in self.rows}
+        for panel, name in zip(panels, names, strict=False):
+            for place, row in enumerate(scores.values()):
+                if name in row:
+                    error = np.nan_to_num(row[name].standard_error)
+                    panel.errorbar(row[name].mean, place, xerr=error, fmt="o", markersize=4, color=f"C{place}")
+            panel.set_title(f"{name} ({_reading(name).unit})" if _reading(name).unit else name, fontsize=9)
+            panel.set_yticks(range(len(scores)), list(scores))
+            panel.set_ylim(len(scores) - 0.5, -0.5)
+            panel.tick_params(labelsize=8)
+            panel.grid(axis="x", alpha=0.3)
+        for panel in panels[len(names) :]:
+            panel.set_axis_off()
+        return figure
+
+    def to_json(self) -> str:
+        """Everything, with means and standard errors written out; numbers that are not finite become null."""
+        document = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        document["rows"] = {method: self._document(method) for method in self.rows}
+        return json.dumps(document, indent=1, allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> "Evaluation":
+        """The evaluation that `to_json` wrote.
+
+        Raises:
+            ValueError: text that is not such a document.
+        """
+        try:
+            document = json.loads(text)
+            rows = {method: _row(row) for method, row in document.pop("rows").items()}
+            return cls(rows=rows, **document)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"this is not an evaluation written by Evaluation.to_json: {error!r}") from error
+
+    def save(self, path: str | Path) -> None:
+        """Write `to_json()` to a file."""
+        Path(path).write_text(self.to_json() + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Evaluation":
+        """Read the file that `save` wrote; errors as in `from_json`."""
+        return cls.from_json(Path(path).read_text(encoding="utf-8"))
+
+    def __rich__(self) -> Table:
+        return self.table()
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=400)
+        with console.capture() as capture:
+            console.print(self.table())
+        return capture.get().rstrip()
+
+    def _row(self, method: str) -> Row:
+        if method not in self.rows:
+            raise KeyError(f"no method {method!r} in this evaluation; it has {', '.join(self.rows)}")
+        return self.rows[method]
+
+    def _score(self, clip_means: np.ndarray) -> Score:
+        """Mean over windows, a ratio of sums over clips; its variance by linearisation."""
+        counts = np.array(list(self.clips.values()))
+        mean = float((counts * clip_means).sum() / counts.sum())
+        if len(counts) < 2:
+            return Score(mean, math.nan)
+        deviations = counts * (clip_means - mean) / counts.sum()
+        return Score(mean, math.sqrt(len(counts) / (len(counts) - 1) * float((deviations**2).sum())))
+
+    def _document(self, method: str) -> dict[str, Any]:
+        row = dataclasses.asdict(self.rows[method])
+        clip_means = row.pop("clip_means")
+        row["scores"] = {
+            name: {
+                **dataclasses.asdict(_reading(name)),
+                **dataclasses.asdict(score),
+                "clip_means": clip_means[name],
+            }
+            for name, score in self[method].items()
+        }
+        return _plain(row)
+
+    def _title(self) -> str:
+        name = self.protocol.get("name", "")
+        parts = [name, f"{self.data['windows']} windows of {len(self.clips)} clips"]
+        parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]
+        return " · ".join(part for part in parts if part)
+
+
+class HeldOutWindows(Protocol):
+    """What an evaluation needs of its windows; those of `dvae.motion` and `ArrayWindows` have it."""
+
+    @property
+    def protocol(self) -> Any:
+        """A dataclass with `observed` (frames) and `multimodal_threshold` (distance of last poses)."""
+
+    @property
+    def keys(self) -> Sequence[tuple[str, str, int]]:
+        """(split, clip, first frame) of every window."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of the windows and their data."""
+
+    def all(self) -> Batch:
+        """All windows: x `(N, T, D)` and context variables."""
+
+
+@dataclass(frozen=True)
+class ArrayProtocol:
+    """How plain arrays are split into observed and predicted frames."""
+
+    observed: int
+    multimodal_threshold: float
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayWindows:
+    """Plain arrays as windows to evaluate on.
+
+    Args:
+        x: `(N, T, D)`, tensor or numpy array.
+        observed: frames the model sees; the other T - observed are predicted.
+        multimodal_threshold: distance below which two last observed poses are alike, in the unit of x.
+        clips: name of the clip each window was cut from; without it the windows count as independent.
+
+    Raises:
+        ValueError: x that is not `(N, T, D)`, or as many clip names as windows are not given.
+    """
+
+    x: Tensor | np.ndarray
+    observed: int
+    multimodal_threshold: float = 0.5
+    clips: Sequence[str] | None = None
+
+    def __post_init__(self) -> None:
+        if self.x.ndim != 3:
+            raise ValueError(f"windows must be (N, T, D), but x has shape {tuple(self.x.shape)}")
+        if self.clips is not None and len(self.clips) != len(self.x):
+            raise ValueError(f"{len(self.x)} windows need as many clip names, not {len(self.clips)}")
+
+    @property
+    def protocol(self) -> ArrayProtocol:
+        """Observed frames and multimodal threshold."""
+        return ArrayProtocol(self.observed, self.multimodal_threshold)
+
+    @property
+    def keys(self) -> list[tuple[str, str, int]]:
+        """(split, clip, first frame) of every window; the first frame is unknown here and 0."""
+        clips = self.clips if self.clips is not None else range(len(self.x))
+        return [("array", str(clip), 0) for clip in clips]
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the values, their shape and type."""
+        values = np.ascontiguousarray(np.asarray(self.x))
+        return hashlib.sha256(f"{values.shape} {values.dtype}".encode() + values.tobytes()).hexdigest()
+
+    def all(self) -> Batch:
+        """All windows, x `(N, T, D)`."""
+        return {"x": torch.as_tensor(self.x)}
+
+
+def zero_velocity(observed: Tensor, horizon: int) -> Tensor:
+    """The last pose repeated: the forecast that any method should beat.
+
+    Args:
+        observed: `(B, O, D)`.
+        horizon: frames H to predict.
+
+    Returns:
+        One forecast, `(1, B, H, D)`, laid out like those of a model.
+    """
+    return observed[None, :, -1:].expand(-1, -1, horizon, -1)
+
+
+def nearest_neighbours(observed: Tensor, training: Tensor, samples: int = 50) -> Tensor:
+    """The futures of the training windows whose last observed poses are closest: memory without a model.
+
+    Args:
+        observed: `(B, O, D)`.
+        training: `(N, O + H, D)`, training windows observed for as many frames.
+        samples: K, the number of neighbours.
+
+    Returns:
+        `(K, B, H, D)`, the closest neighbour first.
+
+    Raises:
+        ValueError: training windows of another size or without a future, or fewer of them than K.
+    """
+    frames, size = observed.shape[1:]
+    if training.ndim != 3 or training.shape[2] != size or training.shape[1] <= frames:
+        raise ValueError(
+            f"training windows must be (N, T, {size}) with T above the {frames} observed frames, but have "
+            f"shape {tuple(training.shape)}"
+        )
+    if len(training) < samples:
+        raise ValueError(f"{samples} neighbours were asked of {len(training)} training windows; use fewer")
+    distances = torch.cdist(observed[:, -1], training[:, frames - 1])
+    return training[distances.topk(samples, largest=False).indices.T, frames:]
+
+
+def evaluate(
+    model: nn.Module | Mapping[str, nn.Module],
+    windows: HeldOutWindows,
+    *,
+    samples: int = 50,
+    seed: int = 0,
+    batch_size: int = 32,
+    draw_emission: bool = False,
+    bound_particles: int = 0,
+    references: bool = True,
+    training_windows: HeldOutWindows | None = None,
+    configs: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: bool = True,
+) -> Evaluation:
+    """Score one model or several, and the reference rows, on the same windows.
+
+    Every method draws from the same seed, so that its scores do not depend on which others are evaluated;
+    they do depend on `batch_size`, as draws come batch by batch. The models' modes and torch's random state
+    are restored.
+
+    Args:
+        model: a model, or `{name: model}`.
+        windows: `dvae.motion` windows or `ArrayWindows`.
+        samples: K, the forecasts per window.
+        seed: seed of every method's draws.
+        batch_size: windows forecast at once.
+        draw_emission: forecast draws of x instead of its means. The motion papers score means; the energy and
+            variogram scores judge the model's predictive distribution only when x is drawn.
+        bound_particles: particles of the importance-weighted bound and its k-hat; 0 leaves both out.
+        references: whether to add the reference rows.
+        training_windows: where the nearest neighbours are taken from; without it that row is left out.
+        configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
+        progress: whether to show a progress bar.
+
+    Returns:
+        The evaluation; print it, or take its `table`, `plot` and `to_json`.
+
+    Raises:
+        ValueError: windows that are ragged, masked or leave nothing to predict; a forecast of the wrong
+            shape; a model with the name of a reference row; fewer than one sample.
+        FloatingPointError: a forecast or bound that is not finite, naming method and window.
+    """
+    models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
+    if samples < 1:
+        raise ValueError(f"every method needs at least 1 forecast per window, not samples={samples}")
+    held = _hold(windows)
+    baselines = _references(held, samples, training_windows) if references else {}
+    if clash := models.keys() & baselines.keys():
+        raise ValueError(f"a model must not have the name of a reference row: {', '.join(sorted(clash))}")
+
+    rows: dict[str, Row] = {}
+    console = Console()
+    visible = progress and (console.is_terminal or console.is_jupyter)
+    with Progress(transient=True, console=console, disable=not visible) as bar:
+
+        def parts(label: str) -> Iterator[slice]:
+            for start in bar.track(range(0, len(held.keys), batch_size), description=label):
+                yield slice(start, start + batch_size)
+
+        for name, (count, forecaster) in baselines.items():
+            scores = _free_running(name, forecaster, count, held, parts(name))
+            rows[name] = Row(count, held.clip_means(scores))
+        for name, each in models.items():
+            with _evaluating(each, seed):
+                scores = _free_running(
+                    name, _forecaster(each, draw_emission), samples, held, parts(f"{name}, forecasts")
+                )
+            with _evaluating(each, seed):
+                scores |= _teacher_forced(name, each, bound_particles, held, parts(f"{name}, bound"))
+            equations = {"generative": each.generative.text, "inference": each.inference.text}
+            rows[name] = Row(samples, held.clip_means(scores), equations, dict((configs or {}).get(name, {})))
+
+    return Evaluation(
+        rows=rows,
+        clips=held.clips,
+        data=held.description(),
+        protocol=_plain(dataclasses.asdict(windows.protocol)),
+        samples=samples,
+        emission="drawn" if draw_emission else "mean",
+        bound_particles=bound_particles,
+        seed=seed,
+    )
+
+
+@dataclass(frozen=True)
+class _Held:
+    """The windows of one evaluation, prepared once for all its rows."""
+
+    windows: HeldOutWindows
+    batch: Batch
+    observed: int
+    keys: list[tuple[str, str, int]]
+    admissible: list[Tensor]
+
+    @property
+    def x(self) -> Tensor:
+        return self.batch["x"]
+
+    @property
+    def futures(self) -> Tensor:
+        return self.x[:, self.observed :]
+
+    @property
+    def clips(self) -> dict[str, int]:
+        return dict(Counter(f"{split}/{clip}" for split, clip, _ in self.keys))
+
+    def description(self) -> dict[str, Any]:
+        count, frames, coordinates = self.x.shape
+        skeleton = getattr(self.windows, "skeleton", None)
+        joints = {"joints": list(skeleton.names)} if skeleton is not None else {}
+        found = {"fingerprint": self.windows.fingerprint, "windows": count, "frames": frames}
+        return {**found, "coordinates": coordinates, **joints}
+
+    def clip_means(self, scores: dict[str, Tensor]) -> dict[str, tuple[float, ...]]:
+        """Means over the windows of each clip, from scores `(N,)`."""
+        places = {clip: place for place, clip in enumerate(self.clips)}
+        clip = [places[f"{split}/{clip}"] for split, clip, _ in self.keys]
+        counts = np.bincount(clip)
+        return {
+            name: tuple((np.bincount(clip, weights=values.double().numpy()) / counts).tolist())
+            for name, values in scores.items()
+        }
+
+
+def _hold(windows: HeldOutWindows) -> _Held:
+    batch = windows.all()
+    observed = windows.protocol.observed
+    if partial := {"lengths", "mask"} & batch.keys():
+        raise ValueError(f"evaluation needs complete windows, but these have {', '.join(sorted(partial))}")
+    if not 1 <= observed < batch["x"].shape[1]:
+        raise ValueError(
+            f"windows of {batch['x'].shape[1]} frames, {observed} of them observed, leave nothing to "
+            "observe or nothing to predict"
+        )
+    last = batch["x"][:, observed - 1]
+    admissible = metrics.multimodal_truths(last, windows.protocol.multimodal_threshold)
+    return _Held(windows, batch, observed, list(windows.keys), admissible)
+
+
+def _references(
+    held: _Held, samples: int, training_windows: HeldOutWindows | None
+) -> dict[str, tuple[int, Forecaster]]:
+    """Number of forecasts and forecaster of each reference row."""
+    rows: dict[str, tuple[int, Forecaster]] = {
+        "zero velocity": (1, lambda observed, horizon, samples: zero_velocity(observed["x"], horizon))
+    }
+    if training_windows is not None:
+        training = training_windows.all()["x"]
+        neighbours = min(samples, len(training))
+        rows["nearest neighbours"] = (
+            neighbours,
+            lambda observed, horizon, samples: nearest_neighbours(
+                observed["x"], training[:, : held.observed + horizon], samples
+            ),
+        )
+    return rows
+
+
+def _free_running(
+    name: str, forecaster: Forecaster, samples: int, held: _Held, parts: Iterator[slice]
+) -> dict[str, Tensor]:
+    """Scores `(N,)` of free-running forecasts."""
+    found = []
+    for part in parts:
+        batch = {variable: value[part] for variable, value in held.batch.items()}
+        truth = held.futures[part]
+        forecasts = forecaster({**batch, "x": batch["x"][:, : held.observed]}, truth.shape[1], samples).cpu()
+        expected = (samples, *truth.shape)
+        if forecasts.shape != expected:
+            raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
+        _refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
+        forecasts = forecasts.movedim(0, 1)
+        scores = {"APD": metrics.average_pairwise_distance(forecasts)}
+        scores |= {metric: score(forecasts, truth) for metric, score in _PAIRED.items()}
+        for metric, score in _MULTIMODAL.items():
+            pairs = zip(forecasts, held.admissible[part], strict=True)
+            scores[metric] = torch.stack([score(window, held.futures[others]) for window, others in pairs])
+        if hasattr(held.windows, "skeleton"):
+            scores["bone-length error"] = _bone_length_error(held.windows, batch["x"][:, : held.observed], forecasts)
+        found.append(scores)
+    return _concatenate(found)
+
+
+def _teacher_forced(name: str, model: Any, particles: int, held: _Held, parts: Iterator[slice]) -> dict[str, Tensor]:
+    """Bounds and KL terms `(N,)`, in nats per frame."""
+    found = []
+    for part in parts:
+        batch = _like(model, {variable: value[part] for variable, value in held.batch.items()})
+        terms = SequenceELBO().terms(model, batch)
+        scores = {"ELBO": terms.per_frame}
+        scores |= {f"KL {latent}": kl / terms.frames for latent, kl in terms.kl.items()}
+        if particles:
+            weighted = importance_bound(model, batch, particles=particles)
+            scores |= {"importance bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
+        _refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), held.keys[part])
+        found.append({metric: values.cpu() for metric, values in scores.items()})
+    return _concatenate(found)
+
+
+def _refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:
+    """Raise for the first window whose entry in `finite` (B,) is False."""
+    if not finite.all():
+        split, clip, start = keys[int(finite.logical_not().nonzero()[0])]
+        raise FloatingPointError(
+            f"the {what} of {name} is not finite for the window at frame {start} of clip {clip!r} ({split}); "
+            "it cannot be left out, since all methods are scored on the same ones"
+        )
+
+
+def _bone_length_error(windows: Any, observed: Tensor, forecasts: Tensor) -> Tensor:
+    """Mean of |length / observed length - 1| over samples, frames and bones: (B,) from (B, K, T, D)."""
+    lengths, reference = (windows.skeleton.bone_lengths(windows.positions(poses)) for poses in (forecasts, observed))
+    return (lengths / reference.mean(1)[:, None, None] - 1).abs().mean((1, 2, 3))
+
+
+def _forecaster(model: Any, draw_emission: bool) -> Forecaster:
+    return lambda observed, horizon, samples: model.forecast(
+        _like(model, observed), horizon, samples, draw_emission=draw_emission
+    )["x"]
+
+
+def _like(model: nn.Module, batch: Batch) -> Batch:
+    """The batch on the device and in the floating type of the model's parameters."""
+    parameter = next(model.parameters())
+    return {
+        name: value.to(parameter) if value.is_floating_point() else value.to(parameter.device)
+        for name, value in batch.items()
+    }
+
+
+def _concatenate(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+@contextmanager
+def _evaluating(model: nn.Module, seed: int) -> Iterator[None]:
+    """Evaluation mode, no gradients and draws from `seed`; mode and random state are restored."""
+    device = next(model.parameters()).device
+    training = model.training
+    model.eval()
+    try:
+        with torch.no_grad(), torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(seed)
+            yield
+    finally:
+        model.train(training)
+
+
+def _reading(name: str) -> Metric:
+    """How to read a metric; every latent has a `KL` of its own."""
+    return METRICS[name] if name in METRICS else Metric("nats/frame", "teacher-forced", "")
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON holds it: tuples become lists, and numbers that are not finite None."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _row(document: dict[str, Any]) -> Row:
+    scores = document.pop("scores")
+    means = {
+        name: tuple(math.nan if mean is None else mean for mean in score["clip_means"])
+        for name, score in scores.items()
+    }
+    return Row(clip_means=means, **document)

@@ -1,0 +1,672 @@
+"""The shared loop: stochastic variational inference (Hoffman et al. 2013, arXiv 1206.7051) for every method.
+
+`fit` draws a batch, asks the bound for its terms and the objective for a number, and takes a step of a torch
+optimiser. lightning-fabric runs the same code on a CPU, a GPU, in bfloat16, or in several processes. Whatever
+varies over time is a schedule of the global step, and every random number comes from generators that a
+checkpoint stores: a resumed run repeats, bit for bit on a CPU, what the uninterrupted run would have done.
+"""
+
+import difflib
+import io
+import math
+import os
+import signal
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import torch
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor, nn
+
+from .batches import Batch, Sequences, Source, each, sequences
+from .bounds import SequenceELBO, Terms
+from .checkpoints import BEST, LAST, OPTIMISER, CheckpointError, Run, load_weights, weights
+from .objectives import Evidence, Objective
+from .schedules import Schedule, clamp, schedule, to_config
+from .trackers import JSONLines, Memory, Terminal, Tracker
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+    from matplotlib.figure import Figure
+
+# each of them can be fused
+OPTIMISERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch.optim.SGD}
+
+
+@dataclass(frozen=True)
+class Training:
+    """Options of `fit`.
+
+    Args:
+        steps: optimiser steps in all.
+        batch_size: sequences in a batch, in each process.
+        learning_rate: a number or a schedule.
+        optimizer: "adam", "adamw" or "sgd".
+        weight_decay: the optimiser's weight decay.
+        gradient_clip: largest norm of the gradient of the loss (nats per frame); None for no limit.
+        self_feeding: probability that a frame of x's history is replaced by the program's own mean (scheduled
+            sampling, Bengio et al. 2015, arXiv 1506.03099); a number or a schedule. The best weights are then
+            by the self-fed bound, from when the schedule has reached its last value.
+        particles: draws from the guide for each sequence and step.
+        validate_every: steps from one validation and checkpoint to the next.
+        patience: validations without a better bound after which the run stops; None to run all steps.
+        log_every: steps from one row of the log to the next.
+        seed: seed of batches and latent draws; each process adds its rank.
+        accelerator: where to run: "auto", "cpu", "cuda" or "mps".
+        devices: number of devices, with one process each.
+        precision: precision of the computation; "32-true" leaves the model's own.
+        progress: whether to show the terms on the terminal.
+
+    Raises:
+        ValueError: when an option is out of range.
+    """
+
+    steps: int = 2000
+    batch_size: int = 64
+    learning_rate: float | Schedule = 1e-3
+    optimizer: Literal["adam", "adamw", "sgd"] = "adam"
+    weight_decay: float = 0.0
+    gradient_clip: float | None = 10.0
+    self_feeding: float | Schedule = 0.0
+    particles: int = 1
+    validate_every: int = 100
+    patience: int | None = None
+    log_every: int = 10
+    seed: int = 0
+    accelerator: str = "auto"
+    devices: int = 1
+    precision: Literal["32-true", "64-true", "bf16-mixed", "bf16-true"] = "32-true"
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        counts = ("steps", "batch_size", "particles", "validate_every", "patience", "log_every", "devices")
+        for name in counts:
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} is {value}; it must be at least 1")
+        if self.gradient_clip is not None and self.gradient_clip <= 0:
+            raise ValueError(f"gradient_clip is {self.gradient_clip}; it must be positive, or None for no limit")
+        if self.optimizer not in OPTIMISERS:
+            raise ValueError(f"unknown optimizer {self.optimizer!r}; choose {', '.join(OPTIMISERS)}")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a run with its own objective, for training in phases. Schedules still see the global step.
+
+    Args:
+        steps: length of the stage.
+        objective: what it minimises.
+        learning_rate: that of `Training` if None.
+        self_feeding: that of `Training` if None.
+    """
+
+    steps: int
+    objective: Objective = field(default_factory=Evidence)
+    learning_rate: float | Schedule | None = None
+    self_feeding: float | Schedule | None = None
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise ValueError(f"a stage has {self.steps} steps; it needs at least 1")
+
+
+@dataclass
+class State:
+    """Where a run stands. Callbacks read it, and set `stop` to end the run after the step."""
+
+    model: nn.Module
+    step: int = 0
+    terms: Terms | None = None
+    row: dict[str, float] = field(default_factory=dict)
+    best_step: int | None = None
+    best_bound: float | None = None
+    waited: int = 0
+    status: str = "running"
+    stop: bool = False
+
+
+class Callback(Protocol):
+    """Hooks of the loop. Subclass it and define those you need."""
+
+    def on_step(self, state: State) -> None:
+        """Run after each step; `state.terms` holds the terms of its batch."""
+
+    def on_validation(self, state: State) -> None:
+        """Run after each validation; `state.row` holds its numbers."""
+
+    def on_end(self, state: State) -> None:
+        """Run once after the last step, also of an interrupted run, before the best weights are put back."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a run leaves.
+
+    Args:
+        history: the rows of the log, in nats per frame (see `trackers`).
+        step: the last step.
+        best_step: the step of the best unweighted validation bound; None without validation data.
+        best_bound: that bound, in nats per frame; of the self-fed program in a run with self-feeding.
+        status: "finished", "stopped early" or "interrupted".
+        run: the run directory, if there is one.
+    """
+
+    history: list[dict[str, Any]]
+    step: int
+    best_step: int | None
+    best_bound: float | None
+    status: str
+    run: Path | None
+
+    def series(self, name: str) -> tuple[list[int], list[float]]:
+        """Return the steps and values of one number of the log, such as "kl/z" or "validation/bound"."""
+        rows = [row for row in self.history if name in row]
+        return [row["step"] for row in rows], [row[name] for row in rows]
+
+    def plot(self) -> "Figure":
+        """Draw the learning curves: the bound, and the KL of each latent, in nats per frame."""
+        from matplotlib import pyplot as plt
+
+        figure, (bound, divergence) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
+        bound.plot(*self.series("bound"), color="0.7", label="training batch")
+        if self.best_step is not None:
+            bound.plot(*self.series("validation/bound"), marker=".", label="validation")
+            bound.axvline(self.best_step, color="0.3", linestyle=":", label=f"best: step {self.best_step}")
+        bound.set(xlabel="step", ylabel="bound (nats per frame)")
+        bound.legend()
+        for name in sorted({name for row in self.history for name in row if name.startswith("kl/")}):
+            divergence.plot(*self.series(name), label=name.removeprefix("kl/"))
+            divergence.legend()
+        divergence.set(xlabel="step", ylabel="KL (nats per frame)")
+        return figure
+
+
+class NonFiniteError(FloatingPointError):
+    """A loss or its gradient is NaN or infinite; the step was not taken."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """The run was stopped by Ctrl-C or SIGTERM, after a whole step and a checkpoint.
+
+    Args:
+        fit: what the run leaves.
+        signal: number of the signal; a command line exits with 128 + signal.
+    """
+
+    def __init__(self, fit: Fit, signal: int) -> None:
+        how = (
+            f"resume with fit(…, out={str(fit.run)!r}, resume=True)"
+            if fit.run
+            else "without out=… it cannot be resumed"
+        )
+        super().__init__(f"interrupted after step {fit.step}; {how}")
+        self.fit = fit
+        self.signal = signal
+
+
+def fit(
+    model: nn.Module,
+    train: Any,
+    validation: Any = None,
+    *,
+    objective: Objective | None = None,
+    stages: Sequence[Stage] = (),
+    out: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    config: Mapping[str, Any] | None = None,
+    trackers: Sequence[Tracker] = (),
+    callbacks: Sequence[Callback] = (),
+    **options: Any,
+) -> Fit:
+    """Fit a model and its guide.
+
+    Afterwards the model is in evaluation mode and holds the weights of the best unweighted validation bound,
+    or without validation data the last ones. The caller's random state is left as it was.
+
+    Args:
+        model: a `DynamicalVAE`, or any module that `SequenceELBO` takes.
+        train: x as a tensor (N, T, D), a batch of N sequences, or an object with `sample(batch_size,
+            generator)`.
+        validation: x as a tensor, a batch, or an object whose `all()` returns a batch.
+        objective: what to minimise; `Evidence()` by default.
+        stages: objectives one after the other, in place of `objective`; their steps are those of the run.
+        out: run directory for checkpoints and `log.jsonl` (see `checkpoints`).
+        resume: continue the run in `out` from its last checkpoint up to `steps`.
+        config: what is run, in JSON's types, for `config.json`; the training options are added to it.
+        trackers: further receivers of the log's rows.
+        callbacks: hooks after steps, after validations and at the end.
+        **options: fields of `Training`, such as steps=2000, batch_size=64, learning_rate=1e-3.
+
+    Returns:
+        The history, and the best bound and its step.
+
+    Raises:
+        NonFiniteError: when a loss or gradient is NaN or infinite, naming step, site and term; the last
+            checkpoint stays.
+        Interrupted: after Ctrl-C or SIGTERM; the step is complete, the checkpoint written.
+        CheckpointError: when `out` holds a run and `resume` is False, or a run that cannot be resumed.
+
+    Example:
+        warm_up = Evidence(kl_weight=Linear(0.0, 1.0, steps=500))
+        result = fit(model, x, validation=y, objective=warm_up, steps=2000, out="runs/first")
+    """
+    training, plan = _plan(options, objective, stages)
+    source = train if isinstance(train, Source) else sequences(train)
+    held_out = None if validation is None else sequences(validation)
+    if training.patience is not None and held_out is None:
+        raise ValueError("patience counts validations; give validation data, or leave patience out")
+    run = None if out is None else Run(out)
+    if resume and (run is None or not run.exists):
+        raise CheckpointError(
+            f"there is no run to resume in {out}; give its directory as out=…, or leave out resume=True"
+        )
+    if run is not None and run.exists and not resume:
+        raise CheckpointError(f"{out} already holds a run; continue it with resume=True, or choose another directory")
+
+    from lightning_fabric import Fabric  # over a second to import, half of what `import dvae` would take
+
+    fabric = Fabric(accelerator=training.accelerator, devices=training.devices, precision=training.precision)
+    fabric.launch()
+    with ExitStack() as stack:
+        stack.enter_context(_forked_random_state(fabric.device))
+        stack.callback(model.eval)
+        loop = _Loop(fabric, model, training, plan, run)
+        state = loop.state
+        fabric.barrier()  # every process has looked for an earlier run before the first one writes
+        if resume:
+            loop.restore()
+            fabric.barrier()  # every process has read the checkpoint before the first one writes
+        memory, receivers = Memory(), list[Tracker]()
+        if fabric.is_global_zero:
+            if run is not None:
+                run.write_config((run.config if resume else {}) | _record(training, plan) | dict(config or {}))
+                log = JSONLines(run.path / "log.jsonl")
+                memory = Memory(log.read() if resume else [])
+                receivers = [log]
+            receivers += [memory, *trackers, *([Terminal(training.steps)] if training.progress else [])]
+        for tracker in receivers:
+            tracker.start(state.step)
+            stack.callback(tracker.close)
+        signals = stack.enter_context(_Signals())
+
+        def report(row: dict[str, float]) -> None:
+            state.row = row
+            for tracker in receivers:
+                tracker.log(state.step, row)
+
+        def call(hook: str) -> None:
+            try:
+                for callback in callbacks:
+                    getattr(callback, hook)(state)
+            except KeyboardInterrupt:  # the step is complete, so this is as good a place to stop as any
+                signals.received = signal.SIGINT
+
+        if not resume:
+            loop.save()
+        state.status = loop.status()
+        while state.status == "running":
+            loop.step(source)
+            if state.step % training.log_every == 0 or state.step == training.steps:
+                report(loop.row())
+            call("on_step")
+            due = state.step % training.validate_every == 0 or state.step == training.steps or state.stop
+            if due and held_out is not None:
+                report(loop.validate(held_out))
+                call("on_validation")
+            state.status = "interrupted" if loop.any_process(signals.received) else loop.status()
+            if due or state.status != "running":
+                loop.save()
+        call("on_end")
+        if loop.best is not None:
+            model.load_state_dict(loop.best)
+    result = Fit(memory.rows, state.step, state.best_step, state.best_bound, state.status, run.path if run else None)
+    if state.status == "interrupted":
+        raise Interrupted(result, signals.received or signal.SIGINT)
+    return result
+
+
+class _Bound(nn.Module):
+    """The bound's terms as the output of a module, which is what synchronises gradients between processes.
+
+    Pyro's `ELBOModule` does the same for a single number; objectives need the terms.
+    """
+
+    def __init__(self, model: nn.Module, estimator: SequenceELBO) -> None:
+        super().__init__()
+        self.model = model
+        self.estimator = estimator
+
+    def forward(self, batch: Batch, program: Mapping[str, Any]) -> dict[str, Any]:
+        return dict(vars(self.estimator.terms(self.model, batch, **program)))
+
+
+class _Loop:
+    """The engine and its state: takes steps, validates, saves and restores."""
+
+    def __init__(
+        self, fabric: "Fabric", model: nn.Module, training: Training, plan: Sequence[Stage], run: Run | None
+    ) -> None:
+        self.fabric, self.training, self.plan, self.run = fabric, training, plan, run
+        self.state = State(model)
+        self.final_feeding = _value(plan[-1].self_feeding, training.self_feeding, training.steps - 1)
+        self.best: dict[str, Tensor] | None = None
+        parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+        if not parameters:
+            raise ValueError(
+                f"{type(model).__name__} has no parameters that require gradients; there is nothing to fit"
+            )
+        self.parameters = parameters
+        optimizer = OPTIMISERS[training.optimizer](
+            parameters, lr=schedule(training.learning_rate)(0), weight_decay=training.weight_decay, fused=True
+        )
+        self.module, self.optimizer = fabric.setup(_Bound(model, SequenceELBO(training.particles)), optimizer)
+        self.generator = torch.Generator().manual_seed(training.seed + fabric.global_rank)
+        # Another seed than the generator's own: equal seeds would tie the latent draws to the choice of the
+        # batch.
+        torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
+        self.module.train()
+
+    def step(self, source: Source) -> None:
+        """Take one optimiser step."""
+        state, training = self.state, self.training
+        stage = _stage(self.plan, state.step)
+        rate = _value(stage.learning_rate, training.learning_rate, state.step)
+        feeding = _value(stage.self_feeding, training.self_feeding, state.step)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        where = f"step {state.step + 1}"
+        terms = self._terms(source.sample(training.batch_size, self.generator), where, feeding)
+        loss = stage.objective(terms, state.step)
+        self.optimizer.zero_grad()
+        self.fabric.backward(loss)
+        gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
+        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
+        numbers = torch.stack([loss.detach(), norm])
+        if not torch.isfinite(self._total(numbers)).all():
+            self._mark_failed()
+            raise NonFiniteError(
+                f"{where}: {_culprit(state.model, terms, loss)}; no step was taken. Try a lower learning "
+                "rate, a smaller gradient_clip or a longer warm-up"
+            )
+        if training.gradient_clip is not None and norm > training.gradient_clip:
+            for gradient in gradients:
+                gradient.mul_(training.gradient_clip / norm)
+        self.optimizer.step()
+        state.step += 1
+        state.terms = terms
+        self._numbers, self._rates = numbers, {"learning_rate": rate, "self_feeding": feeding}
+
+    def row(self) -> dict[str, float]:
+        """Return the numbers of the last step."""
+        assert self.state.terms is not None
+        loss, norm = self._numbers.tolist()
+        return {"loss": loss, "gradient_norm": norm, **self._rates, **_per_frame(_sums(self.state.terms))}
+
+    def validate(self, data: Sequences) -> dict[str, float]:
+        """Return the terms of the unweighted bound on held-out data; keep the weights if it is the best.
+
+        The draws from the guide are the same each time, so that bounds differ by the weights alone; the
+        random state of training is left as it was. Every process scores all the data.
+
+        A run with self-feeding learns to run on its own output, which costs it bound on the true past. There
+        the best is by the bound of the self-fed program, once the schedule has reached its last value.
+        """
+        state = self.state
+        row = self._score(data, 0.0)
+        score, counts = row["bound"], True
+        if self.final_feeding:
+            row["self_fed/bound"] = score = self._score(data, self.final_feeding)["bound"]
+            counts = self._rates["self_feeding"] == self.final_feeding
+        if counts:
+            state.waited += 1
+            best = -math.inf if state.best_bound is None else state.best_bound
+            if score > best:  # never true of NaN
+                state.best_step, state.best_bound, state.waited = state.step, score, 0
+                self.best = weights(state.model)
+        return {f"validation/{name}": value for name, value in row.items()}
+
+    def _score(self, data: Sequences, feeding: float) -> dict[str, float]:
+        """The unweighted terms on held-out data, per frame, with the same draws each time."""
+        sums = dict[str, Tensor]()
+        self.module.eval()
+        with _forked_random_state(self.fabric.device), torch.no_grad():
+            torch.manual_seed(self.training.seed)
+            for batch in data.split(self.training.batch_size):
+                terms = self._terms(batch, f"validation after step {self.state.step}", feeding)
+                for name, value in _sums(terms).items():
+                    sums[name] = sums[name] + value if name in sums else value
+        self.module.train()
+        # one verdict for every process, whatever the rounding on its device
+        totals = self._total(torch.stack(list(sums.values())))
+        return _per_frame(dict(zip(sums, totals, strict=True)))
+
+    def status(self) -> str:
+        """Return "finished", "stopped early" or "running"."""
+        if self.state.step >= self.training.steps:
+            return "finished"
+        patience = self.training.patience
+        impatient = patience is not None and self.state.waited >= patience
+        return "stopped early" if self.state.stop or impatient else "running"
+
+    def any_process(self, value: object) -> bool:
+        """Whether the value is true in any process."""
+        return self._total(torch.tensor(float(bool(value)))).item() > 0
+
+    def save(self) -> None:
+        """Write a checkpoint, if the run has a directory."""
+        if self.run is None:
+            return
+        state = self.state
+        random = {name: self._gathered(value) for name, value in self._random_state().items()}
+        if not self.fabric.is_global_zero:
+            return
+        name, buffer = self.training.optimizer, io.BytesIO()
+        torch.save({"name": name, "optimizer": self.optimizer.state_dict(), "random": random}, buffer)
+        files = {LAST: save_tensors(weights(state.model)), OPTIMISER: buffer.getvalue()}
+        if self.best is not None and state.waited == 0:
+            files[BEST] = save_tensors(self.best)
+        self.run.commit({name: getattr(state, name) for name in _STORED}, files)
+
+    def restore(self) -> None:
+        """Return to the last checkpoint.
+
+        Raises:
+            CheckpointError: when its files are damaged, of another model, another optimiser or another number
+                of processes.
+        """
+        assert self.run is not None
+        load_weights(self.state.model, self.run.path / LAST)
+        stored, content = self.run.state, self.run.optimiser_state()
+        if content["name"] != self.training.optimizer:
+            raise CheckpointError(
+                f"{self.run.path} was fitted with optimizer={content['name']!r}, not "
+                f"{self.training.optimizer!r}; resume with the same optimiser"
+            )
+        self.optimizer.load_state_dict(content["optimizer"])
+        processes = len(content["random"]["generator"])
+        if processes != self.fabric.world_size:
+            raise CheckpointError(
+                f"{self.run.path} was fitted by {processes} processes, not {self.fabric.world_size}; resume "
+                "with as many"
+            )
+        # a copy: set_state reads the storage, so it takes another row's bytes for a view, or crashes
+        random = {name: value[self.fabric.global_rank].clone() for name, value in content["random"].items()}
+        self.generator.set_state(random["generator"])
+        torch.set_rng_state(random["torch"])
+        if "cuda" in random and self.fabric.device.type == "cuda":
+            torch.cuda.set_rng_state(random["cuda"], self.fabric.device)
+        for name in _STORED:
+            setattr(self.state, name, stored[name])
+        if BEST in stored["fingerprints"]:
+            self.best = load_tensors(self.run.read(BEST))
+
+    def _terms(self, batch: Batch, where: str, feeding: float = 0.0) -> Terms:
+        """Terms of a batch, on the device and in the precision of the model."""
+        dtype = self.parameters[0].dtype
+        placed = each(batch, lambda v: v.to(dtype) if v.is_floating_point() else v)
+        program = {"self_feeding": feeding} if feeding else {}
+        try:
+            return Terms(**self.module(self.fabric.to_device(placed), program))
+        except ValueError as error:
+            # torch's distributions refuse NaN parameters and values before there is a term to look at
+            if "invalid values" not in str(error) and "within the support" not in str(error):
+                raise
+            self._mark_failed()
+            raise NonFiniteError(f"{where}: {str(error).partition(chr(10))[0]}") from error
+
+    def _total(self, value: Tensor) -> Tensor:
+        """The sum over the processes."""
+        total = self.fabric.all_reduce(value.clone(), reduce_op="sum")
+        assert isinstance(total, Tensor)
+        return total
+
+    def _gathered(self, value: Tensor) -> Tensor:
+        """The values (N,) of every process, (processes, N), on the CPU."""
+        gathered = self.fabric.all_gather(value)
+        assert isinstance(gathered, Tensor)
+        return gathered.reshape(self.fabric.world_size, -1).cpu()  # one process gets no leading axis
+
+    def _random_state(self) -> dict[str, Tensor]:
+        states = {"generator": self.generator.get_state(), "torch": torch.get_rng_state()}
+        if self.fabric.device.type == "cuda":
+            states["cuda"] = torch.cuda.get_rng_state(self.fabric.device)
+        return states
+
+    def _mark_failed(self) -> None:
+        """Note the failure beside the last checkpoint, whose files stay as they are."""
+        if self.run is not None and self.fabric.is_global_zero:
+            self.run.commit({**self.run.state, "status": "failed"}, {})
+
+
+_STORED = ("step", "best_step", "best_bound", "waited", "status")
+
+
+class _Signals:
+    """Remembers the first Ctrl-C or SIGTERM, for the loop to stop after its step; a second acts at once."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> "_Signals":
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if signal.getsignal(number) != signal.SIG_IGN:
+                    self._previous[number] = signal.signal(number, self._remember)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        while self._previous:
+            number, handler = self._previous.popitem()
+            signal.signal(number, handler or signal.SIG_DFL)
+
+    def _remember(self, number: int, _: FrameType | None) -> None:
+        self.received = number
+        self.__exit__()
+
+
+def _plan(
+    options: Mapping[str, Any], objective: Objective | None, stages: Sequence[Stage]
+) -> tuple[Training, list[Stage]]:
+    """The training options and the stages, with schedules that end in time."""
+    known = [option.name for option in fields(Training)]
+    for name in options:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean {near[0]}?" if near else f"; the options are {', '.join(known)}"
+            raise TypeError(f"fit has no option {name!r}{hint}")
+    training = Training(**options)
+    if not stages:
+        stages = [Stage(training.steps, Evidence() if objective is None else objective)]
+    elif objective is not None:
+        raise ValueError("give either objective or stages: each stage has its own objective")
+    total = sum(stage.steps for stage in stages)
+    if "steps" in options and training.steps != total:
+        raise ValueError(f"steps is {training.steps}, but the stages take {total} steps; leave steps out")
+    plan, end = [], 0
+    for stage in stages:
+        end += stage.steps
+        plan.append(clamp(stage, end))
+    return clamp(replace(training, steps=total), total), plan
+
+
+def _stage(plan: Sequence[Stage], step: int) -> Stage:
+    """The stage that a global step belongs to."""
+    for stage in plan:
+        if step < stage.steps:
+            return stage
+        step -= stage.steps
+    return plan[-1]
+
+
+def _value(first: float | Schedule | None, otherwise: float | Schedule, step: int) -> float:
+    return schedule(otherwise if first is None else first)(step)
+
+
+def _record(training: Training, plan: Sequence[Stage]) -> dict[str, Any]:
+    """The options in JSON's types."""
+    return {
+        "training": {option.name: to_config(getattr(training, option.name)) for option in fields(training)},
+        "stages": [
+            {
+                "steps": stage.steps,
+                "objective": stage.objective.to_config()
+                if isinstance(stage.objective, Evidence)
+                else repr(stage.objective),
+                "learning_rate": to_config(stage.learning_rate),
+                "self_feeding": to_config(stage.self_feeding),
+            }
+            for stage in plan
+        ],
+    }
+
+
+@contextmanager
+def _forked_random_state(device: torch.device) -> Iterator[None]:
+    """Put the random state of torch back at the end."""
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        yield
+
+
+def _sums(terms: Terms) -> dict[str, Tensor]:
+    """Each term summed over the sequences of a batch, and the number of frames."""
+    named = {
+        "bound": terms.bound,
+        **{f"log_likelihood/{name}": value for name, value in terms.log_likelihood.items()},
+        **{f"kl/{name}": value for name, value in terms.kl.items()},
+        **{f"energy/{name}": value for name, value in terms.energies.items()},
+        "frames": terms.frames,
+    }
+    return {name: value.detach().double().sum() for name, value in named.items()}
+
+
+def _per_frame(sums: Mapping[str, Tensor]) -> dict[str, float]:
+    return {name: float(value / sums["frames"]) for name, value in sums.items() if name != "frames"}
+
+
+def _culprit(model: nn.Module, terms: Terms, loss: Tensor) -> str:
+    """The first term, or else the loss or a gradient, that is not finite."""
+    groups = {"log likelihood": terms.log_likelihood, "KL": terms.kl, "energy": terms.energies}
+    for group, values in groups.items():
+        for name, value in values.items():
+            bad = ~torch.isfinite(value)
+            if bad.any():
+                first = f"the {group} of {name} is {value[bad][0].item()}"
+                where = f"in {int(bad.sum())} of {len(value)} sequences"
+                if name in terms.steps:
+                    frames = (~torch.isfinite(terms.steps[name])).any(0).nonzero().flatten().tolist()
+                    where += f", frames {', '.join(map(str, frames[:3]))}{'…' if len(frames) > 3 else ''}"
+                return f"{first} {where}"
+    if not torch.isfinite(loss):
+        return f"the loss is {loss.item()} though every term is finite, so a weight of the objective is not"
+    for name, parameter in model.named_parameters():
+        if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+            return f"the gradient of {name} is not finite though the loss is"
+    return "the norm of the gradient overflows, or the loss of another process is not finite"

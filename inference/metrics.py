@@ -1,0 +1,270 @@
+"""Scores of stochastic forecasts, as pure functions on arrays.
+
+The motion errors follow the evaluation code of DLow (Yuan and Kitani 2020, arXiv:2003.08386) and GSPS (Mao,
+Liu and Salzmann 2021, arXiv:2108.08422); the median versions are those of HiT-DVAE (Bie et al. 2022,
+arXiv:2204.01565). They reward the best (or the median) of K samples and are not proper: a forecaster gains by
+spreading its samples. The energy score (Gneiting and Raftery 2007, section 4.3) and the variogram score
+(Scheuerer and Hamill 2015) stand beside them.
+
+Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`,
+or `(..., M, T, D)` where M futures are admissible; the result has the leading shape `(...)`. Torch tensors
+and numpy arrays are accepted, a tensor comes back. A displacement is the Euclidean norm over *all* D
+coordinates of a frame, in the unit of the data (metres); it is not a mean over joints. The value for a data
+set is the plain mean over its windows. Every function raises ValueError for shapes that do not fit. Windows
+are scored one after another, so that memory does not grow with their number.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = [
+    "average_displacement_error",
+    "average_pairwise_distance",
+    "energy_score",
+    "final_displacement_error",
+    "median_average_displacement_error",
+    "median_final_displacement_error",
+    "median_multimodal_average_displacement_error",
+    "median_multimodal_final_displacement_error",
+    "multimodal_average_displacement_error",
+    "multimodal_final_displacement_error",
+    "multimodal_truths",
+    "variogram_score",
+]
+
+Array = Tensor | np.ndarray
+
+
+def average_pairwise_distance(samples: Array) -> Tensor:
+    """APD, the diversity of the samples: mean of ||vec(X_j) - vec(X_k)|| over the K (K - 1) / 2 pairs.
+
+    The norm runs over all T * D numbers and is not divided by time. A single sample has diversity 0.
+
+    Args:
+        samples: `(..., K, T, D)`.
+
+    Returns:
+        `(...)`, in the unit of the data.
+    """
+    samples = _samples(samples)
+    return _per_window(_pairwise, samples)
+
+
+def average_displacement_error(samples: Array, truth: Array) -> Tensor:
+    """ADE: displacement averaged over the T frames, of the best of the K samples.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truth: `(..., T, D)`.
+
+    Returns:
+        `(...)`, in the unit of the data.
+    """
+    return _per_window(lambda x, y: _displacement(x, y).mean(-1).amin(), *_paired(samples, truth))
+
+
+def final_displacement_error(samples: Array, truth: Array) -> Tensor:
+    """FDE: displacement at the last frame, of the sample that is best there. Shapes as in ADE."""
+    return _per_window(lambda x, y: _displacement(x[:, -1], y[-1]).amin(), *_paired(samples, truth))
+
+
+def median_average_displacement_error(samples: Array, truth: Array) -> Tensor:
+    """ADEm: median over the K samples of the mean displacement (even K: mean of the middle two)."""
+    return _per_window(lambda x, y: _median(_displacement(x, y).mean(-1)), *_paired(samples, truth))
+
+
+def median_final_displacement_error(samples: Array, truth: Array) -> Tensor:
+    """FDEm: median over the K samples of the final displacement (even K: mean of the middle two)."""
+    return _per_window(lambda x, y: _median(_displacement(x[:, -1], y[-1])), *_paired(samples, truth))
+
+
+def multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
+    """MMADE: the ADE to each of M admissible futures, averaged over them.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truths: `(..., M, T, D)`, the futures that `multimodal_truths` finds, the true one among them.
+
+    Returns:
+        `(...)`, in the unit of the data.
+    """
+    return _per_window(lambda x, y: _cross(x, y).amin(0).mean(), *_multimodal(samples, truths))
+
+
+def multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
+    """MMFDE: the FDE to each of M admissible futures, averaged over them. Shapes as in MMADE."""
+    return _per_window(lambda x, y: _cross(x[:, -1:], y[:, -1:]).amin(0).mean(), *_multimodal(samples, truths))
+
+
+def median_multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
+    """MMADEm: the ADEm to each of M admissible futures, averaged over them. Shapes as in MMADE."""
+    return _per_window(lambda x, y: _median(_cross(x, y)).mean(), *_multimodal(samples, truths))
+
+
+def median_multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
+    """MMFDEm: the FDEm to each of M admissible futures, averaged over them. Shapes as in MMADE."""
+    return _per_window(lambda x, y: _median(_cross(x[:, -1:], y[:, -1:])).mean(), *_multimodal(samples, truths))
+
+
+def multimodal_truths(last_observed: Array, threshold: float) -> list[Tensor]:
+    """For every window, the windows that were in almost the same pose when their future began.
+
+    Two windows belong together when their last observed poses are at a Euclidean distance *below* the
+    threshold, over all coordinates. A window always belongs to itself, and a window that nobody joins keeps
+    its single truth and is scored like the others. (DLow does so; GSPS leaves such windows out of every
+    metric, so that its published numbers are on a subset.)
+
+    Args:
+        last_observed: `(N, D)`, the last observed pose of each window.
+        threshold: largest distance (exclusive), in the unit of the data; 0.5 m in the papers.
+
+    Returns:
+        N index tensors `(M_n,)`, ascending; `futures[indices[n]]` are the truths `(M_n, T, D)` of window n.
+
+    Raises:
+        ValueError: poses that are not `(N, D)`, or a threshold that is not positive.
+    """
+    poses = torch.as_tensor(last_observed)
+    if poses.ndim != 2:
+        raise ValueError(f"last observed poses must be (N, D), one row per window, but have shape {_shape(poses)}")
+    if not threshold > 0:
+        raise ValueError(f"the multimodal threshold is a distance and must be positive, but is {threshold}")
+    poses = poses.double()
+    found: list[Tensor] = []
+    for block in poses.split(512):
+        # Matrix-product distances would cancel right at the threshold, where the comparison is strict.
+        close = torch.cdist(block, poses, compute_mode="donot_use_mm_for_euclid_dist") < threshold
+        found += [row.nonzero()[:, 0] for row in close]
+    return found
+
+
+def energy_score(samples: Array, truth: Array) -> Tensor:
+    """Energy score of the future as one vector; proper, lower is better (Gneiting and Raftery 2007).
+
+    ES = mean_k ||vec(X_k) - vec(y)|| - 1/2 mean_{j<k} ||vec(X_j) - vec(X_k)||, the unbiased ("fair")
+    estimate, whose expectation does not depend on K. The second mean is the APD. With K = 1 the forecast is a
+    point mass and the score is the distance itself, which is fair to a deterministic forecast but not to one
+    draw of a stochastic one.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truth: `(..., T, D)`.
+
+    Returns:
+        `(...)`, in the unit of the data.
+    """
+
+    def score(x: Tensor, y: Tensor) -> Tensor:
+        return _displacement(x.flatten(1), y.flatten()).mean() - _pairwise(x) / 2
+
+    return _per_window(score, *_paired(samples, truth))
+
+
+def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
+    """Variogram score of the coordinates of each frame; proper, lower is better (Scheuerer and Hamill 2015).
+
+    VS = mean over frames and coordinate pairs i < j of (|y_i - y_j|^p - mean_k |X_ki - X_kj|^p)^2. It sees
+    wrong dependence between coordinates (limbs that do not move together), which moves the energy score
+    little, and it does not see an offset common to all coordinates. A single coordinate has no pairs and
+    scores 0.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truth: `(..., T, D)`.
+        order: the exponent p.
+
+    Returns:
+        `(...)`, in the unit of the data to the power 2 p.
+
+    Raises:
+        ValueError: an order that is not positive.
+    """
+    if not order > 0:
+        raise ValueError(f"the order of a variogram must be positive, but is {order}")
+
+    def score(x: Tensor, y: Tensor) -> Tensor:
+        frames, size = y.shape
+        total = y.new_zeros(())
+        # Pairs (i, i + lag): a slice stays in the cache, where all D * D pairs at once would not.
+        for lag in range(1, size):
+            actual = (y[:, lag:] - y[:, :-lag]).abs().pow(order)
+            forecast = (x[..., lag:] - x[..., :-lag]).abs().pow(order).mean(0)
+            total = total + (actual - forecast).square().sum()
+        return total / max(1, frames * size * (size - 1) // 2)
+
+    return _per_window(score, *_paired(samples, truth))
+
+
+def _displacement(samples: Tensor, truth: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(samples - truth, dim=-1)
+
+
+def _pairwise(samples: Tensor) -> Tensor:
+    """Mean distance over pairs of (K, T, D), each a vector of T * D numbers."""
+    return torch.pdist(samples.flatten(1)).mean() if len(samples) > 1 else samples.new_zeros(())
+
+
+def _cross(samples: Tensor, truths: Tensor) -> Tensor:
+    """Displacement averaged over frames between each of (K, T, D) and each of (M, T, D): (K, M)."""
+    # cdist expands |x - y|^2 into products; about the centre of the truths the cancellation is harmless.
+    centre = truths.mean(0)
+    return torch.cdist((samples - centre).transpose(0, 1), (truths - centre).transpose(0, 1)).mean(0)
+
+
+def _median(errors: Tensor) -> Tensor:
+    return errors.quantile(0.5, dim=0)
+
+
+def _per_window(score: Callable[..., Tensor], samples: Tensor, *truth: Tensor) -> Tensor:
+    lead = samples.shape[:-3]
+    windows = [part.reshape(-1, *part.shape[len(lead) :]) for part in (samples, *truth)]
+    return torch.stack([score(*window) for window in zip(*windows, strict=True)]).reshape(lead)
+
+
+def _samples(samples: Array) -> Tensor:
+    samples = torch.as_tensor(samples)
+    if samples.ndim < 3:
+        raise ValueError(
+            f"samples must be (..., K, T, D), but have shape {_shape(samples)}; "
+            "one forecast (T, D) needs an axis for K = 1"
+        )
+    if not samples.numel():
+        raise ValueError(f"there is nothing to score: samples (..., K, T, D) have shape {_shape(samples)}")
+    return samples if samples.is_floating_point() else samples.double()
+
+
+def _paired(samples: Array, truth: Array) -> tuple[Tensor, Tensor]:
+    samples = _samples(samples)
+    truth = torch.as_tensor(truth, device=samples.device)
+    expected = samples.shape[:-3] + samples.shape[-2:]
+    if truth.shape != expected:
+        raise ValueError(
+            f"samples (..., K, T, D) of shape {_shape(samples)} need a truth (..., T, D) of shape "
+            f"{tuple(expected)}, not {_shape(truth)}; a model's forecasts (K, B, T, D) need "
+            "samples.movedim(0, 1) first"
+        )
+    return _same_type(samples, truth)
+
+
+def _multimodal(samples: Array, truths: Array) -> tuple[Tensor, Tensor]:
+    samples = _samples(samples)
+    truths = torch.as_tensor(truths, device=samples.device)
+    without_count = truths.shape[:-3] + truths.shape[-2:]
+    if truths.ndim < 3 or without_count != samples.shape[:-3] + samples.shape[-2:] or not truths.numel():
+        raise ValueError(
+            f"samples (..., K, T, D) of shape {_shape(samples)} need truths (..., M, T, D) that differ "
+            f"from them in M alone, M at least 1, not {_shape(truths)}"
+        )
+    return _same_type(samples, truths)
+
+
+def _same_type(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    dtype = torch.promote_types(samples.dtype, truth.dtype)
+    return samples.to(dtype), truth.to(dtype)
+
+
+def _shape(array: Tensor) -> tuple[int, ...]:
+    return tuple(array.shape)

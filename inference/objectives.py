@@ -1,0 +1,101 @@
+"""Objectives: from the terms of a bound to the number that training minimises.
+
+An objective is a function of `Terms` and the global step. `Evidence` is the negative evidence lower bound
+with a weight on each KL term (warm-up; Bowman et al. 2016, arXiv 1511.06349; beta-VAE, Higgins et al. 2017)
+and free bits (Kingma et al. 2016, arXiv 1606.04934). The weights never touch the bound that is recorded:
+model selection reads `Terms.bound`.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Protocol
+
+from torch import Tensor
+
+from .schedules import Schedule, from_config, schedule, to_config
+
+if TYPE_CHECKING:
+    from .bounds import Terms
+
+
+class Objective(Protocol):
+    """A scalar to minimise, in nats per frame, from the terms of a batch."""
+
+    def __call__(self, terms: "Terms", step: int) -> Tensor:
+        """Return the loss of a batch at a global step."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Minus the weighted evidence lower bound, in nats per frame, so that learning rates do not depend on the
+    length.
+
+    With sums over the sequences of the batch, and F their number of frames,
+
+        loss = - sum log p / F + sum_latents weight * max(KL / F, free bits) + sum_energies weight * energy /
+        F.
+
+    Args:
+        kl_weight: weight of the KL terms, a number or a schedule; or one for each latent by name (others
+            weigh 1).
+        free_bits: nats per frame, averaged over the batch, below which a latent's KL costs nothing more; a
+            number for every latent, or one for each latent by name (others have none).
+        energy_weights: weight of each energy by name (others weigh 1).
+
+    Raises:
+        ValueError: on the first call, when a name is not among the terms.
+
+    Example:
+        Evidence(kl_weight=Linear(0.0, 1.0, steps=500), free_bits={"z": 0.1})
+    """
+
+    kl_weight: float | Schedule | Mapping[str, float | Schedule] = 1.0
+    free_bits: float | Mapping[str, float] = 0.0
+    energy_weights: Mapping[str, float | Schedule] = field(default_factory=dict)
+
+    def __call__(self, terms: "Terms", step: int) -> Tensor:
+        """Return the loss, a scalar."""
+        kl_weight = _by_name("kl_weight", self.kl_weight, terms.kl, default=1.0)
+        free_bits = _by_name("free_bits", self.free_bits, terms.kl, default=0.0)
+        energy_weights = _by_name("energy_weights", self.energy_weights, terms.energies, default=1.0)
+        frames = terms.frames.sum()
+        loss = -sum((value.sum() for value in terms.log_likelihood.values()), frames.new_zeros(())) / frames
+        for latent, kl in terms.kl.items():
+            rate = kl.sum() / frames
+            if free_bits[latent] > 0:  # at zero there is no floor: an unbiased estimate of a KL may be negative
+                rate = rate.clamp(min=free_bits[latent])
+            loss = loss + schedule(kl_weight[latent])(step) * rate
+        for name, energy in terms.energies.items():
+            loss = loss + schedule(energy_weights[name])(step) * energy.sum() / frames
+        return loss
+
+    def to_config(self) -> dict[str, Any]:
+        """Return the objective as a JSON object; `from_config` reads it."""
+        return {"objective": "Evidence"} | {f.name: to_config(getattr(self, f.name)) for f in fields(self)}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> "Evidence":
+        """Return the objective of a JSON object.
+
+        Raises:
+            ValueError: when the object describes another objective, or has unknown keys.
+        """
+        arguments = {key: from_config(value) for key, value in config.items() if key != "objective"}
+        known = [f.name for f in fields(cls)]
+        if config.get("objective") != "Evidence" or set(arguments) - set(known):
+            raise ValueError(
+                f"expected an objective 'Evidence' with {', '.join(known)}; the config gives {dict(config)}"
+            )
+        return cls(**arguments)
+
+
+def _by_name(option: str, value: Any, names: Iterable[str], default: float) -> dict[str, Any]:
+    """One value for each name, from one value for all or from a mapping with some of the names."""
+    names = list(names)
+    if not isinstance(value, Mapping):
+        return dict.fromkeys(names, value)
+    if unknown := set(value) - set(names):
+        raise ValueError(
+            f"{option} names {', '.join(sorted(map(repr, unknown)))}, but the terms are {', '.join(names) or 'none'}"
+        )
+    return {name: value.get(name, default) for name in names}

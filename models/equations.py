@@ -1,0 +1,51 @@
+"""Any pair of equations, as a method: the factorization is the user's, the networks are of one kind throughout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from ..model import DynamicalVAE
+from ..networks import Attention, Dense, Linear, NetworkSpec, Recurrent
+from ..notation import Factorization
+from .method import Method
+
+
+@dataclass(frozen=True)
+class Equations(Method):
+    """A model of its own equations.
+
+    Args:
+        p, q: the generative and the inference factorization.
+        network: "recurrent", "attention", "dense" or "linear", for every factor.
+        width: of the networks.
+        latents: sizes of the latents, where they differ from `latent`.
+    """
+
+    name: ClassVar[str] = "equations"
+    source: ClassVar[str] = "your own"
+
+    p: str = "p(z_t | z_{t-1}) p(x_t | z_t)"
+    q: str = "q(z_t | z_{t-1}, x_{1:T})"
+    network: str = "recurrent"
+    width: int = 64
+    latents: dict[str, int] = field(default_factory=dict)
+
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        """One kind for every factor."""
+        kinds: dict[str, NetworkSpec] = {
+            "recurrent": Recurrent(self.width, hidden=(self.width,)),
+            "attention": Attention(self.width),
+            "dense": Dense((self.width,)),
+            "linear": Linear(steps=512),
+        }
+        if self.network not in kinds:
+            raise ValueError(f"unknown network {self.network!r}; known: {', '.join(kinds)}")
+        return {"default": kinds[self.network]}
+
+    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
+        """The model; `residual` holds where p(x_t | ...) reads x_{t-1}."""
+        generative, inference = Factorization.parse(self.p), Factorization.parse(self.q)
+        sizes = {name: self.latents.get(name, self.latent) for name in generative.variables if name not in data}
+        return DynamicalVAE(generative, inference, {**sizes, **data}, self.networks(), self.heads())

@@ -1,0 +1,227 @@
+"""Runs of methods on motion data: fit, resume and load a run directory that says all it takes to do so.
+
+`config.json` of such a run holds the method with its options, the data file as it was given with the
+fingerprint of its content, and every field of the protocol. A relative path stays relative, so that a project
+folder can be moved.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .. import motion
+from ..inference.checkpoints import CONFIG, CheckpointError, Run, load_weights
+from ..inference.fit import Callback, Fit, Training
+from ..inference.fit import fit as fit_model
+from ..inference.objectives import Evidence
+from ..inference.schedules import from_config as option_from_config
+from ..model import DynamicalVAE
+from ..motion import PROTOCOLS, MotionSet, Protocol, Windows
+from .method import Method, from_config
+
+SIMULATED = "simulated"
+
+DEFAULT_PROTOCOLS = {
+    "bandai21": "bandai2-by-style",
+    "cmu21": "cmu8",
+    "human36m": "h36m",
+    "humaneva": "humaneva",
+    "walker": "simulated",
+}
+"""Protocols by the name of the skeleton, where none is named."""
+
+
+@dataclass(frozen=True)
+class Data:
+    """Motion data under a protocol.
+
+    Args:
+        path: the file as it was given, or "simulated".
+        motion: its clips.
+        protocol: how windows are cut from them.
+        skip_bad: whether unusable clips were left out.
+    """
+
+    path: str
+    motion: MotionSet
+    protocol: Protocol
+    skip_bad: bool = False
+
+    @classmethod
+    def open(
+        cls,
+        path: str | os.PathLike[str] = SIMULATED,
+        protocol: str | Protocol | None = None,
+        skip_bad: bool = False,
+    ) -> Data:
+        """Reads a motion file, or simulates.
+
+        Args:
+            path: of a file that `dvae.motion.load` reads, or "simulated" for `dvae.motion.simulate()`.
+            protocol: one of `dvae.motion.PROTOCOLS` or its name; by default the one of the skeleton.
+            skip_bad: leave out unusable clips instead of refusing the file.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: a file that cannot be read, an unknown protocol, or none for the skeleton.
+        """
+        name = os.fspath(path)
+        clips = motion.simulate() if name == SIMULATED else motion.load(name, skip_bad=skip_bad)
+        if protocol is None:
+            if clips.skeleton.name not in DEFAULT_PROTOCOLS:
+                raise ValueError(
+                    f"{name}: which protocol? The skeleton {clips.skeleton.name!r} has none of its own; "
+                    f"choose one of {', '.join(PROTOCOLS)}"
+                )
+            protocol = DEFAULT_PROTOCOLS[clips.skeleton.name]
+        return cls(name, clips, named_protocol(protocol) if isinstance(protocol, str) else protocol, skip_bad)
+
+    def windows(self, split: str) -> Windows:
+        """The windows of "train", "validation", "test" or "train+validation"."""
+        return motion.windows(self.motion, self.protocol, split)
+
+    def config(self) -> dict[str, Any]:
+        """The data and the protocol in JSON's types."""
+        source = {"path": self.path, "fingerprint": self.motion.fingerprint(), "skip_bad": self.skip_bad}
+        return {"data": source, "protocol": asdict(self.protocol)}
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A run, read back: `loaded.model.forecast(...)`, `loaded.data.windows("test")`.
+
+    Args:
+        path: the run directory.
+        method: the method with its options.
+        model: the model with the run's best weights, in evaluation mode.
+        data: the data and protocol that it was fitted on.
+    """
+
+    path: Path
+    method: Method
+    model: DynamicalVAE
+    data: Data
+
+
+def named_protocol(name: str) -> Protocol:
+    """A preset protocol.
+
+    Raises:
+        ValueError: an unknown name, with the nearest known one.
+    """
+    if name not in PROTOCOLS:
+        close = difflib.get_close_matches(name, PROTOCOLS, n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        raise ValueError(f"unknown protocol {name!r}{hint}; known: {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]
+
+
+def fit(
+    method: Method,
+    data: Data,
+    out: str | os.PathLike[str],
+    training: Training | None = None,
+    callbacks: Sequence[Callback] = (),
+) -> Fit:
+    """Fits a method to motion data, in a run directory that `load` and `resume` read.
+
+    Args:
+        method: such as `dvae.method("hit-dvae", latent=8)`; it tells objective and self-feeding.
+        data: training and validation windows are taken from it.
+        out: the run directory.
+        training: the other options; its seed is also that of the initial weights.
+        callbacks: hooks of the loop.
+    """
+    training = training or Training()
+    train, validation = data.windows("train"), data.windows("validation")
+    with torch.random.fork_rng():
+        torch.manual_seed(training.seed)
+        model = method.build({"x": train.size})
+    return fit_model(
+        model,
+        train,
+        validation,
+        objective=method.objective(),
+        out=out,
+        config={"method": method.config(), **data.config()},
+        callbacks=callbacks,
+        **vars(replace(training, self_feeding=method.feeding(training.steps))),
+    )
+
+
+def resume(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None, **options: Any) -> Fit:
+    """Continues a run from its last checkpoint, under the options and schedules it was started with.
+
+    Args:
+        path: the run directory.
+        data: where the data lie now, if the path in the run no longer leads there.
+        **options: options of `dvae.fit` to change, such as steps=4000 for a longer run.
+
+    Raises:
+        CheckpointError: no run, a damaged one, or one whose data have changed.
+    """
+    run = load(path, data)
+    config = Run(path).config
+    try:
+        training = {name: option_from_config(value) for name, value in config["training"].items()}
+        objective = Evidence.from_config(config["stages"][0]["objective"])
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise CheckpointError(f"{run.path / CONFIG} is damaged: {error!r}; fit again") from error
+    return fit_model(
+        run.model,
+        run.data.windows("train"),
+        run.data.windows("validation"),
+        objective=objective,
+        out=path,
+        resume=True,
+        **{**training, **options},
+    )
+
+
+def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> Loaded:
+    """Reads a run back: method, model with its best weights, data and protocol.
+
+    Args:
+        path: the run directory, as `dvae fit` writes it.
+        data: where the data lie now, if the path in the run no longer leads there.
+
+    Raises:
+        CheckpointError: no run, a damaged one, or one whose data have changed.
+    """
+    config = Run(path).config
+    try:
+        method, source = from_config(config["method"]), config["data"]
+        protocol = Protocol(**_tuples(config["protocol"]))
+        recorded, expected, skip_bad = source["path"], source["fingerprint"], source["skip_bad"]
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(
+            f"{Path(path) / CONFIG} does not tell method, data and protocol ({error!r}); was this run made "
+            "by `dvae fit`?"
+        ) from error
+    where = os.fspath(data or recorded)
+    try:
+        opened = Data.open(where, protocol, skip_bad)
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            f"{path} was fitted on {recorded}, but {where} is not here; relative paths count from the "
+            "working directory, so change to where it was fitted, or tell where the data lie now (--data)"
+        ) from error
+    if (found := opened.motion.fingerprint()) != expected:
+        raise CheckpointError(
+            f"{where} has changed since {path} was fitted on it: its fingerprint is {found[:12]}…, the run's "
+            f"{expected[:12]}…; restore the file, or fit again"
+        )
+    model = method.build({"x": opened.windows("train").size})
+    load_weights(model, path)
+    return Loaded(Path(path), method, model.eval(), opened)
+
+
+def _tuples(options: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}

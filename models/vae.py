@@ -1,0 +1,36 @@
+"""The VAE, frame by frame: what is left of a dynamical VAE without dynamics.
+
+    p(z_t) p(x_t | z_t)        q(z_t | x_t)
+
+Kingma and Welling, 2014, arXiv 1312.6114; as a member of the family: Girin et al., "Dynamical variational autoencoders:
+a comprehensive review", 2021, arXiv 2008.12595.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ..networks import Dense, NetworkSpec
+from .method import Method
+
+
+@dataclass(frozen=True)
+class VAE(Method):
+    """See the file.
+
+    Args:
+        hidden: widths of the encoder; the decoder has them in reverse.
+    """
+
+    name: ClassVar[str] = "vae"
+    source: ClassVar[str] = "Kingma and Welling, 2014, arXiv 1312.6114"
+    generative: ClassVar[str] = "p(z_t) p(x_t | z_t)"
+    inference: ClassVar[str] = "q(z_t | x_t)"
+
+    hidden: tuple[int, ...] = (64, 32)
+
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        """Perceptrons, frame by frame."""
+        return {"q(z)": Dense(self.hidden), "p(x)": Dense(self.hidden[::-1])}

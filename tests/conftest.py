@@ -1,0 +1,49 @@
+"""What every test starts from: the same seeds, an empty parameter store; and what it must leave as it was."""
+
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pyro
+import pytest
+import torch
+from hypothesis import settings
+
+# Examples are the same in every run, so that a failure is one for everybody.
+settings.register_profile("dvae", derandomize=True, deadline=None)
+settings.load_profile("dvae")
+
+
+def global_state() -> dict[str, Any]:
+    return {
+        "default dtype": torch.get_default_dtype(),
+        "grad mode": torch.is_grad_enabled(),
+        "inference mode": torch.is_inference_mode_enabled(),
+        "anomaly detection": torch.is_anomaly_enabled(),
+        "deterministic algorithms": torch.are_deterministic_algorithms_enabled(),
+        "threads": torch.get_num_threads(),
+        "Pyro settings": pyro.settings.get(),
+    }
+
+
+@pytest.fixture(autouse=True)
+def _seeded_and_guarded() -> Iterator[None]:
+    pyro.set_rng_seed(0)  # of torch, numpy and random
+    pyro.clear_param_store()
+    before = global_state()
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
+    changed = [
+        f"{name}: {value} -> {now}"
+        for (name, value), now in zip(before.items(), global_state().values())
+        if value != now
+    ]
+    if changed:
+        torch.set_default_dtype(before["default dtype"])
+        torch.set_grad_enabled(before["grad mode"])
+        torch.autograd.set_detect_anomaly(before["anomaly detection"])
+        torch.use_deterministic_algorithms(before["deterministic algorithms"])
+        torch.set_num_threads(before["threads"])
+        pyro.settings.set(**before["Pyro settings"])
+        pytest.fail(f"the test changed the global state: {'; '.join(changed)}")

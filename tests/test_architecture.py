@@ -1,0 +1,95 @@
+"""The house rules: imports run one way, one path leads to each package, nothing is tied to one machine."""
+
+import ast
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import dvae
+
+ROOT = Path(__file__).parent.parent
+LAYERS = {"dvae": 0, "dvae.inference": 1, "dvae.models": 2, "dvae.testing": 3, "dvae.cli": 4}
+
+
+def sources():
+    """Module name -> file, without going through the links."""
+    files = [path for path in (ROOT / "dvae").rglob("*.py") if not {"models", "inference"} & set(path.parts)]
+    found = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files}
+    for name in ("models", "inference"):
+        found |= {f"dvae.{name}.{path.stem}": path for path in (ROOT / name).glob("*.py")}
+    return found
+
+
+def imports(module, path):
+    """Absolute names of the modules of this project that a module imports, wherever in the file it does."""
+    package = module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "dvae")
+        elif isinstance(node, ast.ImportFrom):
+            base = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            target = ".".join([*base, *([node.module] if node.module else [])])
+            if target.split(".")[0] == "dvae":
+                yield from (f"{target}.{alias.name}" for alias in node.names)
+
+
+def layer(module):
+    return max(rank for name, rank in LAYERS.items() if f"{module}.".startswith(f"{name}."))
+
+
+def test_imports_run_one_way():
+    for module, path in sources().items():
+        if module == "dvae.__init__":  # the façade shows all of them
+            continue
+        for target in imports(module, path):
+            assert layer(target) <= layer(module), f"{module} imports {target}"
+
+
+def test_motion_knows_nothing_of_models():
+    for module, path in sources().items():
+        if module.startswith("dvae.motion."):
+            for target in imports(module, path):
+                assert target.startswith("dvae.motion"), f"{module} imports {target}"
+
+
+def test_methods_hold_no_loop_and_no_optimiser():
+    for path in (ROOT / "models").glob("*.py"):
+        names = {node.attr for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Attribute)}
+        assert not names & {"backward", "zero_grad", "optim", "DataLoader"}, path.name
+
+
+@pytest.mark.parametrize("name", ["models", "inference"])
+def test_a_second_import_path_is_refused(name):
+    command = [sys.executable, "-c", f"import {name}"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert f"import this package as dvae.{name}" in result.stderr
+
+
+def test_the_public_names_exist():
+    assert len(set(dvae.__all__)) == len(dvae.__all__)
+    for name in dvae.__all__:
+        assert getattr(dvae, name) is not None
+
+
+def test_every_module_can_be_imported_and_says_what_it_is():
+    for module, path in sources().items():
+        name = module.removesuffix(".__init__")
+        assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or not path.read_text(), name
+        importlib.import_module(name)
+
+
+def test_nothing_is_tied_to_one_machine():
+    absolute = re.compile(r"""(?:^|[\s"'(=])/(?:home|root|work|tmp|Users|opt)/""", re.MULTILINE)
+    kept = [ROOT / name for name in ("Makefile", "README.md", "pyproject.toml", "constraints.txt", ".ci/run")]
+    for path in [*sources().values(), *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.py"), *kept]:
+        assert not absolute.search(path.read_text(encoding="utf-8")), path
+
+
+def test_readme_example_runs():
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    exec(compile(re.sub(r"steps=\d+", "steps=4", example), "README.md", "exec"), {})

@@ -1,0 +1,280 @@
+"""The command line, as a user meets it: what works, what is refused and how, what a signal leaves behind."""
+
+import json
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import dvae
+from dvae import motion
+from dvae.cli import main
+from dvae.models import runs
+
+SMALL = ["--batch-size", "4", "--warm-up", "4", "--latent", "3", "--validate-every", "5"]
+EQUATIONS = ["--p", "p(z_t | z_{t-1}) p(x_t | z_t)", "--q", "q(z_t | x_{t:T}, z_{t-1})"]
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "people.npz"
+    motion.save(path, motion.simulate(clips=14, frames=90, seed=1))
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(people, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "fitted"
+    assert main(["fit", "vae", "--data", str(people), "--out", str(out), "--steps", "10", *SMALL]) == 0
+    return out
+
+
+@pytest.fixture
+def run(fitted, tmp_path):
+    """A copy of a run, to be damaged."""
+    return Path(shutil.copytree(fitted, tmp_path / "run"))
+
+
+def failure(capsys, *arguments, code=1):
+    """The sentence with which a command fails."""
+    assert main(list(arguments)) == code
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    return error
+
+
+def test_every_method_is_listed_with_its_equations(capsys):
+    assert main(["list"]) == 0
+    printed = capsys.readouterr().out
+    for name, kind in dvae.methods().items():
+        assert name in printed
+        assert kind.source.split(",")[0] in printed
+
+
+def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
+    assert main(["show", "hit-dvae", "--out", str(tmp_path / "graph.png")]) == 0
+    printed = capsys.readouterr().out
+    assert "∏_t p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)" in printed
+    assert "z_{<t}" in printed.splitlines()[-3]
+    assert "not exact" in printed
+    assert (tmp_path / "graph.png").read_bytes().startswith(b"\x89PNG")
+    equations = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t)", "--inference", "q(z_t | z_{t-1}, x_{t:T})"]
+    assert main(["show", *equations]) == 0
+    assert "exact: the guide reads everything" in capsys.readouterr().out
+
+
+def test_wrong_arguments_exit_with_2(capsys, tmp_path):
+    out = ["--out", str(tmp_path / "run")]
+    assert "did you mean 'hit-dvae'" in failure(capsys, "show", "hitdvae", code=2)
+    assert "both --generative and --inference" in failure(capsys, "show", code=2)
+    assert "not both" in failure(capsys, "show", "srnn", "--generative", "p(z_t) p(x_t | z_t)", code=2)
+    assert "hit-dvae, equations" in failure(capsys, "fit", "hitdvae", *out, code=2)
+    assert "--steps" in failure(capsys, "fit", "vae", *out, "--step", "3", code=2)
+    assert "emission" in failure(capsys, "fit", "vae", *out, "--emission", "loud", code=2)
+    assert "batch_size is 0" in failure(capsys, "fit", "vae", *out, "--batch-size", "0", code=2)
+    assert "cmu8" in failure(capsys, "fit", "vae", *out, "--protocol", "cmu", code=2)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_typo_in_an_equation_is_shown_under_its_column(capsys, tmp_path):
+    equations = ["--p", "p(z_t | z_{t-1}) p(x_t | z_t", "--q", "q(z_t | x_t)"]
+    error = failure(capsys, "fit", "equations", *equations, "--out", str(tmp_path / "run"), code=2)
+    equation, caret = error.splitlines()[1:3]
+    assert equation[caret.index("^") - 1] == "t"
+    assert len(equation) == caret.index("^")
+
+
+def test_a_file_that_is_no_motion_is_refused_in_a_sentence(capsys, tmp_path, people):
+    class Hostile:
+        def __reduce__(self):
+            return os.system, ("true",)
+
+    hostile, text, metres = tmp_path / "hostile.npz", tmp_path / "text.npz", tmp_path / "far" / "metres.npz"
+    np.savez(hostile, positions_3d=np.array(Hostile(), dtype=object))
+    text.write_text("not a zip archive")
+    shutil.copy(people.with_name("skeleton.json"), tmp_path)
+    metres.parent.mkdir()
+    shutil.copy(people.with_name("skeleton.json"), metres.parent)
+    np.savez(metres, **{"train/a": 1000 * np.load(people)["train/person_0000"]})
+    assert "no such file" in failure(capsys, "data", "info", str(tmp_path / "nowhere.npz"))
+    assert "system" in failure(capsys, "data", "info", str(hostile))
+    assert str(text) in failure(capsys, "data", "info", str(text))
+    assert "millimetres" in failure(capsys, "data", "info", str(metres))
+    assert "no clips; 1 were skipped" in failure(capsys, "data", "info", str(metres), "--skip-bad")
+
+
+def test_data_info_tells_what_a_file_holds(capsys, people):
+    assert main(["data", "info", str(people)]) == 0
+    printed = capsys.readouterr().out
+    assert "17 joints" in printed
+    assert "train" in printed
+
+
+def test_evaluation_is_printed_and_written_with_all_that_it_rests_on(capsys, run, people):
+    assert main(["evaluate", str(run), "--samples", "3", "--figure", str(run / "scores.png")]) == 0
+    printed = capsys.readouterr().out
+    for word in ("zero velocity", "nearest neighbours", "ADE", "ELBO", "vae"):
+        assert word in printed
+    evaluation = dvae.Evaluation.load(run / "evaluation.json")
+    assert evaluation.samples == 3
+    assert evaluation.rows["vae"].config["data"]["path"] == str(people)
+    assert evaluation.data["fingerprint"] == dvae.load(run).data.windows("test").fingerprint
+    assert (run / "scores.png").exists()
+
+
+def test_runs_of_other_windows_are_not_put_in_one_table(capsys, run, people, tmp_path):
+    other = tmp_path / "other"
+    motion.save(tmp_path / "few.npz", motion.simulate(clips=12, frames=90, seed=2))
+    data = str(tmp_path / "few.npz")
+    assert main(["fit", "vae", "--data", data, "--out", str(other), "--steps", "5", *SMALL]) == 0
+    capsys.readouterr()
+    assert "other test windows" in failure(capsys, "evaluate", str(run), str(other))
+    assert "named twice" in failure(capsys, "evaluate", str(run), str(run), code=2)
+    assert "at least one run" in failure(capsys, "evaluate", code=2)
+
+
+def test_forecasts_continue_what_was_observed(capsys, run, tmp_path):
+    out = tmp_path / "futures.npz"
+    assert main(["forecast", str(run), "--out", str(out), "--samples", "2", "--figure", f"{out}.png"]) == 0
+    windows = dvae.load(run).data.windows("test")
+    with np.load(out) as file:
+        assert file["forecasts"].shape == (2, len(windows), 60, 17, 3)
+        assert file["observed"].shape == (len(windows), 15, 17, 3)
+        keys = zip(file["split"].tolist(), file["clip"].tolist(), file["start"].tolist(), strict=True)
+        assert list(keys) == windows.keys
+        truth = windows.positions(windows.all()["x"][:, 15:])
+        np.testing.assert_array_equal(file["truth"], truth.numpy())
+    assert main(["forecast", str(run), "--out", str(out), "--clip", "person_0000", "--horizon", "80"]) == 0
+    with np.load(out) as file:
+        assert file["forecasts"].shape[2] == 80
+        assert set(file["split"]) == {"train"}
+    assert "no clip 'nobody'" in failure(capsys, "forecast", str(run), "--out", str(out), "--clip", "nobody")
+    assert "at least 1" in failure(capsys, "forecast", str(run), "--out", str(out), "--samples", "0", code=2)
+
+
+def test_equations_of_ones_own_are_fitted_and_read_back(people, tmp_path):
+    out = tmp_path / "own"
+    options = ["--latents", "z", "2", "--network", "dense", "--steps", "5", *SMALL]
+    assert main(["fit", "equations", *EQUATIONS, *options, "--data", str(people), "--out", str(out)]) == 2
+    options[options.index("dense")] = "recurrent"  # a perceptron cannot read x_{t:T}
+    assert main(["fit", "equations", *EQUATIONS, *options, "--data", str(people), "--out", str(out)]) == 0
+    loaded = dvae.load(out)
+    assert loaded.model.sizes == {"z": 2, "x": 48}
+    assert str(loaded.model.inference) == str(dvae.Factorization.parse(EQUATIONS[3]))
+
+
+def test_a_loaded_run_forecasts_as_the_fitted_model_does(people, tmp_path):
+    data = runs.Data.open(people)
+    training = dvae.Training(steps=5, batch_size=4, validate_every=5, progress=False)
+    runs.fit(dvae.method("vrnn", latent=3, width=8, warm_up=4), data, tmp_path / "a", training)
+    loaded = dvae.load(tmp_path / "a")
+    x = data.windows("test").all()["x"][:, :15]
+    draws = []
+    for model in (loaded.model, dvae.load(tmp_path / "a").model):
+        torch.manual_seed(3)
+        draws.append(model.forecast({"x": x}, 5, 2)["x"])
+    assert torch.equal(*draws)
+    assert loaded.method == dvae.method("vrnn", latent=3, width=8, warm_up=4)
+    assert loaded.data.protocol == data.protocol
+
+
+def test_a_resumed_run_is_the_uninterrupted_one(people, tmp_path, capsys):
+    class Stop:
+        def on_step(self, state):
+            if state.step == 7:
+                raise KeyboardInterrupt
+
+        def on_validation(self, state):
+            pass
+
+        def on_end(self, state):
+            pass
+
+    method = dvae.method("vrnn", latent=3, width=8, warm_up=8, self_feeding=0.5)
+    training = dvae.Training(steps=12, batch_size=4, validate_every=5, progress=False)
+    data = runs.Data.open(people)
+    runs.fit(method, data, tmp_path / "whole", training)
+    with pytest.raises(KeyboardInterrupt, match="interrupted after step 7"):
+        runs.fit(method, data, tmp_path / "parts", training, callbacks=[Stop()])
+    assert main(["resume", str(tmp_path / "parts")]) == 0
+    assert "finished at step 12" in capsys.readouterr().out
+    whole, parts = ((tmp_path / name / "last.safetensors").read_bytes() for name in ("whole", "parts"))
+    assert whole == parts
+
+
+def test_a_run_is_neither_overwritten_nor_invented(capsys, run, people, tmp_path):
+    again = ["fit", "vae", "--data", str(people), "--out", str(run)]
+    assert f"dvae resume {run}" in failure(capsys, *again)
+    assert "is no run directory" in failure(capsys, "resume", str(tmp_path / "none"))
+    assert "is no run directory" in failure(capsys, "evaluate", str(tmp_path))
+
+
+def test_a_damaged_run_is_refused(capsys, run):
+    weights = run / "best.safetensors"
+    good = weights.read_bytes()
+    weights.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
+    assert "is damaged or from another run" in failure(capsys, "evaluate", str(run))
+    weights.write_bytes(good)
+    (run / "last.state.pt").write_bytes(pickle.dumps(os.getcwd))
+    assert "is damaged or from another run" in failure(capsys, "resume", str(run))
+    config = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps({**config, "method": {**config["method"], "latent": 4}}))
+    assert "weights of another model" in failure(capsys, "evaluate", str(run))
+    (run / "config.json").write_text(json.dumps({"method": config["method"]}))
+    assert "does not tell method, data and protocol" in failure(capsys, "evaluate", str(run))
+    (run / "config.json").write_text("{")
+    assert "not JSON" in failure(capsys, "evaluate", str(run))
+
+
+def test_changed_or_moved_data_are_noticed(capsys, people, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("people.npz", "skeleton.json", "labels.csv"):
+        shutil.copy(people.with_name(name), tmp_path)
+    assert main(["fit", "vae", "--data", "people.npz", "--out", "run", "--steps", "5", *SMALL]) == 0
+    assert json.loads(Path("run/config.json").read_text())["data"]["path"] == "people.npz"
+    Path("elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    capsys.readouterr()
+    assert "people.npz is not here" in failure(capsys, "evaluate", "../run")
+    assert main(["evaluate", "../run", "--data", "../people.npz", "--samples", "2"]) == 0
+    motion.save(tmp_path / "people.npz", motion.simulate(clips=14, frames=90, seed=5))
+    capsys.readouterr()
+    assert "has changed since ../run was fitted" in failure(capsys, "evaluate", "../run", "--data", "../people.npz")
+
+
+def test_debug_shows_where_it_failed(capsys, tmp_path):
+    assert main(["data", "info", str(tmp_path / "nowhere.npz"), "--debug"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_ctrl_c_leaves_a_run_that_resumes(people, tmp_path):
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "dvae.cli", "fit", "vae", "--data", str(people), "--out", str(run)]
+    process = subprocess.Popen(
+        [*command, "--steps", "100000", *SMALL], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        deadline = time.monotonic() + 120
+        log = run / "log.jsonl"
+        while not (log.exists() and log.read_text()) and time.monotonic() < deadline:
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        error = process.communicate(timeout=60)[1]
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert f"resume with: dvae resume {run}" in error
+    assert "Traceback" not in error
+    stopped = json.loads((run / "state.json").read_text())
+    assert stopped["status"] == "interrupted"
+    assert main(["resume", str(run), "--steps", str(stopped["step"] + 5)]) == 0
+    assert json.loads((run / "state.json").read_text())["step"] == stopped["step"] + 5

@@ -1,0 +1,406 @@
+"""Evaluation: all rows on the same windows, honest standard errors, records that say what was measured."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from dvae import motion
+from dvae.inference import metrics
+from dvae.inference.bounds import SequenceELBO
+from dvae.inference.evaluate import (
+    ArrayWindows,
+    Evaluation,
+    Row,
+    Score,
+    evaluate,
+    nearest_neighbours,
+    zero_velocity,
+)
+from dvae.model import DynamicalVAE
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+OBSERVED, FRAMES, SIZE = 4, 9, 3
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def array_windows(count=12, clips=None, **options):
+    clips = [f"clip_{i // 3}" for i in range(count)] if clips is None else clips
+    return ArrayWindows(draw(count, FRAMES, SIZE).cumsum(1), OBSERVED, clips=clips, **options)
+
+
+@pytest.fixture(scope="module")
+def model():
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        return DynamicalVAE(
+            "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})", {"z": 2, "x": SIZE}
+        ).double()
+
+
+class Forecaster(nn.Module):
+    """A model that forecasts what it is told, and has no uncertainty to speak of."""
+
+    generative = SimpleNamespace(text="p(x_t)")
+    inference = SimpleNamespace(text="q(z)")
+
+    def __init__(self, forecast):
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(1, dtype=torch.float64))
+        self.told = forecast
+
+    def forecast(self, batch, horizon, samples, *, draw_emission=False):
+        return {"x": self.told(batch["x"], horizon, samples)}
+
+
+def run(model, windows, **options):
+    return evaluate(model, windows, **({"samples": 5, "progress": False} | options))
+
+
+def free_running(forecaster, windows, **options):
+    """Scores of a forecaster that has no bound."""
+
+    def no_bound(self, model, batch):
+        return SimpleNamespace(per_frame=torch.zeros(len(batch["x"])), kl={}, frames=FRAMES)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SequenceELBO, "terms", no_bound)
+        return run(forecaster, windows, **options)["model"]
+
+
+# Reference rows
+
+
+def test_zero_velocity_repeats_the_last_pose():
+    observed = draw(2, 4, 3)
+    forecast = zero_velocity(observed, 5)
+    assert forecast.shape == (1, 2, 5, 3)
+    assert (forecast == observed[:, -1:]).all()
+
+
+def test_neighbours_of_training_windows_are_themselves_first_and_then_farther():
+    training = draw(30, 9, 3)
+    futures = nearest_neighbours(training[:7, :4], training, samples=30)
+    assert futures.shape == (30, 7, 5, 3)
+    assert torch.equal(futures[0], training[:7, 4:])
+    last = {tuple(future.flatten().tolist()): pose for future, pose in zip(training[:, 4:], training[:, 3])}
+    distances = torch.stack(
+        [(last[tuple(future.flatten().tolist())] - training[2, 3]).norm() for future in futures[:, 2]]
+    )
+    assert (distances.diff() >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("training", "message"),
+    [
+        (draw(9, 9, 2), r"must be \(N, T, 3\)"),
+        (draw(9, 4, 3), "above the 4 observed"),
+        (draw(4, 9, 3), "5 neighbours were asked of 4"),
+    ],
+)
+def test_training_windows_that_do_not_fit_are_refused(training, message):
+    with pytest.raises(ValueError, match=message):
+        nearest_neighbours(draw(2, 4, 3), training, samples=5)
+
+
+# One evaluation
+
+
+def test_scores_are_the_metrics_of_the_forecasts_and_the_bound_per_frame(model):
+    windows = array_windows()
+    result = run({"dkf": model}, windows, batch_size=12, training_windows=array_windows(20), seed=3)
+    assert list(result.rows) == ["zero velocity", "nearest neighbours", "dkf"]
+    assert [row.samples for row in result.rows.values()] == [1, 5, 5]
+    x = windows.all()["x"]
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(3)
+        forecasts = model.forecast({"x": x[:, :OBSERVED]}, FRAMES - OBSERVED, 5)["x"].movedim(0, 1)
+        torch.manual_seed(3)
+        bound = SequenceELBO().terms(model, {"x": x}).bound / FRAMES
+    ade = metrics.average_displacement_error(forecasts, x[:, OBSERVED:])
+    assert result["dkf"]["ADE"].mean == pytest.approx(ade.mean().item())
+    assert result["dkf"]["ELBO"].mean == pytest.approx(bound.mean().item())
+    assert {"KL z", "ELBO"} <= result["dkf"].keys()
+    assert not {"KL z", "ELBO"} & result["zero velocity"].keys()
+
+
+def test_scores_depend_on_the_seed_and_not_on_the_company(model):
+    windows = array_windows()
+    alone, again = run({"a": model}, windows, references=False), run({"b": model, "a": model}, windows)
+    assert alone.rows["a"] == again.rows["a"] == again.rows["b"]
+    assert run({"a": model}, windows, seed=1).rows["a"] != alone.rows["a"]
+
+
+def test_evaluation_leaves_mode_and_random_state_alone(model):
+    model.train()
+    state = torch.get_rng_state()
+    run(model, array_windows())
+    assert model.training
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_drawn_emissions_are_more_diverse_than_means_and_labelled(model):
+    mean, drawn = (run(model, array_windows(), draw_emission=value) for value in (False, True))
+    assert (mean.emission, drawn.emission) == ("mean", "drawn")
+    assert drawn["model"]["APD"].mean > mean["model"]["APD"].mean
+
+
+def test_importance_bound_is_above_the_elbo_and_its_diagnosis_beside_it(model):
+    row = run(model, array_windows(), bound_particles=50)["model"]
+    assert row["importance bound"].mean > row["ELBO"].mean
+    assert math.isfinite(row["k-hat"].mean)
+
+
+def test_a_perfect_forecast_has_no_error_and_a_lone_window_keeps_its_own_truth():
+    windows = array_windows(multimodal_threshold=1e-9)
+    truth = iter(windows.all()["x"][:, OBSERVED:].split(5))
+    perfect = Forecaster(lambda x, horizon, samples: next(truth).expand(samples, -1, -1, -1))
+    scores = free_running(perfect, windows, batch_size=5)
+    for name in ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "MMFDEm", "energy score", "variogram score", "APD"):
+        assert scores[name].mean == pytest.approx(0, abs=1e-6), name
+
+
+def test_multimodal_errors_average_over_every_window_in_the_same_pose():
+    x = draw(6, FRAMES, SIZE)
+    x[:3, OBSERVED - 1] = x[0, OBSERVED - 1]
+    windows = ArrayWindows(x, OBSERVED, multimodal_threshold=1e-6)
+    still = evaluate({}, windows, progress=False)["zero velocity"]
+    forecast = zero_velocity(x[:, :OBSERVED], FRAMES - OBSERVED)[0]
+    errors = (forecast[:, None] - x[None, :, OBSERVED:]).norm(dim=-1).mean(-1)
+    expected = (3 * errors[:3, :3].mean() + errors.diagonal()[3:].sum()) / 6
+    assert still["MMADE"].mean == pytest.approx(expected.item(), abs=1e-6)
+
+
+# Standard errors
+
+
+def evaluation(values, clips):
+    """Zero velocity on windows whose final error is `values`, of the given clips."""
+    x = torch.zeros(len(values), 2, 1, dtype=torch.float64)
+    x[:, 1, 0] = torch.as_tensor(values)
+    return evaluate({}, ArrayWindows(x, 1, clips=clips), progress=False)
+
+
+def test_independent_windows_have_the_standard_error_of_a_mean():
+    values = draw(30).abs()
+    score = evaluation(values, None)["zero velocity"]["FDE"]
+    assert score.mean == pytest.approx(values.mean().item())
+    assert score.standard_error == pytest.approx((values.std() / math.sqrt(30)).item())
+
+
+def test_copies_of_windows_in_a_clip_add_no_certainty():
+    values = draw(10).abs()
+    once = evaluation(values, [str(i) for i in range(10)])["zero velocity"]["FDE"]
+    thrice = evaluation(values.repeat(3), [str(i) for i in range(10)] * 3)["zero velocity"]["FDE"]
+    assert thrice.mean == pytest.approx(once.mean)
+    assert thrice.standard_error == pytest.approx(once.standard_error)
+
+
+def test_the_mean_is_over_windows_where_clips_differ_in_number():
+    score = evaluation([1.0, 1.0, 1.0, 5.0], ["a", "a", "a", "b"])["zero velocity"]["FDE"]
+    assert score.mean == pytest.approx(2)
+
+
+def test_clustered_error_is_the_spread_of_the_mean_where_windows_of_a_clip_agree():
+    # 40 clips of 1 to 9 windows that share its value: repetitions tell the error of the mean.
+    random = np.random.default_rng(0)
+    clips = {str(clip): int(count) for clip, count in enumerate(random.integers(1, 10, 40))}
+    record = evaluation([1.0], None)
+    scores = [
+        replace(record, clips=clips, rows={"a": Row(1, {"FDE": tuple(values)})})["a"]["FDE"]
+        for values in 1 + random.random((2000, 40))
+    ]
+    spread = np.std([score.mean for score in scores])
+    assert np.mean([score.standard_error for score in scores]) == pytest.approx(spread, rel=0.1)
+
+
+def test_one_clip_has_no_standard_error():
+    assert math.isnan(evaluation([1.0, 2.0], ["a", "a"])["zero velocity"]["FDE"].standard_error)
+
+
+def test_differences_are_paired(model):
+    result = run({"a": model, "b": model}, array_windows())
+    assert result.difference("a", "b", "ADE") == Score(0, 0)
+    paired = result.difference("a", "zero velocity", "ADE")
+    assert paired.mean == pytest.approx(result["a"]["ADE"].mean - result["zero velocity"]["ADE"].mean)
+    with pytest.raises(KeyError, match="'zero velocity' has no score 'ELBO'"):
+        result.difference("a", "zero velocity", "ELBO")
+    with pytest.raises(KeyError, match=r"no method 'c' .* it has zero velocity, a, b"):
+        result["c"]
+
+
+# Records
+
+
+def test_the_record_says_what_was_measured_and_comes_back_from_json(model, tmp_path):
+    windows = array_windows()
+    result = run({"dkf": model}, windows, configs={"dkf": {"width": 8}}, bound_particles=3, seed=5)
+    result.save(tmp_path / "evaluation.json")
+    assert Evaluation.load(tmp_path / "evaluation.json").to_json() == result.to_json()
+    document = json.loads(result.to_json())
+    assert document["data"] == {
+        "fingerprint": windows.fingerprint,
+        "windows": 12,
+        "frames": FRAMES,
+        "coordinates": SIZE,
+    }
+    assert (document["samples"], document["seed"], document["bound_particles"]) == (5, 5, 3)
+    assert document["protocol"] == {"observed": OBSERVED, "multimodal_threshold": 0.5}
+    row = document["rows"]["dkf"]
+    assert row["config"] == {"width": 8}
+    assert row["equations"]["generative"] == model.generative.text
+    assert row["scores"]["ADE"]["program"] == "free-running"
+    assert row["scores"]["ELBO"]["program"] == "teacher-forced"
+    assert row["scores"]["ELBO"]["unit"] == "nats/frame"
+    assert row["scores"]["k-hat"]["mean"] is None  # three particles have no tail
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"rows": {"a": {}}}', '{"rows": {}, "unknown": 1}'])
+def test_other_documents_are_not_evaluations(text):
+    with pytest.raises(ValueError, match="not an evaluation"):
+        Evaluation.from_json(text)
+
+
+def test_the_fingerprint_follows_the_data():
+    x = draw(2, 5, 3)
+    assert ArrayWindows(x, 2).fingerprint == ArrayWindows(x.numpy(), 2).fingerprint
+    assert ArrayWindows(x, 2).fingerprint != ArrayWindows(x + 1e-9, 2).fingerprint
+    assert ArrayWindows(x, 2).fingerprint != ArrayWindows(x.reshape(2, 3, 5), 2).fingerprint
+
+
+def test_table_and_plot_show_every_method_and_metric(model):
+    result = run({"dkf": model}, array_windows())
+    text = str(result)
+    for part in (
+        "zero velocity",
+        "dkf",
+        "K = 5",
+        "K = 1",
+        "teacher-forced",
+        "KL z",
+        "±",
+        "12 windows of 4 clips",
+    ):
+        assert part in text
+    assert str(result["dkf"]["ADE"]) in text
+    panels = [axes.get_title() for axes in result.plot().axes if axes.axison]
+    assert [title.split(" (")[0] for title in panels] == result.metrics
+    assert len([axes for axes in result.plot(["ADE", "FDE"]).axes if axes.axison]) == 2
+
+
+@pytest.mark.parametrize(
+    ("score", "text"),
+    [
+        (Score(0.49331, 0.0192), "0.493 ± 0.019"),
+        (Score(0.00542, 0.00042), "0.0054 ± 0.0004"),
+        (Score(0.0, 0.0), "0.000"),
+        (Score(1.25, math.nan), "1.250"),
+        (Score(math.nan, math.nan), "–"),
+    ],
+)
+def test_scores_print_as_in_the_papers(score, text):
+    assert str(score) == text
+
+
+# Refusals
+
+
+def nan_at_the_second_window(x, horizon, samples):
+    forecast = zero_velocity(x, horizon).repeat(samples, 1, 1, 1)
+    forecast[0, 1, 2, 0] = math.nan
+    return forecast
+
+
+def test_forecasts_that_are_not_finite_are_an_error_naming_method_and_window():
+    windows = array_windows(clips=[f"clip_{i}" for i in range(12)])
+    with pytest.raises(FloatingPointError, match=r"forecast of wild is not finite .* frame 0 of clip 'clip_1'"):
+        run({"wild": Forecaster(nan_at_the_second_window)}, windows)
+
+
+def test_forecasts_of_another_shape_are_an_error_naming_both():
+    short = Forecaster(lambda x, horizon, samples: zero_velocity(x, horizon - 1).expand(samples, -1, -1, -1))
+    with pytest.raises(ValueError, match=r"forecasts of model must be .* \(5, 12, 5, 3\), not \(5, 12, 4, 3\)"):
+        run(short, array_windows())
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: run({}, array_windows(), samples=0), "at least 1 forecast"),
+        (
+            lambda: run({"zero velocity": Forecaster(None)}, array_windows()),
+            "name of a reference row: zero velocity",
+        ),
+        (lambda: run({}, ArrayWindows(draw(3, 4, 2), 4)), "4 frames, 4 of them observed"),
+        (lambda: run({}, ArrayWindows(draw(3, 4, 2), 0)), "4 frames, 0 of them observed"),
+        (lambda: ArrayWindows(draw(3, 4), 2), r"must be \(N, T, D\)"),
+        (lambda: ArrayWindows(draw(3, 4, 2), 2, clips=["a"]), "3 windows need as many clip names, not 1"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_ragged_windows_are_refused():
+    windows = array_windows()
+    ragged = SimpleNamespace(
+        protocol=windows.protocol, keys=windows.keys, all=lambda: {**windows.all(), "lengths": torch.ones(12)}
+    )
+    with pytest.raises(ValueError, match="complete windows, but these have lengths"):
+        run({}, ragged)
+
+
+# Motion
+
+
+@pytest.fixture(scope="module")
+def people():
+    protocol = motion.PROTOCOLS["simulated"]
+    clips = motion.simulate(clips=10, frames=90, test=0.4)
+    return motion.windows(clips, protocol, "test"), motion.windows(clips, protocol, "train+validation")
+
+
+def test_bone_lengths_tell_stretched_people(people):
+    test, training = people
+    tall = Forecaster(lambda x, horizon, samples: 1.1 * zero_velocity(x, horizon).expand(samples, -1, -1, -1))
+    assert free_running(tall, test)["bone-length error"].mean == pytest.approx(0.1, abs=1e-3)
+    result = evaluate({}, test, training_windows=training, samples=2, progress=False)
+    assert result["zero velocity"]["bone-length error"].mean < 1e-3
+    assert result.data["joints"] == list(test.skeleton.names)
+    assert result.protocol["name"] == "simulated"
+    assert result.clips == {f"test/{clip.name}": 2 for clip in test.clips}
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("file", "protocol", "still", "neighbours"),
+    [
+        ("bandai/bandai2.npz", "bandai2-by-style", (0.493, 0.641), (0.285, 0.260, 2.92)),
+        ("bandai/bandai2.npz", "bandai2-by-take", (0.441, 0.518), (0.126, 0.110, 2.66)),
+        ("cmu/cmu8.npz", "cmu8", (0.755, 0.906), (0.503, 0.457, 5.60)),
+    ],
+)
+def test_reference_rows_of_real_data_are_those_published_with_it(file, protocol, still, neighbours):
+    if not (DATA / file).exists():
+        pytest.skip(f"{file} is not beside the project")
+    clips = motion.load(DATA / file)
+    test = motion.windows(clips, motion.PROTOCOLS[protocol], "test")
+    x = test.all()["x"]
+    training = motion.windows(clips, motion.PROTOCOLS[protocol], "train+validation").all()["x"]
+    observed, futures = x[:, : test.protocol.observed], x[:, test.protocol.observed :]
+    ade, fde = metrics.average_displacement_error, metrics.final_displacement_error
+    point = zero_velocity(observed, futures.shape[1]).movedim(0, 1)
+    assert [score(point, futures).mean().item() for score in (ade, fde)] == pytest.approx(still, abs=6e-4)
+    many = nearest_neighbours(observed, training, 50).movedim(0, 1)
+    scores = [ade(many, futures), fde(many, futures), metrics.average_pairwise_distance(many)]
+    assert [score.mean().item() for score in scores] == pytest.approx(neighbours, abs=5e-3)

@@ -1,0 +1,193 @@
+"""Scores of forecasts: their definitions, written out with loops, and the laws they obey."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dvae.inference import metrics
+from dvae.inference.metrics import (
+    average_displacement_error,
+    average_pairwise_distance,
+    energy_score,
+    final_displacement_error,
+    median_average_displacement_error,
+    median_final_displacement_error,
+    median_multimodal_average_displacement_error,
+    median_multimodal_final_displacement_error,
+    multimodal_average_displacement_error,
+    multimodal_final_displacement_error,
+    multimodal_truths,
+    variogram_score,
+)
+
+PAIRED = (
+    average_displacement_error,
+    final_displacement_error,
+    median_average_displacement_error,
+    median_final_displacement_error,
+    energy_score,
+    variogram_score,
+)
+MULTIMODAL = (
+    multimodal_average_displacement_error,
+    multimodal_final_displacement_error,
+    median_multimodal_average_displacement_error,
+    median_multimodal_final_displacement_error,
+)
+SIZES = st.tuples(*[st.integers(1, 4)] * 4, st.integers(0, 2**16))
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def by_the_letter(samples, truths):
+    """Every score of samples (K, T, D) by definition; the true future is the first of truths (M, T, D)."""
+    count, frames, size = samples.shape
+    norm = np.linalg.norm
+    apart = [norm(samples[j] - samples[k]) for j in range(count) for k in range(j)]
+    ade = [[np.mean([norm(s[t] - y[t]) for t in range(frames)]) for s in samples] for y in truths]
+    fde = [[norm(s[-1] - y[-1]) for s in samples] for y in truths]
+    pairs = [(t, i, j) for t in range(frames) for i in range(size) for j in range(i)]
+    truth = truths[0]
+    variogram = [
+        (abs(truth[t, i] - truth[t, j]) ** 0.5 - np.mean(abs(samples[:, t, i] - samples[:, t, j]) ** 0.5)) ** 2
+        for t, i, j in pairs
+    ]
+    return {
+        average_pairwise_distance: np.mean(apart) if apart else 0.0,
+        average_displacement_error: min(ade[0]),
+        final_displacement_error: min(fde[0]),
+        median_average_displacement_error: np.median(ade[0]),
+        median_final_displacement_error: np.median(fde[0]),
+        multimodal_average_displacement_error: np.mean([min(errors) for errors in ade]),
+        multimodal_final_displacement_error: np.mean([min(errors) for errors in fde]),
+        median_multimodal_average_displacement_error: np.mean([np.median(errors) for errors in ade]),
+        median_multimodal_final_displacement_error: np.mean([np.median(errors) for errors in fde]),
+        energy_score: np.mean([norm(s - truth) for s in samples]) - (np.mean(apart) if apart else 0.0) / 2,
+        variogram_score: np.mean(variogram) if variogram else 0.0,
+    }
+
+
+@settings(max_examples=30, deadline=None)
+@given(SIZES)
+def test_every_score_is_its_definition_at_every_size(sizes):
+    count, modes, frames, size, seed = sizes
+    samples, truths = draw(count, frames, size, seed=seed), draw(modes, frames, size, seed=seed + 1)
+    for score, expected in by_the_letter(samples.numpy(), truths.numpy()).items():
+        if score is average_pairwise_distance:
+            found = score(samples)
+        else:
+            found = score(samples, truths if score in MULTIMODAL else truths[0])
+        assert found.item() == pytest.approx(expected, abs=1e-7), score.__name__
+
+
+@pytest.mark.parametrize("score", [average_pairwise_distance, *PAIRED, *MULTIMODAL])
+def test_leading_dimensions_are_windows_scored_alone(score):
+    samples, truths = draw(2, 3, 5, 4, 6), draw(2, 3, 2, 4, 6, seed=1)
+    rest = () if score is average_pairwise_distance else (truths if score in MULTIMODAL else truths[:, :, 0],)
+    together = score(samples, *rest)
+    assert together.shape == (2, 3)
+    for i in range(2):
+        for j in range(3):
+            torch.testing.assert_close(together[i, j], score(samples[i, j], *(r[i, j] for r in rest)))
+
+
+@pytest.mark.parametrize("score", [*PAIRED, *MULTIMODAL])
+def test_order_of_samples_is_irrelevant_and_numpy_is_accepted(score):
+    samples, truth = draw(5, 4, 3), draw(4, 3, seed=1)
+    truth = truth[None] if score in MULTIMODAL else truth
+    expected = score(samples, truth)
+    torch.testing.assert_close(score(samples.flip(0), truth), expected)
+    torch.testing.assert_close(score(samples.numpy(), truth.numpy()), expected)
+
+
+def test_the_best_sample_counts_and_the_error_is_in_metres_over_all_coordinates():
+    truth = torch.zeros(2, 4, dtype=torch.float64)
+    samples = torch.stack([torch.full((2, 4), 3.0), torch.tensor([[1.0] * 4, [2.0] * 4])]).double()
+    assert average_displacement_error(samples, truth) == pytest.approx((2 + 4) / 2)
+    assert final_displacement_error(samples, truth) == pytest.approx(4)
+    assert median_final_displacement_error(samples, truth) == pytest.approx((4 + 6) / 2)
+    assert average_displacement_error(truth[None], truth) == 0
+
+
+def test_diversity_is_not_divided_by_time_and_one_sample_has_none():
+    still = torch.zeros(1, 9, 4)
+    assert average_pairwise_distance(still) == 0
+    assert average_pairwise_distance(torch.cat([still, still + 1])) == pytest.approx(math.sqrt(9 * 4))
+
+
+def test_single_precision_products_do_not_blur_coinciding_futures():
+    futures = (2 + draw(60, 30, 60) / 3).float()
+    assert multimodal_average_displacement_error(futures, futures) < 2e-3
+
+
+def test_energy_score_of_a_point_is_its_distance():
+    sample, truth = draw(1, 3, 2), draw(3, 2, seed=1)
+    assert energy_score(sample, truth) == pytest.approx((sample[0] - truth).norm().item())
+
+
+def test_energy_score_prefers_the_true_distribution_to_a_narrow_a_wide_and_a_shifted_one():
+    samples, truth = draw(2000, 20, 3, 2), draw(2000, 3, 2, seed=1)
+    right = energy_score(samples, truth)
+    for wrong in (0.3 * samples, 3 * samples, samples + 1):
+        excess = energy_score(wrong, truth) - right
+        assert excess.mean() > 4 * excess.std() / math.sqrt(len(excess))
+
+
+def test_best_of_many_rewards_spread_that_the_energy_score_punishes():
+    samples, truth = draw(200, 20, 1, 12), 0.2 * draw(200, 1, 12, seed=1)
+    right, wide = 0.2 * samples, torch.cat([0.2 * samples, 2 * draw(200, 200, 1, 12, seed=2)], 1)
+    assert average_displacement_error(wide, truth).mean() <= average_displacement_error(right, truth).mean()
+    assert energy_score(wide, truth).mean() > energy_score(right, truth).mean()
+
+
+def test_variogram_score_sees_lost_dependence_and_not_a_common_offset():
+    common = draw(500, 20, 1, 1) + 0.1 * draw(500, 20, 1, 4, seed=1)
+    truth = draw(500, 1, 1, seed=2) + 0.1 * draw(500, 1, 4, seed=3)
+    independent = draw(500, 20, 1, 4, seed=4)
+    assert variogram_score(common, truth).mean() < 0.2 * variogram_score(independent, truth).mean()
+    torch.testing.assert_close(variogram_score(common + 7, truth), variogram_score(common, truth))
+
+
+def test_like_windows_are_strictly_below_the_threshold_and_include_the_window_itself():
+    poses = torch.tensor([[0.0, 0.0], [0.5, 0.0], [0.25, 0.0], [9.0, 9.0]])
+    assert [found.tolist() for found in multimodal_truths(poses, 0.5)] == [[0, 2], [1, 2], [0, 1, 2], [3]]
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(1, 700), st.integers(0, 99))
+def test_likeness_of_windows_is_symmetric_in_every_block(count, seed):
+    found = multimodal_truths(draw(count, 2, seed=seed), 0.4)
+    pairs = {(i, j) for i, others in enumerate(found) for j in others.tolist()}
+    assert len(found) == count
+    assert all((j, i) in pairs for i, j in pairs)
+    assert all((i, i) in pairs for i in range(count))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: average_pairwise_distance(draw(4, 3)), "axis for K = 1"),
+        (lambda: average_pairwise_distance(draw(0, 4, 3)), "nothing to score"),
+        (lambda: average_displacement_error(draw(5, 4, 3), draw(3, 3)), r"of shape \(4, 3\), not \(3, 3\)"),
+        (lambda: average_displacement_error(draw(5, 2, 4, 3), draw(2, 4, 3)), "movedim"),
+        (lambda: multimodal_average_displacement_error(draw(5, 4, 3), draw(4, 3)), "differ from them in M"),
+        (lambda: multimodal_final_displacement_error(draw(5, 4, 3), draw(0, 4, 3)), "M at least 1"),
+        (lambda: variogram_score(draw(5, 4, 3), draw(4, 3), order=0), "order of a variogram"),
+        (lambda: multimodal_truths(draw(4, 3, 2), 0.5), r"\(N, D\)"),
+        (lambda: multimodal_truths(draw(4, 3), 0), "must be positive"),
+    ],
+)
+def test_what_does_not_fit_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_all_scores_are_public():
+    public = {metrics.average_pairwise_distance, metrics.multimodal_truths, *PAIRED, *MULTIMODAL}
+    assert {getattr(metrics, name) for name in metrics.__all__} == public

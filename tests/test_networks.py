@@ -1,0 +1,332 @@
+"""The contract of every network: masks are true, one step at a time is all steps at once, padding is unseen."""
+
+import copy
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dvae.networks import Attention, Dense, Input, Linear, Recurrent
+from dvae.networks.base import computing_once, shift
+from dvae.networks.recurrent import tie_past
+from dvae.notation import Relation
+
+T = 6
+NETWORKS = {
+    "linear": Linear(steps=T),
+    "gru": Recurrent(4, cell="gru", hidden=(5,)),
+    "lstm": Recurrent(4, hidden=(5, 3)),
+    "lstm, two layers, embedded": Recurrent(4, layers=2, embed=3, hidden=(5,)),
+    "attention": Attention(8, heads=2),
+    "attention, two layers": Attention(8, heads=4, layers=2, feedforward=6),
+    "dense": Dense((5, 4)),
+}
+RELATIONS = [
+    *("t", "t-1", "t+1", "t-2:t-1", "t-1:t+2", "<t", "<=t", "<=t-2", "<=t+1", ">t", ">=t", ">=t+2", ">=t-1"),
+    "1:T",
+]
+COMPOSED = {
+    "all but t": ~Relation.parse("t"),
+    "past and t+2": Relation.parse("<t") | Relation.parse("t+2"),
+    "recent or old": Relation.parse("t-1") | Relation.parse("<=t-3"),
+}
+
+
+def even_steps(length):
+    return np.arange(length)[None, :] % 2 == np.zeros((length, 1))
+
+
+def band(length):
+    steps = np.arange(length)
+    return abs(steps[:, None] - steps - 1) <= 1
+
+
+CUSTOM = {
+    "even steps": Relation.custom("even", even_steps),
+    "band": Relation.custom("band", band),
+    "past, even steps": Relation.parse("<t") & Relation.custom("even", even_steps),
+}
+
+
+def build(kind, inputs, local=True, size=2, dtype=torch.float64):
+    return NETWORKS[kind].build(inputs, local, size).to(dtype)
+
+
+def supports(kind, relation):
+    if kind == "dense":
+        return relation.intervals is not None and relation.pointwise
+    return relation.intervals is not None or "attention" in kind or kind == "linear"
+
+
+def draw(inputs, batch, steps=T, dtype=torch.float64, lengths=None):
+    """Random parents, zero at padding."""
+    shapes = {p.name: (batch, p.size) if p.relation is None else (batch, steps, p.size) for p in inputs}
+    values = {name: torch.randn(shape, dtype=dtype) for name, shape in shapes.items()}
+    if lengths is not None:
+        pad = torch.arange(steps) >= lengths[:, None]
+        values |= {name: v.masked_fill(pad[..., None], 0) for name, v in values.items() if v.dim() == 3}
+    return values
+
+
+def reads(network, parents, name):
+    """Which steps of a parent the features at each step depend on: (T, T), or (1, T) of a static child."""
+
+    def features(value):
+        out = network({**parents, name: value}, T)
+        return (out @ torch.linspace(1.0, 2.0, out.shape[-1], dtype=out.dtype)).flatten()  # one number a step
+
+    jacobian = torch.autograd.functional.jacobian(features, parents[name])
+    return (jacobian != 0).any(-1)[:, 0].numpy()
+
+
+# ------------------------------------------------------------------------------------------------------ masks
+
+EVERY = {text: Relation.parse(text) for text in RELATIONS} | COMPOSED | CUSTOM
+
+
+@pytest.mark.parametrize("relation", EVERY)
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_features_depend_on_what_the_mask_shows_and_on_nothing_else(kind, relation):
+    relation = EVERY[relation]
+    if not supports(kind, relation):
+        with pytest.raises(ValueError, match=r"use networks\.(Recurrent or networks\.)?Attention"):
+            build(kind, [Input("z", 2, relation)])
+        return
+    inputs = [Input("z", 2, relation), Input("c", 1, Relation.parse("t-1")), Input("w", 2)]
+    network = build(kind, inputs)
+    mask = np.broadcast_to(relation.mask(T), (T, T))
+    assert np.array_equal(reads(network, draw(inputs, 1), "z"), mask)
+
+
+@pytest.mark.parametrize("relation", ["1:T", "even steps"])
+@pytest.mark.parametrize("kind", [k for k in NETWORKS if k != "dense"])
+def test_a_static_child_reads_what_its_mask_shows(kind, relation):
+    rows = (lambda length: even_steps(length)[:1]) if relation == "even steps" else None
+    relation = Relation.parse(relation) if rows is None else Relation.custom("even", rows)
+    if not supports(kind, relation):
+        return
+    inputs = [Input("z", 2, relation), Input("v", 3)]
+    network = build(kind, inputs, local=False)
+    parents = draw(inputs, 3)
+    assert network(parents, T).shape == (3, network.features)
+    one = {name: value[:1] for name, value in parents.items()}
+    assert np.array_equal(reads(network, one, "z"), relation.mask(T)[:1])
+
+
+def test_a_custom_mask_is_that_of_the_length_at_hand():
+    # The last step only: at length 4 that is not what it is at length 6.
+    relation = Relation.custom("last", lambda length: np.arange(length)[None] == np.full((length, 1), length - 1))
+    for kind in ("linear", "attention"):
+        network = build(kind, [Input("z", 1, relation)])
+        value = torch.randn(1, 4, 1, dtype=torch.float64, requires_grad=True)
+        (gradient,) = torch.autograd.grad(network({"z": value}, 4).square().sum(), value)
+        assert (gradient.flatten() != 0).tolist() == [False, False, False, True]
+
+
+# --------------------------------------------------------------------------------------- one step at a time
+
+FORWARD = {"z": "<t", "x": "t-1", "u": "t-2:t", "v": "<=t"}
+BACKWARD = {"z": ">t", "x": "t+1", "u": "t:t+2", "v": ">=t"}
+SPLITS = [set(split) for n in range(1, 4) for split in itertools.combinations("zxu", n)] + [{"z", "x", "u", "v"}]
+
+
+def by_steps(network, parents, live, direction, lengths=None):
+    """Features from `start` and `step`. A value that the loop has not drawn yet is None, and so cannot be read."""
+    batch, steps = parents["x"].shape[:2]
+    given = {name: value for name, value in parents.items() if name not in live}
+    state = network.start(given, batch, steps, lengths)
+    drawn = {name: [None] * steps for name in live}
+    now = [p.name for p in network.inputs if p.name in live and p.relation.mask(1)[0, 0]]
+    features = [None] * steps
+    for t in range(steps)[::direction]:
+        for name in now:
+            drawn[name][t] = parents[name][:, t]
+        features[t], state = network.step(state, t, drawn)
+        for name in live - set(now):
+            drawn[name][t] = parents[name][:, t]
+    return torch.stack(features, 1)
+
+
+def loop_inputs(kind, direction):
+    relations = FORWARD if direction > 0 else BACKWARD
+    pick = {name: Relation.parse(text) for name, text in relations.items()}
+    if kind == "dense":
+        pick |= {"z": pick["x"], "v": pick["u"]}
+    return [
+        *(Input(name, size, pick[name]) for name, size in (("z", 2), ("x", 3), ("u", 1), ("v", 2))),
+        Input("c", 2, pick["u"] if kind == "dense" else Relation.parse("1:T")),
+        Input("w", 2),
+    ]
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_steps_agree_with_all_at_once(kind, direction):
+    inputs = loop_inputs(kind, direction)
+    network = build(kind, inputs)
+    lengths = torch.tensor([T, 1, 4])
+    for ragged in (None, lengths):
+        parents = draw(inputs, 3, lengths=ragged)
+        together = network(parents, T, ragged)
+        counted = torch.ones(3, T, 1) if ragged is None else (torch.arange(T) < lengths[:, None])[..., None]
+        for live in SPLITS:
+            for grad in (True, False):
+                with torch.set_grad_enabled(grad):
+                    alone = by_steps(network, parents, live, direction, ragged)
+                torch.testing.assert_close(alone * counted, together * counted, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_steps_agree_in_single_precision_and_in_their_gradients(kind):
+    inputs = loop_inputs(kind, 1)
+    network = build(kind, inputs, dtype=torch.float32)
+    parents = draw(inputs, 2, dtype=torch.float32)
+    live = {"z", "x", "u", "v"}
+    together, alone = network(parents, T), by_steps(network, parents, live, 1)
+    torch.testing.assert_close(alone, together, rtol=0, atol=1e-5)
+    gradients = [torch.autograd.grad(out.square().sum(), list(network.parameters())) for out in (together, alone)]
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["linear", "attention", "attention, two layers"])
+def test_steps_agree_under_a_mask_of_ones_own(kind):
+    relation = CUSTOM["past, even steps"]
+    inputs = [Input("z", 2, relation), Input("x", 2, Relation.parse("<=t"))]
+    network = build(kind, inputs)
+    parents = draw(inputs, 2)
+    for live in ({"z"}, {"x"}, {"z", "x"}):
+        torch.testing.assert_close(by_steps(network, parents, live, 1), network(parents, T), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_every_size_may_be_one(kind):
+    inputs = [Input("z", 1, Relation.parse("t-1")), Input("x", 1, Relation.parse("t")), Input("w", 1)]
+    network = build(kind, inputs, size=1)
+    parents = draw(inputs, 1, steps=1)
+    together = network(parents, 1)
+    assert together.shape == (1, 1, network.features)
+    torch.testing.assert_close(by_steps(network, parents, {"z", "x"}, 1), together)
+    static = build(kind, [Input("w", 1)], local=False, size=1)
+    assert static({"w": torch.ones(1, 1, dtype=torch.float64)}, 1).shape == (1, static.features)
+
+
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_static_parents_alone_give_features_at_every_step(kind):
+    network = build(kind, [Input("w", 2)])
+    assert network({"w": torch.ones(3, 2, dtype=torch.float64)}, T).shape == (3, T, network.features)
+
+
+# ---------------------------------------------------------------------------------------------------- padding
+
+
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_padding_changes_nothing(kind):
+    names = ["t-1", "t:t+1"] if kind == "dense" else ["<t", ">=t", "1:T", "t+1", "<=t-2", "t-1:t+2"]
+    inputs = [Input(f"y{i}", 2, Relation.parse(text)) for i, text in enumerate(names)]
+    network = build(kind, inputs)
+    lengths = torch.tensor([3, T, 1])
+    parents = draw(inputs, 3, lengths=lengths)
+    padded = network(parents, T, lengths)
+    for i, n in enumerate(lengths.tolist()):
+        alone = network({name: v[i : i + 1, :n] for name, v in parents.items()}, n)
+        torch.testing.assert_close(padded[i : i + 1, :n], alone, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", [k for k in NETWORKS if k not in ("dense", "linear")])
+def test_padding_changes_nothing_for_a_static_child(kind):
+    inputs = [Input("z", 2, Relation.parse("1:T")), Input("x", 1, Relation.parse("1:T"))]
+    network = build(kind, inputs, local=False)
+    lengths = torch.tensor([3, T, 1])
+    parents = draw(inputs, 3, lengths=lengths)
+    padded = network(parents, T, lengths)
+    for i, n in enumerate(lengths.tolist()):
+        alone = network({name: v[i : i + 1, :n] for name, v in parents.items()}, n)
+        torch.testing.assert_close(padded[i : i + 1], alone, rtol=0, atol=1e-10)
+
+
+# ------------------------------------------------------------------------------------------------ shared work
+
+
+def recurrent_pair():
+    past = [Input("x", 2, Relation.parse("<t"))]
+    first = build("lstm", [*past, Input("z", 1, Relation.parse("t"))])
+    second = build("lstm", [Input("x", 2, Relation.parse("1:T")), Input("z", 1, Relation.parse("t-1"))])
+    return first, second, draw(second.inputs, 3)
+
+
+def test_a_tied_past_is_evaluated_once_and_learns_from_every_use():
+    first, second, parents = recurrent_pair()
+    tie_past(first, second)
+    untied = copy.deepcopy(second)  # has a copy of the memory
+    calls = []
+    first.past.layers[0].register_forward_hook(lambda *_: calls.append(1))
+
+    def outputs(other):
+        return first(parents, T).square().sum() + other(parents, T).cos().sum()
+
+    memory = list(first.past.parameters())
+    with computing_once():
+        together = torch.autograd.grad(outputs(second), memory)
+    assert len(calls) == 1
+    apart = outputs(untied)
+    assert len(calls) == 2
+    copied = list(untied.past.parameters())
+    expected = [
+        a + b
+        for a, b in zip(
+            torch.autograd.grad(apart, memory, retain_graph=True), torch.autograd.grad(apart, copied), strict=True
+        )
+    ]
+    torch.testing.assert_close(together, tuple(expected), rtol=0, atol=1e-12)
+
+
+def test_computing_once_ends_with_its_block_and_sees_new_inputs():
+    first, _, parents = recurrent_pair()
+    with computing_once():
+        before = first(parents, T)
+        other = first({**parents, "x": parents["x"] + 1}, T)
+    assert not torch.equal(before, other)
+    with torch.no_grad():
+        first.past.layers[0].weight_ih_l0.add_(1)
+    assert not torch.equal(before, first(parents, T))
+
+
+def test_memories_of_different_pasts_are_not_tied():
+    first, _, _ = recurrent_pair()
+    other = build("lstm", [Input("x", 2, Relation.parse("<=t"))])
+    with pytest.raises(ValueError, match="different pasts"):
+        tie_past(first, other)
+    with pytest.raises(ValueError, match="only recurrent networks"):
+        tie_past(first, build("dense", [Input("x", 2, Relation.parse("t"))]))
+
+
+@given(steps=st.integers(1, 6), lag=st.integers(-8, 8))
+def test_shift_reads_zero_outside_of_the_sequence(steps, lag):
+    values = torch.arange(1.0, steps + 1)[None, :, None]
+    expected = [values[0, t + lag, 0].item() if 0 <= t + lag < steps else 0.0 for t in range(steps)]
+    assert shift(values, lag).flatten().tolist() == expected
+
+
+# ------------------------------------------------------------------------------------------------------ errors
+
+
+@pytest.mark.parametrize(
+    ("spec", "relation", "message"),
+    [
+        (Attention(width=10, heads=4), "<t", "width 10 is not a multiple of heads 4"),
+        (Recurrent(cell="rnn"), "<t", "unknown cell 'rnn'; known: gru, lstm"),
+        (Dense(), "<t", r"Dense reads single steps of its parents, but z is read at \{<t\}; use networks.Recurrent"),
+    ],
+)
+def test_descriptions_that_cannot_be_built(spec, relation, message):
+    with pytest.raises(ValueError, match=message):
+        spec.build([Input("z", 2, Relation.parse(relation))], True, 2)
+
+
+def test_linear_names_the_steps_it_was_built_for():
+    network = Linear(steps=3).build([Input("z", 2, Relation.parse("t"))], True, 2)
+    with pytest.raises(ValueError, match=r"Linear\(steps=3\) was given 5 steps; build it with steps=5"):
+        network({"z": torch.zeros(1, 5, 2)}, 5)

@@ -1,0 +1,284 @@
+"""The oracle against brute force, and every bound of the library against the oracle."""
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyro.infer import Trace_ELBO
+from torch.distributions.transforms import ReshapeTransform
+
+from dvae import DynamicalVAE, Oracle, SequenceELBO, audit, price, twin
+from dvae.heads import FixedNormal
+from dvae.networks import Linear
+from dvae.notation import Factorization
+from dvae.testing.strategies import factorizations
+
+T = 4
+DKF = "p(z_t | z_{t-1}) p(x_t | z_t)"
+TWO_LAYERS = "p(w) p(u_t | u_{t-1}, w) p(z_t | z_{t-1}, u_t) p(x_t | x_{<t}, z_t)"
+HIT_DVAE = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
+PAIRS = {
+    "dkf": (DKF, "q(z_t | z_{t-1}, x_{t:T})"),
+    "dkf, mean field": (DKF, "q(z_t | x_{1:T})"),
+    "dkf, backward": (DKF, "q(z_t | z_{t+1}, x_{<=t})"),
+    "srnn": ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"),
+    "vrnn": ("p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{<=t}, z_{<t})"),
+    "storn": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{1:T})"),
+    "rvae": ("p(z_t) p(x_t | z_{<=t})", "q(z_t | z_{<t}, x_{t:T})"),
+    "dsae": ("p(w) p(z_t | z_{<t}) p(x_t | w, z_t)", "q(w | x_{1:T}) q(z_t | w, x_{1:T})"),
+    "dsae, with z": ("p(w) p(z_t | z_{<t}) p(x_t | w, z_t)", "q(w | x_{1:T}) q(z_t | z_{<t}, w, x_{1:T})"),
+    "hit-dvae": (HIT_DVAE, "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"),
+    "hit-dvae, with z": (HIT_DVAE, "q(w | x_{1:T}) q(z_t | z_{<t}, x_{1:T}, w)"),
+    # w tells of the u_{>t} through which later data tell of z_t.
+    "two layers": (
+        TWO_LAYERS,
+        "q(w | x_{1:T}) q(u_t | u_{t-1}, z_{t-1}, x_{1:T}, w) q(z_t | z_{t-1}, u_t, x_{1:T}, w)",
+    ),
+    "two layers, mean field": (TWO_LAYERS, "q(w | x_{1:T}) q(u_t | x_{1:T}) q(z_t | x_{1:T})"),
+    "statics": ("p(v) p(w | v) p(x_t | x_{t-1}, w)", "q(v | x_{1:T}) q(w | v, x_{1:T})"),
+}
+EXACT = {"dkf", "dkf, backward", "srnn", "rvae", "dsae, with z", "hit-dvae, with z", "two layers", "statics"}
+
+
+def build(pair, size=1, seed=0, steps=T, scale=0.4):
+    generative, inference = map(Factorization.parse, PAIRS.get(pair, pair) if isinstance(pair, str) else pair)
+    sizes = dict.fromkeys(generative.variables, size)
+    return twin(generative, inference, sizes, steps, seed, scale=scale)
+
+
+def data(model, n, steps=T):
+    return model.sample(n, steps)["x"]
+
+
+def z_score(draws, expected):
+    """How many standard errors the mean of draws (N, ...) lies from what is expected."""
+    error = draws.std(0) / len(draws) ** 0.5
+    return ((draws.mean(0) - expected).abs() / (error + 1e-9)).max().item()
+
+
+# ------------------------------------------------------------------------------- the oracle against brute force
+
+
+def kalman(A, C, b, d, Q, R, x):
+    """log p(x) and smoothed moments for z_t = A_t z_{t-1} + b_t + N(0, Q_t), x_t = C_t z_t + d_t + N(0, R_t)."""
+    steps, n = len(A), A.shape[1]
+    mean, cov, log_evidence, filtered = np.zeros(n), np.zeros((n, n)), 0.0, []
+    for t in range(steps):
+        prior_mean, prior_cov = A[t] @ mean + b[t], A[t] @ cov @ A[t].T + Q[t]
+        S = C[t] @ prior_cov @ C[t].T + R[t]
+        innovation = x[t] - C[t] @ prior_mean - d[t]
+        log_evidence -= 0.5 * (innovation @ np.linalg.solve(S, innovation) + np.linalg.slogdet(2 * np.pi * S)[1])
+        gain = np.linalg.solve(S, C[t] @ prior_cov).T
+        mean, cov = prior_mean + gain @ innovation, prior_cov - gain @ S @ gain.T
+        filtered.append((mean, cov, prior_mean, prior_cov))
+    means, covs = [mean], [cov]
+    for t in range(steps - 2, -1, -1):
+        mean, cov = filtered[t][:2]
+        next_mean, next_cov = filtered[t + 1][2:]
+        back = np.linalg.solve(next_cov, A[t + 1] @ cov).T
+        means.insert(0, mean + back @ (means[0] - next_mean))
+        covs.insert(0, cov + back @ (covs[0] - next_cov) @ back.T)
+    return log_evidence, np.array(means), np.array(covs)
+
+
+def test_evidence_and_posterior_are_the_kalman_filters_and_smoothers():
+    model = twin(*PAIRS["dkf"], {"z": 2, "x": 3}, T)
+    x = data(model, 3)
+    oracle = Oracle(model, T)
+    z_net, x_net = model.generator["z"], model.generator["x"]
+    W, V = z_net.network.weight("z", T).detach().numpy(), x_net.network.weight("z", T).detach().numpy()
+    A = np.array([W[t, t - 1] if t else np.zeros((2, 2)) for t in range(T)])
+    C = np.array([V[t, t] for t in range(T)])
+    b, d = z_net.network.bias.detach().numpy(), x_net.network.bias.detach().numpy()
+    Q, R = (np.array([np.diag(s) for s in c.head.log_scale.exp().square().detach().numpy()]) for c in (z_net, x_net))
+    evidence, (means, covariance) = oracle.evidence(x).detach(), oracle.posterior(x)
+    for i in range(3):
+        log_evidence, smoothed, covs = kalman(A, C, b, d, Q, R, x[i].numpy())
+        assert abs(evidence[i].item() - log_evidence) < 1e-9
+        np.testing.assert_allclose(means[i].detach().reshape(T, 2), smoothed, atol=1e-9)
+        blocks = covariance.detach().reshape(T, 2, T, 2)
+        np.testing.assert_allclose([blocks[t, :, t] for t in range(T)], covs, atol=1e-9)
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_log_joint_is_evidence_plus_log_posterior(pair):
+    model = build(pair, size=2)
+    x = data(model, 4)
+    latents = {name: value.detach() for name, value in model.guide(x).items()}
+    oracle = Oracle(model, T)
+    mean, covariance = oracle.posterior(x)
+    log_posterior = dist.MultivariateNormal(mean, covariance).log_prob(oracle._stack(latents, model.latents))
+    joint = sum(model.log_joint(x, latents).values())
+    torch.testing.assert_close(joint, (oracle.evidence(x) + log_posterior).detach(), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("pair", ["dkf, backward", "two layers", "statics"])
+def test_the_guides_moments_are_those_of_its_draws(pair):
+    model = build(pair)
+    x = data(model, 1)
+    gain, offset, root = Oracle(model, T)._guide()
+    n = 20_000
+    latents = model.guide(x.expand(n, -1, -1))
+    draws = torch.cat([latents[name].flatten(1) for name in model.latents], 1).detach()
+    assert z_score(draws, (gain @ x.flatten() + offset).detach()) < 5
+    centred = draws - draws.mean(0)
+    products = centred[:, :, None] * centred[:, None]
+    assert z_score(products, (root @ root.t()).detach()) < 5
+
+
+# -------------------------------------------------------------------------------- bounds against the evidence
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_sequence_elbo_is_the_exact_bound(pair):
+    model = build(pair)
+    x = data(model, 2)
+    oracle = Oracle(model, T)
+    with torch.no_grad():
+        exact, evidence = oracle.bound(x), oracle.evidence(x)
+        terms = SequenceELBO().terms(model, x.repeat(4000, 1, 1))
+        bounds = terms.bound.reshape(4000, 2)
+    assert (exact <= evidence + 1e-9).all()
+    assert z_score(bounds, exact) < 5
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_gap_is_the_mean_of_evidence_minus_bound(pair):
+    model = build(pair)
+    oracle = Oracle(model, T)
+    with torch.no_grad():
+        x = data(model, 4000)
+        assert z_score(oracle.evidence(x) - oracle.bound(x), oracle.gap()) < 5
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_gap_closes_exactly_where_the_audit_says_so(pair):
+    oracle = Oracle(build(pair), T)
+    assert audit(*PAIRS[pair]).exact == (pair in EXACT)
+    gap = oracle.fit_guide()
+    assert gap > -1e-9
+    assert (gap < 1e-6) == (pair in EXACT), gap
+
+
+@settings(max_examples=25)
+@given(factorizations(), st.integers(0, 999))
+def test_bounds_of_random_factorizations_lie_below_the_evidence(pair, seed):
+    model = build(pair, seed=seed)
+    oracle = Oracle(model, T)
+    torch.manual_seed(seed)
+    x = data(model, 3)
+    with torch.no_grad():
+        assert (oracle.bound(x) <= oracle.evidence(x) + 1e-9).all()
+        bounds = SequenceELBO().terms(model, x.repeat(1000, 1, 1)).bound.reshape(1000, 3)
+        assert z_score(bounds, oracle.bound(x)) < 5.5
+        assert oracle.gap() > -1e-9
+
+
+@settings(max_examples=20)
+@given(factorizations(), st.integers(0, 999))
+def test_random_guides_are_tight_exactly_where_the_audit_says_so(pair, seed):
+    verdict = audit(*pair)
+    gap = Oracle(build(pair, seed=seed, scale=0.6), T).fit_guide()
+    assert gap > -1e-9
+    assert (gap < 1e-6) == verdict.exact, gap
+
+
+@pytest.mark.parametrize("pair", ["dkf", "srnn", "rvae", "storn"])
+def test_with_the_exact_smoother_as_guide_trace_elbo_is_the_evidence_with_no_variance(pair):
+    model = build(pair, size=2)
+    x = data(model, 3)
+    oracle = Oracle(model, T)
+    mean, covariance = (m.detach() for m in oracle.posterior(x))
+
+    def smoother(batch):
+        with pyro.plate("sequences", len(batch), dim=-1):
+            law = dist.MultivariateNormal(mean, covariance)
+            pyro.sample("z", dist.TransformedDistribution(law, [ReshapeTransform((2 * T,), (T, 2))]))
+
+    evidence = oracle.evidence(x).sum().item()
+    for elbo in (Trace_ELBO(), SequenceELBO()):
+        for _ in range(3):
+            assert abs(elbo.loss(model.model, smoother, x) + evidence) < 1e-8
+    torch.testing.assert_close(
+        SequenceELBO().terms(model, x, smoother).bound.detach(), oracle.evidence(x).detach(), rtol=0, atol=1e-9
+    )
+
+
+# ---------------------------------------------------------------------------------- where the analytic KL is wrong
+
+
+AGAINST = {
+    "local": (*PAIRS["dkf, backward"], "z", "z"),
+    # w is drawn first, though v is its parent.
+    "static": ("p(v) p(w | v) p(x_t | w)", "q(w | x_{1:T}) q(v | w)", "w", "v"),
+}
+
+
+@pytest.mark.parametrize("pair", AGAINST)
+def test_a_latent_that_the_guide_draws_against_the_arrows_has_no_analytic_kl(pair, monkeypatch):
+    *equations, child, parent = AGAINST[pair]
+    model = build(tuple(equations))
+    with torch.no_grad():
+        model.generator[child].network.weights[parent].fill_(1.0)  # a strong arrow between latents
+    oracle = Oracle(model, T)
+    assert oracle.fit_guide() < 1e-6  # so the exact bound is the evidence, and draws vary little about it
+    x = data(model, 1).repeat(4000, 1, 1)
+    with torch.no_grad():
+        exact = oracle.bound(x[:1])
+        ours = SequenceELBO().terms(model, x).bound
+        assert z_score(ours, exact) < 5
+        monkeypatch.setattr("dvae.inference.bounds._closed_forms", lambda *sites: set(model.latents))
+        forced = SequenceELBO().terms(model, x).bound
+    assert z_score(forced, exact) > 20
+
+
+# ----------------------------------------------------------------------------------------------- price and errors
+
+
+def test_the_price_of_a_dropped_arrow():
+    sizes = {"z": 1, "x": 1}
+    full = price(DKF, "q(z_t | z_{t-1}, x_{t:T})", sizes, steps=T, seeds=2)
+    dropped = price(DKF, "q(z_t | x_{t:T})", sizes, steps=T, seeds=2)
+    assert full.shape == (2,)
+    assert full.abs().max() < 1e-6
+    assert dropped.min() > 1e-3
+
+
+def test_fitting_the_guide_leaves_the_model_and_its_gradients_alone():
+    model = build("storn")
+    before = {name: p.clone() for name, p in model.generator.named_parameters()}
+    Oracle(model, T).fit_guide(iterations=5)
+    for name, parameter in model.generator.named_parameters():
+        assert torch.equal(parameter, before[name])
+        assert parameter.grad is None
+
+
+def test_twins_of_a_seed_are_equal_and_take_nothing_from_the_global_generator():
+    state = torch.get_rng_state()
+    first, second, other = build("srnn"), build("srnn"), build("srnn", seed=1)
+    assert torch.equal(state, torch.get_rng_state())
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
+    assert not torch.equal(first.generator["z"].network.bias, other.generator["z"].network.bias)
+
+
+def test_models_that_the_oracle_does_not_know():
+    with pytest.raises(ValueError, match=r"q\(z_t .* is not linear-Gaussian: the oracle needs networks.Linear"):
+        Oracle(DynamicalVAE(*PAIRS["dkf"], {"z": 1, "x": 1}).double(), T).gap()
+    driven = ("p(z_t | z_{t-1}, c_t) p(x_t | z_t)", "q(z_t | x_{1:T})")
+    with pytest.raises(ValueError, match="no law of the context c"):
+        Oracle(twin(*driven, {"z": 1, "x": 1, "c": 1}, T), T)
+    from dvae.priors import NormalPrior
+
+    own = DynamicalVAE(
+        "p(w) p(x_t | w)",
+        "q(w | x_{1:T})",
+        {"w": 1, "x": 1},
+        Linear(T),
+        FixedNormal(project=False),
+        priors={"w": NormalPrior(1)},
+    )
+    with pytest.raises(ValueError, match="normal priors only"):
+        Oracle(own, T)
