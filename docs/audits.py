@@ -11,12 +11,14 @@ HIT_DVAE = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
 FAMILY = {
     "VAE": ("p(z_t) p(x_t | z_t)", "q(z_t | x_t)"),
     "DKF": ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"),
-    "STORN": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{1:T})"),
+    "STORN, filtering": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{<=t})"),
+    "STORN, smoothing": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{1:T})"),
     "STORN, z_{<t} added": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | z_{<t}, x_{1:T})"),
     "VRNN": ("p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{<=t}, z_{<t})"),
     "VRNN, x_{>t} added": ("p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})", "q(z_t | z_{<t}, x_{1:T})"),
     "SRNN": ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"),
     "RVAE, causal": ("p(z_t) p(x_t | z_{<=t})", "q(z_t | z_{<t}, x_{t:T})"),
+    "RVAE, non-causal": ("p(z_t) p(x_t | z_{1:T})", "q(z_t | z_{<t}, x_{1:T})"),
     "DSAE": ("p(w) p(z_t | z_{<t}) p(x_t | z_t, w)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"),
     "DSAE, z_{<t} added": (
         "p(w) p(z_t | z_{<t}) p(x_t | z_t, w)",

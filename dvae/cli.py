@@ -27,6 +27,7 @@ from .graph import audit
 from .inference.checkpoints import Run
 from .inference.evaluate import evaluate as evaluate_models
 from .inference.fit import Fit, Interrupted, Training
+from .inference.schedules import Piecewise
 from .models import method as method_by_name
 from .models import methods, runs
 from .models.method import Method
@@ -122,6 +123,7 @@ def fit(
     steps: int = Training.steps,
     batch_size: int = Training.batch_size,
     learning_rate: float = 1e-3,
+    decay: float = 0.5,
     optimizer: Literal["adam", "adamw", "sgd"] = Training.optimizer,
     validate_every: int = Training.validate_every,
     patience: int | None = Training.patience,
@@ -143,6 +145,7 @@ def fit(
         steps: optimiser steps.
         batch_size: windows in a batch.
         learning_rate: step size of the optimiser.
+        decay: last share of the run over which the learning rate falls linearly to 0.
         optimizer: which optimiser.
         validate_every: steps from one validation and checkpoint to the next.
         patience: validations without a better bound after which to stop.
@@ -158,7 +161,7 @@ def fit(
         training = Training(
             steps=steps,
             batch_size=batch_size,
-            learning_rate=learning_rate,
+            learning_rate=_falling(learning_rate, steps, decay),
             optimizer=optimizer,
             validate_every=validate_every,
             patience=patience,
@@ -374,6 +377,12 @@ def _arguments() -> Iterator[None]:
         yield
     except ValueError as error:
         raise UsageError(str(error)) from error
+
+
+def _falling(rate: float, steps: int, decay: float) -> Piecewise:
+    if not 0 <= decay <= 1:
+        raise UsageError(f"decay is a share of the run, between 0 and 1; got {decay}")
+    return Piecewise(((0, rate), (round((1 - decay) * steps), rate), (steps, rate * (decay == 0))))
 
 
 def _report(result: Fit) -> None:

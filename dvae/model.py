@@ -383,10 +383,12 @@ class _Evaluating:
         self.module = module
 
     def __enter__(self) -> None:
+        self.training = [module for module in self.module.modules() if module.training]
         self.module.eval()
 
     def __exit__(self, *_: object) -> None:
-        self.module.train()
+        for module in self.training:
+            module.training = True
 
 
 def _factorization(equations: str | Factorization, masks: Mapping[str, MaskFunction] | None) -> Factorization:

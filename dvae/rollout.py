@@ -80,8 +80,9 @@ class Rollout:
 
     def know(self, name: str, value: Tensor) -> None:
         """Record the value of a site, which later sites read."""
-        if name in self._drawn and value is not self._drawn[name]:
-            dependants = [other for other in self._drawn if other != name and other in self._block[name].names]
+        if name in self._drawn and not _same(value, self._drawn[name]):
+            handed_out = self.values.keys() & self._drawn.keys() & set(self._block[name].names)
+            dependants = sorted(handed_out - {name})
             if dependants:
                 raise ValueError(
                     f"{name} was set to a value after {', '.join(dependants)} had been drawn along with another draw "
@@ -109,7 +110,7 @@ class Rollout:
     def draw(self, name: str) -> Tensor:
         """A draw (B, T, D) of a local variable, and with it of the variables that its loop interleaves it with."""
         if name not in self._drawn or any(
-            self.values.get(other, value) is not value
+            not _same(self.values.get(other, value), value)
             for other, value in self._drawn.items()
             if other in self._block[name].names
         ):
@@ -223,6 +224,11 @@ class Rollout:
 
     def _hide(self, value: Tensor) -> Tensor:
         return value if self._valid is None else value * self._valid
+
+
+def _same(value: Tensor, drawn: Tensor) -> bool:
+    """Whether a site's value is the draw: Pyro may hand it back detached."""
+    return value is drawn or torch.equal(value, drawn)
 
 
 def _like(module: nn.Module) -> Tensor:

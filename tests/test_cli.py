@@ -255,6 +255,7 @@ def test_debug_shows_where_it_failed(capsys, tmp_path):
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("ignore:.*clamped to:UserWarning")  # it resumes for a much shorter run
 def test_ctrl_c_leaves_a_run_that_resumes(people, tmp_path):
     run = tmp_path / "run"
     command = [sys.executable, "-m", "dvae.cli", "fit", "vae", "--data", str(people), "--out", str(run)]

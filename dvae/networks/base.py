@@ -195,6 +195,8 @@ class Join(nn.Module):
 
     def __init__(self, sizes: Sequence[int], widths: Sequence[int], activation: str):
         super().__init__()
+        if activation not in ACTIVATIONS:
+            raise ValueError(f"unknown activation {activation!r}; known: {', '.join(ACTIVATIONS)}")
         self.sizes = tuple(sizes)
         self.first = nn.Linear(sum(sizes), widths[0])
         self.kind = activation

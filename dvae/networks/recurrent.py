@@ -173,12 +173,16 @@ class RecurrentNetwork(Network):
                     "reads all of a past or future; use networks.Attention or networks.Linear for this factor"
                 )
             for low, high in parent.relation.intervals:
+                first = 0 if math.isinf(low) else int(low)
+                last = (-1 if local and math.isinf(low) else 0) if math.isinf(high) else int(high)
+                # A memory has read its past (future) by t; what lies on the other side of t joins by single steps.
                 if math.isinf(low):
-                    past.append((parent, (-1 if local else 0) if math.isinf(high) else int(high)))
+                    past.append((parent, min(last, 0)))
+                    first = 1
                 if math.isinf(high):
-                    future.append((parent, 0 if math.isinf(low) else int(low)))
-                if not math.isinf(low) and not math.isinf(high):
-                    self.points += [(parent, lag) for lag in range(int(low), int(high) + 1)]
+                    future.append((parent, max(0 if math.isinf(low) else int(low), 0)))
+                    last = -1
+                self.points += [(parent, lag) for lag in range(first, last + 1)]
         self.past = Memory(spec, past, +1) if past else None
         self.future = Memory(spec, future, -1) if future else None
         sizes = [spec.width] * len(self.memories) + [parent.size for parent, _ in self.points]

@@ -194,5 +194,5 @@ def _run(program: Callable[..., Any], *args: Any, **kwargs: Any) -> tuple[dict[s
     """Values and log densities (B,) of a program's sites."""
     trace = poutine.trace(program).get_trace(*args, **kwargs)
     trace.compute_log_prob()
-    sites = {n: s for n, s in trace.nodes.items() if s["type"] == "sample" and n != "sequences"}
+    sites: dict[str, Any] = {n: s for n, s in trace.nodes.items() if s["type"] == "sample" and n != "sequences"}
     return {n: s["value"] for n, s in sites.items()}, {n: s["log_prob"] for n, s in sites.items()}
