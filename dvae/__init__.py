@@ -27,6 +27,7 @@ from .models import method, methods  # noqa: E402
 from .models.runs import load  # noqa: E402
 from .notation import Factorization  # noqa: E402
 from .oracle import Oracle, price, twin  # noqa: E402
+from .rollout import SelfFeeding  # noqa: E402
 
 __all__ = [
     "Audit",
@@ -36,6 +37,7 @@ __all__ = [
     "Factorization",
     "Fit",
     "Oracle",
+    "SelfFeeding",
     "SequenceELBO",
     "Terms",
     "Training",

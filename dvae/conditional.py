@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from .distributions.chain import DERIVATIVES, GaussianChain
@@ -36,7 +37,7 @@ class Conditional(nn.Module):
         inputs = [Input(p.name, sizes[p.name], p.relation if p.local else None) for p in factor.parents]
         if inputs or not generative:
             self.network = network.build(inputs or [Input(CONSTANT, 1)], factor.local, self.size)
-            self.head: Head = head.build(self.network.features, self.size)
+            self.head: Head = head.build(self.network.features, self.size, factor.local)
         else:
             self.head = StandardNormal(self.size)
         self.parents = [parent.name for parent in factor.parents]
@@ -85,6 +86,8 @@ class Conditional(nn.Module):
 
     def chain(self, state: Any, direction: int, noise: Tensor) -> tuple[Tensor, Parameters] | None:
         """Draws (B, T, D) and their parameters by one fused loop, where the factor is a Gaussian chain; else None."""
+        if torch.is_autocast_enabled(noise.device.type):  # the fused loop runs in one precision
+            return None
         form = None if self.network is None else self.network.chain(state)
         if form is None or form.lag != -direction or form.join.kind not in DERIVATIVES:
             return None

@@ -59,8 +59,8 @@ class Head(nn.Module):
 class HeadSpec(Protocol):
     """A description of a head: a frozen dataclass that `build`s one."""
 
-    def build(self, features: int, size: int) -> Head:
-        """The head from features H to a variable of dimension D."""
+    def build(self, features: int, size: int, local: bool = True) -> Head:
+        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
         ...
 
 
@@ -76,8 +76,8 @@ class Normal:
     min_scale: float = 1e-3
     residual: bool = False
 
-    def build(self, features: int, size: int) -> Head:
-        """The head from features H to a variable of dimension D."""
+    def build(self, features: int, size: int, local: bool = True) -> Head:
+        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
         return NormalHead(self, features, size)
 
 
@@ -103,7 +103,7 @@ class FixedNormal:
         scale: standard deviation, the initial one where it is learned.
         learned: one learned scale per dimension.
         project: a linear layer from features to location; False takes the features themselves.
-        steps: with `learned`, one scale per time step too, for up to so many steps.
+        steps: with `learned`, one scale per time step too, for up to so many steps. For a local variable only.
         residual: the location is an offset from the variable's own previous value.
     """
 
@@ -113,10 +113,15 @@ class FixedNormal:
     steps: int = 0
     residual: bool = False
 
-    def build(self, features: int, size: int) -> Head:
-        """The head from features H to a variable of dimension D."""
+    def build(self, features: int, size: int, local: bool = True) -> Head:
+        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
         if self.scale <= 0:
             raise ValueError(f"FixedNormal's scale is positive, got {self.scale}")
+        if self.steps and not local:
+            raise ValueError(
+                f"FixedNormal(steps={self.steps}) has one scale per time step, but its variable is static, with one "
+                "value per sequence; give static variables a head of their own, with steps=0"
+            )
         if not self.project and features != size:
             raise ValueError(f"a head without projection takes {size} features, but the network gives {features}")
         return FixedNormalHead(self, features, size)
@@ -164,8 +169,8 @@ class StudentT:
     min_scale: float = 1e-3
     residual: bool = False
 
-    def build(self, features: int, size: int) -> Head:
-        """The head from features H to a variable of dimension D."""
+    def build(self, features: int, size: int, local: bool = True) -> Head:
+        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
         if self.df <= 2:
             raise ValueError(f"StudentT needs df > 2, where the variance is finite; got {self.df}")
         return StudentTHead(self, features, size)

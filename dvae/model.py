@@ -7,6 +7,7 @@ with different things known.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from typing import Any
@@ -23,6 +24,8 @@ from .networks.base import valid_steps
 from .notation import Factorization, check_pair
 from .priors import Prior
 from .rollout import Rollout, SelfFeeding
+
+_COUNT = itertools.count()
 
 Batch = Tensor | Mapping[str, Tensor]
 MaskFunction = Callable[[int], Any]
@@ -63,6 +66,7 @@ class DynamicalVAE(nn.Module):
         masks: Mapping[str, MaskFunction] | None = None,
     ):
         super().__init__()
+        self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
         self.generative = _factorization(generative, masks)
         self.inference = _factorization(inference, masks)
         self.sizes = dict(sizes)
@@ -70,6 +74,8 @@ class DynamicalVAE(nn.Module):
         for name, size in self.sizes.items():
             if size < 1:
                 raise ValueError(f"the size of {name} is {size}; sizes are positive")
+            if hasattr(nn.ModuleDict, name):
+                raise ValueError(f"a variable cannot be named {name!r}, which is an attribute of torch's modules")
         self.networks = _by_factor(network, Recurrent(), "network")
         self.heads = _by_factor(heads, Normal(), "head")
         keys = {f"{f.kind}({f.child})" for f in (*self.generative.factors, *self.inference.factors)}
@@ -119,7 +125,8 @@ class DynamicalVAE(nn.Module):
         Args:
             batch: the data (B, T, D), or a mapping from variable names to tensors (context too), with optional
                 "lengths" (B,) of a ragged batch and "mask", True where an entry of the data was observed: (B, T, D),
-                or a mapping of these by name.
+                or a mapping of these by name. At a missing entry the model reads its own mean, the guide 0. Arrays
+                are taken as tensors, in the model's precision.
             length: T. Beyond the length of the data, the data are a prefix from which the program continues.
             size: B, where the batch does not tell.
             prefix: name to the first values (B, O, D) of a latent.
@@ -129,7 +136,15 @@ class DynamicalVAE(nn.Module):
         Returns:
             Name to value of every variable.
         """
+        self._register()
         rollout = self._rollout(self.generative, self.generator, batch, length, size)
+        for name, value in (prefix or {}).items():
+            if name not in self.latents or value.dim() != 3 or value.shape[1] > rollout.length:
+                raise ValueError(
+                    f"the prefix of {name} has shape {tuple(value.shape)}; expected the first values (B, O, D) of one "
+                    f"of the latents {', '.join(self.latents)}, O at most {rollout.length}"
+                )
+            self._check(name, value)
         rollout.prefix = {**rollout.prefix, **(prefix or {})}
         rollout.mean_emission = mean_emission
         rollout.feeding = SelfFeeding(self_feeding) if isinstance(self_feeding, int | float) else self_feeding
@@ -147,6 +162,7 @@ class DynamicalVAE(nn.Module):
         Returns:
             Name to value of every latent.
         """
+        self._register()
         rollout = self._rollout(self.inference, self.encoder, batch, None, 1)
         for name in self.observed:
             if name not in rollout.values and any(name in c.parents for c in self.encoder.values()):
@@ -243,7 +259,7 @@ class DynamicalVAE(nn.Module):
         if horizon < 1 or samples < 1:
             raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
         past = data[self.observed[0]].shape[1]
-        data = {name: _repeat(value, samples) for name, value in data.items()}
+        data = {name: repeat(value, samples) for name, value in data.items()}
         seen = {
             name: value[:, :past] if name in self.context and value.dim() == 3 else value
             for name, value in data.items()
@@ -264,7 +280,7 @@ class DynamicalVAE(nn.Module):
         Returns:
             Name to (S, B, T, D) for every data variable.
         """
-        data = {name: _repeat(value, samples) for name, value in self._mapping(batch).items()}
+        data = {name: repeat(value, samples) for name, value in self._mapping(batch).items()}
         with self._evaluating():
             latents = self.guide(data)
             rollout = self._rollout(self.generative, self.generator, data, None, 1)
@@ -274,10 +290,23 @@ class DynamicalVAE(nn.Module):
 
     @torch.no_grad()
     def log_joint(self, batch: Batch, latents: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint."""
+        """log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint.
+
+        Raises:
+            ValueError: a latent without a value, or with one of another shape.
+        """
+        if missing := [name for name in self.latents if name not in latents]:
+            raise ValueError(f"the log joint needs a value of every latent; missing are {', '.join(missing)}")
+        for name, value in latents.items():
+            self._check(name, value)
         trace = poutine.trace(poutine.condition(self.model, data=dict(latents))).get_trace(batch)
         trace.compute_log_prob(site_filter=lambda name, site: name in self.generative.variables)
         return {name: trace.nodes[name]["log_prob"] for name in self.generative.variables}
+
+    def _register(self) -> None:
+        """Names the parameters in Pyro's store while `pyro.infer.SVI` looks for them, and else costs nothing."""
+        if any(getattr(handler, "param_only", False) for handler in poutine.runtime._PYRO_STACK):
+            pyro.module(self._name, self)
 
     # Reading a batch -----------------------------------------------------------------------------------------------
 
@@ -287,16 +316,24 @@ class DynamicalVAE(nn.Module):
     def _mapping(self, batch: Batch | None) -> dict[str, Any]:
         if batch is None:
             return {}
-        if isinstance(batch, Tensor):
+        if not isinstance(batch, Mapping):
             if len(self.observed) > 1:
                 raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
-            return {self.observed[0]: batch}
+            batch = {self.observed[0]: batch}
         unknown = [name for name in batch if name not in (*self.sizes, "lengths", "mask")]
         if unknown:
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(self.sizes)}, 'lengths', 'mask'"
             )
-        return dict(batch)
+        dtype = _like(self).dtype
+
+        def tensors(value: Any) -> Any:
+            if isinstance(value, Mapping):
+                return {name: tensors(v) for name, v in value.items()}
+            tensor = torch.as_tensor(value)
+            return tensor.to(dtype) if tensor.is_floating_point() else tensor
+
+        return tensors(batch)
 
     def _rollout(
         self,
@@ -315,6 +352,8 @@ class DynamicalVAE(nn.Module):
         sizes = {v.shape[0] for v in values.values()} or {size}
         if len(sizes) > 1:
             raise ValueError(f"the batch holds different numbers of sequences: {_shapes(values)}")
+        if sizes == {0}:
+            raise ValueError(f"the batch holds no sequences: {_shapes(values)}")
         steps = {v.shape[1] for v in local.values()}
         if length is None:
             if not steps:
@@ -341,8 +380,13 @@ class DynamicalVAE(nn.Module):
                 )
             values[name] = values[name].masked_fill(~seen, 0)
         if lengths is not None:
-            if lengths.shape != (next(iter(sizes)),) or lengths.min() < 1 or lengths.max() > length:
-                raise ValueError(f"lengths must be (B,) numbers between 1 and {length}, got {lengths.tolist()}")
+            if (
+                lengths.is_floating_point()
+                or lengths.shape != (next(iter(sizes)),)
+                or lengths.min() < 1
+                or lengths.max() > length
+            ):
+                raise ValueError(f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}")
             valid = valid_steps(lengths, length)[..., None]
             values |= {name: v.masked_fill(~valid, 0) for name, v in values.items() if v.dim() == 3}
         for name, value in values.items():
@@ -408,9 +452,10 @@ def _by_factor(given: Any, default: Any, what: str) -> dict[str, Any]:
     return {"default": default, **table}
 
 
-def _repeat(value: Any, samples: int) -> Any:
+def repeat(value: Any, samples: int) -> Any:
+    """A batch, or a tensor (B, ...), `samples` times over: (samples * B, ...), sample by sample."""
     if isinstance(value, Mapping):
-        return {name: _repeat(v, samples) for name, v in value.items()}
+        return {name: repeat(v, samples) for name, v in value.items()}
     return value.repeat(samples, *[1] * (value.dim() - 1))
 
 

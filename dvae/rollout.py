@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
+import numpy as np
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
@@ -33,6 +35,10 @@ class SelfFeeding:
     probability: float
     passes: int | None = None
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.probability <= 1 or (self.passes is not None and self.passes < 1):
+            raise ValueError(f"expected a probability in [0, 1] and at least one pass, got {self}")
+
 
 @dataclass
 class Rollout:
@@ -45,7 +51,8 @@ class Rollout:
         values: what is known: data, context, statics (B, D) and, as they become known, latents (B, T, D).
         data: names of the observed variables.
         lengths: (B,) valid steps of a ragged batch.
-        observed: name to (B, T, D) True where an entry of the data was observed.
+        observed: name to (B, T, D) True where an entry of the data was observed. The model reads its own mean in
+            place of the others, the guide 0.
         prefix: name to (B, O, D) first values of a variable that is then drawn on.
         mean_emission: data variables are not drawn but set to their means.
         feeding: self-feeding of the data's history, or None.
@@ -64,6 +71,7 @@ class Rollout:
     feeding: SelfFeeding | None = None
 
     def __post_init__(self) -> None:
+        _check_custom_masks(self.factorization, self.length)
         self._block = {name: block for block in self.factorization.blocks for name in block.names}
         self._drawn: dict[str, Tensor] = {}
         self._evaluated: dict[str, tuple[Tensor, Parameters]] = {}
@@ -118,39 +126,45 @@ class Rollout:
         return self._drawn[name]
 
     def history(self) -> dict[str, Tensor]:
-        """What the model reads as the data's past: the data, or under self-feeding its mixture with own means."""
-        if self.feeding is None or self.feeding.probability == 0:
-            return {}
+        """What the model reads as the data's past where it may not read them: its own means."""
         if self._history is None:
+            hidden = self._hidden()
             with torch.no_grad():
-                frames = torch.rand(self.batch, self.length, 1, device=next(iter(self.values.values())).device)
-                self._history = self._feed(frames < self.feeding.probability, self.feeding.passes)
+                self._history = self._feed(hidden) if hidden else {}
         return self._history
 
-    def _feed(self, frames: Tensor, passes: int | None) -> dict[str, Tensor]:
+    def _hidden(self) -> dict[str, Tensor]:
+        """Name to (B, T, 1 or D) True at the entries of the data that the model may not read."""
+        hidden = {name: ~seen for name, seen in self.observed.items() if name in self.values and not seen.all()}
+        if self.feeding is not None and self.feeding.probability:
+            frames = torch.rand(self.batch, self.length, 1, device=next(iter(self.values.values())).device)
+            fed = frames < self.feeding.probability
+            for name in self.data & self.values.keys():
+                hidden[name] = fed | hidden[name] if name in hidden else fed
+        return hidden
+
+    def _feed(self, hidden: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        passes = None if self.feeding is None else self.feeding.passes
         fed: dict[str, Tensor] = {}
         for block in self.factorization.blocks:
-            names = [name for name in block.names if name in self.data]
+            names = [name for name in block.names if name in hidden]
             if not names:
                 continue
             if passes is None:
-                fed.update(self._run(block, fed, frames))
+                fed.update(self._run(block, fed, hidden))
                 continue
             for _ in range(passes):
                 known = {**self.values, **fed}
                 for name in names:
                     mean = self.conditionals[name](known, self.batch, self.length, self.lengths)[0]
-                    fed[name] = torch.where(frames, mean, self.values[name])
+                    fed[name] = self._hide(torch.where(hidden[name], mean, self.values[name]))
         return fed
 
     def _run(
-        self, block: Block, fed: Mapping[str, Tensor] | None = None, frames: Tensor | None = None
+        self, block: Block, fed: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
-        """Values of the unknown variables of a block; with `frames`, of its data, self-fed at those frames."""
-        if frames is None:
-            live = [name for name in block.names if name not in self.values]
-        else:
-            live = [name for name in block.names if name in self.data]
+        """Values of the unknown variables of a block; with `hidden`, of its data, with own means at those entries."""
+        live = [name for name in block.names if (name not in self.values if hidden is None else name in hidden)]
         given = {name: value for name, value in {**self.values, **(fed or {})}.items() if name not in live}
         loop = any(parent in live for name in live for parent in self.conditionals[name].parents)
         noise = {
@@ -158,21 +172,22 @@ class Rollout:
                 (self.batch, self.length, self.conditionals[name].size), _like(self.conditionals[name])
             )
             for name in live
-            if frames is None and not (self.mean_emission and name in self.data)
+            if hidden is None and not (self.mean_emission and name in self.data)
         }
         if loop:
-            return self._loop(block, live, given, noise, frames)
+            return self._loop(block, live, given, noise, hidden)
         drawn = {}
         for name in live:
             conditional = self.conditionals[name]
             parameters = conditional(given, self.batch, self.length, self.lengths)
             value = conditional.head.draw(parameters, noise[name]) if name in noise else parameters[0]
-            if frames is not None:
-                value = torch.where(frames, value, self.values[name])
+            if hidden is not None:
+                value = torch.where(hidden[name], value, self.values[name])
             elif name in self.prefix:
-                value = torch.cat([self.prefix[name], value[:, self.prefix[name].shape[1] :]], dim=1)
+                seen = self.prefix[name].shape[1]
+                value = torch.cat([self._continue(name, slice(seen), value[:, :seen]), value[:, seen:]], dim=1)
             drawn[name] = self._hide(value)
-            if frames is None:
+            if hidden is None:
                 self._evaluated[name] = (drawn[name], parameters)
         return drawn
 
@@ -182,11 +197,11 @@ class Rollout:
         live: list[str],
         given: Mapping[str, Tensor],
         noise: Mapping[str, Tensor],
-        frames: Tensor | None,
+        hidden: Mapping[str, Tensor] | None,
     ) -> dict[str, Tensor]:
         states = {name: self.conditionals[name].start(given, self.batch, self.length, self.lengths) for name in live}
         padded = self._valid is not None and block.direction < 0  # a backward loop meets the padding first
-        if len(live) == 1 and frames is None and not padded and live[0] in noise and live[0] not in self.prefix:
+        if len(live) == 1 and hidden is None and not padded and live[0] in noise and live[0] not in self.prefix:
             name = live[0]
             chain = self.conditionals[name].chain(states[name], block.direction, noise[name])
             if chain is not None:
@@ -196,34 +211,53 @@ class Rollout:
         drawn: dict[str, list[Tensor]] = {name: [None] * self.length for name in live}  # type: ignore[list-item]
         evaluated: dict[str, list[Parameters]] = {name: [] for name in live}
         steps = {name: values.unbind(1) for name, values in noise.items()}
-        prefix = {name: self.prefix[name].unbind(1) for name in live if name in self.prefix}
         order = range(self.length) if block.direction >= 0 else range(self.length - 1, -1, -1)
         for t in order:
             for name in live:
                 conditional = self.conditionals[name]
                 parameters, states[name] = conditional.step(states[name], t, drawn)
                 evaluated[name].append(parameters)
-                if name in prefix and t < len(prefix[name]):
-                    value = prefix[name][t]
-                elif name in steps:
-                    value = conditional.head.draw(parameters, steps[name][t])
-                else:
-                    value = parameters[0]
-                if frames is not None:
-                    value = torch.where(frames[:, t], value, self.values[name][:, t])
+                value = conditional.head.draw(parameters, steps[name][t]) if name in steps else parameters[0]
+                if hidden is not None:
+                    value = torch.where(hidden[name][:, t], value, self.values[name][:, t])
+                elif name in self.prefix and t < self.prefix[name].shape[1]:
+                    value = self._continue(name, t, value)
                 if padded:
                     value = value * self._valid[:, t]  # type: ignore[index]
                 drawn[name][t] = value
         values = {name: self._hide(torch.stack(drawn[name], dim=1)) for name in live}
-        if frames is None:
+        if hidden is None:
             for name in live:
                 in_time = evaluated[name] if block.direction >= 0 else evaluated[name][::-1]
                 stacked = tuple(torch.stack(p, dim=1) for p in zip(*in_time, strict=True))
                 self._evaluated[name] = (values[name], stacked)
         return values
 
+    def _continue(self, name: str, steps: int | slice, value: Tensor) -> Tensor:
+        """The known first values of a variable; `value` at entries that are missing there."""
+        known = self.prefix[name][:, steps]
+        return torch.where(self.observed[name][:, steps], known, value) if name in self.observed else known
+
     def _hide(self, value: Tensor) -> Tensor:
         return value if self._valid is None else value * self._valid
+
+
+@lru_cache(maxsize=1024)
+def _check_custom_masks(factorization: Factorization, length: int) -> None:
+    """Refuses a custom mask that at this length reads what its loop has not drawn yet."""
+    for block in factorization.blocks:
+        for i, name in enumerate(block.names if block.direction else ()):
+            for parent in factorization.factor(name).parents:
+                if parent.name not in block.names or parent.relation is None or parent.relation.intervals is not None:
+                    continue
+                drawn = np.tri(length, k=0 if parent.name in block.names[:i] else -1, dtype=bool)
+                ahead = parent.relation.mask(length) & ~(drawn if block.direction > 0 else drawn.T)
+                if ahead.any():
+                    t, s = np.argwhere(ahead)[0] + 1
+                    raise ValueError(
+                        f"the mask {parent.relation} of {factorization.factor(name)} reads {parent.name}_{s} at t={t} "
+                        f"of {length} steps, drawn after {name}_{t}; a mask keeps its direction at every length"
+                    )
 
 
 def _same(value: Tensor, drawn: Tensor) -> bool:

@@ -23,7 +23,7 @@ from torch.distributions import kl_divergence
 
 from ..distributions import Sequence
 from ..graph import analytic_kl
-from ..model import Batch, DynamicalVAE
+from ..model import Batch, DynamicalVAE, repeat
 from ..networks.base import computing_once
 from ..rollout import Rollout
 
@@ -265,7 +265,7 @@ def importance_bound(
     with model._evaluating():
         for first in range(0, particles, at_once):
             count = min(at_once, particles - first)
-            log_weights = _log_weights(model, _repeat(data, count), options)
+            log_weights = _log_weights(model, repeat(data, count), options)
             weights.append(log_weights.unflatten(0, (count, size)))
     log_weights = torch.cat(weights)
     return ImportanceBound(
@@ -273,12 +273,6 @@ def importance_bound(
         khat=_khat(log_weights),
         particles=particles,
     )
-
-
-def _repeat(value: Any, count: int) -> Any:
-    if isinstance(value, Mapping):
-        return {name: _repeat(v, count) for name, v in value.items()}
-    return value.repeat(count, *[1] * (value.dim() - 1))
 
 
 def _log_weights(model: DynamicalVAE, batch: Batch, options: Mapping[str, Any]) -> Tensor:

@@ -58,8 +58,22 @@ class Run:
 
     @property
     def state(self) -> dict[str, Any]:
-        """Step, best step and bound, status, and the fingerprints of the checkpoint's files."""
-        return self._json(STATE)
+        """Step, best step and bound, status, and the fingerprints of the checkpoint's files.
+
+        Raises:
+            CheckpointError: when the file is missing, damaged, or leaves a file of the checkpoint unverified.
+        """
+        state = self._json(STATE)
+        fingerprints = state.get("fingerprints")
+        if not isinstance(fingerprints, dict) or not all(isinstance(value, str) for value in fingerprints.values()):
+            problem = "its fingerprints are no object of texts"
+        elif lacking := {LAST, *([BEST] if state.get("best_step") is not None else [])} - fingerprints.keys():
+            problem = f"it has no fingerprint of {' and '.join(sorted(lacking))}"
+        else:
+            return state
+        raise CheckpointError(
+            f"{self.path / STATE} is damaged: {problem}; copy the run directory whole, or fit again"
+        )
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Write `config.json`.
@@ -125,13 +139,16 @@ class Run:
     def _json(self, name: str) -> dict[str, Any]:
         path = self.path / name
         try:
-            return json.loads(path.read_text())
+            content = json.loads(path.read_text())
         except FileNotFoundError:
             raise CheckpointError(
                 f"{self.path} is no run directory: it has no {name}; give the folder that fit wrote with out=…"
             ) from None
         except ValueError as error:
             raise CheckpointError(f"{path} is damaged, it is not JSON ({error}); fit again") from error
+        if not isinstance(content, dict):
+            raise CheckpointError(f"{path} is damaged, it holds no JSON object but {type(content).__name__}; fit again")
+        return content
 
 
 def weights(model: nn.Module) -> dict[str, Tensor]:
@@ -163,7 +180,7 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
     if path.is_dir():
         path = path / (BEST if BEST in Run(path).state["fingerprints"] else LAST)
     run = Run(path.parent)
-    if run.exists and path.name in run.state["fingerprints"]:
+    if run.exists and (path.name in (BEST, LAST) or path.name in run.state["fingerprints"]):
         content = run.read(path.name)
     elif path.exists():
         content = path.read_bytes()

@@ -11,10 +11,12 @@ import io
 import math
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields, replace
+from numbers import Integral
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -26,9 +28,9 @@ from torch import Tensor, nn
 
 from .batches import Batch, Sequences, Source, each, sequences
 from .bounds import SequenceELBO, Terms
-from .checkpoints import BEST, LAST, OPTIMISER, CheckpointError, Run, load_weights, weights
+from .checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE, CheckpointError, Run, load_weights, weights
 from .objectives import Evidence, Objective
-from .schedules import Schedule, clamp, schedule, to_config
+from .schedules import Constant, Piecewise, Schedule, clamp, schedule, to_config
 from .trackers import JSONLines, Memory, Terminal, Tracker
 
 if TYPE_CHECKING:
@@ -47,6 +49,8 @@ class Training:
         steps: optimiser steps in all.
         batch_size: sequences in a batch, in each process.
         learning_rate: a number or a schedule.
+        decay: last share of the run over which a learning rate that is a number falls linearly to 0; a resumed run
+            with more steps falls later.
         optimizer: "adam", "adamw" or "sgd".
         weight_decay: the optimiser's weight decay.
         gradient_clip: largest norm of the gradient of the loss (nats per frame); None for no limit.
@@ -70,6 +74,7 @@ class Training:
     steps: int = 2000
     batch_size: int = 64
     learning_rate: float | Schedule = 1e-3
+    decay: float = 0.0
     optimizer: Literal["adam", "adamw", "sgd"] = "adam"
     weight_decay: float = 0.0
     gradient_clip: float | None = 10.0
@@ -86,14 +91,33 @@ class Training:
 
     def __post_init__(self) -> None:
         counts = ("steps", "batch_size", "particles", "validate_every", "patience", "log_every", "devices")
-        for name in counts:
+        for name in (*counts, "seed"):
             value = getattr(self, name)
-            if value is not None and value < 1:
+            if value is None and name == "patience":
+                continue
+            if not isinstance(value, Integral):
+                raise TypeError(f"{name} is {value!r}; it must be a whole number")
+            if name in counts and value < 1:
                 raise ValueError(f"{name} is {value}; it must be at least 1")
-        if self.gradient_clip is not None and self.gradient_clip <= 0:
+        for name, largest in (("learning_rate", None), ("weight_decay", None), ("decay", 1), ("self_feeding", 1)):
+            value = schedule(getattr(self, name))
+            if isinstance(value, Constant) and not 0 <= value.value <= (largest or sys.float_info.max):
+                expected = "finite and at least 0" if largest is None else f"between 0 and {largest}"
+                raise ValueError(f"{name} is {value.value}; it must be {expected}")
+        if self.decay and isinstance(self.learning_rate, Schedule):
+            raise ValueError("decay is for a learning rate that is a number; a schedule falls by itself, so leave decay 0")
+        if self.gradient_clip is not None and not self.gradient_clip > 0:
             raise ValueError(f"gradient_clip is {self.gradient_clip}; it must be positive, or None for no limit")
         if self.optimizer not in OPTIMISERS:
             raise ValueError(f"unknown optimizer {self.optimizer!r}; choose {', '.join(OPTIMISERS)}")
+
+    @property
+    def rate(self) -> Schedule:
+        """The learning rate with its decay laid out over `steps`."""
+        rate = schedule(self.learning_rate)
+        if not self.decay:
+            return rate
+        return Piecewise(((0, rate(0)), (round((1 - self.decay) * self.steps), rate(0)), (self.steps, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -251,7 +275,8 @@ def fit(
         NonFiniteError: when a loss or gradient is NaN or infinite, naming step, site and term; the last
             checkpoint stays.
         Interrupted: after Ctrl-C or SIGTERM; the step is complete, the checkpoint written.
-        CheckpointError: when `out` holds a run and `resume` is False, or a run that cannot be resumed.
+        CheckpointError: when `out` holds a run and `resume` is False, or a run that cannot be resumed, such as one
+            fitted on training data with another `fingerprint`.
 
     Example:
         warm_up = Evidence(kl_weight=Linear(0.0, 1.0, steps=500))
@@ -269,6 +294,9 @@ def fit(
         )
     if run is not None and run.exists and not resume:
         raise CheckpointError(f"{out} already holds a run; continue it with resume=True, or choose another directory")
+    record = _record(training, plan, train)
+    if resume and run is not None:
+        _same_data(run, record)
 
     from lightning_fabric import Fabric  # over a second to import, half of what `import dvae` would take
 
@@ -286,7 +314,7 @@ def fit(
         memory, receivers = Memory(), list[Tracker]()
         if fabric.is_global_zero:
             if run is not None:
-                run.write_config((run.config if resume else {}) | _record(training, plan) | dict(config or {}))
+                run.write_config((run.config if resume else {}) | record | dict(config or {}))
                 log = JSONLines(run.path / "log.jsonl")
                 memory = Memory(log.read() if resume else [])
                 receivers = [log]
@@ -364,7 +392,7 @@ class _Loop:
             )
         self.parameters = parameters
         optimizer = OPTIMISERS[training.optimizer](
-            parameters, lr=schedule(training.learning_rate)(0), weight_decay=training.weight_decay, fused=True
+            parameters, lr=training.rate(0), weight_decay=training.weight_decay, fused=True
         )
         self.module, self.optimizer = fabric.setup(_Bound(model, SequenceELBO(training.particles)), optimizer)
         self.generator = torch.Generator().manual_seed(training.seed + fabric.global_rank)
@@ -377,7 +405,7 @@ class _Loop:
         """Take one optimiser step."""
         state, training = self.state, self.training
         stage = _stage(self.plan, state.step)
-        rate = _value(stage.learning_rate, training.learning_rate, state.step)
+        rate = _value(stage.learning_rate, training.rate, state.step)
         feeding = _value(stage.self_feeding, training.self_feeding, state.step)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
@@ -482,8 +510,13 @@ class _Loop:
                 of processes.
         """
         assert self.run is not None
-        load_weights(self.state.model, self.run.path / LAST)
         stored, content = self.run.state, self.run.optimiser_state()
+        if wrong := [name for name, kind in _STORED.items() if not isinstance(stored.get(name, ...), kind)]:
+            raise CheckpointError(
+                f"{self.run.path / STATE} is damaged: {', '.join(wrong)} missing or of another type; copy the run "
+                "directory whole, or fit again"
+            )
+        load_weights(self.state.model, self.run.path / LAST)
         if content["name"] != self.training.optimizer:
             raise CheckpointError(
                 f"{self.run.path} was fitted with optimizer={content['name']!r}, not "
@@ -545,7 +578,8 @@ class _Loop:
             self.run.commit({**self.run.state, "status": "failed"}, {})
 
 
-_STORED = ("step", "best_step", "best_bound", "waited", "status")
+# what state.json holds of `State`, and of which type
+_STORED = {"step": int, "best_step": int | None, "best_bound": float | None, "waited": int, "status": str}
 
 
 class _Signals:
@@ -610,9 +644,22 @@ def _value(first: float | Schedule | None, otherwise: float | Schedule, step: in
     return schedule(otherwise if first is None else first)(step)
 
 
-def _record(training: Training, plan: Sequence[Stage]) -> dict[str, Any]:
-    """The options in JSON's types."""
+def _same_data(run: Run, record: Mapping[str, Any]) -> None:
+    """Refuse to resume on training data that are known to be others."""
+    name = "training_data"
+    before, now = run.config.get(name), record.get(name)
+    if before is not None and now is not None and before != now:
+        raise CheckpointError(
+            f"{run.path} was fitted on other training data: {CONFIG} has the fingerprint {str(before)[:12]}…, these "
+            f"data {now[:12]}…; resume on the same data, or fit anew in another directory"
+        )
+
+
+def _record(training: Training, plan: Sequence[Stage], train: Any) -> dict[str, Any]:
+    """The options, and the training data's fingerprint if they have one, in JSON's types."""
+    fingerprint = getattr(train, "fingerprint", None)
     return {
+        **({"training_data": fingerprint} if isinstance(fingerprint, str) else {}),
         "training": {option.name: to_config(getattr(training, option.name)) for option in fields(training)},
         "stages": [
             {

@@ -17,7 +17,8 @@ class Equations(Method):
     """A model of its own equations.
 
     Args:
-        p, q: the generative and the inference factorization.
+        generative: the model's factorization.
+        inference: the guide's.
         network: "recurrent", "attention", "dense" or "linear", for every factor.
         width: of the networks.
         latents: sizes of the latents, where they differ from `latent`.
@@ -26,8 +27,9 @@ class Equations(Method):
     name: ClassVar[str] = "equations"
     source: ClassVar[str] = "your own"
 
-    p: str = "p(z_t | z_{t-1}) p(x_t | z_t)"
-    q: str = "q(z_t | z_{t-1}, x_{1:T})"
+    # options here, where other methods have constants
+    generative: str = "p(z_t | z_{t-1}) p(x_t | z_t)"  # type: ignore[misc]
+    inference: str = "q(z_t | z_{t-1}, x_{1:T})"  # type: ignore[misc]
     network: str = "recurrent"
     width: int = 64
     latents: dict[str, int] = field(default_factory=dict)
@@ -46,6 +48,6 @@ class Equations(Method):
 
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
         """The model; `residual` holds where p(x_t | ...) reads x_{t-1}."""
-        generative, inference = Factorization.parse(self.p), Factorization.parse(self.q)
+        generative, inference = Factorization.parse(self.generative), Factorization.parse(self.inference)
         sizes = {name: self.latents.get(name, self.latent) for name in generative.variables if name not in data}
         return DynamicalVAE(generative, inference, {**sizes, **data}, self.networks(), self.heads())

@@ -10,10 +10,14 @@ from importlib.metadata import entry_points
 from typing import Any, ClassVar, Literal
 
 from ..heads import FixedNormal, HeadSpec, Normal, StudentT
-from ..inference.objectives import Evidence
+from ..inference.objectives import Evidence, Objective
 from ..inference.schedules import Linear, Schedule
 from ..model import DynamicalVAE
 from ..networks import NetworkSpec
+
+
+class OptionError(ValueError):
+    """An option of a method is out of range."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,9 @@ class Method:
         warm_up: steps over which the KL weight rises from 0 to 1.
         self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over a
             third of training, after the first tenth.
+
+    Raises:
+        OptionError: when an option is out of range.
     """
 
     name: ClassVar[str]
@@ -41,6 +48,14 @@ class Method:
     residual: bool = False
     warm_up: int = 500
     self_feeding: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.latent < 1:
+            raise OptionError(f"latent is {self.latent}; it must be at least 1")
+        if self.warm_up < 0:
+            raise OptionError(f"warm_up is {self.warm_up}; it must be at least 0")
+        if not 0 <= self.self_feeding <= 1:
+            raise OptionError(f"self_feeding is {self.self_feeding}; it must be a probability, between 0 and 1")
 
     def sizes(self) -> dict[str, int]:
         """Sizes of the latents."""
@@ -65,7 +80,7 @@ class Method:
         """The model for data of these sizes, such as {"x": 60}."""
         return DynamicalVAE(self.generative, self.inference, {**self.sizes(), **data}, self.networks(), self.heads())
 
-    def objective(self) -> Evidence:
+    def objective(self) -> Objective:
         """What training minimises."""
         return Evidence(kl_weight=Linear(0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0)
 

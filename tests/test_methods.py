@@ -65,8 +65,8 @@ class TestEquations(Contract):
 class TestEquationsWithAttention(Contract):
     name = "equations"
     options: ClassVar = {
-        "p": "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-2:t-1}, z_t)",
-        "q": "q(w | x_{1:T}) q(z_t | z_{>t}, x_{1:T}, w)",
+        "generative": "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-2:t-1}, z_t)",
+        "inference": "q(w | x_{1:T}) q(z_t | z_{>t}, x_{1:T}, w)",
         "network": "attention",
         "width": 8,
     }

@@ -238,9 +238,8 @@ def test_the_value_of_a_missing_entry_changes_nothing(pair, network):
     latents = {name: value.detach() for name, value in model.guide({**holes, "mask": seen}).items()}
     missing = {**holes, "mask": seen}
     close(log_guide(model, missing, latents), log_guide(model, zeros, latents))
-    masked, full = model.log_joint(missing, latents), model.log_joint(zeros, latents)
-    for name in model.latents:
-        torch.testing.assert_close(masked[name], full[name])
+    others = {name: data[name].masked_fill(~seen[name], 17.0) for name in model.observed}
+    close(model.log_joint(missing, latents), model.log_joint({**others, "mask": seen}, latents))
     everything = {name: torch.ones_like(mask) for name, mask in seen.items()}
     close(model.log_joint({**data, "mask": everything}, latents), model.log_joint(data, latents))
     nothing = {name: torch.zeros_like(mask) for name, mask in seen.items()}
@@ -385,13 +384,28 @@ def test_feeding_on_ones_own_means(pair, network, residual):
     assert not torch.allclose(some["x"], exact["x"])
 
 
-def test_self_feeding_passes_no_gradient_through_the_fed_frames():
+@pytest.mark.parametrize("feeding", [SelfFeeding(1.0), SelfFeeding(1.0, passes=2)])
+def test_self_feeding_passes_no_gradient_through_the_fed_frames(feeding):
     model = build("srnn")
-    loss = Trace_ELBO()(model, model.guide)
-    value = loss(draw(model)["x"], self_feeding=1.0)
-    value.backward()
-    assert torch.isfinite(value)
-    assert not model._rollout(model.generative, model.generator, draw(model), None, 1).history()
+    data = draw(model)
+    values = {**data, **model.guide(data)}  # the fed means depend on these draws, and so on the guide's parameters
+    rollout = model._rollout(model.generative, model.generator, values, None, 1)
+    assert not rollout.history()
+    rollout.feeding = feeding
+    history = rollout.history()
+    assert history.keys() == {"x"}
+    assert not history["x"].requires_grad
+
+    trace = poutine.trace(poutine.condition(model.model, data=values)).get_trace(data, self_feeding=feeding)
+    given = {**values, "x": history["x"].clone()}
+    expected = 0.0
+    for name in model.generative.variables:
+        conditional = model.generator[name]
+        law = conditional.head.distribution(conditional(given, B, T))
+        expected = expected + law.log_prob(values[name]).sum()
+    parameters = list(model.parameters())
+    got, expected = (torch.autograd.grad(loss, parameters, retain_graph=True) for loss in (trace.log_prob_sum(), expected))
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-9)
 
 
 # ------------------------------------------------------------------------------------------ parameters of one's own
@@ -494,8 +508,8 @@ X = torch.zeros(B, T, 3, dtype=torch.float64)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sizes": {"z": 2}}, "x"),
-        ({"sizes": {"z": 2, "x": 3, "y": 1}}, "y"),
+        ({"sizes": {"z": 2}}, "sizes missing for x; needed are z, x"),
+        ({"sizes": {"z": 2, "x": 3, "y": 1}}, "sizes given for y, not in the equations, which have z, x"),
         ({"sizes": {"z": 0, "x": 3}}, "the size of z is 0; sizes are positive"),
         (
             {"network": {"p(y)": Dense()}},
@@ -508,8 +522,11 @@ X = torch.zeros(B, T, 3, dtype=torch.float64)
             r"the head of 'p\(x\)' is Linear.*; expected a description such as Normal",
         ),
         ({"priors": {"z": priors.NormalPrior(2)}}, r"a prior replaces a factor p\(z\) of a static latent"),
-        ({"inference": "q(z_t | x_t) q(y_t | x_t)"}, "y"),
-        ({"inference": "q(u_t | x_t)"}, "z"),
+        (
+            {"inference": "q(z_t | x_t) q(y_t | x_t)"},
+            r"q\(y_t \| x_t\): no latent y in .*; remove this factor, or add p\(y_t \| \.\.\.\) to the generative model",
+        ),
+        ({"inference": "q(u_t | x_t)"}, r"q\(u_t \| x_t\): no latent u in .*; remove this factor"),
     ],
 )
 def test_models_that_cannot_be(change, message):
@@ -545,7 +562,7 @@ def test_models_that_cannot_be(change, message):
         (lambda m: m.model({"x": X, "mask": {"y": X == 0}}), "a mask of y, but the batch holds no data of that name"),
         (
             lambda m: m.model({"x": X, "lengths": torch.tensor([5, 6, 1])}),
-            r"lengths must be \(B,\) numbers between 1 and 5",
+            r"lengths must be \(B,\) whole numbers between 1 and 5",
         ),
         (lambda m: m.model({"x": X, "lengths": torch.tensor([5, 0, 1])}), "lengths must be"),
         (lambda m: m.model({"x": X, "lengths": torch.tensor([5, 1])}), "lengths must be"),

@@ -22,10 +22,16 @@ import numpy as np
 from numpy.lib import format as npy
 
 from .data import Clip, MotionSet
-from .skeleton import Skeleton
+from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton
 
-LARGEST_MEMBER = 4 * 2**30
-"""Bytes that one member may unpack to: a small zip can declare, and hold, far more than any machine has."""
+LARGEST = 4 * 2**30
+"""Bytes that a file may unpack to: a small zip can declare, and hold, far more than any machine has."""
+
+_ARCHIVES = (
+    ({f"S{i}" for i in (1, 5, 6, 7, 8, 9, 11)}, 32, HUMAN36M, HUMAN36M_KEPT),
+    ({f"{part}/S{i}" for part in ("Train", "Validate") for i in (1, 2, 3)}, 15, HUMANEVA, None),
+)
+"""VideoPose3D's archives: subjects, joints, skeleton, and which of the joints make it up."""
 
 
 def load(
@@ -40,7 +46,8 @@ def load(
     An npz with the member `positions_3d` is VideoPose3D's archive; any other npz holds one (F, J, 3) array
     per clip under the key "split/clip" (a key without a slash belongs to the split "all"). `skeleton.json`
     and `labels.csv` (one row per clip with the columns split, clip and whatever is known) beside the file are
-    read too.
+    read too. VideoPose3D's archives of Human3.6M and HumanEva-I have no skeleton.json; they are known by their
+    subjects and joints.
 
     Args:
         path: the npz file.
@@ -61,10 +68,13 @@ def load(
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    skeleton = skeleton or _skeleton_beside(path)
+    found = _read_clips(path)
+    if skeleton is None:
+        skeleton, kept = _skeleton_of(path, found)
+        joints = kept if joints is None else joints
     known = _read_labels(path, Path(labels) if labels else None)
     clips = []
-    for split, name, positions in _read_clips(path):
+    for split, name, positions in found:
         if joints is not None and positions.ndim == 3 and positions.shape[1] > max(joints):
             positions = positions[:, list(joints)]
         clips.append(Clip(split, name, positions, known.get((split, name), known.get((None, name), {}))))
@@ -98,10 +108,18 @@ def save(path: str | Path, motion: MotionSet) -> None:
             writer.writerows({**clip.labels, "split": clip.split, "clip": clip.name} for clip in motion)
 
 
-def _skeleton_beside(path: Path) -> Skeleton:
+def _skeleton_of(
+    path: Path, clips: Sequence[tuple[str, str, np.ndarray]]
+) -> tuple[Skeleton, tuple[int, ...] | None]:
+    """The skeleton beside a file or of a known archive, and which of the file's joints make it up."""
     beside = path.with_name("skeleton.json")
     if beside.is_file():
-        return Skeleton.from_json(beside)
+        return Skeleton.from_json(beside), None
+    splits = {split for split, _, _ in clips}
+    counts = {positions.shape[1] for _, _, positions in clips if positions.ndim == 3}
+    for subjects, joints, skeleton, kept in _ARCHIVES:
+        if splits and splits <= subjects and joints in counts:
+            return skeleton, kept
     raise ValueError(
         f"{path}: which skeleton? Put a skeleton.json beside it "
         '({"joint_names": [...], "parents": [-1, 0, ...], "joints_left": [...], "joints_right": [...], '
@@ -143,10 +161,6 @@ class _Member(NamedTuple):
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Member:
-    if info.file_size > LARGEST_MEMBER:
-        raise ValueError(
-            f"{info.filename} would unpack to {info.file_size:,} bytes, at most {LARGEST_MEMBER:,} are read"
-        )
     file = io.BytesIO(archive.read(info))  # whole, so that the zip's checksum is verified before anything is believed
     version = npy.read_magic(file)
     if version not in ((1, 0), (2, 0)):
@@ -159,6 +173,9 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Member:
 def _read_clips(path: Path) -> list[tuple[str, str, np.ndarray]]:
     try:
         with zipfile.ZipFile(path) as archive:
+            unpacked = sum(info.file_size for info in archive.infolist())
+            if unpacked > LARGEST:
+                raise ValueError(f"it would unpack to {unpacked:,} bytes, at most {LARGEST:,} are read")
             members = [_read_member(archive, info) for info in archive.infolist() if not info.is_dir()]
         if [member.name for member in members] == ["positions_3d"]:
             return _nested_clips(members[0])

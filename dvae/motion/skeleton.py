@@ -230,7 +230,7 @@ HUMAN36M = Skeleton(
 """The 17 joints of Human3.6M that the papers keep, as in VideoPose3D's archive: z up, 50 Hz."""
 
 HUMAN36M_KEPT = (0, 1, 2, 3, 6, 7, 8, 12, 13, 14, 15, 17, 18, 19, 25, 26, 27)
-"""Which of the archive's 32 joints these are: `load(path, skeleton=HUMAN36M, joints=HUMAN36M_KEPT)`."""
+"""Which of the archive's 32 joints these are; `load` takes them by itself from an archive of 32 joints."""
 
 HUMANEVA = Skeleton(
     names=(

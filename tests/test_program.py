@@ -1,0 +1,179 @@
+"""What the program does with what is not there, not in order, or not a tensor."""
+
+import numpy as np
+import pyro
+import pytest
+import torch
+from pyro.infer import SVI, Trace_ELBO
+
+import dvae
+from dvae import DynamicalVAE, SequenceELBO
+from dvae.networks import Attention, Dense, Recurrent
+
+SRNN = ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})")
+
+
+def srnn(**options) -> DynamicalVAE:
+    return DynamicalVAE(*SRNN, sizes={"z": 2, "x": 3}, network=Recurrent(8, hidden=(8,)), **options).double()
+
+
+# ------------------------------------------------------------------------------------------------- missing entries
+
+
+def gap(x: torch.Tensor, *steps: int) -> dict[str, torch.Tensor]:
+    mask = torch.ones_like(x, dtype=torch.bool)
+    mask[:, list(steps)] = False
+    return {"x": x.masked_fill(~mask, torch.nan), "mask": mask}
+
+
+def test_the_model_reads_its_own_mean_in_place_of_a_missing_entry():
+    model = srnn()
+    x, z = torch.randn(4, 6, 3).double(), torch.randn(4, 6, 2).double()
+    batch = gap(x, 2)
+    with torch.no_grad():
+        conditional = model.generator["x"]
+        mean = conditional({"x": x, "z": z}, 4, 6)[0][:, 2]
+        filled = x.clone()
+        filled[:, 2] = mean
+        loc, scale = conditional({"x": filled, "z": z}, 4, 6)
+        log_prob = torch.distributions.Normal(loc, scale).log_prob(x)
+        expected = log_prob.sum((1, 2)) - log_prob[:, 2].sum(-1)
+    torch.testing.assert_close(model.log_joint(batch, {"z": z})["x"], expected)
+
+
+def test_a_gap_does_not_wreck_the_next_frame_of_a_residual_model():
+    model = srnn(heads={"p(x)": dvae.heads.FixedNormal(residual=True)})
+    with torch.no_grad():
+        for parameter in model.generator["x"].head.parameters():
+            parameter.zero_()
+    x = torch.full((1, 6, 3), 5.0).double()
+    means = model.reconstruct(gap(x, 2))["x"]
+    assert (means[:, :, 1:] == 5).all()
+    continued = model.forecast(gap(x, 2, 5), horizon=2)["x"]
+    assert (continued == 5).all()
+
+
+def test_removing_frames_of_a_well_predicted_sequence_raises_no_alarm():
+    """A missing frame takes its own log-likelihood along, and little of its neighbours'."""
+    model = srnn(heads={"p(x)": dvae.heads.FixedNormal(scale=0.05, residual=True)})
+    with torch.no_grad():
+        for parameter in model.generator["x"].head.parameters():
+            parameter.zero_()
+    x = torch.full((2, 20, 3), 0.8).double()
+    z = torch.zeros(2, 20, 2).double()
+    whole, without = model.log_joint(x, {"z": z})["x"], model.log_joint(gap(x, 9), {"z": z})["x"]
+    per_frame = whole - model.log_joint(x[:, :19], {"z": z[:, :19]})["x"]
+    torch.testing.assert_close(without, whole - per_frame)
+
+
+@pytest.mark.parametrize("options", [{}, {"self_feeding": 0.5}])
+def test_no_gap_is_no_change(options):
+    model = srnn()
+    x = torch.randn(4, 6, 3).double()
+    bounds = []
+    for batch in ({"x": x}, {"x": x, "mask": torch.ones_like(x, dtype=torch.bool)}):
+        pyro.set_rng_seed(0)
+        bounds.append(SequenceELBO().terms(model, batch, **options).bound)
+    torch.testing.assert_close(*bounds)
+
+
+def test_padding_is_unseen_by_self_feeding_in_passes():
+    model = DynamicalVAE(
+        "p(z_t) p(x_t | z_t) p(y_t | x_{t+1}, z_t)",
+        "q(z_t | x_t)",
+        {"z": 1, "x": 1, "y": 1},
+        network=Dense((8,)),
+        observed=("x", "y"),
+    ).double()
+    feeding = dvae.SelfFeeding(1.0, passes=5)
+    data = {name: torch.randn(1, 5, 1).double() for name in "xyz"}
+
+    def log_prob(length: int, lengths: torch.Tensor | None) -> torch.Tensor:
+        batch = {name: data[name][:, :length] for name in "xy"}
+        batch |= {} if lengths is None else {"lengths": lengths}
+        program = pyro.poutine.condition(model.model, data={"z": data["z"][:, :length]})
+        trace = pyro.poutine.trace(program).get_trace(batch, self_feeding=feeding)
+        trace.compute_log_prob()
+        return trace.nodes["y"]["log_prob"]
+
+    torch.testing.assert_close(log_prob(5, torch.tensor([3])), log_prob(3, None))
+
+
+# ------------------------------------------------------------------------------------------------------ custom masks
+
+
+def test_a_custom_mask_that_turns_ahead_at_some_length_is_refused_there():
+    def leak(length: int) -> np.ndarray:
+        mask = np.tri(length, k=-1, dtype=bool)
+        if length > 8:
+            mask[0, 8] = True
+        return mask
+
+    model = DynamicalVAE(
+        "p(z_t) p(x_t | z_t, x_{leak})", "q(z_t | x_t)", {"z": 1, "x": 1}, network=Attention(8, 2), masks={"leak": leak}
+    )
+    SequenceELBO().terms(model, torch.randn(2, 8, 1))
+    with pytest.raises(ValueError, match=r"the mask {leak} of p\(x_t .* reads x_9 at t=1 of 12 steps"):
+        SequenceELBO().terms(model, torch.randn(2, 12, 1))
+    with pytest.raises(ValueError, match="keeps its direction at every length"):
+        model.sample(2, length=12)
+
+
+# ---------------------------------------------------------------------------------------------------------- engines
+
+
+def test_pyros_svi_trains_every_parameter_and_keeps_models_apart():
+    models = [srnn(), srnn()]
+    x = torch.randn(4, 6, 3).double()
+    before = [[p.detach().clone() for p in model.parameters()] for model in models]
+    for model in models:
+        svi = SVI(model.model, model.guide, pyro.optim.Adam({"lr": 1e-2}), Trace_ELBO())
+        for _ in range(2):
+            svi.step(x)
+    for model, old in zip(models, before, strict=True):
+        assert all((a != b).any() for a, b in zip(old, model.parameters(), strict=True))
+    assert not torch.equal(next(models[0].parameters()), next(models[1].parameters()))
+
+
+@pytest.mark.parametrize("name", [name for name in dvae.methods() if name != "equations"])
+def test_mixed_precision_trains(name):
+    model = dvae.method(name).build({"x": 3})
+    with torch.autocast("cpu", torch.bfloat16):
+        bound = SequenceELBO().terms(model, torch.randn(4, 6, 3), self_feeding=0.5).bound.mean()
+    bound.backward()
+    assert torch.isfinite(bound)
+    assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
+
+
+# ------------------------------------------------------------------------------------------------------------ inputs
+
+
+def test_arrays_are_taken_in_the_models_precision():
+    model = srnn()
+    x = np.random.default_rng(0).normal(size=(2, 4, 3))
+    assert model.forecast(x, 2)["x"].dtype == torch.float64
+    assert model.float().forecast({"x": x}, 2)["x"].dtype == torch.float32
+    frames = SequenceELBO().terms(model, {"x": x, "lengths": [4, 2]}).frames
+    assert frames.tolist() == [4, 2]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda m, x: m.forecast(x[:0], 2), "holds no sequences"),
+        (lambda m, x: m.guide({"x": x, "lengths": [4, 2.5]}), "whole numbers between 1 and 4"),
+        (lambda m, x: m.log_joint(x, {}), "a value of every latent; missing are z"),
+        (lambda m, x: m.log_joint(x, {"z": x}), r"z has shape \(2, 4, 3\), expected \(B, T, 2\)"),
+        (lambda m, x: m.model(x, self_feeding=1.5), r"a probability in \[0, 1\]"),
+        (lambda m, x: m.model(length=4, prefix={"v": x}), "of one of the latents z"),
+        (lambda m, x: m.model(length=3, size=2, prefix={"z": x[..., :2]}), "O at most 3"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_a_sentence(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(srnn(), torch.randn(2, 4, 3).double())
+
+
+def test_names_that_torch_needs_are_refused():
+    with pytest.raises(ValueError, match="cannot be named 'keys'"):
+        DynamicalVAE("p(keys_t) p(x_t | keys_t)", "q(keys_t | x_t)", {"keys": 1, "x": 1})
