@@ -14,7 +14,7 @@ import dvae
 from dvae.motion.plot import futures
 
 OUT = Path("demo")
-STEPS = {"hit-dvae": 300, "srnn": 400}
+STEPS = {"hit-dvae": 400, "srnn": 700}
 
 people = dvae.motion.simulate(clips=160, frames=150, seed=0)
 protocol = dvae.motion.PROTOCOLS["simulated"]
@@ -22,7 +22,7 @@ train, validation, test = (dvae.motion.windows(people, protocol, split) for spli
 
 models = {}
 for name, steps in STEPS.items():
-    method = dvae.method(name, latent=8, emission="fixed", self_feeding=1.0, warm_up=steps // 3)
+    method = dvae.method(name, latent=8, self_feeding=1.0, warm_up=steps // 3)
     print(f"\n[bold]{name}[/bold]  {method.generative}   {method.inference}", method.source)
     torch.manual_seed(0)
     models[name] = method.build({"x": train.size})
@@ -32,7 +32,8 @@ for name, steps in STEPS.items():
         validation,
         steps=steps,
         batch_size=32,
-        learning_rate=3e-3,
+        learning_rate={"hit-dvae": 3e-3, "srnn": 1e-3}[name],
+        decay=0.5,
         objective=method.objective(),
         self_feeding=method.feeding(steps),
     )

@@ -12,9 +12,9 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from .graph import audit
 from .inference.checkpoints import Run
 from .inference.evaluate import evaluate as evaluate_models
 from .inference.fit import Fit, Interrupted, Training
-from .inference.schedules import Piecewise
+from .inference.trackers import TensorBoard
 from .models import method as method_by_name
 from .models import methods, runs
 from .models.method import Method
@@ -65,7 +65,9 @@ def list_methods() -> None:
     for column in ("method", "equations", "source"):
         table.add_column(column)
     for name, kind in methods().items():
-        equations = f"{kind.generative}\n{kind.inference}" if hasattr(kind, "generative") else "--p and --q"
+        equations = (
+            "--generative and --inference" if _asks_for_equations(kind) else f"{kind.generative}\n{kind.inference}"
+        )
         table.add_row(name, equations, kind.source)
     OUT.print(table, highlight=False)
 
@@ -87,12 +89,14 @@ def show(
         steps: time steps in the figure.
         out: save the unrolled graphs of model and guide to this file (png, pdf, svg).
     """
+    _at_least(1, steps=steps)
+    _check_figure(out, "out")
     if method is not None and (generative or inference):
         raise UsageError("give the name of a method or two equations, not both")
     if method is not None:
         with _arguments():
             kind = method_by_name(method)
-        if not hasattr(kind, "generative"):
+        if _asks_for_equations(kind):
             raise UsageError(f"{method} has no equations of its own; give --generative and --inference")
         generative, inference = kind.generative, kind.inference
     if not generative or not inference:
@@ -128,9 +132,10 @@ def fit(
     validate_every: int = Training.validate_every,
     patience: int | None = Training.patience,
     seed: int = Training.seed,
-    accelerator: str = Training.accelerator,
+    accelerator: Literal["auto", "cpu", "cuda", "mps"] = "auto",
     devices: int = Training.devices,
     precision: Literal["32-true", "64-true", "bf16-mixed", "bf16-true"] = Training.precision,
+    tensorboard: bool = False,
 ) -> None:
     """Fit a method, or equations of your own, to motion data.
 
@@ -150,10 +155,13 @@ def fit(
         validate_every: steps from one validation and checkpoint to the next.
         patience: validations without a better bound after which to stop.
         seed: of initial weights, batches and draws.
-        accelerator: where to compute: auto, cpu, cuda or mps.
+        accelerator: where to compute.
         devices: number of devices.
         precision: of the computation.
+        tensorboard: write TensorBoard files to the run directory too.
     """
+    if out.is_file():
+        raise UsageError(f"--out {out} is a file; name a directory for the run")
     if Run(out).exists:
         raise ValueError(f"{out} already holds a run; continue it with: dvae resume {out}, or choose another directory")
     with _arguments():
@@ -161,7 +169,8 @@ def fit(
         training = Training(
             steps=steps,
             batch_size=batch_size,
-            learning_rate=_falling(learning_rate, steps, decay),
+            learning_rate=learning_rate,
+            decay=decay,
             optimizer=optimizer,
             validate_every=validate_every,
             patience=patience,
@@ -170,20 +179,34 @@ def fit(
             devices=devices,
             precision=precision,
         )
-    result = runs.fit(method, runs.Data.open(data, protocol, skip_bad), out, training)
-    _report(result)
+    opened = runs.Data.open(data, protocol, skip_bad)
+    _report(runs.fit(method, opened, out, training, trackers=[TensorBoard(out)] if tensorboard else []))
 
 
 @app.command
-def resume(run: Annotated[Path, tyro.conf.Positional], data: str | None = None, steps: int | None = None) -> None:
+def resume(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str | None = None,
+    steps: int | None = None,
+    learning_rate: float | None = None,
+    tensorboard: bool = False,
+) -> None:
     """Continue a run from its last checkpoint.
+
+    The learning rate falls, and self-feeding rises, over the same shares of the run when it is made longer.
 
     Args:
         run: the run directory.
         data: where the data lie now, if the path in the run no longer leads there.
         steps: optimiser steps in all, to make the run longer.
+        learning_rate: step size of the optimiser from here on.
+        tensorboard: write TensorBoard files to the run directory too.
     """
-    _report(runs.resume(run, data, **({} if steps is None else {"steps": steps})))
+    given = {"steps": steps, "learning_rate": learning_rate}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    with _arguments():
+        Training(**options)
+    _report(runs.resume(run, data, [TensorBoard(run)] if tensorboard else [], **options))
 
 
 @app.command(help="Score runs on test windows.")
@@ -213,6 +236,10 @@ def evaluate(
     """
     if not run:
         raise UsageError("give at least one run directory")
+    _at_least(1, samples=samples, batch_size=batch_size)
+    _at_least(0, bound_particles=bound_particles)
+    _check_file(out, "out")
+    _check_figure(figure, "figure")
     loaded = [runs.load(path, data) for path in run]
     first, windows = loaded[0], loaded[0].data.windows("test")
     for other in loaded[1:]:
@@ -267,8 +294,9 @@ def forecast(
         data: where the data lie now, if the path in the run no longer leads there.
         figure: save a figure of the first window's futures.
     """
-    if samples < 1 or (horizon is not None and horizon < 1):
-        raise UsageError(f"samples and horizon are at least 1, got {samples} and {horizon}")
+    _at_least(1, samples=samples, horizon=horizon)
+    _check_file(out, "out")
+    _check_figure(figure, "figure")
     loaded = runs.load(run, data)
     protocol = loaded.data.protocol
     if clip is None:
@@ -379,10 +407,32 @@ def _arguments() -> Iterator[None]:
         raise UsageError(str(error)) from error
 
 
-def _falling(rate: float, steps: int, decay: float) -> Piecewise:
-    if not 0 <= decay <= 1:
-        raise UsageError(f"decay is a share of the run, between 0 and 1; got {decay}")
-    return Piecewise(((0, rate), (round((1 - decay) * steps), rate), (steps, rate * (decay == 0))))
+def _at_least(smallest: int, **options: int | None) -> None:
+    for name, value in options.items():
+        if value is not None and value < smallest:
+            raise UsageError(f"--{name.replace('_', '-')} is {value}; it must be at least {smallest}")
+
+
+def _check_file(path: Path | None, option: str) -> None:
+    """Refuse, before any work, a path that cannot become a file."""
+    if path is not None and path.is_dir():
+        raise UsageError(f"--{option} {path} is a directory; name a file")
+
+
+def _check_figure(path: Path | None, option: str) -> None:
+    """Refuse, before any work, a path that cannot become a figure."""
+    _check_file(path, option)
+    if path is not None:
+        from matplotlib.backend_bases import FigureCanvasBase
+
+        known = FigureCanvasBase.get_supported_filetypes()
+        if path.suffix.lower().removeprefix(".") not in known:
+            raise UsageError(f"--{option} {path}: the end of the name is the format, one of {', '.join(sorted(known))}")
+
+
+def _asks_for_equations(kind: Method | type[Method]) -> bool:
+    """Whether the equations of a method are options of it."""
+    return "generative" in {option.name for option in fields(kind)}
 
 
 def _report(result: Fit) -> None:

@@ -11,8 +11,8 @@ autoencoders: a comprehensive review* (arXiv 2008.12595).
     relation := t | {t-k} | {t+k} | {<t} | {<=t} | {>t} | {>=t} | {a:b} | {1:T} | {a name given in masks}
                 where a is 1, t, t-k or t+k and b is T, t, t-k or t+k
 
-LaTeX spellings (\mid, \leq, \geq, \prod_t) are understood. A parent without a factor of its own is *context*:
-given, never drawn.
+LaTeX spellings (\mid, \leq, \geq, \prod_t) are understood, and fonts (\mathbf{z}_t) ignored. A parent without a
+factor of its own is *context*: given, never drawn.
 """
 
 from __future__ import annotations
@@ -38,7 +38,12 @@ Node = tuple[str, int | None]
 MaskFunction = Callable[[int], np.ndarray]
 
 KNOWN_RELATIONS = "t, {t-1}, {t+1}, {t-k}, {t-a:t+b}, {<t}, {<=t}, {>t}, {>=t}, {1:t}, {t:T}, {1:T}"
-RESERVED = {"lengths": "the number of valid steps", "mask": "which entries are observed"}
+RESERVED = {
+    "lengths": "the batch's entry for the number of valid steps",
+    "mask": "the batch's entry for which entries are observed",
+    "sequences": "the name of the plate over the batch",
+}
+FONT = r"\\(?:math(?:bf|rm|it|sf)|boldsymbol|bm)(?![a-z])\s*"
 
 
 class NotationError(ValueError):
@@ -90,7 +95,9 @@ class Relation:
         """The relation of a subscript, given without braces; ValueError for one the grammar lacks."""
         for sign, spelling in {"<=": r"\\leq?", ">=": r"\\geq?", "<": r"\\lt", ">": r"\\gt"}.items():
             text = re.sub(rf"(?:{spelling})(?![a-z])", sign, text)
-        text = re.sub(r"\s|\\[,;:! ]", "", text.replace("≤", "<=").replace("≥", ">="))
+        for sign, spelling in {"<=": "≤", ">=": "≥", "-": "\N{MINUS SIGN}"}.items():
+            text = text.replace(spelling, sign)
+        text = re.sub(r"\s|\\[,;:! ]", "", text)
         if single := re.fullmatch(r"t([+-]\d+)?", text):
             offset = int(single[1] or 0)
             return cls.of([(offset, offset)])
@@ -361,7 +368,10 @@ class Factorization:
         Raises:
             NotationError: the text cannot be read; the message shows the column.
             ValueError: it can be read but not drawn (see the class).
+            TypeError: not text at all.
         """
+        if not isinstance(text, str):
+            raise TypeError(f'equations are text such as "p(z_t | z_{{t-1}}) p(x_t | z_t)", got {text!r}')
         return cls(*_Reader(text, masks or {}).factorization())
 
     # what there is -----------------------------------------------------------------------------------------
@@ -566,7 +576,9 @@ class _Reader:
 
     SPACE = re.compile(r"(?:\s|\\[,;:! ]|\\q?quad)*")
     BETWEEN = re.compile(r"(?:\s|\\[,;:! ]|\\q?quad|[*·,]|\\cdot|(?:∏|\\prod)(?:_\{t(?:=1\}\^\{?T)?\}|_t)?)*")
-    NAME = re.compile(r"[^\W\d_]\w*")
+    NAME = re.compile(rf"(?:{FONT})?([^\W\d_]\w*)")
+    NAME_IN_BRACES = re.compile(rf"{FONT}\{{\s*([^\W\d_](?:\w|\\_)*)\s*\}}(\w*)")
+    SUBSCRIPT = re.compile(r"\{((?:[^{}]|\{[^{}]*\})*)\}")
 
     def __init__(self, text: str, masks: Mapping[str, Relation | MaskFunction]) -> None:
         self.text, self.at = text, 0
@@ -609,7 +621,7 @@ class _Reader:
         return factors[0].kind, tuple(factors)
 
     def factor(self) -> Factor:
-        head = self.take(r"([pq])(?:_\{?\\?\w+\}?)?\s*(?:\\left)?\(")
+        head = self.take(r"([pq])(?:_[^\s()|]+?)?\s*(?:\\left)?\(")
         if head is None:
             self.fail("expected a factor: p(...) or q(...)")
         kind: Literal["p", "q"] = "p" if head[1] == "p" else "q"
@@ -643,18 +655,18 @@ class _Reader:
         return relation == ALL or relation.intervals is None
 
     def variable(self) -> Parent:
-        name = self.take(self.NAME)
+        name = self.take(self.NAME_IN_BRACES) or self.take(self.NAME)
         if name is None:
             self.fail("expected a variable: a name, or a name with a subscript such as z_t or z_{t-1}")
-        start, word, relation = name.start(), name[0], None
+        start, word, relation = name.start(), "".join(name.groups()).replace(r"\_", "_"), None
         if word.endswith("_") and self.text[self.at : self.at + 1] == "{":
             word, relation = word[:-1], self.relation()
         elif word.endswith("_t"):
             word, relation = word[:-2], NOW
-            if shift := self.take(r"[+-]\s*\d+|[:<>=]"):
+            if shift := self.take(r"[+\-\N{MINUS SIGN}]\s*\d+|[:<>=]"):
                 self.fail(
                     f"braces are missing: write {word}_{{t{shift[0]}}}"
-                    if shift[0][0] in "+-"
+                    if shift[0][-1].isdigit()
                     else f"braces are missing: write {word}_{{...}}",
                     start,
                 )
@@ -668,7 +680,7 @@ class _Reader:
                 start,
             )
         if word in RESERVED:
-            self.fail(f"{word!r} is the batch's entry for {RESERVED[word]}; choose another name", start)
+            self.fail(f"{word!r} is {RESERVED[word]}; choose another name", start)
         local = relation is not None
         if self.local.setdefault(word, local) != local:
             was, now = ("per step", "per sequence") if self.local[word] else ("per sequence", "per step")
@@ -681,10 +693,10 @@ class _Reader:
 
     def relation(self) -> Relation:
         opening = self.at
-        closing = self.text.find("}", opening)
-        if closing < 0:
+        subscript = self.take(self.SUBSCRIPT)
+        if subscript is None:
             self.fail('"{" without "}"', opening)
-        inside, self.at = self.text[opening + 1 : closing], closing + 1
+        inside = re.sub(FONT + r"\{([^{}]*)\}", r"\1", subscript[1])
         if inside.strip() in self.masks:
             return self.masks[inside.strip()]
         try:

@@ -71,9 +71,7 @@ class Run:
             problem = f"it has no fingerprint of {' and '.join(sorted(lacking))}"
         else:
             return state
-        raise CheckpointError(
-            f"{self.path / STATE} is damaged: {problem}; copy the run directory whole, or fit again"
-        )
+        raise CheckpointError(f"{self.path / STATE} is damaged: {problem}; copy the run directory whole, or fit again")
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Write `config.json`.

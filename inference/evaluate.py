@@ -437,6 +437,10 @@ def evaluate(
     models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
     if samples < 1:
         raise ValueError(f"every method needs at least 1 forecast per window, not samples={samples}")
+    if batch_size < 1 or bound_particles < 0:
+        raise ValueError(
+            f"batch_size is at least 1 and bound_particles at least 0, not {batch_size} and {bound_particles}"
+        )
     held = _hold(windows)
     baselines = _references(held, samples, training_windows) if references else {}
     if clash := models.keys() & baselines.keys():

@@ -105,7 +105,9 @@ class Training:
                 expected = "finite and at least 0" if largest is None else f"between 0 and {largest}"
                 raise ValueError(f"{name} is {value.value}; it must be {expected}")
         if self.decay and isinstance(self.learning_rate, Schedule):
-            raise ValueError("decay is for a learning rate that is a number; a schedule falls by itself, so leave decay 0")
+            raise ValueError(
+                "decay is for a learning rate that is a number; a schedule falls by itself, so leave decay 0"
+            )
         if self.gradient_clip is not None and not self.gradient_clip > 0:
             raise ValueError(f"gradient_clip is {self.gradient_clip}; it must be positive, or None for no limit")
         if self.optimizer not in OPTIMISERS:
@@ -294,7 +296,7 @@ def fit(
         )
     if run is not None and run.exists and not resume:
         raise CheckpointError(f"{out} already holds a run; continue it with resume=True, or choose another directory")
-    record = _record(training, plan, train)
+    record = {} if run is None else _record(training, plan, train)
     if resume and run is not None:
         _same_data(run, record)
 

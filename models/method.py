@@ -16,10 +16,6 @@ from ..model import DynamicalVAE
 from ..networks import NetworkSpec
 
 
-class OptionError(ValueError):
-    """An option of a method is out of range."""
-
-
 @dataclass(frozen=True)
 class Method:
     """A method of the literature. A subclass is one file of this package: its equations, networks and sizes.
@@ -35,7 +31,7 @@ class Method:
             third of training, after the first tenth.
 
     Raises:
-        OptionError: when an option is out of range.
+        ValueError: when an option is out of range.
     """
 
     name: ClassVar[str]
@@ -51,11 +47,11 @@ class Method:
 
     def __post_init__(self) -> None:
         if self.latent < 1:
-            raise OptionError(f"latent is {self.latent}; it must be at least 1")
+            raise ValueError(f"latent is {self.latent}; it must be at least 1")
         if self.warm_up < 0:
-            raise OptionError(f"warm_up is {self.warm_up}; it must be at least 0")
+            raise ValueError(f"warm_up is {self.warm_up}; it must be at least 0")
         if not 0 <= self.self_feeding <= 1:
-            raise OptionError(f"self_feeding is {self.self_feeding}; it must be a probability, between 0 and 1")
+            raise ValueError(f"self_feeding is {self.self_feeding}; it must be a probability, between 0 and 1")
 
     def sizes(self) -> dict[str, int]:
         """Sizes of the latents."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,8 @@ from .. import motion
 from ..inference.checkpoints import CONFIG, CheckpointError, Run, load_weights
 from ..inference.fit import Callback, Fit, Training
 from ..inference.fit import fit as fit_model
-from ..inference.objectives import Evidence
 from ..inference.schedules import from_config as option_from_config
+from ..inference.trackers import Tracker
 from ..model import DynamicalVAE
 from ..motion import PROTOCOLS, MotionSet, Protocol, Windows
 from .method import Method, from_config
@@ -129,6 +130,7 @@ def fit(
     out: str | os.PathLike[str],
     training: Training | None = None,
     callbacks: Sequence[Callback] = (),
+    trackers: Sequence[Tracker] = (),
 ) -> Fit:
     """Fits a method to motion data, in a run directory that `load` and `resume` read.
 
@@ -138,8 +140,17 @@ def fit(
         out: the run directory.
         training: the other options; its seed is also that of the initial weights.
         callbacks: hooks of the loop.
+        trackers: further receivers of the log's rows.
+
+    Raises:
+        ValueError: `training` sets the self-feeding, which is the method's to tell.
     """
     training = training or Training()
+    if training.self_feeding != 0:
+        raise ValueError(
+            f"self-feeding is an option of the method here; instead of Training(self_feeding={training.self_feeding}) "
+            f"write dvae.method({method.name!r}, self_feeding=…)"
+        )
     train, validation = data.windows("train"), data.windows("validation")
     with torch.random.fork_rng():
         torch.manual_seed(training.seed)
@@ -152,36 +163,45 @@ def fit(
         out=out,
         config={"method": method.config(), **data.config()},
         callbacks=callbacks,
+        trackers=trackers,
         **vars(replace(training, self_feeding=method.feeding(training.steps))),
     )
 
 
-def resume(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None, **options: Any) -> Fit:
-    """Continues a run from its last checkpoint, under the options and schedules it was started with.
+def resume(
+    path: str | os.PathLike[str],
+    data: str | os.PathLike[str] | None = None,
+    trackers: Sequence[Tracker] = (),
+    **options: Any,
+) -> Fit:
+    """Continues a run from its last checkpoint, under the options it was started with.
+
+    What is a share of the run, the falling end of the learning rate and the rise of self-feeding, is laid out anew
+    over other steps.
 
     Args:
         path: the run directory.
         data: where the data lie now, if the path in the run no longer leads there.
-        **options: options of `dvae.fit` to change, such as steps=4000 for a longer run.
+        trackers: further receivers of the log's rows.
+        **options: options of `Training` to change, such as steps=4000 for a longer run.
 
     Raises:
         CheckpointError: no run, a damaged one, or one whose data have changed.
     """
     run = load(path, data)
-    config = Run(path).config
-    try:
-        training = {name: option_from_config(value) for name, value in config["training"].items()}
-        objective = Evidence.from_config(config["stages"][0]["objective"])
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise CheckpointError(f"{run.path / CONFIG} is damaged: {error!r}; fit again") from error
+    with _recorded(path):
+        recorded = Run(path).config["training"]
+        training = Training(**{name: option_from_config(value) for name, value in recorded.items()})
+    feeding = run.method.feeding(options.get("steps", training.steps))
     return fit_model(
         run.model,
         run.data.windows("train"),
         run.data.windows("validation"),
-        objective=objective,
+        objective=run.method.objective(),
         out=path,
         resume=True,
-        **{**training, **options},
+        trackers=trackers,
+        **{**vars(training), "self_feeding": feeding, **options},
     )
 
 
@@ -195,16 +215,13 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
     Raises:
         CheckpointError: no run, a damaged one, or one whose data have changed.
     """
-    config = Run(path).config
-    try:
+    with _recorded(path):
+        config = Run(path).config
         method, source = from_config(config["method"]), config["data"]
         protocol = Protocol(**_tuples(config["protocol"]))
         recorded, expected, skip_bad = source["path"], source["fingerprint"], source["skip_bad"]
-    except (KeyError, TypeError) as error:
-        raise CheckpointError(
-            f"{Path(path) / CONFIG} does not tell method, data and protocol ({error!r}); was this run made "
-            "by `dvae fit`?"
-        ) from error
+        if not isinstance(recorded, str) or not isinstance(expected, str):
+            raise TypeError(f"path and fingerprint of the data are texts, not {recorded!r} and {expected!r}")
     where = os.fspath(data or recorded)
     try:
         opened = Data.open(where, protocol, skip_bad)
@@ -218,9 +235,24 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
             f"{where} has changed since {path} was fitted on it: its fingerprint is {found[:12]}…, the run's "
             f"{expected[:12]}…; restore the file, or fit again"
         )
-    model = method.build({"x": opened.windows("train").size})
+    with _recorded(path):  # the data are those of the run: if they do not fit, the config is not
+        model = method.build({"x": opened.windows("train").size})
     load_weights(model, path)
     return Loaded(Path(path), method, model.eval(), opened)
+
+
+@contextmanager
+def _recorded(path: str | os.PathLike[str]) -> Iterator[None]:
+    """What fails within it is the config of a run."""
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{Path(path) / CONFIG} does not tell method, data, protocol and training ({error!r}); it is damaged, or "
+            "was not written by `dvae fit` with these methods"
+        ) from error
 
 
 def _tuples(options: Mapping[str, Any]) -> dict[str, Any]:

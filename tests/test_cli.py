@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ from dvae.cli import main
 from dvae.models import runs
 
 SMALL = ["--batch-size", "4", "--warm-up", "4", "--latent", "3", "--validate-every", "5"]
-EQUATIONS = ["--p", "p(z_t | z_{t-1}) p(x_t | z_t)", "--q", "q(z_t | x_{t:T}, z_{t-1})"]
+EQUATIONS = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t)", "--inference", "q(z_t | x_{t:T}, z_{t-1})"]
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +86,45 @@ def test_wrong_arguments_exit_with_2(capsys, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("fit vae --learning-rate -1", "learning_rate is -1.0; it must be finite and at least 0"),
+        ("fit vae --learning-rate nan", "learning_rate is nan"),
+        ("fit vae --decay 1.5", "decay is 1.5; it must be between 0 and 1"),
+        ("fit vae --warm-up -3", "warm_up is -3; it must be at least 0"),
+        ("fit vae --self-feeding 2", "self_feeding is 2.0"),
+        ("fit vae --latent 0", "latent is 0"),
+        ("fit vae --accelerator abacus", "abacus"),
+        ("resume RUN --learning-rate nan", "learning_rate is nan"),
+        ("resume RUN --steps 0", "steps is 0"),
+        ("evaluate RUN --samples 0", "--samples is 0; it must be at least 1"),
+        ("evaluate RUN --batch-size 0", "--batch-size is 0"),
+        ("evaluate RUN --bound-particles -1", "--bound-particles is -1; it must be at least 0"),
+        ("evaluate RUN --out .", "--out . is a directory; name a file"),
+        ("evaluate RUN --figure scores.xyz", "--figure scores.xyz: the end of the name is the format, one of"),
+        ("forecast RUN --out .", "--out . is a directory"),
+        ("show srnn --steps 0", "--steps is 0"),
+        ("show srnn --out graph.xyz", "--out graph.xyz: the end of the name is the format"),
+        ("show srnn --out graph", "--out graph: the end of the name is the format"),
+    ],
+)
+def test_numbers_and_files_that_make_no_sense_exit_with_2_before_any_work(
+    capsys, tmp_path, monkeypatch, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    out = ["--out", "run"] if arguments.startswith("fit") else []
+    error = failure(capsys, *arguments.split(), *out, code=2)
+    assert message in " ".join(error.replace("│", " ").split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_is_a_directory(capsys, people):
+    assert "is a file; name a directory" in failure(capsys, "fit", "vae", "--out", str(people), code=2)
+
+
 def test_a_typo_in_an_equation_is_shown_under_its_column(capsys, tmp_path):
-    equations = ["--p", "p(z_t | z_{t-1}) p(x_t | z_t", "--q", "q(z_t | x_t)"]
+    equations = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t", "--inference", "q(z_t | x_t)"]
     error = failure(capsys, "fit", "equations", *equations, "--out", str(tmp_path / "run"), code=2)
     equation, caret = error.splitlines()[1:3]
     assert equation[caret.index("^") - 1] == "t"
@@ -116,6 +155,25 @@ def test_data_info_tells_what_a_file_holds(capsys, people):
     printed = capsys.readouterr().out
     assert "17 joints" in printed
     assert "train" in printed
+
+
+def test_the_archive_of_human36m_needs_no_skeleton(capsys, tmp_path):
+    walks = motion.simulate(clips=14, frames=140, seed=3)
+    subjects = [f"S{i}" for i in (1, 5, 6, 7, 8, 9, 11)]
+    nested = {subject: {} for subject in subjects}
+    for i, walk in enumerate(walks):
+        full = np.zeros((140, 32, 3), np.float32)
+        full[:, list(motion.HUMAN36M_KEPT)] = walk.positions[..., [2, 0, 1]]  # z up
+        nested[subjects[i % 7]][f"Walking {i // 7}"] = full
+    path = str(tmp_path / "data_3d_h36m.npz")
+    np.savez_compressed(path, positions_3d=np.array(nested, dtype=object))
+    assert main(["data", "info", path]) == 0
+    assert "human36m: 17 joints, z up" in capsys.readouterr().out
+    run = str(tmp_path / "run")
+    assert main(["fit", "vae", "--data", path, "--protocol", "h36m", "--out", run, "--steps", "4", *SMALL]) == 0
+    loaded = dvae.load(run)
+    assert loaded.model.sizes["x"] == 48
+    assert {clip.split for clip in loaded.data.windows("test").clips} == {"S9", "S11"}
 
 
 def test_evaluation_is_printed_and_written_with_all_that_it_rests_on(capsys, run, people):
@@ -199,7 +257,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(people, tmp_path, capsys):
             pass
 
     method = dvae.method("vrnn", latent=3, width=8, warm_up=8, self_feeding=0.5)
-    training = dvae.Training(steps=12, batch_size=4, validate_every=5, progress=False)
+    training = dvae.Training(steps=12, batch_size=4, validate_every=5, decay=0.5, progress=False)
     data = runs.Data.open(people)
     runs.fit(method, data, tmp_path / "whole", training)
     with pytest.raises(KeyboardInterrupt, match="interrupted after step 7"):
@@ -208,6 +266,56 @@ def test_a_resumed_run_is_the_uninterrupted_one(people, tmp_path, capsys):
     assert "finished at step 12" in capsys.readouterr().out
     whole, parts = ((tmp_path / name / "last.safetensors").read_bytes() for name in ("whole", "parts"))
     assert whole == parts
+
+
+def log(run):
+    return [row for row in map(json.loads, (run / "log.jsonl").read_text().splitlines()) if "learning_rate" in row]
+
+
+@pytest.mark.filterwarnings("ignore:.*clamped to:UserWarning")
+def test_a_longer_run_is_laid_out_anew(people, tmp_path):
+    """The learning rate falls over the last half of all steps, self-feeding rises over their first half."""
+    out, options = tmp_path / "run", ["--width", "8", "--self-feeding", "0.5", *SMALL]
+    fit = ["fit", "vrnn", "--data", str(people), "--out", str(out), "--learning-rate", "0.01"]
+    assert main([*fit, "--steps", "20", *options]) == 0
+    assert [row["learning_rate"] for row in log(out)] == pytest.approx([0.01, 0.001])
+    assert main(["resume", str(out), "--steps", "60"]) == 0
+    rates = [row["learning_rate"] for row in log(out)]
+    assert rates[2:] == pytest.approx([0.01, 0.01 * 21 / 30, 0.01 * 11 / 30, 0.01 / 30])
+    feeding = dvae.load(out).method.feeding(60)
+    assert [row["self_feeding"] for row in log(out)][2:] == pytest.approx([feeding(s - 1) for s in (30, 40, 50, 60)])
+    assert main(["resume", str(out), "--steps", "70", "--learning-rate", "0.02"]) == 0
+    assert log(out)[-1]["learning_rate"] == pytest.approx(0.02 / 35)
+
+
+def test_tensorboard_files_lie_in_the_run(people, tmp_path):
+    out = tmp_path / "run"
+    assert main(["fit", "vae", "--data", str(people), "--out", str(out), "--steps", "4", *SMALL, "--tensorboard"]) == 0
+    before = len(list(out.glob("events.*")))
+    assert main(["resume", str(out), "--steps", "5", "--tensorboard"]) == 0
+    assert (before, len(list(out.glob("events.*")))) == (1, 2)
+
+
+def test_a_method_with_an_objective_of_its_own_resumes(people, tmp_path, monkeypatch):
+    seen = []
+
+    @dataclass(frozen=True)
+    class Plain(type(dvae.method("vae"))):
+        name: ClassVar[str] = "plain"
+
+        def objective(self):
+            return lambda terms, step: (seen.append(step), -terms.bound.sum() / terms.frames.sum())[1]
+
+    monkeypatch.setitem(dvae.methods(), "plain", Plain)
+    training = dvae.Training(steps=3, batch_size=4, progress=False)
+    runs.fit(Plain(latent=3), runs.Data.open(people), tmp_path / "run", training)
+    runs.resume(tmp_path / "run", steps=5)
+    assert seen == [0, 1, 2, 3, 4]
+
+
+def test_self_feeding_is_told_by_the_method_alone(people, tmp_path):
+    with pytest.raises(ValueError, match=r"instead of Training\(self_feeding=0.5\) write dvae.method\('vrnn', self_"):
+        runs.fit(dvae.method("vrnn"), runs.Data.open(people), tmp_path / "run", dvae.Training(self_feeding=0.5))
 
 
 def test_a_run_is_neither_overwritten_nor_invented(capsys, run, people, tmp_path):
@@ -229,9 +337,43 @@ def test_a_damaged_run_is_refused(capsys, run):
     (run / "config.json").write_text(json.dumps({**config, "method": {**config["method"], "latent": 4}}))
     assert "weights of another model" in failure(capsys, "evaluate", str(run))
     (run / "config.json").write_text(json.dumps({"method": config["method"]}))
-    assert "does not tell method, data and protocol" in failure(capsys, "evaluate", str(run))
+    assert "does not tell method, data, protocol and training" in failure(capsys, "evaluate", str(run))
     (run / "config.json").write_text("{")
     assert "not JSON" in failure(capsys, "evaluate", str(run))
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        ([], []),
+        ([], None),
+        (["method"], "vae"),
+        (["method", "latent"], "wide"),
+        (["method", "hidden"], "wide"),
+        (["method", "method"], "nothing"),
+        (["data"], 3),
+        (["data", "path"], 3),
+        (["data", "fingerprint"], None),
+        (["protocol", "observed"], "many"),
+        (["protocol", "train"], 3),
+        (["protocol", "unknown"], 3),
+        (["training"], []),
+        (["training", "steps"], "many"),
+        (["training", "learning_rate"], "fast"),
+        (["training", "learning_rate"], {"schedule": "Falling"}),
+        (["training", "seed"], 0.5),
+    ],
+)
+def test_a_config_of_wrong_types_is_refused_in_a_sentence(capsys, run, keys, value):
+    config = content = json.loads((run / "config.json").read_text())
+    for key in keys[:-1]:
+        content = content[key]
+    if keys:
+        content[keys[-1]] = value
+    (run / "config.json").write_text(json.dumps(config if keys else value))
+    error = failure(capsys, "resume", str(run), "--steps", "12")
+    assert "config.json" in error
+    assert "looks like a bug" not in error
 
 
 def test_changed_or_moved_data_are_noticed(capsys, people, tmp_path, monkeypatch):
@@ -255,7 +397,6 @@ def test_debug_shows_where_it_failed(capsys, tmp_path):
     assert "Traceback" in capsys.readouterr().err
 
 
-@pytest.mark.filterwarnings("ignore:.*clamped to:UserWarning")  # it resumes for a much shorter run
 def test_ctrl_c_leaves_a_run_that_resumes(people, tmp_path):
     run = tmp_path / "run"
     command = [sys.executable, "-m", "dvae.cli", "fit", "vae", "--data", str(people), "--out", str(run)]

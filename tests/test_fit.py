@@ -325,6 +325,26 @@ def test_half_a_run_and_the_other_half_are_the_whole_run(tmp_path):
     assert (again.step, again.status, again.history) == (100, "finished", result.history)
 
 
+def test_a_decay_is_laid_out_over_the_steps_of_the_longer_run(tmp_path):
+    options = {"out": tmp_path, "learning_rate": 0.02, "decay": 0.5, "log_every": 1}
+    run(steps=10, **options)
+    rates = run(build(seed=9), steps=20, resume=True, **options).series("learning_rate")[1]
+    assert rates[:11] == pytest.approx([0.02] * 6 + [0.016, 0.012, 0.008, 0.004, 0.02])
+    assert rates[10:] == pytest.approx([0.02 - 0.002 * i for i in range(10)])
+
+
+def test_other_training_data_are_not_resumed_on(tmp_path):
+    class Windows(Sequences):
+        @property
+        def fingerprint(self):
+            return f"{self.batch['x'].sum():.6f}"
+
+    run(train=Windows({"x": TRAIN}), out=tmp_path, steps=5)
+    with pytest.raises(CheckpointError, match=r"was fitted on other training data: config\.json has the fingerprint"):
+        run(train=Windows({"x": TRAIN + 1}), out=tmp_path, steps=10, resume=True)
+    assert run(train=Windows({"x": TRAIN}), out=tmp_path, steps=10, resume=True).step == 10
+
+
 def test_patience_counts_on_across_a_resume(tmp_path):
     options = {"validation": HELD_OUT, "learning_rate": 0.0, "validate_every": 5, "out": tmp_path}
     with pytest.raises(Interrupted):
@@ -445,8 +465,16 @@ def test_options_that_do_not_exist_or_make_sense_are_refused():
         run(train="data.npz")
     with pytest.raises(ValueError, match="patience counts validations"):
         run(patience=3)
-    for wrong in ({"steps": 0}, {"patience": 0}, {"gradient_clip": 0.0}, {"optimizer": "lion"}):
-        with pytest.raises(ValueError, match=r"must be|unknown optimizer"):
+    for wrong in (
+        *({"steps": 0}, {"patience": 0}, {"gradient_clip": 0.0}, {"gradient_clip": math.nan}, {"optimizer": "lion"}),
+        *({"learning_rate": rate} for rate in (-1, math.nan, math.inf)),
+        *({"weight_decay": -1.0}, {"decay": 1.5}, {"self_feeding": 2}, {"self_feeding": -0.1}),
+        {"decay": 0.5, "learning_rate": Linear(1e-3, 0.0, 10)},
+    ):
+        with pytest.raises(ValueError, match=r"must be|unknown optimizer|leave decay 0"):
+            Training(**wrong)
+    for wrong in ({"steps": 2.5}, {"seed": "one"}, {"learning_rate": "fast"}):
+        with pytest.raises(TypeError, match=r"must be a whole number|expected a number or a schedule"):
             Training(**wrong)
 
 
@@ -486,6 +514,52 @@ def test_damaged_files_are_refused_by_name(finished, name, damage):
     expected = "is missing; copy the run directory whole" if damage == "missing" else "is damaged or from another run"
     with pytest.raises(CheckpointError, match=f"{name} {expected}"):
         run(out=finished, steps=10, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ({}, "its fingerprints are no object of texts"),
+        ([], "it holds no JSON object but list"),
+        (None, "it holds no JSON object but NoneType"),
+        ({"fingerprints": 3}, "its fingerprints are no object of texts"),
+        ({"fingerprints": {"last.safetensors": None}}, "its fingerprints are no object of texts"),
+        ({"fingerprints": {}}, "it has no fingerprint of last.safetensors"),
+    ],
+)
+def test_a_state_that_verifies_nothing_is_refused(finished, state, message):
+    (finished / "state.json").write_text(json.dumps(state))
+    for path in (finished, finished / "best.safetensors"):
+        with pytest.raises(CheckpointError, match=rf"state\.json is damaged[,:] {message}"):
+            load_weights(build(), path)
+    with pytest.raises(CheckpointError, match=r"state\.json is damaged"):
+        run(out=finished, steps=10, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"step": "five"}, "step missing or of another type"),
+        ({"status": None, "waited": 1.5}, "waited, status missing or of another type"),
+        ({"best_bound": "high"}, "best_bound missing"),
+    ],
+)
+def test_a_state_of_wrong_types_is_refused(finished, change, message):
+    state = json.loads((finished / "state.json").read_text()) | change
+    (finished / "state.json").write_text(json.dumps(state))
+    with pytest.raises(CheckpointError, match=f"state.json is damaged: {message}"):
+        run(out=finished, steps=10, resume=True)
+
+
+def test_a_best_checkpoint_without_its_fingerprint_is_refused(finished):
+    state = json.loads((finished / "state.json").read_text())
+    del state["fingerprints"]["best.safetensors"]
+    (finished / "state.json").write_text(json.dumps(state))
+    with pytest.raises(CheckpointError, match=r"it has no fingerprint of best\.safetensors"):
+        load_weights(build(), finished)
+    (finished / "state.json").write_text(json.dumps(state | {"best_step": None}))
+    with pytest.raises(CheckpointError, match=r"lists no best\.safetensors"):
+        load_weights(build(), finished / "best.safetensors")
 
 
 def test_the_weights_of_another_model_are_refused(finished, tmp_path):

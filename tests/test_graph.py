@@ -1,6 +1,9 @@
 """What exact posteriors depend on, by d-separation, against what the guides of the literature read."""
 
 import doctest
+import re
+import runpy
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import networkx as nx
@@ -165,6 +168,33 @@ def test_steps_only_widen_the_view():
 @pytest.mark.parametrize("module", [dvae.graph, dvae.notation])
 def test_examples_in_the_docstrings(module):
     assert doctest.testmod(module).failed == 0
+
+
+def documented():
+    """Name -> (generative, inference, missing, redundant), each a list of terms, of the table in docs/audits.md."""
+    page = Path(__file__).parents[1] / "docs" / "audits.md"
+    lines = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
+    rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines[1:]]
+    return {
+        name: [[term.replace(r"\|", "|") for term in re.findall("`(.*?)`", cell)] for cell in cells]
+        for name, *cells, _ in rows
+    }
+
+
+DOCUMENTED = documented()
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_the_page_of_audits_tells_what_audit_tells(name):
+    (generative,), (inference,), missing, redundant = DOCUMENTED[name]
+    result = audit(generative, inference)
+    assert missing == [term for terms in result.missing.values() for term in terms]
+    assert redundant == [term for terms in result.redundant.values() for term in terms]
+
+
+def test_the_page_of_audits_lists_what_its_script_does():
+    script = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "audits.py"))
+    assert {name: (p, q) for name, ((p,), (q,), *_) in DOCUMENTED.items()} == script["FAMILY"]
 
 
 def test_a_pair_that_does_not_fit_is_refused():

@@ -8,7 +8,7 @@ import torch
 
 from dvae import heads
 from dvae.conditional import Conditional
-from dvae.networks import Dense
+from dvae.networks import Dense, Recurrent
 from dvae.notation import Factorization
 
 HEADS = {
@@ -121,6 +121,10 @@ def test_a_description_is_plain_data(name):
         (lambda: heads.FixedNormal(project=False).build(3, D), "takes 2 features, but the network gives 3"),
         (lambda: heads.FixedNormal(scale=0.0).build(D, D), "scale is positive, got 0.0"),
         (
+            lambda: heads.FixedNormal(steps=2).build(D, D, local=False),
+            r"FixedNormal\(steps=2\) has one scale per time step, but its variable is static",
+        ),
+        (
             lambda: heads.FixedNormal(steps=2).build(D, D)(torch.zeros(B, T, D)),
             r"FixedNormal\(steps=2\) was given 3 steps",
         ),
@@ -140,3 +144,12 @@ def test_a_residual_head_needs_the_previous_value(equation):
     factor = Factorization.parse(equation).factors[0]
     with pytest.raises(ValueError, match=r"residual head, which adds .* but it does not read that"):
         Conditional(factor, {"x": D, "z": D}, Dense(), heads.Normal(residual=True), generative=True)
+
+
+@pytest.mark.parametrize("equation", ["q(w | x_{1:T})", "p(w | v)"])
+def test_a_static_variable_has_no_scales_by_step(equation):
+    factor = Factorization.parse(equation).factors[0]
+    sizes = {"w": D, "v": 1, "x": D}
+    with pytest.raises(ValueError, match=r"its variable is static, with one value per sequence; .* with steps=0"):
+        Conditional(factor, sizes, Recurrent(4), heads.FixedNormal(learned=True, steps=T), generative=False)
+    Conditional(factor, sizes, Recurrent(4), heads.FixedNormal(learned=True), generative=False)

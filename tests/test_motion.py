@@ -400,6 +400,29 @@ class TestPlain:
         read = load(tmp_path / "a.npz", skeleton=HUMAN36M, joints=HUMAN36M_KEPT)
         np.testing.assert_array_equal(read.clips[0].positions, full[:, list(HUMAN36M_KEPT)])
 
+    def test_the_known_archives_need_no_skeleton(self, tmp_path):
+        random = np.random.default_rng(0)
+        wide, narrow = (random.uniform(-0.8, 0.8, (9, joints, 3)).astype(np.float32) for joints in (32, 15))
+        for name, nested in (
+            ("h36m", {"S1": {"Walking": wide}, "S11": {"Eating 1": wide}}),
+            ("humaneva", {"Train/S1": {"Jog 1": narrow}, "Validate/S3": {"Box 1": narrow}}),
+            ("stranger", {"S1": {"Walking": narrow}}),
+        ):
+            np.savez(tmp_path / f"{name}.npz", positions_3d=np.array(nested, dtype=object))
+        human36m, humaneva = load(tmp_path / "h36m.npz"), load(tmp_path / "humaneva.npz")
+        assert (human36m.skeleton, humaneva.skeleton) == (HUMAN36M, HUMANEVA)
+        np.testing.assert_array_equal(human36m.clips[0].positions, wide[:, list(HUMAN36M_KEPT)])
+        np.testing.assert_array_equal(humaneva.clips[1].positions, narrow)
+        with pytest.raises(ValueError, match=r"skeleton\.json beside it"):
+            load(tmp_path / "stranger.npz")
+
+    def test_what_a_file_unpacks_to_is_limited_as_a_whole(self, tmp_path, monkeypatch):
+        positions = people((9,))[0].positions
+        np.savez_compressed(tmp_path / "a.npz", **{f"train/{i}": positions for i in range(4)})
+        monkeypatch.setattr("dvae.motion.formats.LARGEST", 2 * positions.nbytes)
+        with pytest.raises(ValueError, match=r"a\.npz: it would unpack to [\d,]+ bytes, at most 7,344 are read"):
+            load(tmp_path / "a.npz", skeleton=WALKER)
+
 
 class TestWindows:
     def expected(self, protocol, key, length=None):

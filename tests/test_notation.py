@@ -1,7 +1,9 @@
 """The grammar: what is read, what it means as masks and drawing order, and how the rest is refused."""
 
 import contextlib
+import html
 import math
+import re
 
 import numpy as np
 import pytest
@@ -33,6 +35,8 @@ def band(T):
         ("t", ((0, 0),), "{t}"),
         ("t-1", ((-1, -1),), "{t-1}"),
         ("t - 3", ((-3, -3),), "{t-3}"),
+        ("t\N{MINUS SIGN}3", ((-3, -3),), "{t-3}"),
+        ("≥t\N{MINUS SIGN}1", ((-1, inf),), "{>=t-1}"),
         ("t+2", ((2, 2),), "{t+2}"),
         ("<t", ((-inf, -1),), "{<t}"),
         (r"\leq t", ((-inf, 0),), "{<=t}"),
@@ -119,6 +123,31 @@ def test_spellings_of_the_same_equation():
     assert parse("p(w),p(z_t|x_{t-1},w , z_{<t})\n\n  p(x_t|x_{<t},z_t,w)").blocks == parse(HIT_DVAE).blocks
 
 
+def test_fonts_are_ignored():
+    latex = r"p_{\theta_{\mathbf{w}}}(\mathbf{w}) p(\mathbf z_t \mid \boldsymbol{z}_{<t}, \bm{x}_{t-1}, \mathbf{w}) "
+    latex += r"p(\mathbf{x}_t \mid \mathbf{x}_{1:\mathrm{t}-1}, \mathbf{z}_t, \boldsymbol{w})"
+    assert parse(latex) == parse(HIT_DVAE)
+    assert parse(r"p(\mathrm{arm\_left}_t | \mathrm{arm\_left}_{<t})") == parse("p(arm_left_t | arm_left_{<t})")
+    with pytest.raises(NotationError, match="z_1 names one step"):
+        parse(r"p(\mathbf{z}_1)")
+
+
+@given(factorizations())
+def test_the_factors_of_what_is_displayed_are_read_back(pair):
+    for f in map(parse, pair):
+        latex = f._repr_latex_().strip("$").partition("=")[2]
+        shown = re.sub("<sub>(.*?)</sub>", r"_{\1}", f._repr_html_()).replace("_{<i>t</i>}", "_t").partition("=")[2]
+        plain = html.unescape(re.sub("</?(?:i|span)>", "", shown))
+        for text in (latex, plain):
+            assert sorted(parse(text).factors, key=str) == sorted(f.factors, key=str)
+
+
+@pytest.mark.parametrize("given", [5, None, ["p(x_t)"]])
+def test_equations_are_text(given):
+    with pytest.raises(TypeError, match=r"equations are text such as \"p\(z_t .*\", got"):
+        parse(given)
+
+
 def test_what_a_factorization_knows():
     f = parse("p(z_t | z_{t-1}, c_t, pose) p(x_t | z_t, arm_left_{<t})")
     assert f.kind == "p"
@@ -198,7 +227,9 @@ def test_any_text_is_read_or_refused_as_a_value_error(text):
             6,
             "w has one value per sequence and so no t that x_{<t} could refer to; it can read x_{1:T}",
         ),
+        ("p(z_t | x_{t-1) p(x_t)", 10, '"{" without "}"'),
         ("p(mask_t)", 2, "'mask' is the batch's entry for which entries are observed; choose another name"),
+        ("p(sequences)", 2, "'sequences' is the name of the plate over the batch; choose another name"),
     ],
 )
 def test_what_cannot_be_read_is_shown_at_its_column(text, column, says):

@@ -108,9 +108,7 @@ def save(path: str | Path, motion: MotionSet) -> None:
             writer.writerows({**clip.labels, "split": clip.split, "clip": clip.name} for clip in motion)
 
 
-def _skeleton_of(
-    path: Path, clips: Sequence[tuple[str, str, np.ndarray]]
-) -> tuple[Skeleton, tuple[int, ...] | None]:
+def _skeleton_of(path: Path, clips: Sequence[tuple[str, str, np.ndarray]]) -> tuple[Skeleton, tuple[int, ...] | None]:
     """The skeleton beside a file or of a known archive, and which of the file's joints make it up."""
     beside = path.with_name("skeleton.json")
     if beside.is_file():
