@@ -72,7 +72,7 @@ class Training:
     """
 
     steps: int = 2000
-    batch_size: int = 64
+    batch_size: int = 32
     learning_rate: float | Schedule = 1e-3
     decay: float = 0.0
     optimizer: Literal["adam", "adamw", "sgd"] = "adam"
@@ -268,7 +268,7 @@ def fit(
         config: what is run, in JSON's types, for `config.json`; the training options are added to it.
         trackers: further receivers of the log's rows.
         callbacks: hooks after steps, after validations and at the end.
-        **options: fields of `Training`, such as steps=2000, batch_size=64, learning_rate=1e-3.
+        **options: fields of `Training`, such as steps=2000, batch_size=32, learning_rate=1e-3.
 
     Returns:
         The history, and the best bound and its step.
