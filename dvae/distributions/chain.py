@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn import functional
 
 DERIVATIVES = {  # of the activation, in terms of its value
     "tanh": lambda value: torch.addcmul(torch.ones((), dtype=value.dtype, device=value.device), value, value, value=-1),
@@ -52,35 +53,38 @@ class GaussianChain(torch.autograd.Function):
         weights, biases = layers[::2], layers[1::2]
         act = IN_PLACE[activation]
         hidden = [base.new_empty(steps, batch, w.shape[1]) for w in weights]
-        out = base.new_empty(steps, batch, 2 * size)
-        values, scales = torch.empty_like(noise), torch.empty_like(noise)
         transposed = [w.t() for w in weights]
         inner = list(zip(transposed[:-1], biases[:-1], [h.unbind(0) for h in hidden[1:]], strict=True))
-        recurrent, final, bias = weight.t(), transposed[-1], biases[-1]
-        zero = base.new_zeros(())
+        recurrent, final = weight.t(), transposed[-1]
+        # z = (loc + s e) + softplus(raw) e: the least scale enters with the bias, outside the loop
+        least = min_scale * noise
+        offset = biases[-1] + torch.cat([least, torch.zeros_like(noise)], dim=-1)
+        out, values = torch.empty_like(offset), torch.empty_like(noise)
         value = base.new_zeros(batch, size)
-        for base_t, first, last, out_t, raw, loc, scale, noise_t, new in zip(
-            base.unbind(0),
-            hidden[0].unbind(0),
-            hidden[-1].unbind(0),
-            out.unbind(0),
-            out[..., size:].unbind(0),
-            out[..., :size].unbind(0),
-            scales.unbind(0),
-            noise.unbind(0),
-            range(steps),
-            strict=True,
+        for t, (base_t, first, last, offset_t, out_t, loc, raw, noise_t, new) in enumerate(
+            zip(
+                base.unbind(0),
+                hidden[0].unbind(0),
+                hidden[-1].unbind(0),
+                offset.unbind(0),
+                out.unbind(0),
+                out[..., :size].unbind(0),
+                out[..., size:].unbind(0),
+                noise.unbind(0),
+                values.unbind(0),
+                strict=True,
+            )
         ):
             act(torch.addmm(base_t, value, recurrent, out=first))
             previous = first
-            for matrix, offset, cells in inner:
-                previous = act(torch.addmm(offset, previous, matrix, out=cells[new]))
-            torch.addmm(bias, last, final, out=out_t)
-            torch.logaddexp(raw, zero, out=scale).add_(min_scale)
-            value = torch.addcmul(loc, scale, noise_t, out=values[new])
+            for matrix, bias, cells in inner:
+                previous = act(torch.addmm(bias, previous, matrix, out=cells[t]))
+            torch.addmm(offset_t, last, final, out=out_t)
+            value = torch.addcmul(loc, functional.softplus(raw), noise_t, out=new)
+        scales = functional.softplus(out[..., size:]) + min_scale
         ctx.activation = activation
         ctx.save_for_backward(noise, values, out, weight, *weights, *hidden)
-        return values, out[..., :size].clone(), scales
+        return values, out[..., :size] - least, scales
 
     @staticmethod
     @once_differentiable

@@ -172,22 +172,27 @@ class AttentionNetwork(Network):
         queries = self.point.hoist(known, batch, length) if self.point is not None else None
         fixed = [p for p in self.ranged if p.name in given]
         live = [p for p in self.ranged if p.name not in given]
-        tokens = bias = self.origin.new_zeros(())
+        tokens = bias = self.origin.new_zeros(1, 1, 1)
         if self.ranged:
             tokens, bias = self.tokens(fixed, given, batch, length, lengths)
-        masks = {p.name: p.relation.mask(length).tolist() for p in live if p.relation is not None}
-        caches = [Cache(layer.project(tokens), room=length * len(live)) for layer in self.layers]
+        given_tokens = bias.shape[-1]
+        if live:
+            ahead = torch.cat([self.bias(p, length) for p in live], dim=-1)[None]
+            if lengths is not None:
+                padding = ~valid_steps(lengths, length).repeat(1, len(live))
+                ahead = ahead.masked_fill(padding[:, None, None], -math.inf)
+            shape = torch.broadcast_shapes(bias.shape[:3], ahead.shape[:3])
+            bias = torch.cat([bias.expand(*shape, -1), ahead.expand(*shape, -1)], dim=-1)
         return Attending(
             queries=queries,
             points=[entry for i, entry in enumerate(self.points) if i not in known],
             bias=bias,
+            given=given_tokens,
             batch=batch,
             live=live,
-            rows=torch.cat([self.bias(p, length) for p in live], dim=-1) if live else bias,
             length=length,
-            masks=masks,
-            caches=caches,
-            lengths=lengths,
+            masks={p.name: p.relation.mask(length).tolist() for p in live if p.relation is not None},
+            caches=[Cache(layer.project(tokens), room=length * len(live)) for layer in self.layers],
         )
 
     def step(self, state: Attending, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
@@ -201,8 +206,8 @@ class AttentionNetwork(Network):
             fresh = []
             for i, parent in enumerate(state.live):
                 for s, visible in enumerate(state.masks[parent.name][t]):
-                    if visible and (column := i * state.length + s) not in state.seen:
-                        state.seen[column] = s
+                    if visible and (token := i * state.length + s) not in state.seen:
+                        state.see(token)
                         fresh.append(self.embed[parent.name](drawn[parent.name][s]))
             if fresh:
                 tokens = torch.stack(fresh, dim=1)
@@ -244,26 +249,26 @@ class Attending:
     queries: Hoisted | None
     points: list[tuple[Input, int | None]]
     bias: Tensor
+    """Of every step to the given tokens and then to all live ones: (B or 1, heads, T, given + parents * T)."""
+    given: int
     batch: int
     live: list[Input]
-    rows: Tensor
-    """Biases (heads, T, parents * T) of the live tokens."""
     length: int
     masks: dict[str, list[list[bool]]]
     caches: list[Cache]
-    lengths: Tensor | None
-    seen: dict[int, int] = field(default_factory=dict)
-    """Column of `rows` and step of every live token, in the order of the cache."""
+    seen: dict[int, None] = field(default_factory=dict)
+    """Live tokens in the order of the cache: the step, plus T times the parent's place."""
+    in_order: bool = True
+
+    def see(self, token: int) -> None:
+        """Note a live token that enters the cache."""
+        self.in_order &= token == len(self.seen)
+        self.seen[token] = None
 
     def row(self, t: int) -> Tensor:
         """The bias of step t to every token in the cache, broadcastable to (B, heads, 1, S)."""
-        fixed = self.bias[:, :, t : t + 1]
-        if not self.seen:
-            return fixed
-        columns = torch.tensor(list(self.seen), device=self.rows.device)
-        live = self.rows[None, :, t : t + 1].index_select(-1, columns)
-        if self.lengths is not None:
-            steps = torch.tensor(list(self.seen.values()), device=self.rows.device)
-            live = live.masked_fill((steps >= self.lengths[:, None])[:, None, None], -math.inf)
-        shape = torch.broadcast_shapes(fixed.shape[:3], live.shape[:3])
-        return torch.cat([fixed.expand(*shape, -1), live.expand(*shape, -1)], dim=-1)
+        row = self.bias[:, :, t : t + 1]
+        if self.in_order:
+            return row[..., : self.given + len(self.seen)]
+        columns = [*range(self.given), *(self.given + token for token in self.seen)]
+        return row.index_select(-1, torch.tensor(columns, device=row.device))
