@@ -23,7 +23,7 @@ from .networks import NetworkSpec, Recurrent
 from .networks.base import valid_steps
 from .notation import Factorization, check_pair
 from .priors import Prior
-from .rollout import Rollout, SelfFeeding
+from .rollout import Rollout, SelfFeeding, like
 
 _COUNT = itertools.count()
 
@@ -192,7 +192,7 @@ class DynamicalVAE(nn.Module):
             conditional = self.generator[name]
             parents = dict(known)
             for other, values in sofar.items():
-                later = torch.randn(size, length - len(values), self.sizes[other]).to(_like(self))
+                later = torch.randn(size, length - len(values), self.sizes[other]).to(like(self))
                 parents[other] = torch.cat([torch.stack(values, 1), later], 1) if values else later
             return conditional.head, conditional(parents, size, length)
 
@@ -325,7 +325,7 @@ class DynamicalVAE(nn.Module):
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(self.sizes)}, 'lengths', 'mask'"
             )
-        dtype = _like(self).dtype
+        dtype = like(self).dtype
 
         def tensors(value: Any) -> Any:
             if isinstance(value, Mapping):
@@ -461,7 +461,3 @@ def repeat(value: Any, samples: int) -> Any:
 
 def _shapes(values: Mapping[str, Tensor]) -> str:
     return ", ".join(f"{name} {tuple(value.shape)}" for name, value in values.items())
-
-
-def _like(module: nn.Module) -> Tensor:
-    return next(module.parameters())

@@ -169,7 +169,7 @@ class Rollout:
         loop = any(parent in live for name in live for parent in self.conditionals[name].parents)
         noise = {
             name: self.conditionals[name].head.noise(
-                (self.batch, self.length, self.conditionals[name].size), _like(self.conditionals[name])
+                (self.batch, self.length, self.conditionals[name].size), like(self.conditionals[name])
             )
             for name in live
             if hidden is None and not (self.mean_emission and name in self.data)
@@ -265,7 +265,7 @@ def _same(value: Tensor, drawn: Tensor) -> bool:
     return value is drawn or torch.equal(value, drawn)
 
 
-def _like(module: nn.Module) -> Tensor:
+def like(module: nn.Module) -> Tensor:
     """A tensor of the module's type and device."""
     for tensor in module.parameters():
         return tensor
