@@ -7,7 +7,8 @@ import dvae
 STEPS, SEEDS = 5, 5
 
 HIT_DVAE = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
-KVAE = "p(z_t | z_{t-1}, a_{<t}) p(a_t | z_t) p(x_t | a_t)"
+KVAE = "p(z_t | z_{t-1}, a_{<t}) p(a_t | z_t, a_{<t}) p(x_t | a_t)"
+COLLAPSED = "p(a_t | a_{<t}) p(x_t | a_t)"
 TWO_LAYERS = "p(w) p(u_t | u_{t-1}, w) p(z_t | z_{t-1}, u_t) p(x_t | x_{<t}, z_t)"
 
 FAMILY = {
@@ -15,7 +16,8 @@ FAMILY = {
     "DKF": ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"),
     "DKF, bidirectional": ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"),
     "KVAE": (KVAE, "q(a_t | x_t) q(z_t | z_{t-1}, a_{1:T})"),
-    "KVAE, a_{<t} and x_{>t} added": (KVAE, "q(a_t | a_{<t}, x_{t:T}) q(z_t | z_{t-1}, a_{1:T})"),
+    "KVAE, z integrated out": (COLLAPSED, "q(a_t | x_t)"),
+    "KVAE, a_{<t} and x_{>t} added": (COLLAPSED, "q(a_t | a_{<t}, x_{t:T})"),
     "STORN, filtering": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{<=t})"),
     "STORN, smoothing": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{1:T})"),
     "STORN, z_{<t} added": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | z_{<t}, x_{1:T})"),

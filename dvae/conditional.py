@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .distributions.chain import DERIVATIVES, GaussianChain
+from .distributions.chain import DERIVATIVES, gaussian_chain
 from .heads import Head, HeadSpec, NormalHead, Parameters, StandardNormal
 from .networks.base import Input, Network, NetworkSpec, at, shift
 from .notation import Factor
@@ -93,10 +93,28 @@ class Conditional(nn.Module):
             return None
         if not isinstance(self.head, NormalHead) or self.head.residual:
             return None
-        layers = [p for layer in (*form.join.rest, self.head.out) for p in layer.parameters()]
-        in_order = [tensor.transpose(0, 1) for tensor in (form.hoisted.base, noise)]
-        if direction < 0:
-            in_order = [tensor.flip(0) for tensor in in_order]
-        out = GaussianChain.apply(*in_order, self.head.min_scale, form.join.kind, form.hoisted.weights[0], *layers)
-        value, *parameters = ((tensor.flip(0) if direction < 0 else tensor).transpose(0, 1) for tensor in out)
+        join, out = form.join, self.head.out
+        batch, length, _ = noise.shape
+        hoisted = form.hoisted if join.first else join.hoist(form.hoisted.known, batch, length, out)
+        linear = [layer for layer in join.rest if isinstance(layer, nn.Linear)]
+        following = [(layer.weight, layer.bias) for layer in ([*linear, out] if join.first else [])]
+
+        def into(values: Tensor) -> Tensor:
+            return values.transpose(0, 1) if direction > 0 else values.transpose(0, 1).flip(0)
+
+        def back(values: Tensor) -> Tensor:
+            return values.transpose(0, 1) if direction > 0 else values.flip(0).transpose(0, 1)
+
+        *drawn, states = gaussian_chain(
+            into(hoisted.base),
+            into(noise),
+            [(hoisted.weights[0], None), *following],
+            before=form.before,
+            cell=None if form.cell is None else (into(form.cell[0]), form.cell[1]),
+            min_scale=self.head.min_scale,
+            activation=join.kind,
+        )
+        value, *parameters = map(back, drawn)
+        if form.keep is not None and states is not None:
+            form.keep(value, back(states))
         return value, tuple(parameters)

@@ -41,7 +41,7 @@ class DynamicalVAE(nn.Module):
         network: description of the networks, or a mapping from factors to descriptions. Its keys are "p(x)" for one
             factor, "p" for all generative ones, "q" for the guide's, and "default".
         heads: the same for the heads; `heads.Normal()` where nothing is said.
-        priors: static latent to its prior, in place of N(0, I).
+        priors: static latent without parents to its prior, in place of N(0, I).
         observed: names of the data variables; every other variable with a generative factor is a latent.
         masks: relations of one's own, name to function of T (see `Factorization.parse`).
 
@@ -84,12 +84,13 @@ class DynamicalVAE(nn.Module):
         self.generator: Any = self._conditionals(self.generative)
         self.encoder: Any = self._conditionals(self.inference)
         self.priors = nn.ModuleDict(dict(priors or {}))
-        for name in self.priors:
+        for name, prior in (priors or {}).items():
             factor = self.generative.factor(name)
-            if factor.local or factor.parents:
+            if factor.local or factor.parents or name not in self.latents:
                 raise ValueError(
                     f"a prior replaces a factor p({name}) of a static latent without parents, not {factor}"
                 )
+            prior.check(self.inference.factor(name), self.sizes, self.observed)
 
     def _conditionals(self, factorization: Factorization) -> Any:
         def pick(table: Mapping[str, Any], kind: str, child: str) -> Any:
@@ -151,7 +152,7 @@ class DynamicalVAE(nn.Module):
         with pyro.plate("sequences", rollout.batch, dim=-1):
             for block in self.generative.blocks:
                 for name in block.names:
-                    law = self.priors[name](rollout.batch) if name in self.priors else rollout.law(name)
+                    law = self._prior(name, rollout.batch) if name in self.priors else rollout.law(name)
                     data = rollout.values.get(name)
                     rollout.know(name, pyro.sample(name, law, obs=data, infer=_note(self.generative)))
         return dict(rollout.values)
@@ -202,7 +203,7 @@ class DynamicalVAE(nn.Module):
                     (name,) = block.names
                     head, parameters = law(name, {})
                     prior = (
-                        self.priors[name](size) if name in self.priors else head.distribution(parameters).to_event(1)
+                        self._prior(name, size) if name in self.priors else head.distribution(parameters).to_event(1)
                     )
                     known[name] = pyro.sample(name, prior)
                     continue
@@ -302,6 +303,10 @@ class DynamicalVAE(nn.Module):
         trace = poutine.trace(poutine.condition(self.model, data=dict(latents))).get_trace(batch)
         trace.compute_log_prob(site_filter=lambda name, site: name in self.generative.variables)
         return {name: trace.nodes[name]["log_prob"] for name in self.generative.variables}
+
+    def _prior(self, name: str, batch: int) -> Any:
+        """The distribution (B, D) of a static latent that has a prior of its own."""
+        return self.priors[name](batch, self.encoder[name])
 
     def _register(self) -> None:
         """Names the parameters in Pyro's store while `pyro.infer.SVI` looks for them, and else costs nothing."""

@@ -15,7 +15,8 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,13 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
+try:
+    import fcntl
+except ImportError:  # no locks on Windows
+    fcntl = None  # type: ignore[assignment]
+
 BEST, LAST, OPTIMISER = "best.safetensors", "last.safetensors", "last.state.pt"
-STATE, CONFIG = "state.json", "config.json"
+STATE, CONFIG, LOCK = "state.json", "config.json", ".lock"
 
 
 class CheckpointError(RuntimeError):
@@ -72,6 +78,25 @@ class Run:
         else:
             return state
         raise CheckpointError(f"{self.path / STATE} is damaged: {problem}; copy the run directory whole, or fit again")
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the directory for one process, which writes to it; the lock goes with the process, however it ends.
+
+        Raises:
+            CheckpointError: when another process holds it.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        with (self.path / LOCK).open("w") as file:
+            if fcntl is not None:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    raise CheckpointError(
+                        f"{self.path} is being fitted by another process; wait for it or stop it, or choose another "
+                        "directory"
+                    ) from error
+            yield
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Write `config.json`.
@@ -140,7 +165,12 @@ class Run:
             content = json.loads(path.read_text())
         except FileNotFoundError:
             raise CheckpointError(
-                f"{self.path} is no run directory: it has no {name}; give the folder that fit wrote with out=…"
+                f"{self.path} is no run directory: it has no {name}; give the folder that fit wrote (out=… in "
+                "Python, --out on the command line)"
+            ) from None
+        except NotADirectoryError:
+            raise CheckpointError(
+                f"{self.path} is a file and no run directory; leave it out, or give the folder that fit wrote"
             ) from None
         except ValueError as error:
             raise CheckpointError(f"{path} is damaged, it is not JSON ({error}); fit again") from error

@@ -131,12 +131,14 @@ class Stage:
         objective: what it minimises.
         learning_rate: that of `Training` if None.
         self_feeding: that of `Training` if None.
+        frozen: parameters whose names start with one of these stay as they are.
     """
 
     steps: int
     objective: Objective = field(default_factory=Evidence)
     learning_rate: float | Schedule | None = None
     self_feeding: float | Schedule | None = None
+    frozen: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.steps < 1:
@@ -307,6 +309,8 @@ def fit(
     with ExitStack() as stack:
         stack.enter_context(_forked_random_state(fabric.device))
         stack.callback(model.eval)
+        if run is not None and fabric.is_global_zero:
+            stack.enter_context(run.locked())
         loop = _Loop(fabric, model, training, plan, run)
         state = loop.state
         fabric.barrier()  # every process has looked for an earlier run before the first one writes
@@ -392,6 +396,12 @@ class _Loop:
             raise ValueError(
                 f"{type(model).__name__} has no parameters that require gradients; there is nothing to fit"
             )
+        names = [name for name, parameter in model.named_parameters() if parameter.requires_grad]
+        for stage in plan:
+            if missing := [start for start in stage.frozen if not any(name.startswith(start) for name in names)]:
+                raise ValueError(f"no parameter's name starts with {', '.join(missing)}; they are {', '.join(names)}")
+            if all(name.startswith(stage.frozen) for name in names):
+                raise ValueError(f"a stage of {stage.steps} steps has every parameter frozen; there is nothing to fit")
         self.parameters = parameters
         optimizer = OPTIMISERS[training.optimizer](
             parameters, lr=training.rate(0), weight_decay=training.weight_decay, fused=True
@@ -416,6 +426,9 @@ class _Loop:
         loss = stage.objective(terms, state.step)
         self.optimizer.zero_grad()
         self.fabric.backward(loss)
+        for name, parameter in state.model.named_parameters() if stage.frozen else ():
+            if name.startswith(stage.frozen):
+                parameter.grad = None  # which the optimiser leaves out, with its state
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
         numbers = torch.stack([loss.detach(), norm])
@@ -626,10 +639,14 @@ def _plan(
     total = sum(stage.steps for stage in stages)
     if "steps" in options and training.steps != total:
         raise ValueError(f"steps is {training.steps}, but the stages take {total} steps; leave steps out")
-    plan, end = [], 0
-    for stage in stages:
-        end += stage.steps
-        plan.append(clamp(stage, end))
+    plan: list[Stage] = []
+    end = last = total
+    for stage, following in zip(reversed(stages), [None, *reversed(stages[1:])], strict=True):
+        # schedules run on through a next stage that differs in length and frozen parameters alone
+        if following is None or replace(following, steps=stage.steps, frozen=stage.frozen) != stage:
+            last = end
+        plan.insert(0, clamp(stage, last))
+        end -= stage.steps
     return clamp(replace(training, steps=total), total), plan
 
 
@@ -671,6 +688,7 @@ def _record(training: Training, plan: Sequence[Stage], train: Any) -> dict[str, 
                 else repr(stage.objective),
                 "learning_rate": to_config(stage.learning_rate),
                 "self_feeding": to_config(stage.self_feeding),
+                "frozen": list(stage.frozen),
             }
             for stage in plan
         ],

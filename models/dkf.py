@@ -2,18 +2,102 @@
 
     p(z_t | z_{t-1}) p(x_t | z_t)        q(z_t | z_{t-1}, x_{t:T})
 
-Krishnan, Shalit and Sontag, 2015 and 2017, arXiv 1511.05121 and 1609.09869. The guide has the dependencies of the
-exact posterior. Its backward network reads the present and the future; the past reaches z_t through z_{t-1}.
+Krishnan, Shalit and Sontag, 2015 and 2017, arXiv 1511.05121 and 1609.09869; layers of the public implementation of
+Girin et al., 2021, arXiv 2008.12595. The transition is gated: its mean mixes a linear and a nonlinear proposal. The
+guide averages features of z_{t-1} and a backward recurrent state of x_{t:T}; it has the dependencies of the exact
+posterior. Nothing is shared between guide and model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from ..networks import Dense, NetworkSpec, Recurrent
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ..heads import Head, HeadSpec, Parameters
+from ..networks import Dense, Input, NetworkSpec, Recurrent
+from ..networks.base import Network, at, shift
 from .method import Method
+
+
+@dataclass(frozen=True)
+class Gated:
+    """The transition of Krishnan et al., 2017, equation 13: gate, proposal and linear part of z_{t-1}.
+
+        g = sigmoid(MLP(z))    h = MLP(z)    mean = (1 - g) * L(z) + g * h    variance = softplus(L(relu(h)))
+
+    Its features are the mean and relu(h); `GatedNormal` is its head.
+    """
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> GatedTransition:
+        """The network of a factor with one parent, a local one at t-1."""
+        if len(inputs) != 1 or inputs[0].lags != (-1,) or inputs[0].size != size:
+            raise ValueError(f"a gated transition is of one variable from its own last value, not from {inputs}")
+        return GatedTransition(inputs, size)
+
+
+class GatedTransition(Network):
+    """See `Gated`."""
+
+    def __init__(self, inputs: Sequence[Input], size: int):
+        super().__init__(inputs, True, 2 * size)
+        self.name, self.size = inputs[0].name, size
+        self.gate, self.proposal = (
+            nn.Sequential(nn.Linear(size, size), nn.ReLU(), nn.Linear(size, size)) for _ in range(2)
+        )
+        self.linear = nn.Linear(size, size)
+
+    def _features(self, previous: Tensor) -> Tensor:
+        proposal = self.proposal(previous)
+        mean = torch.lerp(self.linear(previous), proposal, torch.sigmoid(self.gate(previous)))
+        return torch.cat([mean, functional.relu(proposal)], dim=-1)
+
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """See `Network.forward`."""
+        return self._features(shift(parents[self.name], -1))
+
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """See `Network.start`."""
+        return self(given, length).unbind(1) if self.name in given else self.linear.weight.new_empty(batch, 0)
+
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        """See `Network.step`."""
+        if isinstance(state, tuple):
+            return state[t], state
+        return self._features(at(drawn[self.name], t - 1, state, self.size)), state
+
+
+@dataclass(frozen=True)
+class GatedNormal:
+    """A normal on the features of `Gated`.
+
+    Args:
+        min_scale: the scale stays above it.
+    """
+
+    min_scale: float = 1e-3
+
+    def build(self, features: int, size: int, local: bool = True) -> GatedHead:
+        """The head from features (..., 2 D)."""
+        return GatedHead(self, size)
+
+
+class GatedHead(Head):
+    """See `GatedNormal`."""
+
+    def __init__(self, spec: GatedNormal, size: int):
+        super().__init__()
+        self.min_variance = spec.min_scale**2
+        self.variance = nn.Linear(size, size)
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Head.forward`."""
+        mean, proposal = features.chunk(2, dim=-1)
+        return mean, torch.sqrt(functional.softplus(self.variance(proposal)) + self.min_variance)
 
 
 @dataclass(frozen=True)
@@ -21,9 +105,12 @@ class DKF(Method):
     """See the file.
 
     Args:
-        width: of the guide's recurrent state.
-        hidden: widths of the transition.
+        width: of the guide's recurrent state, and of the features of z_{t-1} beside it.
+        embed: of the dense layer before the state.
+        embed_latent: widths of the layers on z_{t-1} before its last one, of size `width`.
+        hidden: widths of the perceptron on the mean of the two.
         decoder: widths of the decoder.
+        transition: widths of a perceptron for p(z_t | z_{t-1}) in place of the gated transition.
     """
 
     name: ClassVar[str] = "dkf"
@@ -32,13 +119,21 @@ class DKF(Method):
     inference: ClassVar[str] = "q(z_t | z_{t-1}, x_{t:T})"
 
     width: int = 64
+    embed: int = 64
+    embed_latent: tuple[int, ...] = (16,)
     hidden: tuple[int, ...] = (32,)
     decoder: tuple[int, ...] = (32, 64)
+    transition: tuple[int, ...] = ()
 
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """A perceptron for the transition and the emission, a backward network for the guide."""
+        """A gated transition, a perceptron for the data, a backward network for the guide."""
+        extract = {"z": (*self.embed_latent, self.width)}
         return {
-            "p(z)": Dense(self.hidden),
+            "p(z)": Dense(self.transition) if self.transition else Gated(),
             "p(x)": Dense(self.decoder),
-            "q(z)": Recurrent(self.width, embed=self.width, hidden=(32,)),
+            "q(z)": Recurrent(self.width, embed=self.embed, extract=extract, hidden=self.hidden, mean=True),
         }
+
+    def heads(self) -> Mapping[str, HeadSpec]:
+        """The gated transition has its own."""
+        return {**super().heads(), **({} if self.transition else {"p(z)": GatedNormal()})}

@@ -49,5 +49,6 @@ class Equations(Method):
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
         """The model; `residual` holds where p(x_t | ...) reads x_{t-1}."""
         generative, inference = Factorization.parse(self.generative), Factorization.parse(self.inference)
-        sizes = {name: self.latents.get(name, self.latent) for name in generative.variables if name not in data}
-        return DynamicalVAE(generative, inference, {**sizes, **data}, self.networks(), self.heads())
+        latents = {name: self.latents.get(name, self.latent) for name in generative.variables if name not in data}
+        sizes = {**latents, **data}
+        return DynamicalVAE(generative, inference, sizes, self.networks(), self.heads(), self.priors(sizes))

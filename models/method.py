@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib.metadata import entry_points
 from typing import Any, ClassVar, Literal
 
 from ..heads import FixedNormal, HeadSpec, Normal, StudentT
+from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
-from ..inference.schedules import Linear, Schedule
+from ..inference.schedules import Cosine, Linear, Logistic, Schedule
 from ..model import DynamicalVAE
 from ..networks import NetworkSpec
+from ..notation import Factor, Factorization
+from ..priors import FlowPrior, MixturePrior, Prior, VampPrior
+
+SHAPES: dict[str, type[Linear | Cosine | Logistic]] = {"linear": Linear, "cosine": Cosine, "logistic": Logistic}
+EMISSIONS = ("normal", "fixed", "student")
+PRIORS = ("standard", "mixture", "vamp", "flow")
 
 
 @dataclass(frozen=True)
@@ -26,9 +34,15 @@ class Method:
             parents) or "student" (Student t).
         residual: the mean of x_t is an offset from x_{t-1}, which the factor must read. Sharper one step ahead, but a
             free run can drift without bound.
+        prior: distribution of the static latents without parents: "standard" (normal, nothing learned), "mixture" (of
+            normals), "vamp" (of the guide's posteriors of learned pseudo-sequences) or "flow".
+        prior_components: of "mixture" and "vamp".
+        prior_steps: length of the pseudo-sequences of "vamp"; at most that of the training windows.
         warm_up: steps over which the KL weight rises from 0 to 1.
+        warm_up_shape: form of that rise.
+        free_bits: nats per frame below which the KL of a latent, averaged over the batch, costs nothing more.
         self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over a
-            third of training, after the first tenth.
+            third of training, after the first tenth. Nothing is fed to a model that reads no x.
 
     Raises:
         ValueError: when an option is out of range.
@@ -42,14 +56,23 @@ class Method:
     latent: int = 16
     emission: Literal["fixed", "normal", "student"] = "fixed"
     residual: bool = False
+    prior: Literal["standard", "mixture", "vamp", "flow"] = "standard"
+    prior_components: int = 16
+    prior_steps: int = 16
     warm_up: int = 500
+    warm_up_shape: Literal["linear", "cosine", "logistic"] = "linear"
+    free_bits: float = 0.0
     self_feeding: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.latent < 1:
-            raise ValueError(f"latent is {self.latent}; it must be at least 1")
-        if self.warm_up < 0:
-            raise ValueError(f"warm_up is {self.warm_up}; it must be at least 0")
+        for name, least in (("latent", 1), ("prior_components", 1), ("prior_steps", 1), ("warm_up", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        for name, known in (("emission", EMISSIONS), ("prior", PRIORS), ("warm_up_shape", SHAPES)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"unknown {name} {getattr(self, name)!r}; known: {', '.join(known)}")
+        if not 0 <= self.free_bits < math.inf:
+            raise ValueError(f"free_bits is {self.free_bits}; it must be finite and at least 0")
         if not 0 <= self.self_feeding <= 1:
             raise ValueError(f"self_feeding is {self.self_feeding}; it must be a probability, between 0 and 1")
 
@@ -68,21 +91,59 @@ class Method:
             "fixed": FixedNormal(scale=0.1, learned=True, residual=self.residual),
             "student": StudentT(residual=self.residual),
         }
-        if self.emission not in kinds:
-            raise ValueError(f"unknown emission {self.emission!r}; known: {', '.join(kinds)}")
         return {"p(x)": kinds[self.emission]}
+
+    def priors(self, sizes: Mapping[str, int]) -> Mapping[str, Prior]:
+        """Priors of the static latents without parents, where `prior` is not "standard".
+
+        Args:
+            sizes: dimension of every variable.
+
+        Raises:
+            ValueError: a prior without such a latent.
+        """
+        if self.prior == "standard":
+            return {}
+        p, q = Factorization.parse(self.generative), Factorization.parse(self.inference)
+        guides = {
+            f.child: q.factor(f.child) for f in p.factors if f.child in q.variables and not (f.local or f.parents)
+        }
+        if not guides:
+            raise ValueError(
+                f"prior={self.prior!r} is for a static latent without parents, such as p(w), which {p.text} does not "
+                'have; use prior="standard"'
+            )
+        kinds: dict[str, Callable[[Factor], Prior]] = {
+            "mixture": lambda guide: MixturePrior(sizes[guide.child], self.prior_components),
+            "vamp": lambda guide: VampPrior(
+                sizes[guide.child],
+                {parent.name: sizes[parent.name] for parent in guide.parents},
+                self.prior_components,
+                self.prior_steps,
+            ),
+            "flow": lambda guide: FlowPrior(sizes[guide.child]),
+        }
+        return {name: kinds[self.prior](guide) for name, guide in guides.items()}
 
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
         """The model for data of these sizes, such as {"x": 60}."""
-        return DynamicalVAE(self.generative, self.inference, {**self.sizes(), **data}, self.networks(), self.heads())
+        sizes = {**self.sizes(), **data}
+        return DynamicalVAE(self.generative, self.inference, sizes, self.networks(), self.heads(), self.priors(sizes))
 
     def objective(self) -> Objective:
         """What training minimises."""
-        return Evidence(kl_weight=Linear(0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0)
+        weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0
+        return Evidence(kl_weight=weight, free_bits=self.free_bits)
+
+    def stages(self, steps: int) -> Sequence[Stage]:
+        """The stages of a run of `steps`; one, if the method does not train in phases."""
+        return [Stage(steps, self.objective())]
 
     def feeding(self, steps: int) -> Schedule | float:
-        """Probability of self-feeding over a run of `steps`."""
-        if not self.self_feeding:
+        """Probability of self-feeding over a run of `steps`; 0 for a model that reads no data, where nothing is fed."""
+        p, q = Factorization.parse(self.generative), Factorization.parse(self.inference)
+        reads = {parent.name for factor in p.factors for parent in factor.parents}
+        if not self.self_feeding or not reads & (set(p.variables) - set(q.variables)):
             return 0.0
         return Linear(0.0, self.self_feeding, steps=max(steps // 3, 1), delay=steps // 10)
 
@@ -94,9 +155,21 @@ class Method:
 @cache
 def methods() -> dict[str, type[Method]]:
     """Every known method by name: those of this package and of installed packages (entry points "dvae.methods")."""
-    from . import dkf, equations, hit_dvae, srnn, vae, vrnn
+    from . import dkf, dsae, equations, hit_dvae, kvae, rvae, srnn, storn, vae, vrnn
 
-    own: list[type[Method]] = [vae.VAE, dkf.DKF, srnn.SRNN, vrnn.VRNN, hit_dvae.HiTDVAE, equations.Equations]
+    own: list[type[Method]] = [
+        vae.VAE,
+        dkf.DKF,
+        storn.STORN,
+        vrnn.VRNN,
+        srnn.SRNN,
+        rvae.CausalRVAE,
+        rvae.NonCausalRVAE,
+        dsae.DSAE,
+        kvae.KVAE,
+        hit_dvae.HiTDVAE,
+        equations.Equations,
+    ]
     table = {method.name: method for method in own}
     for entry in entry_points(group="dvae.methods"):
         if entry.name in table:

@@ -25,6 +25,7 @@ from ..inference.schedules import from_config as option_from_config
 from ..inference.trackers import Tracker
 from ..model import DynamicalVAE
 from ..motion import PROTOCOLS, MotionSet, Protocol, Windows
+from ..priors import VampPrior
 from .method import Method, from_config
 
 SIMULATED = "simulated"
@@ -143,7 +144,8 @@ def fit(
         trackers: further receivers of the log's rows.
 
     Raises:
-        ValueError: `training` sets the self-feeding, which is the method's to tell.
+        ValueError: `training` sets the self-feeding, which is the method's to tell; or the pseudo-sequences of a
+            prior are longer than the windows.
     """
     training = training or Training()
     if training.self_feeding != 0:
@@ -155,11 +157,14 @@ def fit(
     with torch.random.fork_rng():
         torch.manual_seed(training.seed)
         model = method.build({"x": train.size})
+        for prior in model.priors.values():
+            if isinstance(prior, VampPrior):
+                prior.start_at(train.sample(prior.components, torch.default_generator))
     return fit_model(
         model,
         train,
         validation,
-        objective=method.objective(),
+        stages=method.stages(training.steps),
         out=out,
         config={"method": method.config(), **data.config()},
         callbacks=callbacks,
@@ -172,6 +177,7 @@ def resume(
     path: str | os.PathLike[str],
     data: str | os.PathLike[str] | None = None,
     trackers: Sequence[Tracker] = (),
+    callbacks: Sequence[Callback] = (),
     **options: Any,
 ) -> Fit:
     """Continues a run from its last checkpoint, under the options it was started with.
@@ -183,6 +189,7 @@ def resume(
         path: the run directory.
         data: where the data lie now, if the path in the run no longer leads there.
         trackers: further receivers of the log's rows.
+        callbacks: hooks of the loop.
         **options: options of `Training` to change, such as steps=4000 for a longer run.
 
     Raises:
@@ -192,16 +199,17 @@ def resume(
     with _recorded(path):
         recorded = Run(path).config["training"]
         training = Training(**{name: option_from_config(value) for name, value in recorded.items()})
-    feeding = run.method.feeding(options.get("steps", training.steps))
+    steps = options.get("steps", training.steps)
     return fit_model(
         run.model,
         run.data.windows("train"),
         run.data.windows("validation"),
-        objective=run.method.objective(),
+        stages=run.method.stages(steps),
         out=path,
         resume=True,
         trackers=trackers,
-        **{**vars(training), "self_feeding": feeding, **options},
+        callbacks=callbacks,
+        **{**vars(training), "self_feeding": run.method.feeding(steps), **options},
     )
 
 

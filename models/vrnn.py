@@ -2,8 +2,10 @@
 
     p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})        q(z_t | x_{<=t}, z_{<t})
 
-Chung et al., 2015, arXiv 1506.02216. The guide filters: it does not read x_{>t}, on which the exact posterior depends.
-Ours has one recurrent network per factor, where the original shares one among the three.
+Chung et al., 2015, arXiv 1506.02216; layer sizes of the public implementation of Girin et al., 2021, arXiv 2008.12595.
+All three factors share the state h_t of x_{<t} and z_{<t}, and the dense features of x and of z: the prior reads h_t,
+the guide h_t and features of x_t, the decoder h_t and features of z_t. The guide filters: it does not read x_{>t}, on
+which the exact posterior depends.
 """
 
 from __future__ import annotations
@@ -12,7 +14,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from ..model import DynamicalVAE
 from ..networks import NetworkSpec, Recurrent
+from ..networks.recurrent import tie
 from .method import Method
 
 
@@ -21,9 +25,10 @@ class VRNN(Method):
     """See the file.
 
     Args:
-        width: of the recurrent states.
-        embed: of the dense layer before them; 0 for none.
-        hidden: widths of the perceptron after them.
+        width: of the recurrent state.
+        embed: widths of the dense features of x.
+        embed_latent: widths of those of z.
+        hidden: widths of a perceptron between these and each distribution.
     """
 
     name: ClassVar[str] = "vrnn"
@@ -32,9 +37,17 @@ class VRNN(Method):
     inference: ClassVar[str] = "q(z_t | x_{<=t}, z_{<t})"
 
     width: int = 64
-    embed: int = 64
-    hidden: tuple[int, ...] = (64,)
+    embed: tuple[int, ...] = (64,)
+    embed_latent: tuple[int, ...] = (16, 32)
+    hidden: tuple[int, ...] = ()
 
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """A recurrent network for each factor."""
-        return {"default": Recurrent(self.width, embed=self.embed, hidden=self.hidden)}
+        """One kind for each factor; `build` ties them."""
+        extract = {"x": self.embed, "z": self.embed_latent}
+        return {"default": Recurrent(self.width, extract=extract, hidden=self.hidden, apart=True)}
+
+    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
+        """The model, with one h_t for its three factors."""
+        model = super().build(data)
+        tie(model.generator["z"].network, model.generator["x"].network, model.encoder["z"].network)
+        return model

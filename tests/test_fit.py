@@ -222,6 +222,29 @@ def test_stages_follow_one_another_on_one_global_step():
         run(stages=stages, objective=Evidence())
 
 
+def test_a_stage_keeps_what_it_freezes_also_across_a_resume(tmp_path):
+    stages = [Stage(30, frozen=("generator.z.", "generator.x.head")), Stage(30)]
+    start = build().state_dict()
+
+    def moved(state):
+        now = state.model.state_dict()
+        return {name for name in now if not torch.equal(now[name], start[name])}
+
+    seen = {}
+    watch = [At(step, lambda state, step=step: seen.update({step: moved(state)})) for step in (30, 31)]
+    run(out=tmp_path / "whole", stages=stages, callbacks=watch)
+    assert seen[30] == {name for name in start if not name.startswith(stages[0].frozen)}
+    assert seen[31] == set(start)
+    with pytest.raises(Interrupted):
+        run(out=tmp_path / "parts", stages=stages, callbacks=[At(20, interrupt)])
+    run(build(seed=9), out=tmp_path / "parts", stages=stages, resume=True)
+    assert same(*(load_file(tmp_path / name / "last.safetensors") for name in ("whole", "parts")))
+    with pytest.raises(ValueError, match=r"no parameter's name starts with decoder\.; they are generator\.z"):
+        run(stages=[Stage(2, frozen=("decoder.",))])
+    with pytest.raises(ValueError, match="a stage of 2 steps has every parameter frozen"):
+        run(stages=[Stage(2, frozen=("generator", "encoder"))])
+
+
 def test_the_program_receives_the_scheduled_probability_of_self_feeding():
     seen = []
 
@@ -713,3 +736,9 @@ def test_two_processes_agree_draw_differently_and_resume_bit_for_bit(tmp_path):
     assert first == second
     drawn = Run(tmp_path / "whole").optimiser_state()["random"]["generator"]
     assert not torch.equal(drawn[0], drawn[1])
+
+
+def test_a_run_is_fitted_by_one_process_at_a_time(tmp_path):
+    with Run(tmp_path).locked(), pytest.raises(CheckpointError, match="is being fitted by another process"):
+        run(out=tmp_path)
+    assert run(out=tmp_path).status == "finished"

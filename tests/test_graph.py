@@ -197,6 +197,11 @@ def test_the_page_of_audits_lists_what_its_script_does():
     assert {name: (p, q) for name, ((p,), (q,), *_) in DOCUMENTED.items()} == script["FAMILY"]
 
 
+def test_the_page_of_audits_has_every_method_of_the_family():
+    published = {(m.generative, m.inference) for name, m in dvae.methods().items() if name != "equations"}
+    assert published <= {(p, q) for (p,), (q,), *_ in DOCUMENTED.values()}
+
+
 def test_a_pair_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="the latent z has no factor in the guide"):
         audit(DSAE, "q(v | x_{1:T})")

@@ -1,5 +1,6 @@
 """Every method keeps the contract of its factorizations; the registry finds it; it trains on real motion."""
 
+import copy
 import json
 import sys
 from importlib.metadata import EntryPoint
@@ -12,22 +13,28 @@ import torch
 import dvae
 from dvae import motion
 from dvae.models import from_config
+from dvae.models.dkf import Gated
 from dvae.testing import FactorizationContract
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SMALL = {
     "vae": {"hidden": (5, 4)},
-    "dkf": {"width": 4, "hidden": (4,), "decoder": (4, 5)},
+    "dkf": {"width": 4, "embed": 3, "embed_latent": (3,), "hidden": (4,), "decoder": (4, 5)},
+    "storn": {"width": 4, "embed": 3, "embed_latent": 2, "hidden": (5,)},
+    "vrnn": {"width": 4, "embed": (3,), "embed_latent": (2, 3)},
     "srnn": {"width": 4, "embed": 3, "hidden": (4,), "decoder": (5,)},
-    "vrnn": {"width": 4, "embed": 3, "hidden": (4,)},
+    "rvae-causal": {"width": 4},
+    "rvae-noncausal": {"width": 4},
+    "dsae": {"width": 4, "decoder": (4, 5)},
+    "kvae": {"width": 4, "hidden": (5, 4)},
     "hit-dvae": {"width": 8, "heads_count": 2, "decoder": 8},
     "equations": {"width": 4},
 }
 
 
 def small(name, size=2, **options):
-    statics = {"static": size} if name == "hit-dvae" else {}
-    return dvae.method(name, latent=size, **statics, **{**SMALL[name], **options})
+    others = {"dsae": ("static",), "hit-dvae": ("static",), "kvae": ("auxiliary",)}.get(name, ())
+    return dvae.method(name, **{**dict.fromkeys(("latent", *others), size), **SMALL[name], **options})
 
 
 class Contract(FactorizationContract):
@@ -40,22 +47,57 @@ class Contract(FactorizationContract):
 
 class TestVAE(Contract):
     name = "vae"
+    missing: ClassVar = {}
 
 
 class TestDKF(Contract):
     name = "dkf"
+    missing: ClassVar = {}
 
 
 class TestSRNN(Contract):
     name = "srnn"
+    missing: ClassVar = {}
 
 
 class TestVRNN(Contract):
     name = "vrnn"
+    missing: ClassVar = {"z": ("x_{>t}",)}
+
+
+class TestSTORN(Contract):
+    name = "storn"
+    missing: ClassVar = {"z": ("x_{>t}", "z_{<t}")}
+
+
+class TestCausalRVAE(Contract):
+    name = "rvae-causal"
+    missing: ClassVar = {}
+
+
+class TestNonCausalRVAE(Contract):
+    name = "rvae-noncausal"
+    missing: ClassVar = {}
+
+
+class TestDSAE(Contract):
+    name = "dsae"
+    missing: ClassVar = {"z": ("z_{<t}",)}
+
+
+class TestKVAE(Contract):
+    name = "kvae"
+    missing: ClassVar = {"a": ("x_{>t}", "a_{<t}")}
+
+
+class TestKVAEWithMoreLatentThanAuxiliary(Contract):
+    name = "kvae"
+    options: ClassVar = {"latent": 4, "learn_noise": True, "components": 2}
 
 
 class TestHiTDVAE(Contract):
     name = "hit-dvae"
+    missing: ClassVar = {"z": ("z_{<t}",)}
 
 
 class TestEquations(Contract):
@@ -69,6 +111,25 @@ class TestEquationsWithAttention(Contract):
         "inference": "q(w | x_{1:T}) q(z_t | z_{>t}, x_{1:T}, w)",
         "network": "attention",
         "width": 8,
+    }
+
+
+class TestHiTDVAEWithPosteriorsAsPrior(Contract):
+    name = "hit-dvae"
+    options: ClassVar = {"prior": "vamp", "prior_components": 3, "prior_steps": 4}
+
+
+class TestDSAEWithMixture(Contract):
+    name = "dsae"
+    options: ClassVar = {"prior": "mixture", "prior_components": 3}
+
+
+class TestEquationsWithFlow(Contract):
+    name = "equations"
+    options: ClassVar = {
+        "generative": "p(w) p(x_t | x_{t-1}, w)",
+        "inference": "q(w | x_{1:T})",
+        "prior": "flow",
     }
 
 
@@ -106,6 +167,202 @@ def test_a_network_that_reads_what_it_should_not_breaks_the_contract():
         Broken().test_networks_read_the_declared_parents_and_nothing_else()
     with pytest.raises(AssertionError, match="joint differs by"):
         Broken().test_the_log_joint_is_that_of_the_per_step_program()
+
+
+# ---------------------------------------------------------------------------------- options that every method has
+
+OPTIONS = [
+    {"emission": "fixed"},
+    {"emission": "normal"},
+    {"emission": "student"},
+    {"residual": True},
+    {"prior": "mixture", "prior_components": 2},
+    {"prior": "vamp", "prior_components": 2, "prior_steps": 4},
+    {"prior": "flow"},
+    {"warm_up": 0},
+    {"warm_up": 2, "warm_up_shape": "cosine"},
+    {"warm_up": 2, "warm_up_shape": "logistic"},
+    {"free_bits": 0.1},
+    {"self_feeding": 1.0},
+]
+
+
+def refusal(name, option):
+    """The sentence with which a method's equations refuse an option, if they do."""
+    generative = dvae.Factorization.parse(dvae.method(name).generative)
+    if "prior" in option and all(factor.local for factor in generative.factors):
+        return f"prior='{option['prior']}' is for a static latent without parents"
+    if "residual" in option and "x" not in {parent.name for parent in generative.factor("x").parents}:
+        return "has a residual head, which adds"
+    return None
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: ", ".join(f"{k}={v}" for k, v in option.items()))
+@pytest.mark.parametrize("name", SMALL)
+def test_every_method_takes_every_option_or_says_why_not(name, option):
+    method = small(name, **{"warm_up": 2, "self_feeding": 0.0, **option})
+    if expected := refusal(name, option):
+        with pytest.raises(ValueError, match=expected):
+            method.build({"x": 3})
+        return
+    model = method.build({"x": 3})
+    before = [parameter.detach().clone() for parameter in model.parameters()]
+    result = dvae.fit(
+        model,
+        torch.randn(4, 6, 3),
+        objective=method.objective(),
+        self_feeding=method.feeding(2),
+        steps=2,
+        batch_size=2,
+        log_every=1,
+        accelerator="cpu",
+        progress=False,
+    )
+    assert len(result.history) == 2
+    assert any(not torch.equal(old, new) for old, new in zip(before, model.parameters(), strict=True))
+    assert torch.isfinite(torch.cat([parameter.flatten() for parameter in model.parameters()])).all()
+
+
+def test_options_of_the_loss_reach_it():
+    schedules = dvae.inference.schedules
+    method = dvae.method("hit-dvae", warm_up=7, warm_up_shape="cosine", free_bits=0.3)
+    assert method.objective() == dvae.Evidence(kl_weight=schedules.Cosine(0.0, 1.0, steps=7), free_bits=0.3)
+    assert dvae.method("vae", warm_up=0).objective() == dvae.Evidence()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("vae", {"free_bits": -0.1}, "free_bits is -0.1; it must be finite and at least 0"),
+        ("vae", {"prior_components": 0}, "prior_components is 0; it must be at least 1"),
+        ("vae", {"prior_steps": 0}, "prior_steps is 0; it must be at least 1"),
+        ("vae", {"warm_up_shape": "step"}, "unknown warm_up_shape 'step'; known: linear, cosine, logistic"),
+        ("hit-dvae", {"prior": "gamma"}, "unknown prior 'gamma'; known: standard, mixture, vamp, flow"),
+        (
+            "equations",
+            {
+                "generative": "p(v) p(w) p(x_t | w, v)",
+                "inference": "q(v | x_{1:T}) q(w | x_{1:T}, v)",
+                "prior": "vamp",
+            },
+            r"a VampPrior of w needs a guide that reads the data x over time and nothing else",
+        ),
+    ],
+)
+def test_options_that_are_none(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        dvae.method(name, **options).build({"x": 3})
+
+
+# ----------------------------------------------------------------------------- the family's published networks
+
+PUBLISHED = {  # parameters of the public implementation at its sizes for motion: x 96, z 10
+    "vae": 7_284,
+    "dkf": 52_856,
+    "storn": 96_500,
+    "vrnn": 61_592,
+    "srnn": 100_232,
+    "rvae-causal": 89_204,
+    "rvae-noncausal": 157_556,
+    "dsae": 217_084,
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_the_default_networks_have_the_published_size(name):
+    statics = {"static": 10} if name == "dsae" else {}
+    model = dvae.method(name, latent=10, **statics).build({"x": 96})
+    scales = model.generator["x"].head.log_scale.numel()  # one a coordinate: the public code has no likelihood of x
+    assert sum(parameter.numel() for parameter in model.parameters()) - scales == PUBLISHED[name]
+
+
+@pytest.mark.parametrize("batch_and_steps", [(3, 6), (4, 4), (1, 1)])
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("name", ["dkf", "vrnn", "srnn", "rvae-causal", "rvae-noncausal"])
+def test_the_fused_loop_of_a_guide_is_its_plain_loop(name, activation, batch_and_steps):
+    model = small(name, 3).build({"x": 5}).double()
+    for module in model.modules():
+        for key, child in module.named_children():
+            if activation == "relu" and isinstance(child, torch.nn.Tanh):
+                setattr(module, key, torch.nn.ReLU())
+        if hasattr(module, "kind"):
+            module.kind = activation
+    plain, calls = copy.deepcopy(model), []
+    plain.encoder["z"].chain = lambda *_: None
+    chain = model.encoder["z"].chain
+    model.encoder["z"].chain = lambda *args: calls.append(chain(*args)) or calls[-1]
+    x = torch.randn(*batch_and_steps, 5, dtype=torch.float64)
+    found = []
+    for each in (model, plain):
+        torch.manual_seed(1)
+        bound = dvae.SequenceELBO().terms(each, x).bound
+        found.append((bound, torch.autograd.grad(bound.sum(), list(each.parameters()), materialize_grads=True)))
+    assert calls[0] is not None
+    torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-10)
+
+
+def test_the_recurrence_of_dsae_is_torchs():
+    network = small("dsae", 3).build({"x": 5}).double().encoder["z"].network
+    parents = {name: torch.randn(shape, dtype=torch.float64) for name, shape in (("x", (2, 6, 5)), ("w", (2, 3)))}
+    states = [
+        memory(parents | {"w": parents["w"][:, None].expand(-1, 6, -1)}, parents, None)
+        for memory in (network.past, network.future)
+    ]
+    expected = network.top(torch.cat(states, dim=-1))[0]
+    found = network(parents, 6)
+    grads = [
+        torch.autograd.grad(out.square().sum(), list(network.parameters()), retain_graph=True)
+        for out in (found, expected)
+    ]
+    torch.testing.assert_close((found, grads[0]), (expected, grads[1]), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("vae", {"hidden": ()}),
+        ("dkf", {"decoder": (), "hidden": (), "embed": 0}),
+        ("dkf", {"transition": (3,)}),
+        ("storn", {"embed": 0, "embed_latent": 0, "hidden": ()}),
+        ("vrnn", {"embed": (), "embed_latent": ()}),
+        ("vrnn", {"hidden": (4,)}),
+        ("srnn", {"embed": 0, "decoder": ()}),
+        ("rvae-noncausal", {"hidden": (4,)}),
+        ("dsae", {"decoder": ()}),
+    ],
+)
+def test_layers_may_be_left_out_or_added(name, options):
+    model = small(name, 3, **options).build({"x": 5}).double()
+    x = torch.randn(2, 4, 5, dtype=torch.float64)
+    torch.manual_seed(0)
+    bound = dvae.SequenceELBO().terms(model, x).bound
+    bound.sum().backward()
+    assert all(parameter.grad is not None for parameter in model.parameters())
+    model.encoder["z"].chain = lambda *_: None
+    torch.manual_seed(0)
+    torch.testing.assert_close(dvae.SequenceELBO().terms(model, x).bound, bound, rtol=0, atol=1e-10)
+    assert torch.isfinite(model.forecast(x, 3)["x"]).all()
+
+
+def test_nothing_is_fed_to_a_model_that_reads_no_data():
+    for name, read in (("dkf", False), ("rvae-noncausal", False), ("storn", True), ("srnn", True)):
+        assert bool(dvae.method(name, self_feeding=1.0).feeding(100)) == read
+
+
+def test_the_documented_method_is_one_and_is_not_there_already():
+    page = (Path(__file__).parents[1] / "docs" / "methods.md").read_text()
+    space = {}
+    exec(compile(page.split("```\n")[1], "docs/methods.md", "exec", dont_inherit=True), space)
+    kind = space["SecondOrder"]
+    assert kind.name not in dvae.methods()
+    assert f"{kind.name} = " in page
+    assert torch.isfinite(dvae.SequenceELBO().terms(kind(latent=2).build({"x": 3}), torch.randn(2, 4, 3)).bound).all()
+
+
+def test_the_gated_transition_is_of_a_variable_on_itself():
+    pair = ("p(z_t | z_{t-1}, w) p(w) p(x_t | z_t)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)")
+    with pytest.raises(ValueError, match="a gated transition is of one variable from its own last value"):
+        dvae.DynamicalVAE(*pair, {"z": 2, "w": 2, "x": 3}, {"p(z)": Gated()})
 
 
 # ------------------------------------------------------------------------------------------------- the registry

@@ -466,24 +466,6 @@ def test_a_guides_factor_without_parents_has_a_law_of_its_own():
     assert all(p.grad is not None for p in model.encoder.parameters())
 
 
-@pytest.mark.parametrize("prior", [priors.NormalPrior(2), priors.MixturePrior(2, components=3)])
-def test_priors_of_static_latents_are_densities(prior):
-    model = build("dsae", priors={"w": copy.deepcopy(prior)})
-    with torch.no_grad():
-        for parameter in model.priors.parameters():
-            parameter.add_(0.3 * torch.randn_like(parameter))
-    grid = torch.linspace(-12, 12, 241, dtype=torch.float64)
-    points = torch.cartesian_prod(grid, grid)
-    mass = model.priors["w"](len(points)).log_prob(points).exp().sum() * (grid[1] - grid[0]) ** 2
-    assert abs(mass.item() - 1) < 1e-6
-    x = draw(model)["x"]
-    w = model.sample(20_000, 1)["w"]
-    expected = model.priors["w"](1).mean[0]
-    assert ((w.mean(0) - expected) / (w.std(0) / len(w) ** 0.5)).abs().max() < 5
-    Trace_ELBO()(model, model.guide)(x).backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.priors.parameters())
-
-
 def test_a_mask_of_ones_own_stands_where_a_relation_does():
     model = build(
         ("p(z_t | z_{odd}) p(x_t | z_t)", "q(z_t | x_{1:T})"),

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dvae.networks import Attention, Dense, Input, Linear, Recurrent
 from dvae.networks.base import computing_once, shift
-from dvae.networks.recurrent import tie_past
+from dvae.networks.recurrent import tie
 from dvae.notation import Relation
 
 T = 6
@@ -20,6 +20,11 @@ NETWORKS = {
     "gru": Recurrent(4, cell="gru", hidden=(5,)),
     "lstm": Recurrent(4, hidden=(5, 3)),
     "lstm, two layers, embedded": Recurrent(4, layers=2, embed=3, hidden=(5,)),
+    "lstm, extracted": Recurrent(4, extract={"z": (3, 2), "w": (4,)}, hidden=(5,)),
+    "lstm, separate, apart": Recurrent(4, extract={"c": (3,)}, separate=True, apart=True, hidden=()),
+    "lstm, averaged": Recurrent(
+        4, extract=dict.fromkeys([*"zxuvcw", *(f"y{i}" for i in range(6))], (4,)), mean=True, hidden=(5,)
+    ),
     "attention": Attention(8, heads=2),
     "attention, two layers": Attention(8, heads=4, layers=2, feedforward=6),
     "dense": Dense((5, 4)),
@@ -259,7 +264,7 @@ def recurrent_pair():
 
 def test_a_tied_past_is_evaluated_once_and_learns_from_every_use():
     first, second, parents = recurrent_pair()
-    tie_past(first, second)
+    tie(first, second)
     untied = copy.deepcopy(second)  # has a copy of the memory
     calls = []
     first.past.layers[0].register_forward_hook(lambda *_: calls.append(1))
@@ -298,9 +303,28 @@ def test_memories_of_different_pasts_are_not_tied():
     first, _, _ = recurrent_pair()
     other = build("lstm", [Input("x", 2, Relation.parse("<=t"))])
     with pytest.raises(ValueError, match="different pasts"):
-        tie_past(first, other)
-    with pytest.raises(ValueError, match="only recurrent networks"):
-        tie_past(first, build("dense", [Input("x", 2, Relation.parse("t"))]))
+        tie(first, other)
+    with pytest.raises(ValueError, match="only recurrent networks have a memory to tie, not a DenseNetwork"):
+        tie(first, build("dense", [Input("x", 2, Relation.parse("t"))]))
+    with pytest.raises(ValueError, match="cannot tie a network without a past"):
+        tie(first, build("lstm", [Input("x", 2, Relation.parse(">t"))]))
+    for spec in (Recurrent(5, hidden=(4,)), Recurrent(4, extract={"x": (2,)})):
+        with pytest.raises(ValueError, match="different pasts"):
+            tie(first, spec.build([Input("x", 2, Relation.parse("<t"))], True, 2))
+
+
+@pytest.mark.parametrize(
+    "build",
+    [lambda: Recurrent(0), lambda: Recurrent(layers=0), lambda: Recurrent(extract={"x": (0,)}), lambda: Dense((3, 0))],
+)
+def test_widths_are_at_least_one(build):
+    with pytest.raises(ValueError, match="at least 1"):
+        build().build([Input("x", 2, Relation.parse("t"))], True, 2)
+
+
+def test_a_backward_memory_on_a_forward_one_is_for_whole_sequences():
+    with pytest.raises(ValueError, match=r"stack=True\) is for factors that read over time at \{1:T\} only"):
+        Recurrent(stack=True).build([Input("x", 2, Relation.parse("<t"))], True, 2)
 
 
 @given(steps=st.integers(1, 6), lag=st.integers(-8, 8))

@@ -2,22 +2,25 @@
 
 With everything else hoisted out, a step is
 
-    h_t = act(base_t + z_{t-1} W),  further layers,  (loc_t, raw_t) = h_t V + c
+    f_t = features of z_{t-1}, 0 at the first step                        layers `before`; z_{t-1} itself without them
+    h_t, c_t = LSTM([f_t, h_{t-1}], c_{t-1})                              where there is a cell; else h_t = f_t
+    (loc_t, raw_t) = further layers of (base_t + h_t V)
     z_t = loc_t + (softplus(raw_t) + s) e_t
 
 The forward loop writes into preallocated tensors. The backward loop is written by hand: the derivatives of all
-activations are taken for all steps at once, each step is then three products and two elementwise operations, and the
+activations are taken for all steps at once, each step is then its products and a few elementwise operations, and the
 gradients of the weights are one product each over all steps together.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import repeat
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn import functional
 
 DERIVATIVES = {  # of the activation, in terms of its value
     "tanh": lambda value: torch.addcmul(torch.ones((), dtype=value.dtype, device=value.device), value, value, value=-1),
@@ -26,98 +29,250 @@ DERIVATIVES = {  # of the activation, in terms of its value
 IN_PLACE = {"tanh": torch.Tensor.tanh_, "relu": torch.Tensor.relu_}
 
 
-class GaussianChain(torch.autograd.Function):
-    """Draws (T, B, D), and their locations and scales, of a Gaussian chain; steps run in the order given.
+def gaussian_chain(
+    base: Tensor,
+    noise: Tensor,
+    layers: Sequence[tuple[Tensor, Tensor | None]],
+    *,
+    before: Sequence[tuple[Tensor, Tensor]] = (),
+    cell: tuple[Tensor, Tensor] | None = None,
+    min_scale: float = 0.0,
+    activation: str = "tanh",
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Draws of a Gaussian chain, their locations and scales, (T, B, D); and its states h (T, B, W) if it has a cell.
 
-    Args (of `apply`):
-        base: (T, B, H) the first layer's share of what is not drawn, bias included.
+    Args:
+        base: (T, B, H) share of the first of the `layers` in what is not drawn, bias included.
         noise: (T, B, D) standard normal.
+        layers: weight (out, in) and bias (out,) of every layer from h_t to (loc, raw); the activation stands between
+            them. The first has its bias in `base`.
+        before: weight and bias of the layers on z_{t-1}, each followed by the activation.
+        cell: of an LSTM: (T, B, 4 W) share of its gates in what is not drawn, biases included, and the weight
+            (4 W, F + W) of [f_t, h_{t-1}]; gates in torch's order.
         min_scale: s.
         activation: "tanh" or "relu".
-        weight: (H, D) of z_{t-1}.
-        layers: weight (H', H) and bias (H',) of every further layer, the last one without activation: (2 D, H').
     """
+    gates, recurrent = cell or (None, None)
+    (first, _), *rest = layers
+    tensors = [tensor for layer in (*before, *rest) for tensor in layer]
+    return GaussianChain.apply(noise, base, gates, min_scale, activation, len(before), recurrent, first, *tensors)
+
+
+class GaussianChain(torch.autograd.Function):
+    """See `gaussian_chain`."""
 
     @staticmethod
     def forward(
         ctx: Any,
-        base: Tensor,
         noise: Tensor,
+        base: Tensor,
+        gates: Tensor | None,
         min_scale: float,
         activation: str,
-        weight: Tensor,
-        *layers: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Run the chain; see the class."""
+        count: int,
+        recurrent: Tensor | None,
+        first: Tensor,
+        *tensors: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """Run the chain."""
         steps, batch, size = noise.shape
-        weights, biases = layers[::2], layers[1::2]
         act = IN_PLACE[activation]
-        hidden = [base.new_empty(steps, batch, w.shape[1]) for w in weights]
-        transposed = [w.t() for w in weights]
-        inner = list(zip(transposed[:-1], biases[:-1], [h.unbind(0) for h in hidden[1:]], strict=True))
-        recurrent, final = weight.t(), transposed[-1]
+        before, after = _layers(tensors[: 2 * count]), _layers(tensors[2 * count :])
+
+        def empty(width: int) -> Tensor:
+            return base.new_empty(steps, batch, width)
+
         # z = (loc + s e) + softplus(raw) e: the least scale enters with the bias, outside the loop
         least = min_scale * noise
-        offset = biases[-1] + torch.cat([least, torch.zeros_like(noise)], dim=-1)
-        out, values = torch.empty_like(offset), torch.empty_like(noise)
-        value = base.new_zeros(batch, size)
-        for t, (base_t, first, last, offset_t, out_t, loc, raw, noise_t, new) in enumerate(
+        offset = torch.cat([least, torch.zeros_like(noise)], dim=-1) + (after[-1][1] if after else base)
+        values, out = empty(size), empty(2 * size)
+        # softplus of both halves, as one call on contiguous memory: on a slice it is not vectorised and thrice slower
+        soft, zero = torch.empty_like(out), out.new_zeros(())
+        features = [empty(weight.shape[0]) for weight, _ in before]
+        hidden = [empty(weight.shape[1]) for weight, _ in after]
+        inputs, activated, cells, squashed = None, None, None, None
+        if gates is not None and recurrent is not None:
+            width = gates.shape[-1] // 4
+            entering = recurrent.shape[1] - width
+            inputs = base.new_zeros(steps + 1, batch, entering + width)  # [f_t, h_{t-1}]
+            if features:
+                features[-1] = inputs[:steps, :, :entering]
+            activated, cells, squashed = empty(4 * width), empty(width), empty(width)
+            cell_steps = list(
+                zip(
+                    gates.unbind(0),
+                    inputs[:steps].unbind(0),
+                    inputs[:steps, :, :entering].unbind(0),
+                    inputs[1:, :, entering:].unbind(0),
+                    activated.unbind(0),
+                    activated[..., : 2 * width].unbind(0),
+                    *(part.unbind(0) for part in activated.split(width, dim=-1)),
+                    cells.unbind(0),
+                    squashed.unbind(0),
+                    strict=True,
+                )
+            )
+            product, carried_cell = recurrent.t(), base.new_zeros(batch, width)
+        pre = [(weight.t(), bias, f.unbind(0)) for (weight, bias), f in zip(before, features, strict=True)]
+        # the layers after h_t as (bias at t, weight, output at t), the last one apart
+        targets = [*(h.unbind(0) for h in hidden), out.unbind(0)]
+        matrices = [first.t(), *(weight.t() for weight, _ in after)]
+        biases: list[Any] = [base.unbind(0), *(repeat(bias, steps) for _, bias in after)]
+        biases[-1] = offset.unbind(0)
+        post = [list(zip(*pair, strict=True)) for pair in zip(biases[:-1], targets[:-1], strict=True)]
+        last = list(
             zip(
-                base.unbind(0),
-                hidden[0].unbind(0),
-                hidden[-1].unbind(0),
-                offset.unbind(0),
-                out.unbind(0),
+                biases[-1],
+                targets[-1],
                 out[..., :size].unbind(0),
-                out[..., size:].unbind(0),
+                soft.unbind(0),
+                soft[..., size:].unbind(0),
                 noise.unbind(0),
                 values.unbind(0),
                 strict=True,
             )
-        ):
-            act(torch.addmm(base_t, value, recurrent, out=first))
-            previous = first
-            for matrix, bias, cells in inner:
-                previous = act(torch.addmm(bias, previous, matrix, out=cells[t]))
-            torch.addmm(offset_t, last, final, out=out_t)
-            value = torch.addcmul(loc, functional.softplus(raw), noise_t, out=new)
-        scales = functional.softplus(out[..., size:]) + min_scale
-        ctx.activation = activation
-        ctx.save_for_backward(noise, values, out, weight, *weights, *hidden)
-        return values, out[..., :size] - least, scales
+        )
+        for feature in features:
+            feature[0] = 0
+        value = base.new_zeros(batch, size)
+        for t in range(steps):
+            state = value
+            if t:
+                for matrix, bias, target in pre:
+                    state = act(torch.addmm(bias, state, matrix, out=target[t]))
+            elif pre:
+                state = pre[-1][2][0]
+            if inputs is not None:
+                share, entry, slot, new, gate, two, i, f, g, o, c, s = cell_steps[t]
+                if not pre and t:
+                    slot.copy_(state)
+                torch.addmm(share, entry, product, out=gate)
+                two.sigmoid_()
+                g.tanh_()
+                o.sigmoid_()
+                carried_cell = torch.mul(f, carried_cell, out=c).addcmul_(i, g)
+                state = torch.mul(o, torch.tanh(c, out=s), out=new)
+            for layer, matrix in zip(post, matrices, strict=False):
+                at_t, into = layer[t]
+                state = act(torch.addmm(at_t, state, matrix, out=into))
+            at_t, into, loc, both, scale, e, new_value = last[t]
+            torch.addmm(at_t, state, matrices[-1], out=into)
+            torch.logaddexp(into, zero, out=both)
+            value = torch.addcmul(loc, scale, e, out=new_value)
+        scales = soft[..., size:] + min_scale
+        states = None if inputs is None else inputs[1:, :, entering:]
+        ctx.activation, ctx.count = activation, count
+        ctx.lists = (len(features), len(hidden))
+        ctx.save_for_backward(
+            noise, values, out, recurrent, first, inputs, activated, cells, squashed, *tensors, *features, *hidden
+        )
+        return values, out[..., :size] - least, scales, states
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of base, weight and layers from those of the draws, locations and scales."""
-        noise, values, out, weight, *rest = ctx.saved_tensors
-        weights, hidden = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+        """Gradients of base, gates, weights and biases from those of draws, locations, scales and states."""
+        noise, values, out, recurrent, first, inputs, activated, cells, squashed, *rest = ctx.saved_tensors
+        n_features, n_hidden = ctx.lists
+        count = ctx.count
+        tensors = rest[: len(rest) - n_features - n_hidden]
+        features = rest[len(tensors) : len(tensors) + n_features]
+        hidden = rest[len(tensors) + n_features :]
+        before, after = _layers(tensors[: 2 * count]), _layers(tensors[2 * count :])
         steps, _, size = noise.shape
-        to_value, to_loc, to_scale = gradients
+        to_value, to_loc, to_scale, to_states = gradients
+        slope_of = DERIVATIVES[ctx.activation]
+
         sigmoid = torch.sigmoid(out[..., size:])
         # (loc, raw) receive  c + M * (g, g)  from the gradient g of the value, here twice side by side
-        factor = torch.cat([torch.ones_like(noise), noise * sigmoid], dim=-1)
-        offset = torch.cat([to_loc, to_scale * sigmoid], dim=-1)
+        factors = torch.cat([torch.ones_like(noise), noise * sigmoid], dim=-1).unbind(0)
+        offsets = torch.cat([to_loc, to_scale * sigmoid], dim=-1).unbind(0)
         twice = torch.cat([to_value, to_value], dim=-1).unbind(0)
-        recurrent = torch.cat([weight, weight], dim=1)
-        slopes = [DERIVATIVES[ctx.activation](h) for h in hidden]
         to_out = torch.empty_like(out)
+        outs = to_out.unbind(0)
+
+        # layers after h_t in reverse: weight, slope of what enters it, gradient of that
         to_hidden = [torch.empty_like(h) for h in hidden]
         back = [
-            (w, slope.unbind(0), cells.unbind(0))
-            for w, slope, cells in zip(weights[::-1], slopes[::-1], to_hidden[::-1], strict=True)
+            (weight, slope_of(h).unbind(0), grad.unbind(0))
+            for (weight, _), h, grad in zip(after[::-1], hidden[::-1], to_hidden[::-1], strict=True)
         ]
-        factors, offsets, outs = factor.unbind(0), offset.unbind(0), to_out.unbind(0)
+        to_features = [f.new_zeros(f.shape) for f in features]
+        pre: list[Any] = [
+            (following, slope_of(f).unbind(0), grad.unbind(0))
+            for following, f, grad in zip(
+                [*(weight for weight, _ in before), None][1:], features, to_features, strict=True
+            )
+        ][::-1]
+        # the product through which z_{t-1} enters, twice side by side
+        entry = before[0][0] if before else first if inputs is None else recurrent[:, :size]
+        entry = torch.cat([entry, entry], dim=1)
+        to_gates = None
+        if inputs is not None:
+            width = cells.shape[-1]
+            entering = inputs.shape[-1] - width
+            i, f, g, o = activated.split(width, dim=-1)
+            previous = torch.cat([torch.zeros_like(cells[:1]), cells[:-1]])
+            # the gradients of (i, f, g) are these times that of c_t, the gradient of o this times that of h_t
+            by_cell = torch.cat([g * i * (1 - i), previous * f * (1 - f), i * (1 - g * g)], dim=-1)
+            by_cell = by_cell.unflatten(-1, (3, width)).unbind(0)
+            by_output = (squashed * o * (1 - o)).unbind(0)
+            cell_by_state = (o * (1 - squashed * squashed)).unbind(0)
+            forget = f.unbind(0)
+            to_gates = torch.empty_like(activated)
+            three = to_gates[..., : 3 * width].unflatten(-1, (3, width)).unbind(0)
+            fourth, all_gates = to_gates[..., 3 * width :].unbind(0), to_gates.unbind(0)
+            own = to_states.unbind(0)
+            into_cell = torch.zeros_like(cells[0])
+            into_state = torch.zeros_like(cells[0])
         carried = twice[-1]
         for t in range(steps - 1, -1, -1):
             gradient = torch.addcmul(offsets[t], factors[t], carried, out=outs[t])
-            for matrix, slope, cells in back:
-                gradient = torch.mm(gradient, matrix, out=cells[t]).mul_(slope[t])
-            if t:
-                carried = torch.addmm(twice[t - 1], gradient, recurrent)
-        before = torch.cat([torch.zeros_like(values[:1]), values[:-1]])
-        to_weight = to_hidden[0].flatten(0, 1).t() @ before.flatten(0, 1)
-        to_layers: list[Tensor] = []
-        for incoming, activations in zip([*to_hidden[1:], to_out], hidden, strict=True):
-            to_layers += [incoming.flatten(0, 1).t() @ activations.flatten(0, 1), incoming.sum((0, 1))]
-        return to_hidden[0], None, None, None, to_weight, *to_layers
+            for matrix, slope, target in back:
+                gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
+            if inputs is not None:
+                to_state = torch.add(own[t], into_state).addmm_(gradient, first)
+                into_cell = torch.addcmul(into_cell, to_state, cell_by_state[t])
+                torch.mul(by_cell[t], into_cell.unsqueeze(1), out=three[t])
+                torch.mul(by_output[t], to_state, out=fourth[t])
+                if not t:
+                    break
+                into_cell = into_cell * forget[t]
+                if pre:
+                    to_inputs = torch.mm(all_gates[t], recurrent)
+                    into_state = to_inputs[:, entering:]
+                    gradient = torch.mul(to_inputs[:, :entering], pre[0][1][t], out=pre[0][2][t])
+                else:
+                    gradient = all_gates[t]
+                    into_state = torch.mm(gradient, recurrent[:, entering:])
+            elif not t:
+                break
+            elif pre:
+                gradient = torch.mm(gradient, first, out=pre[0][2][t]).mul_(pre[0][1][t])
+            for matrix, slope, target in pre[1:]:
+                gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
+            carried = torch.addmm(twice[t - 1], gradient, entry)
+
+        earlier = torch.cat([torch.zeros_like(values[:1]), values[:-1]])
+        to_layers = [*to_hidden, to_out]  # gradient of each layer's output
+        to_recurrent = None
+        if to_gates is None:
+            to_first = _product(to_layers[0], features[-1] if features else earlier)
+        else:
+            to_first = _product(to_layers[0], inputs[1:, :, entering:])
+            to_recurrent = _product(to_gates, inputs[:steps])
+        to_tensors: list[Tensor] = []
+        for grad, entered in zip(to_features, [earlier, *features], strict=False):
+            to_tensors += [_product(grad[1:], entered[1:]), grad[1:].sum((0, 1))]
+        for grad, entered in zip(to_layers[1:], hidden, strict=True):
+            to_tensors += [_product(grad, entered), grad.sum((0, 1))]
+        return None, to_layers[0], to_gates, None, None, None, to_recurrent, to_first, *to_tensors
+
+
+def _layers(tensors: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
+    return list(zip(tensors[::2], tensors[1::2], strict=True))
+
+
+def _product(gradient: Tensor, entered: Tensor) -> Tensor:
+    """(H, F): the gradient of a weight from those of its outputs (T, B, H) and its inputs (T, B, F)."""
+    return gradient.flatten(0, 1).t() @ entered.flatten(0, 1)

@@ -6,9 +6,10 @@ model runs beyond the length it was trained on.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from torch.nn import functional
 
 from .base import ACTIVATIONS, Hoisted, Input, Join, Network, at, valid_steps
 from .dense import part
+from .rows import select
 
 
 @dataclass(frozen=True)
@@ -241,6 +243,16 @@ class Cache:
         self.size = end
         self.keys, self.values = (buffer[:, :, :end] for buffer in self.buffers)
 
+    def select(self, rows: Tensor) -> Cache:
+        """Its rows."""
+        chosen = copy.copy(self)
+        if self.buffers is None:
+            chosen.keys, chosen.values = (old.index_select(0, rows) for old in (self.keys, self.values))
+        else:
+            chosen.buffers = tuple(buffer.index_select(0, rows) for buffer in self.buffers)
+            chosen.keys, chosen.values = (buffer[:, :, : self.size] for buffer in chosen.buffers)
+        return chosen
+
 
 @dataclass
 class Attending:
@@ -259,6 +271,19 @@ class Attending:
     seen: dict[int, None] = field(default_factory=dict)
     """Live tokens in the order of the cache: the step, plus T times the parent's place."""
     in_order: bool = True
+    rows: Tensor | None = None
+    """Of the bias, which stays that of the start."""
+
+    def select(self, rows: Tensor) -> Attending:
+        """Its rows."""
+        return replace(
+            self,
+            queries=select(self.queries, rows),
+            batch=len(rows),
+            caches=select(self.caches, rows),
+            seen=dict(self.seen),
+            rows=rows if self.rows is None else self.rows.index_select(0, rows),
+        )
 
     def see(self, token: int) -> None:
         """Note a live token that enters the cache."""
@@ -268,6 +293,8 @@ class Attending:
     def row(self, t: int) -> Tensor:
         """The bias of step t to every token in the cache, broadcastable to (B, heads, 1, S)."""
         row = self.bias[:, :, t : t + 1]
+        if self.rows is not None and row.shape[0] > 1:
+            row = row.index_select(0, self.rows)
         if self.in_order:
             return row[..., : self.given + len(self.seen)]
         columns = [*range(self.given), *(self.given + token for token in self.seen)]

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ..notation import Relation
+from .rows import select
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "gelu": nn.GELU, "elu": nn.ELU}
 
@@ -73,10 +74,21 @@ def once(module: nn.Module, inputs: Sequence[Tensor | None], compute: Callable[[
     kept = _ONCE.get()
     if kept is None:
         return compute()
-    key = (id(module), torch.is_grad_enabled(), *map(id, inputs))
+    key = _key(module, inputs)
     if key not in kept:
         kept[key] = (inputs, compute())  # the inputs are held, so that their ids stay theirs
     return kept[key][1]
+
+
+def keep(module: nn.Module, inputs: Sequence[Tensor | None], result: Tensor) -> None:
+    """Tells `once` a result that came about in another way, such as within a loop."""
+    kept = _ONCE.get()
+    if kept is not None:
+        kept[_key(module, inputs)] = (inputs, result)
+
+
+def _key(module: nn.Module, inputs: Sequence[Tensor | None]) -> tuple[Any, ...]:
+    return id(module), torch.is_grad_enabled(), *map(id, inputs)
 
 
 class Network(nn.Module):
@@ -120,6 +132,10 @@ class Network(nn.Module):
             drawn: name to its values (B, D) by step, for the parents that the loop itself draws.
         """
         raise NotImplementedError
+
+    def select(self, state: Any, rows: Tensor) -> Any:
+        """The state with these rows (N,) of its batch, each as often as it is named (see `rows.select`)."""
+        return select(state, rows)
 
     def chain(self, state: Any) -> Chain | None:
         """The loop after `start` in the form that one fused function runs, where it has that form."""
@@ -165,24 +181,48 @@ def reverse(values: Tensor, lengths: Tensor | None) -> Tensor:
 
 @dataclass
 class Hoisted:
-    """What a `Join` computes before a loop: base (B, T, H), and the weights (H, D) of the parts still to come."""
+    """What a `Join` computes before a loop: base (B, T, H), the weights (H, D) of live parts, and the known parts."""
 
     base: Tensor
     weights: list[Tensor]
+    known: Mapping[int, Tensor]
+    rows: Tensor | None = None
+
+    @property
+    def like(self) -> Tensor:
+        """A tensor of the loop's batch, which `select` may have changed, and its type."""
+        return self.base if self.rows is None else self.base.new_empty(()).expand(len(self.rows), 1)
+
+    def select(self, rows: Tensor) -> Hoisted:
+        """Its rows; they are read from the same base."""
+        chosen = Hoisted(self.base, self.weights, self.known, rows)
+        chosen.steps = select(self.steps, rows)
+        return chosen
 
     @cached_property
-    def steps(self) -> tuple[Tensor, ...]:
+    def steps(self) -> Sequence[Tensor]:
         """The base by step. (unbind, not indexing: T selections would each write a (B, T, H) gradient.)"""
         return self.base.unbind(1)
 
 
 @dataclass
 class Chain:
-    """A loop that adds one product with the child's value a step away to a hoisted base, and then is pointwise."""
+    """A loop in the form that `distributions.chain` runs: one product a step with features of the child's last value.
+
+    Args:
+        lag: where the child's value is read, a step away.
+        join: of the parts; `hoisted` is the share of those that are known.
+        before: layers on the child's value, each followed by the activation.
+        cell: of a memory that reads it: share (B, T, 4 W) of the gates in what is known, and the weight.
+        keep: to be called with the drawn child and the states (B, T, W) of that memory.
+    """
 
     lag: int
-    hoisted: Hoisted
     join: Join
+    hoisted: Hoisted
+    before: Sequence[tuple[Tensor, Tensor]] = ()
+    cell: tuple[Tensor, Tensor] | None = None
+    keep: Callable[[Tensor, Tensor], None] | None = None
 
 
 class Join(nn.Module):
@@ -190,50 +230,91 @@ class Join(nn.Module):
 
     Args:
         sizes: dimension of every part.
-        widths: of the layers; each is followed by the activation.
+        widths: of the layers; each is followed by the activation. Without any, the features are the concatenation.
+        activation: "tanh", "relu", "gelu" or "elu".
+        mean: the mean of the parts in place of their concatenation.
+
+    Raises:
+        ValueError: an unknown activation; parts of different sizes with `mean`.
     """
 
-    def __init__(self, sizes: Sequence[int], widths: Sequence[int], activation: str):
+    like: Tensor
+
+    def __init__(self, sizes: Sequence[int], widths: Sequence[int], activation: str, mean: bool = False):
         super().__init__()
-        if activation not in ACTIVATIONS:
-            raise ValueError(f"unknown activation {activation!r}; known: {', '.join(ACTIVATIONS)}")
+        if mean and len(set(sizes)) > 1:
+            raise ValueError(f"only parts of one size have a mean, not parts of {', '.join(map(str, sizes))}")
         self.sizes = tuple(sizes)
-        self.first = nn.Linear(sum(sizes), widths[0])
+        self.mean = mean
         self.kind = activation
-        self.activation = ACTIVATIONS[activation]()
-        rest: list[nn.Module] = []
-        for a, b in pairwise(widths):
-            rest += [nn.Linear(a, b), ACTIVATIONS[activation]()]
-        self.rest = nn.Sequential(*rest)
+        widths = [sizes[0] if mean else sum(sizes), *widths]
+        self.features = widths[-1]
+        layers = perceptron(widths, activation)
+        self.first: Any = layers[0] if len(layers) else None
+        self.rest: Any = layers[1:]
+        self.register_buffer("like", torch.empty(0), persistent=False)
 
     def forward(self, parts: Sequence[Tensor]) -> Tensor:
         """(B, T, H) from parts (B, T, D) or (B, D); (B, H) where every part is (B, D)."""
-        return self.finish(self.first(_concatenate(parts)))
+        joined = self._join(parts)
+        return joined if self.first is None else self.rest(self.first(joined))
 
-    def hoist(self, given: Mapping[int, Tensor], batch: int, length: int) -> Hoisted:
-        """The first layer's share of the given parts at every step, and the weights of the live parts."""
-        weights = self.first.weight.split(self.sizes, dim=1)
-        base = self.first.bias.expand(batch, length, -1)
-        if given:
-            matrix = torch.cat([weights[i] for i in given], dim=1)
-            base = functional.linear(_concatenate(list(given.values())), matrix, self.first.bias)
+    def _join(self, parts: Sequence[Tensor]) -> Tensor:
+        if len(parts) == 1:
+            return parts[0]
+        parts = _aligned(parts)
+        return torch.stack(parts).mean(0) if self.mean else torch.cat(parts, dim=-1)
+
+    def hoist(self, known: Mapping[int, Tensor], batch: int, length: int, through: nn.Linear | None = None) -> Hoisted:
+        """The first layer's share of the known parts at every step, and the weights of the live ones.
+
+        Args:
+            known: place of a part to its values.
+            batch, length: B and T.
+            through: the layer that comes first where the join has none of its own.
+        """
+        layer = self.first or through
+        if layer is None:
+            none = self.like.new_empty(batch, length, 0)
+            return Hoisted(torch.cat(_aligned([none, *known.values()]), dim=-1), [], known)
+        if self.mean:
+            weights = [layer.weight / len(self.sizes)] * len(self.sizes)
+        else:
+            weights = list(layer.weight.split(self.sizes, dim=1))
+        base = layer.bias.expand(batch, length, -1)
+        if known:
+            matrix = torch.cat([weights[i] for i in known], dim=1)
+            base = functional.linear(torch.cat(_aligned(list(known.values())), dim=-1), matrix, layer.bias)
             base = base if base.dim() == 3 else base[:, None].expand(-1, length, -1)
-        return Hoisted(base, [weight for i, weight in enumerate(weights) if i not in given])
+        return Hoisted(base, [weight for i, weight in enumerate(weights) if i not in known], known)
 
     def add(self, hoisted: Hoisted, t: int, live: Sequence[Tensor]) -> Tensor:
         """Features (B, H) at step t from their hoisted share and the live parts."""
         first = hoisted.steps[t]
+        if self.first is None:
+            seen = dict(zip(hoisted.known, first.split([self.sizes[i] for i in hoisted.known], dim=1), strict=True))
+            coming = iter(live)
+            return self._join([seen[i] if i in seen else next(coming) for i in range(len(self.sizes))])
         for part, weight in zip(live, hoisted.weights, strict=True):
             first = torch.addmm(first, part, weight.t())
-        return self.finish(first)
-
-    def finish(self, first: Tensor) -> Tensor:
-        """The layers after the first product."""
-        return self.rest(self.activation(first))
+        return self.rest(first)
 
 
-def _concatenate(parts: Sequence[Tensor]) -> Tensor:
+def perceptron(widths: Sequence[int], activation: str) -> nn.Sequential:
+    """Linear layers from widths[0] to widths[-1], each followed by the activation."""
+    if activation not in ACTIVATIONS:
+        raise ValueError(f"unknown activation {activation!r}; known: {', '.join(ACTIVATIONS)}")
+    if min(widths) < 1:
+        raise ValueError(f"the widths of a perceptron are at least 1, but these are {', '.join(map(str, widths[1:]))}")
+    layers: list[nn.Module] = []
+    for a, b in pairwise(widths):
+        layers += [nn.Linear(a, b), ACTIVATIONS[activation]()]
+    return nn.Sequential(*layers)
+
+
+def _aligned(parts: Sequence[Tensor]) -> list[Tensor]:
+    """The parts with a time axis, static ones repeated; as they are where none has one."""
     steps = max((part.shape[1] for part in parts if part.dim() == 3), default=None)
-    if steps is not None:
-        parts = [part if part.dim() == 3 else part[:, None].expand(-1, steps, -1) for part in parts]
-    return torch.cat(list(parts), dim=-1) if len(parts) > 1 else parts[0]
+    if steps is None:
+        return list(parts)
+    return [part if part.dim() == 3 else part[:, None].expand(-1, steps, -1) for part in parts]

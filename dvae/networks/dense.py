@@ -16,7 +16,7 @@ class Dense:
     """A multilayer perceptron on pointwise parents (z_t, z_{t-1}, x_{t-3:t-1}, w).
 
     Args:
-        widths: of the layers.
+        widths: of the layers; () for none, the features are then the parents.
         activation: "tanh", "relu", "gelu" or "elu".
     """
 
@@ -32,7 +32,7 @@ class DenseNetwork(Network):
     """See `Dense`."""
 
     def __init__(self, inputs: Sequence[Input], local: bool, widths: Sequence[int], activation: str):
-        super().__init__(inputs, local, widths[-1])
+        super().__init__(inputs, local, 0)
         self.parts: list[tuple[Input, int | None]] = []
         for parent in self.inputs:
             if parent.relation is None:
@@ -45,6 +45,7 @@ class DenseNetwork(Network):
                     "use networks.Recurrent or networks.Attention for this factor"
                 )
         self.join = Join([parent.size for parent, _ in self.parts], widths, activation)
+        self.features = self.join.features
 
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """See `Network.forward`."""
@@ -60,13 +61,13 @@ class DenseNetwork(Network):
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         """See `Network.step`."""
         hoisted, live = state
-        parts = [at(drawn[parent.name], t + lag, hoisted.base, parent.size) for parent, lag in live]
+        parts = [at(drawn[parent.name], t + lag, hoisted.like, parent.size) for parent, lag in live]
         return self.join.add(hoisted, t, parts), state
 
     def chain(self, state: Any) -> Chain | None:
         """See `Network.chain`."""
         hoisted, live = state
-        return Chain(live[0][1], hoisted, self.join) if len(live) == 1 else None
+        return Chain(live[0][1], self.join, hoisted) if len(live) == 1 else None
 
 
 def part(values: Tensor, lag: int | None) -> Tensor:

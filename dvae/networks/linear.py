@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from .base import Input, Network, at
+from .rows import select
 
 
 @dataclass(frozen=True)
@@ -92,3 +93,8 @@ class LinearNetwork(Network):
                 if visible:
                     features = features + at(drawn[name], s, features, weight.shape[-1]) @ weight[t, s].t()
         return features, state
+
+    def select(self, state: Any, rows: Tensor) -> Any:
+        """See `Network.select`."""
+        base, live = state
+        return select(base, rows), live

@@ -4,15 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .base import ACTIVATIONS, Chain, Input, Join, Network, at, once, reverse, shift
+from .base import (
+    Chain,
+    Hoisted,
+    Input,
+    Join,
+    Network,
+    at,
+    keep,
+    once,
+    perceptron,
+    reverse,
+    shift,
+    valid_steps,
+)
 from .dense import part
+from .rows import Rows, select
 
 CELLS: dict[str, type[nn.GRU] | type[nn.LSTM]] = {"gru": nn.GRU, "lstm": nn.LSTM}
 
@@ -32,8 +47,15 @@ class Recurrent:
         cell: "lstm" or "gru"; torch trains the first 2.4 times as fast on a CPU.
         layers: of each recurrent network.
         embed: width of a dense layer on what enters the recurrent networks; 0 for none.
-        hidden: widths of the perceptron that joins the states and the pointwise parents.
+        hidden: widths of the perceptron that joins the states and the pointwise parents; () for none, the features
+            are then their concatenation.
         activation: "tanh", "relu", "gelu" or "elu".
+        extract: widths of a perceptron on a parent, by its name, that comes before all else; () for none. Outside the
+            sequence what it gives is 0.
+        separate: a forward and a backward state for each parent, in place of one for all.
+        apart: a parent read over {<=t} enters the forward network up to t-1, and joins with its value at t.
+        stack: the backward network reads the forward states too, and alone joins. Only for parents read over {1:T}.
+        mean: states and pointwise parents are averaged before the perceptron, in place of concatenated.
     """
 
     width: int = 64
@@ -42,11 +64,20 @@ class Recurrent:
     embed: int = 0
     hidden: tuple[int, ...] = (64,)
     activation: str = "tanh"
+    extract: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    separate: bool = False
+    apart: bool = False
+    stack: bool = False
+    mean: bool = False
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> RecurrentNetwork:
         """The network of a factor with these parents."""
         if self.cell not in CELLS:
             raise ValueError(f"unknown cell {self.cell!r}; known: {', '.join(CELLS)}")
+        if self.width < 1 or self.layers < 1:
+            raise ValueError(
+                f"a recurrent network has width and layers of at least 1, not {self.width} and {self.layers}"
+            )
         return RecurrentNetwork(self, inputs, local)
 
 
@@ -56,29 +87,45 @@ class Memory(nn.Module):
     Args:
         entries: (parent, lag): the network reads the parent at t + lag when it arrives at t.
         direction: +1 forward, -1 backward in time.
+        under: a memory whose states enter before the entries.
     """
 
-    def __init__(self, spec: Recurrent, entries: Sequence[tuple[Input, int]], direction: int):
+    def __init__(
+        self, spec: Recurrent, entries: Sequence[tuple[Input, int]], direction: int, under: Memory | None = None
+    ):
         super().__init__()
         self.layers: list[Any]
         self.embed: Any
         self.entries = tuple(entries)
         self.direction = direction
-        size = sum(parent.size for parent, _ in entries)
+        self.under: Memory | None = under
+        size = sum(parent.size for parent, _ in entries) + (spec.width if under else 0)
         self.reads = [(parent.name, lag) for parent, lag in entries]
-        self.embed = nn.Sequential(nn.Linear(size, spec.embed), ACTIVATIONS[spec.activation]()) if spec.embed else None
+        self.embed = perceptron((size, spec.embed), spec.activation) if spec.embed else None
         kind = CELLS[spec.cell]
         sizes = [spec.embed or size] + [spec.width] * (spec.layers - 1)
         self.layers = nn.ModuleList(kind(a, spec.width, batch_first=True) for a in sizes)  # type: ignore[assignment]
         self.cell = gru_cell if spec.cell == "gru" else lstm_cell
 
-    def forward(self, parents: Mapping[str, Tensor], lengths: Tensor | None) -> Tensor:
-        """States (B, T, W) at every step."""
-        inputs = [parents[parent.name] for parent, _ in self.entries]
-        return once(self, [*inputs, lengths], lambda: self._states(parents, lengths))
+    def forward(self, values: Mapping[str, Tensor], keys: Mapping[str, Tensor], lengths: Tensor | None) -> Tensor:
+        """States (B, T, W) at every step.
 
-    def _states(self, parents: Mapping[str, Tensor], lengths: Tensor | None) -> Tensor:
-        states = torch.cat([shift(parents[parent.name], lag) for parent, lag in self.entries], dim=-1)
+        Args:
+            values: features of the parents, by name.
+            keys: the parents themselves, which tell whether the states have been computed before.
+            lengths: (B,) of a ragged batch.
+        """
+        return once(self, self.key(keys, lengths), lambda: self._states(values, keys, lengths))
+
+    def key(self, keys: Mapping[str, Tensor], lengths: Tensor | None) -> list[Tensor | None]:
+        """What the states are computed from."""
+        return [*(keys[parent.name] for parent, _ in self.entries), lengths]
+
+    def _states(self, values: Mapping[str, Tensor], keys: Mapping[str, Tensor], lengths: Tensor | None) -> Tensor:
+        parts = [shift(values[parent.name], lag) for parent, lag in self.entries]
+        if self.under is not None:
+            parts = [self.under(values, keys, lengths), *parts]
+        states = torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
         if self.embed is not None:
             states = self.embed(states)
         if self.direction < 0:
@@ -94,11 +141,10 @@ class Memory(nn.Module):
         columns = weight.split([parent.size for parent, _ in self.entries], dim=1)
         known = [i for i, (parent, _) in enumerate(self.entries) if parent.name in given]
         live = [i for i in range(len(self.entries)) if i not in known]
+        base = bias.expand(batch, 1, -1)
         if known:
             values = torch.cat([shift(given[self.entries[i][0].name], self.entries[i][1]) for i in known], dim=-1)
-            base = functional.linear(values, torch.cat([columns[i] for i in known], dim=1), bias).unbind(1)
-        else:
-            base = bias.expand(batch, -1)
+            base = functional.linear(values, torch.cat([columns[i] for i in known], dim=1), bias)
         zero = weight.new_zeros(batch, self.layers[0].hidden_size)
         return MemoryState(
             base=base,
@@ -109,7 +155,7 @@ class Memory(nn.Module):
 
     def step(self, state: MemoryState, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Tensor:
         """The state (B, W) at t; `state` is advanced."""
-        value = state.base if isinstance(state.base, Tensor) else state.base[t]
+        value = state.steps[t if len(state.steps) > 1 else 0]
         for parent, lag, weight in state.live:
             value = torch.addmm(value, at(drawn[parent.name], t + lag, value, parent.size), weight)
         if self.embed is not None:
@@ -125,15 +171,35 @@ class Memory(nn.Module):
             value = new[0]
         return value
 
+    def gates(self, state: MemoryState, length: int) -> tuple[Tensor, Tensor] | None:
+        """(B, T, 4 W) share of an LSTM's gates in what is known, and its weight; None for what is not one LSTM."""
+        if self.embed is not None or len(self.layers) > 1 or self.cell is not lstm_cell:
+            return None
+        (layer,) = self.layers
+        live = torch.cat([*(weight.t() for _, _, weight in state.live), layer.weight_hh_l0], dim=1)
+        return (state.base + layer.bias_hh_l0).expand(-1, length, -1), live
+
 
 @dataclass
 class MemoryState:
     """What a `Memory` keeps between steps: hoisted products, live parents, hidden states by layer."""
 
-    base: Tensor | tuple[Tensor, ...]
+    base: Tensor
     live: list[tuple[Input, int, Tensor]]
     lengths: Tensor | None
     hidden: list[tuple[Tensor, Tensor]]
+
+    @cached_property
+    def steps(self) -> Sequence[Tensor]:
+        """The base by step, or one for all steps."""
+        return self.base.unbind(1)
+
+    def select(self, rows: Tensor) -> MemoryState:
+        """Its rows; the base is that of the start."""
+        lengths = None if self.lengths is None else self.lengths[rows]
+        chosen = MemoryState(self.base, self.live, lengths, select(self.hidden, rows))
+        chosen.steps = select(self.steps, rows)
+        return chosen
 
 
 def gru_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple[Tensor, Tensor]:
@@ -159,11 +225,20 @@ class RecurrentNetwork(Network):
     """See `Recurrent`."""
 
     def __init__(self, spec: Recurrent, inputs: Sequence[Input], local: bool):
-        super().__init__(inputs, local, spec.hidden[-1])
+        super().__init__(inputs, local, 0)
+        self.extractors = nn.ModuleDict(
+            {
+                p.name: perceptron((p.size, *spec.extract[p.name]), spec.activation)
+                for p in inputs
+                if spec.extract.get(p.name)
+            }
+        )
         past: list[tuple[Input, int]] = []
         future: list[tuple[Input, int]] = []
         self.points: list[tuple[Input, int | None]] = []
         for parent in self.inputs:
+            if spec.extract.get(parent.name):
+                parent = replace(parent, size=spec.extract[parent.name][-1])
             if parent.relation is None:
                 self.points.append((parent, None))
                 continue
@@ -177,75 +252,199 @@ class RecurrentNetwork(Network):
                 last = (-1 if local and math.isinf(low) else 0) if math.isinf(high) else int(high)
                 # A memory has read its past (future) by t; what lies on the other side of t joins by single steps.
                 if math.isinf(low):
-                    past.append((parent, min(last, 0)))
-                    first = 1
+                    past.append((parent, min(last, -1 if spec.apart and local else 0)))
+                    first = past[-1][1] + 1 if last >= 0 else 1
                 if math.isinf(high):
                     future.append((parent, max(0 if math.isinf(low) else int(low), 0)))
                     last = -1
                 self.points += [(parent, lag) for lag in range(first, last + 1)]
-        self.past = Memory(spec, past, +1) if past else None
-        self.future = Memory(spec, future, -1) if future else None
+        if spec.stack and (
+            not past or {parent for parent, _ in past} != {parent for parent, _ in future} or spec.separate
+        ):
+            raise ValueError(
+                "Recurrent(stack=True) is for factors that read over time at {1:T} only, with one state for all"
+            )
+        pasts = [Memory(spec, entries, +1) for entries in _groups(past, spec.separate)]
+        under = pasts[0] if spec.stack else None
+        futures = [Memory(spec, entries, -1, under) for entries in _groups(future, spec.separate)]
+        self.memories = nn.ModuleList(futures if spec.stack else pasts + futures)
         sizes = [spec.width] * len(self.memories) + [parent.size for parent, _ in self.points]
-        self.join = Join(sizes, spec.hidden, spec.activation)
+        self.join = Join(sizes, spec.hidden, spec.activation, spec.mean)
+        self.features = self.join.features
 
     @property
-    def memories(self) -> list[Memory]:
-        """The forward and the backward memory, where there are such parents."""
-        return [memory for memory in (self.past, self.future) if memory is not None]
+    def past(self) -> Memory | None:
+        """The forward memory, where there is one for all parents."""
+        memories = [memory.under or memory for memory in self._memories()]
+        forward = [memory for memory in memories if memory.direction > 0]
+        return forward[0] if len(forward) == 1 else None
+
+    def _memories(self) -> list[Memory]:
+        return list(self.memories)  # type: ignore[arg-type]
+
+    def _extract(self, parents: Mapping[str, Tensor], lengths: Tensor | None) -> dict[str, Tensor]:
+        """What the memories and the join read of the parents."""
+
+        def features(name: str) -> Tensor:
+            found = self.extractors[name](parents[name])
+            if lengths is None or found.dim() == 2:
+                return found
+            return found * valid_steps(lengths, found.shape[1])[..., None]
+
+        values = dict(parents)
+        for name in self.extractors.keys() & parents.keys():
+            values[name] = once(self.extractors[name], [parents[name], lengths], partial(features, name))
+        return values
 
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """See `Network.forward`."""
-        states = [memory(parents, lengths) for memory in self.memories]
+        values = self._extract(parents, lengths)
+        states = [memory(values, parents, lengths) for memory in self._memories()]
         if not self.local:
             states = [
-                summary(state, memory.direction, lengths) for state, memory in zip(states, self.memories, strict=True)
+                summary(state, memory.direction, lengths)
+                for state, memory in zip(states, self._memories(), strict=True)
             ]
-        points = [part(parents[parent.name], lag) for parent, lag in self.points]
-        features = self.join(states + points)
+        features = self.join([*states, *(part(values[parent.name], lag) for parent, lag in self.points)])
         return features[:, None].expand(-1, length, -1) if self.local and features.dim() == 2 else features
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """See `Network.start`."""
+        values = self._extract(given, lengths)
         known: dict[int, Tensor] = {}
         memories: list[tuple[Memory, MemoryState]] = []
-        for i, memory in enumerate(self.memories):
+        for i, memory in enumerate(self._memories()):
             if all(parent.name in given for parent, _ in memory.entries):
-                known[i] = memory(given, lengths)
+                known[i] = memory(values, given, lengths)
             else:
-                memories.append((memory, memory.start(given, batch, lengths)))
+                memories.append((memory, memory.start(values, batch, lengths)))
         live: list[tuple[Input, int]] = []
         for i, (parent, lag) in enumerate(self.points, len(self.memories)):
             if parent.name in given:
-                known[i] = part(given[parent.name], lag)
+                known[i] = part(values[parent.name], lag)
             elif lag is not None:
                 live.append((parent, lag))
-        return self.join.hoist(known, batch, length), memories, live
+        hoisted = self.join.hoist(known, batch, length)
+        extracted = {name: Rows([None] * length) for name in self.extractors}
+        return RecurrentState(hoisted, memories, live, extracted, dict(given), lengths)
 
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: RecurrentState, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         """See `Network.step`."""
-        hoisted, memories, live = state
-        parts = [memory.step(memory_state, t, drawn) for memory, memory_state in memories]
-        parts += [at(drawn[parent.name], t + lag, hoisted.base, parent.size) for parent, lag in live]
-        return self.join.add(hoisted, t, parts), state
+        values = {name: self._drawn(name, state, value) for name, value in drawn.items()}
+        parts = [memory.step(memory_state, t, values) for memory, memory_state in state.memories]
+        like = parts[0] if parts else state.hoisted.like
+        parts += [at(values[parent.name], t + lag, like, parent.size) for parent, lag in state.live]
+        return self.join.add(state.hoisted, t, parts), state
 
-    def chain(self, state: Any) -> Chain | None:
+    def _drawn(self, name: str, state: RecurrentState, values: Sequence[Tensor]) -> Sequence[Tensor]:
+        """The draws so far, each passed once through the parent's extractor."""
+        if name not in self.extractors:
+            return values
+        seen = state.extracted[name]
+        for s in range(len(values)):
+            if seen.missing(s) and values[s] is not None:
+                features = self.extractors[name](values[s])
+                seen[s] = features if state.lengths is None else features * (s < state.lengths)[:, None]
+        return seen
+
+    def chain(self, state: RecurrentState) -> Chain | None:
         """See `Network.chain`."""
-        hoisted, memories, live = state
-        return Chain(live[0][1], hoisted, self.join) if len(live) == 1 and not memories else None
+        if len(state.memories) + len(state.live) != 1:
+            return None
+        before: tuple[tuple[Tensor, Tensor], ...] = ()
+        if not state.memories:
+            ((parent, lag),) = state.live
+            return Chain(lag, self.join, state.hoisted, self._layers(parent.name))
+        ((memory, memory_state),) = state.memories
+        cell = memory.gates(memory_state, state.hoisted.base.shape[1])
+        if cell is None or len(memory_state.live) != 1:
+            return None
+        ((parent, lag, _),) = memory_state.live
+        before = self._layers(parent.name)
+
+        def remember(drawn: Tensor, states: Tensor) -> None:
+            keep(memory, memory.key({**state.given, parent.name: drawn}, memory_state.lengths), states)
+
+        return Chain(lag, self.join, state.hoisted, before, cell, remember)
+
+    def _layers(self, name: str) -> tuple[tuple[Tensor, Tensor], ...]:
+        if name not in self.extractors:
+            return ()
+        layers: Any = self.extractors[name]
+        return tuple((layer.weight, layer.bias) for layer in layers if isinstance(layer, nn.Linear))
 
 
-def tie_past(first: object, *others: object) -> None:
-    """Gives recurrent networks one forward memory: of the same parents at the same lags, evaluated once for all.
+@dataclass
+class RecurrentState:
+    """What a `RecurrentNetwork` keeps between steps.
+
+    Args:
+        hoisted: the join's share of what is known.
+        memories: those that read what is drawn, and their states.
+        live: pointwise parents that are drawn, and their lags.
+        extracted: name to what the extractor gave for the draws so far.
+        given: the known parents.
+        lengths: (B,) of a ragged batch.
+    """
+
+    hoisted: Hoisted
+    memories: list[tuple[Memory, MemoryState]]
+    live: list[tuple[Input, int]]
+    extracted: dict[str, Rows]
+    given: dict[str, Tensor]
+    lengths: Tensor | None
+
+    def select(self, rows: Tensor) -> RecurrentState:
+        """Its rows; the known parents stay those of the start."""
+        memories = [(memory, state.select(rows)) for memory, state in self.memories]
+        return replace(
+            self,
+            hoisted=self.hoisted.select(rows),
+            memories=memories,
+            extracted=select(self.extracted, rows),
+            lengths=None if self.lengths is None else self.lengths[rows],
+        )
+
+
+def tie(first: Any, *others: Any) -> None:
+    """Gives recurrent networks one forward memory, of the same parents at the same lags, and its extractors.
+
+    What they share is evaluated once for all of them.
 
     Raises:
-        ValueError: networks whose forward memories read different things.
+        ValueError: networks without one forward memory, or whose memories read or hold different things.
     """
+    shape = _shape(first)
     for other in others:
-        if not (isinstance(first, RecurrentNetwork) and isinstance(other, RecurrentNetwork)):
-            raise ValueError(f"only recurrent networks have a memory to tie, not {type(first).__name__}")
-        if first.past is None or other.past is None or first.past.reads != other.past.reads:
-            raise ValueError(f"cannot tie memories of different pasts: {first.past} and {other.past}")
-        other.past = first.past
+        if (theirs := _shape(other)) != shape:
+            raise ValueError(f"cannot tie memories of different pasts: one has {shape}, the other {theirs}")
+        replaced = other.past
+        for memory in other.memories:
+            if memory.under is replaced:
+                memory.under = first.past
+        other.memories = nn.ModuleList(first.past if memory is replaced else memory for memory in other.memories)
+        for name, _ in first.past.reads:
+            if name in first.extractors:
+                other.extractors[name] = first.extractors[name]
+
+
+def _shape(network: Any) -> dict[str, Any]:
+    """What two forward memories must have in common to be one: what they read, and the shapes of their parameters."""
+    if not isinstance(network, RecurrentNetwork):
+        raise ValueError(f"only recurrent networks have a memory to tie, not a {type(network).__name__}")
+    if network.past is None:
+        raise ValueError("cannot tie a network without a past, or with separate memories of several parents")
+    parts = {name: network.extractors[name] for name, _ in network.past.reads if name in network.extractors}
+    shapes = {name: [tuple(p.shape) for p in part.parameters()] for name, part in parts.items()}
+    return {"reads": network.past.reads, "memory": [tuple(p.shape) for p in network.past.parameters()], **shapes}
+
+
+def _groups(entries: list[tuple[Input, int]], separate: bool) -> list[list[tuple[Input, int]]]:
+    """Entries by the memory that reads them."""
+    if not separate:
+        return [entries] if entries else []
+    names = dict.fromkeys(parent.name for parent, _ in entries)
+    return [[entry for entry in entries if entry[0].name == name] for name in names]
 
 
 def summary(states: Tensor, direction: int, lengths: Tensor | None) -> Tensor:

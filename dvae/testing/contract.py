@@ -4,13 +4,14 @@
         def build(self, size):
             return dvae.DynamicalVAE(generative, inference, sizes={"z": size, "x": size}, network=MyNetwork())
 
-pytest collects the subclass and runs every law below on the model, in double precision and on random data.
+pytest collects the subclass and runs every law below on the model: in double precision and on random data, but for the
+last, which trains it.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,7 +23,10 @@ from torch import Tensor
 from ..conditional import Conditional
 from ..graph import audit
 from ..inference.bounds import SequenceELBO
-from ..model import DynamicalVAE
+from ..inference.checkpoints import load_weights, save_weights
+from ..inference.fit import fit
+from ..model import Batch, DynamicalVAE
+from ..motion import PROTOCOLS, simulate, windows
 from ..oracle import Oracle, twin
 
 
@@ -34,12 +38,16 @@ class FactorizationContract:
         steps: T, time steps in a test.
         tolerance: of log densities that two ways of running the program must agree on, in nats.
         still: parameters that need not learn from every batch, by name.
+        missing: what the guide should read and does not, as it is published, {} for nothing; not checked if None.
+        training_steps: of the optimiser, for the test that trains.
     """
 
     batch = 3
     steps = 5
     tolerance = 1e-8
     still: frozenset[str] = frozenset()
+    missing: Mapping[str, tuple[str, ...]] | None = None
+    training_steps = 100
 
     def build(self, size: int) -> DynamicalVAE:
         """The model under test, small.
@@ -48,6 +56,24 @@ class FactorizationContract:
             size: D of the data and, where they are free, of the other variables.
         """
         raise NotImplementedError("a FactorizationContract is subclassed: def build(self, size) returns the model")
+
+    def data(self, size: int) -> Batch:
+        """Sequences to train on: those that the model is made for, if not simulated people in metres.
+
+        Args:
+            size: D. Of wider data, take the first coordinates.
+
+        Returns:
+            x (N, T, D), or a batch.
+        """
+        people = windows(simulate(clips=8, frames=30), PROTOCOLS["simulated"], "train", length=10)
+        return people.all()["x"][..., :size]
+
+    @pytest.fixture(autouse=True)
+    def _seeded(self) -> Iterator[None]:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            yield
 
     def test_networks_read_the_declared_parents_and_nothing_else(self) -> None:
         """Parameters at t have a Jacobian of exactly zero to a parent at s wherever the mask is False."""
@@ -118,6 +144,21 @@ class FactorizationContract:
             guided = _run(poutine.condition(model.guide, data=drawn), alone)[1]
             self._close({name: log[i : i + 1] for name, log in guide_logs.items()}, guided)
 
+    def test_missing_entries_leave_the_likelihood(self) -> None:
+        """A mask that hides nothing changes nothing; hidden data, whatever stands there, have likelihood 1."""
+        model = self._model()
+        data = self._data(model)
+        latents, guided = _run(model.guide, data)
+        names = [name for name in model.observed if self._local(model, name)]
+        seen: Any = {**data, "mask": {name: torch.ones_like(data[name], dtype=torch.bool) for name in names}}
+        self._close(model.log_joint(seen, latents), model.log_joint(data, latents))
+        self._close(_run(poutine.condition(model.guide, data=latents), seen)[1], guided)
+        unseen: Any = {**data, **{name: torch.full_like(data[name], torch.nan) for name in names}}
+        unseen["mask"] = {name: ~mask for name, mask in seen["mask"].items()}
+        terms = SequenceELBO().terms(model, unseen)
+        assert torch.isfinite(terms.bound).all()
+        assert all((terms.log_likelihood[name] == 0).all() for name in names)
+
     def test_every_parameter_learns(self) -> None:
         """The loss has a gradient in every parameter of model and guide."""
         model = self._model()
@@ -125,16 +166,25 @@ class FactorizationContract:
         flat = {name for name, p in model.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0}
         assert not flat - self.still, f"no gradient reaches {', '.join(sorted(flat - self.still))}"
 
-    def test_a_loaded_model_gives_the_same_seeded_draws(self) -> None:
-        """The state_dict holds all there is to a model."""
+    def test_a_loaded_model_gives_the_same_seeded_draws(self, tmp_path: Path) -> None:
+        """The weights on the disk are all there is to a model."""
         model, other = self._model(), self._model()
-        other.load_state_dict(copy.deepcopy(model.state_dict()))
+        save_weights(model, tmp_path / "weights.safetensors")
+        load_weights(other, tmp_path / "weights.safetensors")
         data = self._data(model)
         for run in (lambda m: m.guide(data), lambda m: m.reconstruct(data)):
             torch.manual_seed(1)
             expected = run(model)
             torch.manual_seed(1)
             assert all(torch.equal(value, expected[name]) for name, value in run(other).items())
+
+    def test_the_audit_says_what_is_published(self) -> None:
+        """The guide misses `missing` of the exact posterior's dependencies, and nothing else."""
+        if self.missing is None:
+            pytest.skip("nothing is published on the guide (missing = None)")
+        model = self.build(1)
+        found = audit(model.generative, model.inference, observed=model.observed).missing
+        assert found == dict(self.missing), f"the guide misses {found}, published is {dict(self.missing)}"
 
     def test_its_linear_gaussian_twin_is_bounded_by_the_evidence_and_tight_where_the_audit_says_so(self) -> None:
         """The same equations with known evidence: the best guide's gap is zero if and only if it is exact."""
@@ -149,6 +199,21 @@ class FactorizationContract:
         gap = oracle.fit_guide()
         exact = audit(model.generative, model.inference, observed=model.observed).exact
         assert (gap < 1e-6) == exact, f"the audit says exact: {exact}, but the best guide's gap is {gap:.2g} nats"
+
+    def test_training_stays_finite(self) -> None:
+        """A run of `fit` on `data`, in single precision, and forecasts after it, have no NaN."""
+        size = 4
+        model, data = self.build(size), self.data(size)
+        if not isinstance(data, Mapping):
+            data = {**self._data(model, *data.shape[:2]), model.observed[0]: data}
+        fit(model, data, steps=self.training_steps, batch_size=8, accelerator="cpu", progress=False)
+        assert all(torch.isfinite(parameter).all() for parameter in model.parameters())
+        past = {
+            name: v[:2, : v.shape[1] - 2] if name in model.observed and v.dim() == 3 else v[:2]
+            for name, v in data.items()
+            if name != "lengths"
+        }
+        assert all(torch.isfinite(value).all() for value in model.forecast(past, 2).values())
 
     # ---------------------------------------------------------------------------------------------- what they use
 

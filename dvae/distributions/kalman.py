@@ -1,0 +1,217 @@
+"""Linear-Gaussian chains with time-varying matrices: exact filter, smoother and draws, batched.
+
+    z_1 ~ N(m_1, P_1)        z_t = A_t z_{t-1} + b_t + N(0, Q)        weight of z_t: exp(g_t' z_t - z_t' G_t z_t / 2)
+
+The weights are what observations leave of themselves: a_t = C_t z_t + N(0, R) gives G_t = C_t' R^-1 C_t and
+g_t = C_t' R^-1 a_t, and a missing one zeros. All work is then in the dimension of z (Kalman, 1960; Rauch, Tung and
+Striebel, 1965; in information form, Särkkä, Bayesian Filtering and Smoothing, 2013).
+
+The prediction is one autograd function. With W_t = (I + P_t G_t)^-1 and F_t = A_{t+1} W_t it is
+
+    P_{t+1} = Q + F_t P_t A_{t+1}'        m_{t+1} = F_t m_t + A_{t+1} W_t P_t g_t + b_{t+1}
+
+of which only the first is not linear; its derivative is F_t dP F_t'. So both recursions of the backward pass are linear
+with known matrices: three products a step, all else at all steps at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+
+class Moments(NamedTuple):
+    """Means (T, B, N) and covariances (T, B, N, N) of every z_t."""
+
+    mean: Tensor
+    covariance: Tensor
+
+
+class Smoothed(NamedTuple):
+    """Means (T, B, N) and covariances (T, B, N, N) of every z_t; lag_one (T - 1, B, N, N) is Cov(z_{t+1}, z_t)."""
+
+    mean: Tensor
+    covariance: Tensor
+    lag_one: Tensor
+
+
+@dataclass(frozen=True)
+class LinearGaussianChain:
+    """The chain and its weights, see the file; time comes first. Gradients flow through all its results.
+
+    Args:
+        transition: A_2 to A_T, (T - 1, B, N, N).
+        offset: b_2 to b_T, (T - 1, B, N).
+        noise: Q, (N, N).
+        mean, covariance: m_1 (B, N) and P_1 (B, N, N).
+        information: G, (T, B, N, N), symmetric.
+        potential: g, (T, B, N).
+    """
+
+    transition: Tensor
+    offset: Tensor
+    noise: Tensor
+    mean: Tensor
+    covariance: Tensor
+    information: Tensor
+    potential: Tensor
+
+    @cached_property
+    def predicted(self) -> Moments:
+        """Of z_t given what came before t."""
+        return Moments(
+            *Predict.apply(
+                self.transition,
+                self.offset,
+                self.noise,
+                self.mean,
+                self.covariance,
+                self.information,
+                self.potential,
+            )
+        )
+
+    @cached_property
+    def filtered(self) -> Moments:
+        """Of z_t given what came up to t."""
+        return update(*self.predicted, self.information, self.potential)
+
+    @cached_property
+    def _gain(self) -> Tensor:
+        """(T - 1, B, N, N) coefficient of z_{t+1} in E(z_t | z_{t+1}, what came up to t)."""
+        return torch.linalg.solve(self.predicted.covariance[1:], self.transition @ self.filtered.covariance[:-1]).mT
+
+    @cached_property
+    def smoothed(self) -> Smoothed:
+        """Of z_t given everything."""
+        mean, covariance = ([last[-1]] for last in self.filtered)
+        for t in range(len(self.transition) - 1, -1, -1):
+            gain = self._gain[t]
+            change = mean[-1] - self.predicted.mean[t + 1]
+            mean.append(self.filtered.mean[t] + _times(gain, change))
+            change = covariance[-1] - self.predicted.covariance[t + 1]
+            covariance.append(_symmetric(self.filtered.covariance[t] + gain @ change @ gain.mT))
+        covariances = torch.stack(covariance[::-1])
+        return Smoothed(torch.stack(mean[::-1]), covariances, covariances[1:] @ self._gain.mT)
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """Reparameterised draws (T, B, N) of z_{1:T} given everything, from standard normal noise of that shape."""
+        gain, last = self._gain, self.filtered.covariance[-1:]
+        rest = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain @ self.transition
+        # of z_t given z_{t+1}; a sum of squares (Joseph's form), which stays positive where the difference would not
+        spread = rest @ self.filtered.covariance[:-1] @ rest.mT + gain @ self.noise @ gain.mT
+        roots = torch.linalg.cholesky(torch.cat([_symmetric(spread), last]))
+        independent = self.filtered.mean + _times(roots, noise)
+        values = [independent[-1]]
+        for t in range(len(gain) - 1, -1, -1):
+            values.append(independent[t] + _times(gain[t], values[-1] - self.predicted.mean[t + 1]))
+        return torch.stack(values[::-1])
+
+
+def update(mean: Tensor, covariance: Tensor, information: Tensor, potential: Tensor) -> Moments:
+    """Moments of N(mean, covariance) times exp(g' z - z' G z / 2); shapes (..., N) and (..., N, N)."""
+    identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
+    after = _symmetric(torch.linalg.solve(identity + covariance @ information, covariance))
+    return Moments(mean + _times(after, potential - _times(information, mean)), after)
+
+
+class Predict(torch.autograd.Function):
+    """The arguments of a `LinearGaussianChain` to m (T, B, N) and P (T, B, N, N); see the file."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        transition: Tensor,
+        offset: Tensor,
+        noise: Tensor,
+        mean: Tensor,
+        covariance: Tensor,
+        information: Tensor,
+        potential: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Run the filter."""
+        steps, batch, size = potential.shape
+        identity = torch.eye(size, dtype=mean.dtype, device=mean.device).expand(batch, size, size)
+        noises = noise.expand(batch, size, size)
+        covariances = torch.empty_like(information)
+        covariances[0] = covariance
+        shrink = torch.empty_like(transition).mT  # W; transposed, since the inverse is computed by columns
+        carry = torch.empty_like(transition)  # F
+        inside, right = (mean.new_empty(batch, size, size) for _ in range(2))
+        info = torch.empty(batch, dtype=torch.int32, device=mean.device)
+        sequences = (tensor.unbind(0) for tensor in (transition, information, shrink, carry, covariances[1:]))
+        last = covariances[0]
+        for a, g, w, f, new in zip(*sequences, strict=False):
+            torch.baddbmm(identity, last, g, out=inside)
+            torch.linalg.inv_ex(inside, out=(w, info))
+            torch.bmm(a, w, out=f)
+            torch.bmm(last, a.mT, out=right)
+            last = torch.baddbmm(noises, f, right, out=new)
+        covariances = _symmetric(covariances)
+        filtered = shrink @ covariances[:-1]
+        gathered = (transition @ _column(filtered, potential[:-1])).add_(offset[..., None])
+        means = mean.new_empty(steps, batch, size, 1)
+        means[0] = mean[..., None]
+        states = means.unbind(0)
+        for t, (f, c) in enumerate(zip(carry.unbind(0), gathered.unbind(0), strict=True)):
+            torch.baddbmm(c, f, states[t], out=states[t + 1])
+        means = means[..., 0]
+        ctx.save_for_backward(transition, information, potential, means, filtered, shrink, carry)
+        return means, covariances
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_mean: Tensor, to_covariance: Tensor) -> tuple[Tensor, ...]:
+        """Gradients of the arguments from those of means and covariances.
+
+        That of G is not symmetric; its symmetric part is the gradient, since G is symmetric.
+        """
+        transition, information, potential, means, filtered, shrink, carry = ctx.saved_tensors
+        back = carry.mT
+        total = to_mean[..., None].clone(memory_format=torch.contiguous_format)
+        steps = total.unbind(0)
+        for t in range(len(carry) - 1, -1, -1):
+            steps[t].baddbmm_(back[t], steps[t + 1])
+        later = total[1:]
+        missed = potential[:-1, ..., None] - information[:-1] @ means[:-1, ..., None]
+        totals = to_covariance.clone()
+        totals[:-1] += (back @ later) @ (shrink.mT @ missed).mT
+        totals = _symmetric(totals)
+        steps, carries, backs = totals.unbind(0), carry.unbind(0), back.unbind(0)
+        for t in range(len(carry) - 1, -1, -1):
+            steps[t].baddbmm_(backs[t], torch.bmm(steps[t + 1], carries[t]))
+        laters = totals[1:]
+        to_filtered = transition.mT @ later  # gradient of the filtered mean
+        moved = filtered @ to_filtered
+        spread = transition.mT @ laters @ transition + to_filtered @ missed.mT
+        filtered_mean = means[:-1, ..., None] + filtered @ missed
+        to_information, to_potential = torch.zeros_like(information), torch.zeros_like(potential)
+        to_potential[:-1] = moved[..., 0]
+        to_information[:-1] = -(filtered @ spread @ filtered) - moved @ means[:-1, ..., None].mT
+        to_transition = later @ filtered_mean.mT + 2 * (laters @ (transition @ filtered))
+        return (
+            to_transition,
+            later[..., 0],
+            laters.sum((0, 1)),
+            total[0, ..., 0],
+            totals[0],
+            to_information,
+            to_potential,
+        )
+
+
+def _column(matrix: Tensor, vector: Tensor) -> Tensor:
+    return matrix @ vector[..., None]
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return _column(matrix, vector)[..., 0]
+
+
+def _symmetric(matrix: Tensor) -> Tensor:
+    return 0.5 * (matrix + matrix.mT)

@@ -1,0 +1,114 @@
+"""A normal with full covariance, coordinate by coordinate."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import torch
+from pyro.distributions.torch_distribution import TorchDistribution
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.distributions import Normal, constraints
+from torch.distributions.kl import register_kl
+
+
+class TriangularNormal(TorchDistribution):
+    """N(loc, (U'U)^-1) as the chain of its coordinates, v_d given v_{<d}, with a lower triangular U.
+
+    The shape (..., D) is a batch: `log_prob` gives the D terms of the chain rule,
+
+        log p(v_d | v_{<d}) = log U_dd - e_d^2 / 2 - log(2 pi) / 2,        e = U (v - loc),
+
+    so that their sum is the density of v, and they are masked and summed as those of any elementwise distribution.
+    The divergence of a diagonal normal from it has the expectations of log q(v_d) - log p(v_d | v_{<d}) as its entries.
+
+    Args:
+        loc: (..., D).
+        whitening: U, (..., D, D), lower triangular with a positive diagonal.
+    """
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {
+        "loc": constraints.real_vector,
+        "whitening": constraints.lower_cholesky,
+    }
+    support = constraints.real
+    has_rsample = True
+
+    def __init__(self, loc: Tensor, whitening: Tensor, validate_args: bool | None = None):
+        self.loc, self.whitening = loc, whitening
+        super().__init__(loc.shape, torch.Size(), validate_args=validate_args)
+
+    @property
+    def mean(self) -> Tensor:
+        """(..., D)."""
+        return self.loc
+
+    @property
+    def variance(self) -> Tensor:
+        """(..., D), of v_d alone, not given v_{<d}."""
+        identity = torch.eye(self.loc.shape[-1], dtype=self.loc.dtype, device=self.loc.device)
+        return (torch.linalg.solve_triangular(self.whitening, identity, upper=False) ** 2).sum(-1)
+
+    def rsample(self, sample_shape: Any = ()) -> Tensor:
+        """Draws (*sample_shape, ..., D)."""
+        shape = self._extended_shape(torch.Size(sample_shape))
+        return self.color(torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device))
+
+    def color(self, noise: Tensor) -> Tensor:
+        """The value v whose e is `noise`."""
+        return self.loc + torch.linalg.solve_triangular(self.whitening, noise[..., None], upper=False)[..., 0]
+
+    def whiten(self, value: Tensor) -> Tensor:
+        """e, standard normal where the value is from this distribution."""
+        return (self.whitening @ (value - self.loc)[..., None])[..., 0]
+
+    @property
+    def log_precision(self) -> Tensor:
+        """(..., D) log U_dd."""
+        return self.whitening.diagonal(dim1=-2, dim2=-1).log()
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """(..., D) terms of the chain rule."""
+        return self.log_precision - 0.5 * self.whiten(value) ** 2 - 0.5 * math.log(2 * math.pi)
+
+    def expand(self, batch_shape: Any, _instance: object = None) -> TriangularNormal:
+        """With loc and whitening expanded."""
+        shape = torch.Size(batch_shape)
+        whitening = self.whitening.expand(*shape, shape[-1])
+        return TriangularNormal(self.loc.expand(shape), whitening, validate_args=False)
+
+
+@register_kl(Normal, TriangularNormal)
+def _from_diagonal(q: Normal, p: TriangularNormal) -> Tensor:
+    distance = p.whiten(q.loc) ** 2
+    spread = ((p.whitening * q.scale[..., None, :]) ** 2).sum(-1)
+    return 0.5 * (distance + spread - 1) - p.log_precision - q.scale.log()
+
+
+class InverseCholesky(torch.autograd.Function):
+    """Symmetric positive definite S (..., D, D) to the lower triangular U with U'U = S^-1; nan where S is not that.
+
+    Its backward pass is three products (torch's, through factor and solution, solves triangular systems), and gives a
+    matrix whose symmetric part is the gradient.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor) -> Tensor:
+        """U."""
+        root, info = torch.linalg.cholesky_ex(matrix)
+        identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+        inverse = torch.linalg.solve_triangular(root, identity, upper=False)
+        inverse = inverse.masked_fill(info[..., None, None] != 0, torch.nan)
+        ctx.save_for_backward(inverse)
+        return inverse
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_inverse: Tensor) -> Tensor:
+        """Of dU = -Phi(U dS U') U, where Phi keeps the lower triangle and half of the diagonal."""
+        (inverse,) = ctx.saved_tensors
+        size = inverse.shape[-1]
+        lower = torch.ones(size, size, dtype=inverse.dtype, device=inverse.device).tril_()
+        lower.diagonal().mul_(0.5)
+        return inverse.mT @ (to_inverse @ inverse.mT).mul_(-lower) @ inverse

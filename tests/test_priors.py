@@ -1,0 +1,254 @@
+"""Priors of static latents: densities that integrate to one, draws that follow them, and bounds that hold with them."""
+
+import copy
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+import dvae
+from dvae import DynamicalVAE, SequenceELBO, importance_bound, motion, priors
+from dvae.cli import main
+from dvae.inference.checkpoints import load_weights, save_weights
+from dvae.models import runs
+from dvae.networks import Dense, Recurrent
+
+B, T = 3, 5
+PRIORS = {
+    "normal": priors.NormalPrior,
+    "mixture": lambda size: priors.MixturePrior(size, components=3),
+    "vamp": lambda size: priors.VampPrior(size, {"x": 2}, components=3, steps=4),
+    "flow": priors.FlowPrior,
+}
+PAIR = "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t, w)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
+
+
+def build(kind, size=2, pair=PAIR, network=None):
+    """A model with such a prior, and parameters that are not those it starts with."""
+    sizes = {name: d for name, d in {"w": size, "z": 2, "x": 2}.items() if f"({name}" in pair[0]}
+    model = DynamicalVAE(*pair, sizes, network or Recurrent(4, hidden=(4,)), priors={"w": PRIORS[kind](size)}).double()
+    with torch.no_grad():
+        for name, parameter in (*model.priors.named_parameters(), *model.encoder["w"].named_parameters()):
+            parameter.add_((0.05 if ".nn." in name else 0.2) * torch.randn_like(parameter))  # .nn.: of a coupling
+    return model
+
+
+def law(model, batch=1):
+    return model.priors["w"](batch, model.encoder["w"])
+
+
+def data(batch=B, steps=T):
+    return torch.randn(batch, steps, 2, dtype=torch.float64)
+
+
+def grid(model):
+    """Points, their density under the prior, and the step between them."""
+    axis = torch.linspace(-12, 12, 481 if model.sizes["w"] == 2 else 24_001, dtype=torch.float64)
+    points = torch.cartesian_prod(*[axis] * model.sizes["w"]).reshape(-1, model.sizes["w"])
+    density = law(model, len(points)).log_prob(points).exp()
+    return axis, density.detach().reshape([len(axis)] * model.sizes["w"])
+
+
+@pytest.mark.parametrize("size", [1, 2])
+@pytest.mark.parametrize("kind", PRIORS)
+def test_a_prior_is_a_density_and_draws_follow_it(kind, size):
+    model = build(kind, size)
+    axis, density = grid(model)
+    step = axis[1] - axis[0]
+    assert (density.sum() * step**size).item() == pytest.approx(
+        1, abs=1e-3
+    )  # what the grid leaves at the kinks of a spline
+    draws = model.sample(20_000, 1)["w"]
+    for d in range(size):
+        marginal = density.sum(1 - d) * step if size == 2 else density
+        cumulative = (marginal.cumsum(0) - marginal / 2) * step
+        assert stats.kstest(draws[:, d], lambda at, cdf=cumulative: np.interp(at, axis, cdf)).pvalue > 1e-4
+    if size == 2:
+        product = (density * axis[:, None] * axis).sum() * step**2
+        products = draws.prod(1)
+        assert abs(products.mean() - product) < 5 * products.std() / len(products) ** 0.5
+
+
+@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("kind", PRIORS)
+def test_every_parameter_of_a_prior_learns(kind, size):
+    model = build(kind, size)
+    SequenceELBO().differentiable_loss(model, model.guide, data()).backward()
+    assert [name for name, p in model.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0] == []
+
+
+@pytest.mark.parametrize("kind", PRIORS)
+def test_bounds_lie_below_the_evidence_which_quadrature_knows(kind):
+    model = build(kind, 1, ("p(w) p(x_t | w)", "q(w | x_{1:T})"), {"q": Recurrent(4), "p": Dense((4,))})
+    with torch.no_grad():
+        model.encoder["w"].head.out.bias[1:].fill_(1.0)  # wide enough that importance weights have a variance
+    x = data()
+    points = torch.linspace(-15, 15, 6_001, dtype=torch.float64)[:, None]
+    for i in range(B):
+        many = x[i : i + 1].expand(len(points), -1, -1)
+        joint = sum(model.log_joint(many, {"w": points}).values())
+        evidence = torch.logsumexp(joint, 0) + math.log(30 / 6_000)
+        one = x[i : i + 1]
+        with torch.no_grad():
+            draws = SequenceELBO().terms(model, one.expand(4_000, -1, -1)).bound
+        assert draws.mean() < evidence + 4 * draws.std() / len(draws) ** 0.5
+        found = importance_bound(model, one, 40_000)
+        assert found.khat < 0.7
+        assert found.bound.item() == pytest.approx(evidence.item(), abs=0.05)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in PRIORS if kind != "normal"])
+def test_where_no_closed_form_is_known_the_kl_is_the_log_ratio_at_the_draw(kind):
+    model, x = build(kind), data()
+    torch.manual_seed(1)
+    kl = SequenceELBO().terms(model, x).kl["w"]
+    torch.manual_seed(1)
+    w = model.guide(x)["w"]
+    ours = model.encoder["w"].head.distribution(model.encoder["w"]({"x": x}, B, T)).to_event(1)
+    torch.testing.assert_close(kl, ours.log_prob(w) - law(model, B).log_prob(w))
+
+
+@pytest.mark.parametrize("kind", PRIORS)
+def test_a_prior_follows_its_parameters_and_keeps_nothing(kind):
+    """Also at the same points, which a transform's cache would recognise; and copies are made after a backward pass."""
+    model, points = build(kind), torch.randn(4, 2, dtype=torch.float64)
+    with torch.no_grad():
+        before = law(model, 4).log_prob(points)
+        for parameter in (*model.priors.parameters(), *model.encoder["w"].parameters()):
+            parameter.add_(0.1 * torch.randn_like(parameter))
+        assert ((law(model, 4).log_prob(points) - before).abs() > 1e-6).all()
+    after = law(model, 4).log_prob(points)
+    after.sum().backward()
+    torch.testing.assert_close(law(copy.deepcopy(model), 4).log_prob(points), after)
+
+
+@pytest.mark.parametrize("kind", PRIORS)
+def test_a_saved_prior_is_the_one_loaded(kind, tmp_path):
+    model, points = build(kind), torch.randn(4, 2, dtype=torch.float64)
+    save_weights(model, tmp_path / "weights.safetensors")
+    other = build(kind)
+    load_weights(other, tmp_path / "weights.safetensors")
+    assert torch.equal(law(other, 4).log_prob(points), law(model, 4).log_prob(points))
+
+
+def test_the_vamp_prior_is_the_mean_of_the_guides_posteriors_at_its_pseudo_sequences():
+    model, points = build("vamp"), torch.randn(6, 2, dtype=torch.float64)
+    pseudo = model.priors["w"].pseudo["x"]
+    loc, scale = model.encoder["w"]({"x": pseudo}, 3, 4)
+    each = torch.distributions.Normal(loc, scale).log_prob(points[:, None]).sum(-1)
+    torch.testing.assert_close(law(model, 6).log_prob(points), each.logsumexp(1) - math.log(3))
+    assert [name for name, _ in model.priors.named_parameters()] == ["w.pseudo.x"]  # the guide stays the model's
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_the_density_of_a_flow_is_that_of_its_noise_over_the_volume_it_takes(size):
+    flow = law(build("flow", size))
+
+    def move(noise):
+        for transform in flow.transforms:
+            noise = transform(noise)
+        return noise
+
+    for noise in torch.randn(20, size, dtype=torch.float64):
+        volume = torch.autograd.functional.jacobian(move, noise).slogdet()[1]
+        expected = torch.distributions.Normal(0.0, 1.0).log_prob(noise).sum() - volume
+        torch.testing.assert_close(flow.log_prob(move(noise))[0], expected)
+
+
+def test_a_flow_starts_near_the_standard_normal():
+    points = torch.randn(200, 3)
+    flow = priors.FlowPrior(3)(200, None).log_prob(points)
+    standard = torch.distributions.Normal(0.0, 1.0).log_prob(points).sum(-1)
+    assert (flow - standard).abs().mean() < 1
+    with pytest.raises(ValueError, match=r"no half precision, but its parameters are torch.bfloat16; use mixed"):
+        priors.FlowPrior(3).bfloat16()(1, None)
+
+
+@pytest.mark.parametrize(
+    ("prior", "guide", "message"),
+    [
+        (priors.FlowPrior(3), "q(w | x_{1:T})", "the prior of w has size 3, but w 2"),
+        (
+            priors.VampPrior(2, {"x": 3}),
+            "q(w | x_{1:T})",
+            r"given data of sizes \{'x': 3\}, but q\(w \| x_\{1:T\}\) reads \{'x': 2\}",
+        ),
+        (
+            priors.VampPrior(2, {"x": 2, "z": 2}),
+            "q(w | x_{1:T}, z_{1:T})",
+            r"a VampPrior of w needs a guide that reads the data x over time and nothing else, such as q\(w \| x_",
+        ),
+        (priors.VampPrior(2, {}), r"q(w)", r"nothing else, such as q\(w \| x_\{1:T\}\), not q\(w\)"),
+    ],
+)
+def test_priors_that_do_not_suit(prior, guide, message):
+    with pytest.raises(ValueError, match=message):
+        DynamicalVAE(
+            PAIR[0], f"{guide} q(z_t | x_{{1:T}})", {"w": 2, "z": 2, "x": 2}, Recurrent(4), priors={"w": prior}
+        )
+
+
+# ------------------------------------------------------------------------------------------------------- in a run
+
+OPTIONS = {"latent": 2, "static": 2, "width": 4, "heads_count": 1, "decoder": 4, "warm_up": 0, "self_feeding": 0.0}
+VAMP = {**OPTIONS, "prior": "vamp", "prior_components": 3, "prior_steps": 6}
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "people.npz"
+    motion.save(path, motion.simulate(clips=14, frames=90, seed=1))
+    return path
+
+
+def weights(run: Path):
+    return (run / "last.safetensors").read_bytes()
+
+
+def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
+    """By the run's seed; and a resumed run goes on from where they have come."""
+    data, method = runs.Data.open(people), dvae.method("hit-dvae", **VAMP)
+    still = dvae.Training(steps=1, batch_size=2, learning_rate=0.0, progress=False, validate_every=2)
+    starts = []
+    for seed, name in ((0, "a"), (0, "b"), (1, "c")):
+        runs.fit(method, data, tmp_path / name, dvae.Training(**{**vars(still), "seed": seed}))
+        starts.append(dvae.load(tmp_path / name).model.priors["w"].pseudo["x"])
+    assert torch.equal(starts[0], starts[1])
+    assert not torch.equal(starts[0], starts[2])
+    windows = data.windows("train").all(stride=1)["x"][:, :6]
+    for pseudo in starts[0]:
+        assert (windows == pseudo).flatten(1).all(1).any()
+
+    training = {**vars(still), "learning_rate": 0.01}
+    runs.fit(method, data, tmp_path / "whole", dvae.Training(**{**training, "steps": 6}))
+    runs.fit(method, data, tmp_path / "parts", dvae.Training(**{**training, "steps": 4}))
+    runs.resume(tmp_path / "parts", steps=6)
+    assert weights(tmp_path / "parts") == weights(tmp_path / "whole")
+
+
+def test_pseudo_sequences_longer_than_the_windows(people, tmp_path):
+    method = dvae.method("hit-dvae", **{**VAMP, "prior_steps": 400})
+    with pytest.raises(ValueError, match=r"pseudo-sequences of 400 steps, but those of x that it is to start at have"):
+        runs.fit(method, runs.Data.open(people), tmp_path / "run", dvae.Training(steps=1, progress=False))
+
+
+@pytest.mark.parametrize("prior", ["mixture", "vamp", "flow"])
+def test_priors_on_the_command_line(prior, people, tmp_path):
+    out = tmp_path / "run"
+    small = [f"--{name.replace('_', '-')}={value}" for name, value in OPTIONS.items()]
+    fit = ["fit", "hit-dvae", "--prior", prior, *small, "--free-bits", "0.1", "--warm-up-shape", "cosine"]
+    assert main([*fit, "--data", str(people), "--out", str(out), "--steps", "4", "--batch-size", "2"]) == 0
+    assert main(["resume", str(out), "--steps", "6"]) == 0
+    loaded = dvae.load(out)
+    assert (loaded.method.prior, loaded.method.free_bits, loaded.method.warm_up_shape) == (prior, 0.1, "cosine")
+    x = loaded.data.windows("test").all()["x"][:2, :15]
+    assert torch.isfinite(loaded.model.forecast(x, 5, 2)["x"]).all()
+
+
+def test_the_command_line_says_where_a_prior_has_no_place(people, tmp_path, capsys):
+    run = ["--data", str(people), "--out", str(tmp_path / "run")]
+    assert main(["fit", "dkf", "--prior", "flow", *run]) == 2
+    assert "prior='flow' is for a static latent without parents, such as p(w)" in capsys.readouterr().err
