@@ -49,7 +49,7 @@ class Terms:
     @property
     def bound(self) -> Tensor:
         """(B,) the unweighted evidence lower bound; energies are not part of it."""
-        return sum(self.log_likelihood.values()) - sum(self.kl.values(), torch.zeros_like(self.frames))
+        return sum(self.log_likelihood.values()) - sum(self.kl.values())  # type: ignore[return-value]
 
     @property
     def per_frame(self) -> Tensor:
@@ -221,6 +221,10 @@ def _mean(draws: list[Terms]) -> Terms:
     return Terms(average("log_likelihood"), average("kl"), average("energies"), draws[0].frames, average("steps"))
 
 
+KHAT_PARTICLES = 25
+"""Particles below which k-hat is not estimated: arviz_stats fits the tail to a fifth of them, and needs five."""
+
+
 @dataclass(frozen=True)
 class ImportanceBound:
     """The importance-weighted bound of every sequence and what it says of the guide.
@@ -228,7 +232,8 @@ class ImportanceBound:
     Args:
         bound: (B,) log mean of the weights, in nats.
         khat: (B,) Pareto shape of their tail. Above 0.7 the guide misses so much of the posterior that the bound is
-            unreliable at this number of particles.
+            unreliable at this number of particles. Infinite where a weight of the tail is 0, and NaN with fewer than
+            25 particles alone. With fewer than about 100, k-hat is mostly noise in a single sequence.
         particles: K.
     """
 
@@ -287,10 +292,23 @@ def _log_weights(model: DynamicalVAE, batch: Batch, options: Mapping[str, Any]) 
 
 def _khat(log_weights: Tensor) -> Tensor:
     """(B,) Pareto tail shape of weights (K, B)."""
-    if log_weights.shape[0] < 25:
+    if log_weights.shape[0] < KHAT_PARTICLES:
         return log_weights.new_full(log_weights.shape[1:], math.nan)
+    khat = [_tail_shape(weights) for weights in log_weights.double().cpu().numpy().T]
+    return torch.as_tensor(khat, dtype=log_weights.dtype, device=log_weights.device)
+
+
+def _tail_shape(log_weights: np.ndarray) -> float:
+    """The Pareto shape of weights (K,); by Hill's estimate where the tail underflows or is all the same."""
     from arviz_stats.base import array_stats  # over a second to import
 
-    # psislw is made for leave-one-out: it takes log likelihoods, whose negatives are the log weights.
-    _, khat = array_stats.psislw(-log_weights.double().cpu().numpy(), axis=0)
-    return torch.as_tensor(np.asarray(khat), dtype=log_weights.dtype, device=log_weights.device)
+    tail = np.sort(log_weights)[-(len(log_weights) // 5) - 1 :]
+    if not np.isfinite(tail).all():
+        return math.inf
+    try:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            # psislw is made for leave-one-out: it takes log likelihoods, whose negatives are the log weights.
+            khat = float(array_stats.psislw(-log_weights)[1])
+    except (FloatingPointError, ValueError):
+        khat = math.nan
+    return float((tail[1:] - tail[0]).mean()) if math.isnan(khat) else khat

@@ -229,6 +229,15 @@ def test_khat_is_the_shape_of_a_pareto_tail_and_needs_25_particles():
     assert importance_bound(model, batch, particles=25).khat.isfinite().all()
 
 
+def test_khat_of_weights_that_are_the_same_is_zero_and_of_one_that_outweighs_all_large():
+    same, alone = torch.zeros(64, 1), -1000.0 * torch.arange(64.0)[:, None]
+    infinite = torch.where(torch.arange(64)[:, None] == 3, torch.inf, same)
+    assert _khat(torch.cat([same, infinite], dim=1)).tolist() == [0, math.inf]
+    assert 1e3 < _khat(alone) < 1e4
+    coarse = 1e4 + 1e-3 * torch.randint(0, 2, (64, 5))  # what float32 resolves of a sum of so many nats
+    assert (_khat(coarse) < 0.01).all()
+
+
 def test_importance_weights_of_a_ragged_batch_are_those_of_its_sequences():
     model = twin("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 1}, T)
     x = model.sample(2, T)["x"]

@@ -317,6 +317,65 @@ def test_the_recurrence_of_dsae_is_torchs():
     torch.testing.assert_close((found, grads[0]), (expected, grads[1]), rtol=0, atol=1e-12)
 
 
+def later(values):
+    """Values one step later, 0 at the first."""
+    return torch.cat([torch.zeros_like(values[:, :1]), values[:, :-1]], dim=1)
+
+
+def backward(lstm, values):
+    return lstm(values.flip(1))[0].flip(1)
+
+
+def test_the_networks_are_wired_as_in_the_papers():
+    """Features of the factors that share or stack states, written out from the same layers."""
+    x, z = (torch.randn(2, 6, size, dtype=torch.float64) for size in (5, 3))
+    parents = {"x": x, "z": z}
+
+    def networks(name):
+        model = small(name, 3).build({"x": 5}).double()
+        return (f["z"].network if "z" in f else None for f in (model.generator, model.encoder)), model
+
+    (prior, guide), model = networks("srnn")
+    h = prior.past.layers[0](prior.past.embed(later(x)))[0]
+    future = guide.memories[0]
+    g = backward(future.layers[0], future.embed(torch.cat([h, x], -1)))
+    torch.testing.assert_close(guide(parents, 6), guide.join([g, later(z)]))
+    torch.testing.assert_close(prior(parents, 6), prior.join([h, later(z)]))
+    torch.testing.assert_close(model.generator["x"].network(parents, 6), model.generator["x"].network.join([h, z]))
+
+    (_, guide), _ = networks("dkf")
+    state = backward(guide.memories[0].layers[0], guide.memories[0].embed(x))
+    g = (state + later(guide.extractors["z"](z))) / 2
+    torch.testing.assert_close(guide(parents, 6), torch.tanh(guide.join.first(g)))
+
+    (prior, guide), model = networks("vrnn")
+    fx, fz = prior.extractors["x"](x), prior.extractors["z"](z)
+    h = prior.past.layers[0](torch.cat([later(fx), later(fz)], -1))[0]
+    torch.testing.assert_close(prior(parents, 6), h)
+    torch.testing.assert_close(guide(parents, 6), torch.cat([h, fx], -1))
+    torch.testing.assert_close(model.generator["x"].network(parents, 6), torch.cat([h, fz], -1))
+
+    (_, guide), model = networks("storn")
+    torch.testing.assert_close(guide(parents, 6), guide.join([guide.past.layers[0](guide.extractors["x"](x))[0]]))
+    decoder = model.generator["x"].network
+    read = torch.cat([later(decoder.extractors["x"](x)), decoder.extractors["z"](z)], -1)
+    torch.testing.assert_close(decoder(parents, 6), decoder.past.layers[0](read)[0])
+
+    for name in ("rvae-causal", "rvae-noncausal"):
+        (_, guide), model = networks(name)
+        states = {(m.direction, m.reads[0]): m.layers[0] for m in guide.memories}
+        expected = [states[1, ("z", -1)](later(z))[0], backward(states[-1, ("x", 0)], x)]
+        if name == "rvae-noncausal":
+            expected.insert(1 if guide.memories[1].reads[0][0] == "x" else 0, states[1, ("x", -1)](later(x))[0])
+        torch.testing.assert_close(guide(parents, 6), torch.cat(expected, -1))
+
+    _, model = networks("dsae")
+    static = model.encoder["w"].network
+    past, future = (memory.layers[0] for memory in static.memories)
+    expected = torch.cat([past(x)[0][:, -1], backward(future, x)[:, 0]], -1)
+    torch.testing.assert_close(static({"x": x}, 6), expected)
+
+
 @pytest.mark.parametrize(
     ("name", "options"),
     [
