@@ -19,9 +19,12 @@ pyro.settings.set(module_local_params=True)
 from . import heads, motion, networks, priors  # noqa: E402
 from .graph import Audit, audit  # noqa: E402
 from .inference.bounds import SequenceELBO, Terms, importance_bound  # noqa: E402
+from .inference.compare import Comparison, compare  # noqa: E402
+from .inference.criticism import calibrate, predictive_checks, traverse  # noqa: E402
 from .inference.evaluate import Evaluation, evaluate  # noqa: E402
 from .inference.fit import Fit, Training, fit  # noqa: E402
 from .inference.objectives import Evidence  # noqa: E402
+from .inference.particles import particle_bound  # noqa: E402
 from .model import DynamicalVAE  # noqa: E402
 from .models import method, methods  # noqa: E402
 from .models.runs import load  # noqa: E402
@@ -31,6 +34,7 @@ from .rollout import SelfFeeding  # noqa: E402
 
 __all__ = [
     "Audit",
+    "Comparison",
     "DynamicalVAE",
     "Evaluation",
     "Evidence",
@@ -42,6 +46,8 @@ __all__ = [
     "Terms",
     "Training",
     "audit",
+    "calibrate",
+    "compare",
     "evaluate",
     "fit",
     "heads",
@@ -51,7 +57,10 @@ __all__ = [
     "methods",
     "motion",
     "networks",
+    "particle_bound",
+    "predictive_checks",
     "price",
     "priors",
+    "traverse",
     "twin",
 ]

@@ -13,7 +13,6 @@ score the same windows, and windows of one clip overlap, so standard errors are 
 
 import dataclasses
 import hashlib
-import io
 import json
 import math
 from collections import Counter
@@ -26,13 +25,14 @@ from typing import Any, Protocol
 import matplotlib.figure
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import Progress
+from rich.markup import escape
 from rich.table import Table
 from torch import Tensor, nn
 
 from . import metrics
+from .batches import each
 from .bounds import SequenceELBO, importance_bound
+from .result import Result, progress_bar
 
 __all__ = [
     "METRICS",
@@ -115,8 +115,8 @@ class Row:
     config: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, repr=False)
+class Evaluation(Result):
     """Scores of several methods on the same windows, with all that is needed to say what was measured.
 
     Indexing gives the scores of a method: `evaluation["srnn"]["ADE"].mean`.
@@ -164,7 +164,7 @@ class Evaluation:
         table = Table(title=self._title(), caption="mean ± standard error over windows, clustered by clip")
         table.add_column("", no_wrap=True)  # on a narrow terminal the numbers wrap, never the names
         for method, row in self.rows.items():
-            table.add_column(f"{method}\nK = {row.samples}", justify="right")
+            table.add_column(f"{escape(method)}\nK = {row.samples}", justify="right")
         scores = {method: self[method] for method in self.rows}
         for program in ("free-running", "teacher-forced"):
             names = [name for name in self.metrics if _reading(name).program == program]
@@ -227,23 +227,10 @@ class Evaluation:
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"this is not an evaluation written by Evaluation.to_json: {error!r}") from error
 
-    def save(self, path: str | Path) -> None:
-        """Write `to_json()` to a file."""
-        Path(path).write_text(self.to_json() + "\n", encoding="utf-8")
-
     @classmethod
     def load(cls, path: str | Path) -> "Evaluation":
         """Read the file that `save` wrote; errors as in `from_json`."""
         return cls.from_json(Path(path).read_text(encoding="utf-8"))
-
-    def __rich__(self) -> Table:
-        return self.table()
-
-    def __str__(self) -> str:
-        console = Console(file=io.StringIO(), width=400)
-        with console.capture() as capture:
-            console.print(self.table())
-        return capture.get().rstrip()
 
     def _row(self, method: str) -> Row:
         if method not in self.rows:
@@ -251,13 +238,8 @@ class Evaluation:
         return self.rows[method]
 
     def _score(self, clip_means: np.ndarray) -> Score:
-        """Mean over windows, a ratio of sums over clips; its variance by linearisation."""
-        counts = np.array(list(self.clips.values()))
-        mean = float((counts * clip_means).sum() / counts.sum())
-        if len(counts) < 2:
-            return Score(mean, math.nan)
-        deviations = counts * (clip_means - mean) / counts.sum()
-        return Score(mean, math.sqrt(len(counts) / (len(counts) - 1) * float((deviations**2).sum())))
+        mean, deviations = linearised(clip_means, np.array(list(self.clips.values())))
+        return Score(float(mean), math.sqrt(clustered_variance(deviations)))
 
     def _document(self, method: str) -> dict[str, Any]:
         row = dataclasses.asdict(self.rows[method])
@@ -273,7 +255,7 @@ class Evaluation:
         return _plain(row)
 
     def _title(self) -> str:
-        name = self.protocol.get("name", "")
+        name = escape(self.protocol.get("name", ""))
         parts = [name, f"{self.data['windows']} windows of {len(self.clips)} clips"]
         parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]
         return " · ".join(part for part in parts if part)
@@ -351,6 +333,19 @@ class ArrayWindows:
     def all(self) -> Batch:
         """All windows, x `(N, T, D)`."""
         return {"x": torch.as_tensor(self.x)}
+
+
+def linearised(clip_means: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The weighted mean of clip means (..., C), a ratio of sums over clips, and what each clip adds to its error."""
+    shares = weights / weights.sum()
+    mean = (shares * clip_means).sum(-1)
+    return mean, shares * (clip_means - mean[..., None])
+
+
+def clustered_variance(deviations: np.ndarray) -> float:
+    """Variance of a mean over windows from what each clip adds to its error, (C,); NaN where there is one clip."""
+    clips = len(deviations)
+    return clips / (clips - 1) * float((deviations**2).sum()) if clips > 1 else math.nan
 
 
 def zero_velocity(observed: Tensor, horizon: int) -> Tensor:
@@ -447,12 +442,10 @@ def evaluate(
         raise ValueError(f"a model must not have the name of a reference row: {', '.join(sorted(clash))}")
 
     rows: dict[str, Row] = {}
-    console = Console()
-    visible = progress and (console.is_terminal or console.is_jupyter)
-    with Progress(transient=True, console=console, disable=not visible) as bar:
+    with progress_bar(progress) as bar:
 
         def parts(label: str) -> Iterator[slice]:
-            for start in bar.track(range(0, len(held.keys), batch_size), description=label):
+            for start in bar.track(range(0, len(held.keys), batch_size), description=escape(label)):
                 yield slice(start, start + batch_size)
 
         for name, (count, forecaster) in baselines.items():
@@ -620,10 +613,11 @@ def _forecaster(model: Any, draw_emission: bool) -> Forecaster:
 def _like(model: nn.Module, batch: Batch) -> Batch:
     """The batch on the device and in the floating type of the model's parameters."""
     parameter = next(model.parameters())
-    return {
-        name: value.to(parameter) if value.is_floating_point() else value.to(parameter.device)
-        for name, value in batch.items()
-    }
+
+    def moved(value: Tensor) -> Tensor:
+        return value.to(parameter) if value.is_floating_point() else value.to(parameter.device)
+
+    return dict(each(batch, moved))
 
 
 def _concatenate(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:

@@ -1,0 +1,49 @@
+"""The pytest plugin: the fixture `elbo_regression` and its options.
+
+pytest imports a plugin at every start, in every project of the environment. So this package is installed under a second
+name, `pytest_dvae`, beside dvae and not within it, and imports dvae (and with it torch) when the fixture is first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from dvae.testing.regression import ElboRegression
+
+_OWNERS: pytest.StashKey[dict[Any, str]] = pytest.StashKey()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Adds --update-elbo and --elbo-strict."""
+    group = parser.getgroup("dvae", "evidence bounds (dvae)")
+    group.addoption("--update-elbo", action="store_true", help="renew the records of elbo_regression")
+    group.addoption("--elbo-strict", action="store_true", help="fail where elbo_regression has no record yet")
+
+
+@pytest.fixture
+def elbo_regression(request: pytest.FixtureRequest) -> ElboRegression:
+    """`elbo_regression.check(model, guide, data)` fails when the evidence bound has become significantly worse."""
+    from dvae.testing.regression import ElboRegression
+
+    item, config = request.node, request.config
+    return ElboRegression(
+        folder=item.path.parent / "elbo_regression" / item.path.stem,
+        test=item.nodeid.partition("::")[2].replace("::", "."),
+        update=config.getoption("--update-elbo"),
+        strict=config.getoption("--elbo-strict"),
+        note=lambda line: item.user_properties.append(("elbo_regression", line)),  # xdist brings these home
+        owners=config.stash.setdefault(_OWNERS, {}),
+    )
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Lists records that are new or renewed, and bounds that became better."""
+    reports = [report for group in terminalreporter.stats.values() for report in group]
+    found = [entry for report in reports for entry in getattr(report, "user_properties", ())]
+    if lines := dict.fromkeys(line for key, line in found if key == "elbo_regression"):
+        terminalreporter.section("evidence bounds")
+        for line in lines:
+            terminalreporter.line(line)

@@ -1,0 +1,402 @@
+"""Regression tests of evidence bounds: has a change of the code made a model worse, beyond Monte Carlo error?
+
+The data are fixed, so what is compared is the mean bound of these very sequences, before and after: the spread between
+sequences is no source of error, the draws of the guide are the only one. The record keeps the mean over sequences of
+each of its K draws, b_k. New draws b'_k are taken from the same seeds, one for each k, and the differences
+d_k = b'_k - b_k are K independent numbers with mean
+
+    E d_k = mean over sequences of (new bound - old bound),
+
+so that t = mean(d) sqrt(K) / sd(d) follows Student's t with K - 1 degrees of freedom when nothing has changed (d_k, a
+mean over sequences, is nearly normal). Failing where t is below the alpha quantile fails with probability alpha at
+most, whatever draw k before and draw k after have to do with each other: equal seeds may couple them (an unchanged
+model gives d = 0), decouple them (another network takes its random numbers in another order) or oppose them (a latent
+changed its sign). Standard errors added in squares would be right in the second case only. Had all draws one stream of
+random numbers, one number more would couple draw k to draw k - 1, and the d_k to each other.
+
+A fall of delta nats is found with probability 1 - beta where delta = (t_{1-alpha} + t_{1-beta}) sd(d) / sqrt(K): four
+times the draws halve it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import stats
+from torch import Tensor, nn
+
+from ..inference.bounds import SequenceELBO
+from ..model import _Evaluating
+
+Array = NDArray[np.float64]
+
+# Relative error that arithmetic alone may leave in a bound, on another machine or in another order of sums (float32).
+ROUNDING = 1e-6
+# Relative difference up to which data are the same: made on another machine, they may differ in their last digits.
+SAME_DATA = 1e-5
+
+
+@dataclass(frozen=True)
+class Record:
+    """Bounds of B sequences from K draws, in nats, as a file keeps them.
+
+    Args:
+        bound: (B,) means over draws.
+        error: (B,) their Monte Carlo standard errors.
+        draws: (K,) means over sequences.
+        data: name to shape, root mean squares and checksums of the data (see `checksums`).
+    """
+
+    bound: Array
+    error: Array
+    draws: Array
+    data: dict[str, Any]
+
+    @classmethod
+    def of(cls, bounds: Array, data: dict[str, Any]) -> Record:
+        """The record of bounds (K, B)."""
+        return cls(bounds.mean(0), bounds.std(0, ddof=1) / math.sqrt(len(bounds)), bounds.mean(1), data)
+
+    @property
+    def mean(self) -> float:
+        """The mean bound."""
+        return float(self.draws.mean())
+
+    @property
+    def mean_error(self) -> float:
+        """Its Monte Carlo standard error."""
+        return _standard_error(self.draws)
+
+    def __str__(self) -> str:
+        return f"{self.mean:.6g} ± {self.mean_error:.2g} nats a sequence"
+
+    def dumps(self) -> str:
+        """As JSON, a line for each sequence."""
+        rows = [[_rounded(b, 8), _rounded(e, 3)] for b, e in zip(self.bound, self.error, strict=True)]
+        table = ",\n".join(f"    {json.dumps(row)}" for row in rows)
+        head = {
+            "particles": len(self.draws),
+            "mean bound and its error": [_rounded(self.mean, 8), _rounded(self.mean_error, 3)],
+            "data": self.data,
+            "draws": [_rounded(b, 8) for b in self.draws],
+        }
+        lines = [f"  {json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}," for key, value in head.items()]
+        return "\n".join(["{", *lines, '  "sequences": [', table, "  ]", "}", ""])
+
+    @classmethod
+    def loads(cls, text: str) -> Record:
+        """What `dumps` wrote.
+
+        Raises:
+            ValueError: anything else.
+        """
+        try:
+            stored = json.loads(text)
+            bound, error = np.array(stored["sequences"], dtype=float).reshape(-1, 2).T
+            draws = np.array(stored["draws"], dtype=float)
+            keys = ("shape", "rms", "checksums")
+            data = {name: {key: entry[key] for key in keys} for name, entry in stored["data"].items()}
+        except (KeyError, TypeError, AttributeError, ValueError) as problem:
+            raise ValueError(f"no record of bounds: {problem!r}") from problem
+        if len(draws) != stored.get("particles") or len(draws) < 2:
+            raise ValueError(f"no record of bounds: {len(draws)} draws of {stored.get('particles')} particles")
+        return cls(bound, error, draws, data)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """New bounds against old ones of the same sequences, paired by draw.
+
+    Args:
+        old, new: what is compared.
+        alpha: probability of calling a model worse (or better) that is not.
+    """
+
+    old: Record
+    new: Record
+    alpha: float
+
+    @property
+    def difference(self) -> float:
+        """New minus old mean bound."""
+        return self.new.mean - self.old.mean
+
+    @property
+    def error(self) -> float:
+        """Monte Carlo standard error of the difference."""
+        return _standard_error(self.new.draws - self.old.draws)
+
+    @property
+    def p_worse(self) -> float:
+        """Probability of so low a difference when the bound has not fallen."""
+        return self._p(self.difference)
+
+    @property
+    def worse(self) -> bool:
+        """Whether the bound fell significantly."""
+        return self.p_worse < self.alpha
+
+    @property
+    def better(self) -> bool:
+        """Whether the bound rose significantly."""
+        return self._p(-self.difference) < self.alpha
+
+    def _p(self, difference: float) -> float:
+        slack = ROUNDING * float(np.abs(self.old.bound).mean())
+        t = (difference + slack) / max(self.error, 1e-100)  # an exact bound has no error
+        return float(stats.t.cdf(t, len(self.new.draws) - 1))
+
+    def __str__(self) -> str:
+        lines = [
+            f"  old         {self.old}",
+            f"  new         {self.new}",
+            f"  difference  {self.difference:.4g}, standard error {self.error:.2g}, p = {self.p_worse:.1g} "
+            f"(paired over {len(self.new.draws)} draws; alpha = {self.alpha:g})",
+            f"  worst of {len(self.old.bound)} sequences:",
+            f"  {'':>10}{'old':>14}{'new':>14}{'difference':>14}{'error':>10}",
+        ]
+        differences = self.new.bound - self.old.bound
+        errors = np.hypot(self.new.error, self.old.error)
+        for i in np.argsort(differences)[:5]:
+            bounds = f"{self.old.bound[i]:14.6g}{self.new.bound[i]:14.6g}"
+            lines.append(f"  {i:>10}{bounds}{differences[i]:14.4g}{errors[i]:10.2g}")
+        return "\n".join(lines)
+
+
+class ElboRegression:
+    """The fixture `elbo_regression`.
+
+    Args:
+        folder: where the test's records lie.
+        test: name of the test, that of its record unless `check` gives one.
+        update: renew records.
+        strict: a record that is missing is a failure.
+        note: takes a line for the terminal's summary.
+        owners: the tests whose records have been read or written, by file.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        test: str,
+        update: bool,
+        strict: bool,
+        note: Callable[[str], None],
+        owners: dict[Path, str],
+    ):
+        self.folder, self.test, self.update, self.strict = folder, test, update, strict
+        self.note, self.owners = note, owners
+        self._mine: set[Path] = set()
+
+    def check(
+        self,
+        model: Callable[..., Any],
+        guide: Callable[..., Any],
+        data: Any,
+        *,
+        name: str | None = None,
+        particles: int = 100,
+        alpha: float = 0.001,
+    ) -> None:
+        """Passes unless the mean bound of the data's sequences is significantly below the one on record.
+
+        The first use writes the record, which is to be committed. A bound that is significantly better passes, and the
+        terminal's summary says so. Draws are taken in evaluation mode and from seeds that belong to the name; torch's
+        random state is left as it was.
+
+        Args:
+            model, guide: `DynamicalVAE.model` and `.guide`, or any pair of Pyro callables with sequences in their
+                rightmost plate.
+            data: what they are called with, such as x (B, T, D), a batch, or `Windows.all()`.
+            name: of the record; the test's own if not given.
+            particles: K, draws of every sequence. The error falls with its square root.
+            alpha: probability of failing when the bound has not fallen.
+
+        Raises:
+            AssertionError: the bound fell; old, new, difference, error and the worst sequences are printed.
+            ValueError: the record is of other data or of another number of particles, or damaged, or belongs to
+                another test; bounds that are not finite or not one for each sequence; particles below 2; alpha not
+                between 0 and 0.5.
+        """
+        __tracebackhide__ = True
+        if particles < 2:
+            raise ValueError(f"particles is at least 2, for an estimate of the Monte Carlo error; got {particles}")
+        if not 0 < alpha < 0.5:
+            raise ValueError(f"alpha is a probability of false alarms, between 0 and 0.5; got {alpha}")
+        stem = re.sub(r"[^\w.=-]+", "_", self.test if name is None else name).strip("_")
+        path = self._claim(self.folder / f"{stem}.json")
+        if self.strict and not self.update and not path.exists():
+            raise AssertionError(f"there is no record {_shown(path)}; run without --elbo-strict, and commit it")
+        bounds = measure(model, guide, data, particles, seed=zlib.crc32(stem.encode()))
+        new = Record.of(bounds, checksums(data, bounds.shape[1]))
+        if not path.exists():
+            _write(path, new.dumps())
+            quantiles = stats.t.ppf([1 - alpha, 0.9], particles - 1)
+            loss = quantiles.sum() * math.sqrt(2) * new.mean_error
+            power = f"a loss of {loss:.2g} would be found with probability 0.9"
+            self.note(f"new, to be committed: {_shown(path)}: {new}; {power}")
+        elif self.update:
+            if new.dumps() != path.read_text(encoding="utf-8"):
+                _write(path, new.dumps())
+                self.note(f"renewed, to be committed: {_shown(path)}: {new}")
+        else:
+            self._compare(path, new, alpha)
+
+    def _claim(self, path: Path) -> Path:
+        if path in self._mine or self.owners.setdefault(path, self.test) != self.test:
+            raise ValueError(f"{_shown(path)} is already the record of {self.owners[path]}; pass another name=")
+        self._mine.add(path)
+        return path
+
+    def _compare(self, path: Path, new: Record, alpha: float) -> None:
+        __tracebackhide__ = True
+        try:
+            old = Record.loads(path.read_text(encoding="utf-8"))
+        except ValueError as problem:
+            raise ValueError(
+                f"{_shown(path)} is damaged ({problem}); restore it, or run with --update-elbo"
+            ) from problem
+        if len(old.draws) != len(new.draws):
+            raise ValueError(
+                f"{_shown(path)} is of {len(old.draws)} particles, not of {len(new.draws)}: bounds cannot be paired; "
+                f"pass particles={len(old.draws)}, or run with --update-elbo"
+            )
+        if other := _other_data(old.data, new.data):
+            raise ValueError(f"{_shown(path)} is of other data: {other}; give the same, or run with --update-elbo")
+        comparison = Comparison(old, new, alpha)
+        if comparison.worse:
+            raise AssertionError(
+                f"the evidence bound fell significantly\n{comparison}\n"
+                f"if that is meant, run with --update-elbo and commit {_shown(path)}"
+            )
+        if comparison.better:
+            rise = f"by {comparison.difference:.3g} ± {comparison.error:.2g} to {new}"
+            self.note(f"better {rise}; run with --update-elbo to keep it: {_shown(path)}")
+
+
+def measure(model: Callable[..., Any], guide: Callable[..., Any], data: Any, particles: int, seed: int) -> Array:
+    """Bounds (K, B) of single draws, in evaluation mode; torch's random state is left as it was.
+
+    Args:
+        model, guide, data: as of `ElboRegression.check`.
+        particles: K.
+        seed: of the draws; each has one of its own, whatever the others took.
+
+    Raises:
+        ValueError: bounds that are not finite, or not one for each sequence.
+    """
+    with torch.no_grad(), torch.random.fork_rng(range(torch.cuda.device_count())), ExitStack() as stack:
+        for program in (model, guide):
+            module = getattr(program, "__self__", program)
+            if isinstance(module, nn.Module):
+                stack.enter_context(_Evaluating(module))
+        found = []
+        for each in np.random.SeedSequence(seed).generate_state(particles).tolist():
+            torch.manual_seed(each)
+            found.append(_bound(model, guide, data))
+        bounds = np.stack(found)
+    if bad := np.flatnonzero(~np.isfinite(bounds).all(0)).tolist():
+        raise ValueError(f"the bound of sequence {_listed(bad)} is not finite")
+    return bounds
+
+
+def _bound(model: Callable[..., Any], guide: Callable[..., Any], data: Any) -> Array:
+    terms = SequenceELBO().terms(model, data, guide)
+    bound = sum(terms.log_likelihood.values()) - sum(terms.kl.values())
+    sizes = {len(value) for _, value in _leaves(data) if value.ndim}
+    if not isinstance(bound, Tensor) or bound.dim() != 1 or len(bound) not in sizes:
+        shape = tuple(bound.shape) if isinstance(bound, Tensor) else "without an observed site"
+        raise ValueError(
+            f"the bound is {shape}, expected one for each sequence; data have {sorted(sizes)} rows. Sequences belong "
+            "in the rightmost plate: pyro.plate('sequences', B, dim=-1)"
+        )
+    return bound.double().cpu().numpy()
+
+
+def checksums(data: Any, sequences: int) -> dict[str, Any]:
+    """Shape, and root mean square and checksum of every sequence, by variable.
+
+    A checksum is a projection of the values onto fixed weights: unlike a hash, it can be compared with a tolerance.
+
+    Raises:
+        ValueError: data that are no tensors, arrays or numbers, nor mappings or sequences of these.
+    """
+
+    def table(values: Array) -> dict[str, Any]:
+        finite = np.where(np.isfinite(values), values, 0)  # padding and missing entries may be anything
+        rows = finite.reshape(sequences if values.shape[:1] == (sequences,) else 1, -1)
+        sums = rows @ np.cos(np.arange(rows.shape[1])) / math.sqrt(rows.shape[1])
+        rms = np.sqrt((rows**2).mean(1))
+        numbers = {"rms": rms, "checksums": sums}
+        return {
+            "shape": list(values.shape),
+            **{key: [_rounded(n, 6) for n in column] for key, column in numbers.items()},
+        }
+
+    return {name: table(values) for name, values in _leaves(data)}
+
+
+def _leaves(data: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
+    name = prefix or "data"
+    if isinstance(data, Mapping | list | tuple):
+        items = data.items() if isinstance(data, Mapping) else enumerate(data)
+        for key, value in sorted(((str(key), value) for key, value in items), key=itemgetter(0)):
+            yield from _leaves(value, f"{prefix}.{key}" if prefix else key)
+    elif isinstance(data, Tensor):
+        yield name, data.detach().double().cpu().numpy()
+    elif isinstance(data, np.ndarray | float | int):
+        yield name, np.asarray(data, dtype=float)
+    elif data is not None:
+        raise ValueError(
+            f"{name} is {type(data).__name__}; expected tensors, arrays or numbers, or mappings or sequences of these"
+        )
+
+
+def _other_data(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """What differs, or nothing."""
+    if old.keys() != new.keys():
+        return f"it holds {', '.join(old)}, now there are {', '.join(new)}"
+    for name, now in new.items():
+        if old[name]["shape"] != now["shape"]:
+            return f"the shape of {name} was {tuple(old[name]['shape'])}, now {tuple(now['shape'])}"
+        difference = np.array([np.subtract(now[key], old[name][key]) for key in ("rms", "checksums")])
+        if bad := np.flatnonzero((np.abs(difference) > SAME_DATA * np.array(now["rms"])).any(0)).tolist():
+            return f"{name} differs in sequence {_listed(bad)}"
+    return ""
+
+
+def _standard_error(draws: Array) -> float:
+    return float(draws.std(ddof=1)) / math.sqrt(len(draws))
+
+
+def _rounded(value: float, digits: int) -> float:
+    return float(f"{value:.{digits}g}")
+
+
+def _listed(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers[:8])) + (f" and {len(numbers) - 8} more" if len(numbers) > 8 else "")
+
+
+def _shown(path: Path) -> Path:
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def _write(path: Path, text: str) -> None:
+    """Writes whole or not at all: other processes may read and write the same file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_name(f"{path.name}.{os.getpid()}.new")
+    new.write_text(text, encoding="utf-8", newline="\n")
+    os.replace(new, path)

@@ -1,0 +1,467 @@
+"""Sweeps: methods x seeds fitted side by side with joblib, one process and one torch thread to a run.
+
+Every run has a directory of its own, as `runs.fit` writes it, with the same weights bit for bit. The same call again
+continues a sweep: finished runs are left as they are, others go on from their last checkpoint.
+
+A sweep holds a lease, an empty file beside the run directories, which is removed when the sweep is told to stop or
+fails. A run without a lease writes a checkpoint and stops. Unlike a signal, a file reaches the workers of every
+backend.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, fields, replace
+from datetime import timedelta
+from pathlib import Path
+from types import FrameType
+from typing import Any
+from uuid import uuid4
+
+import torch
+from joblib import Parallel, delayed
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from ..inference import fit as loop
+from ..inference.checkpoints import Run
+from ..inference.fit import Fit, State, Training
+from ..inference.schedules import clamp
+from ..inference.schedules import from_config as option_from_config
+from ..motion import Protocol
+from .method import Method, from_config
+from .runs import SIMULATED, Data, _recorded, _tuples, fit, resume
+
+ENDED = ("finished", "stopped early")
+
+
+@dataclass(frozen=True)
+class Result:
+    """A run of a sweep.
+
+    Args:
+        path: the run directory.
+        method: the method with its options.
+        seed: of initial weights, batches and draws.
+        status: "finished", "stopped early", "interrupted" or "failed".
+        step: the last step.
+        best_bound: the best validation bound, in nats per frame, as in `Fit`.
+        seconds: that this sweep spent on the run; 0 where an earlier one has finished it.
+        error: why it failed.
+    """
+
+    path: Path
+    method: Method
+    seed: int
+    status: str
+    step: int = 0
+    best_bound: float | None = None
+    seconds: float = 0.0
+    error: str = ""
+
+    def __str__(self) -> str:
+        if self.status == "failed":
+            return f"{self.path.name} failed: {self.error}"
+        how = f"in {_clock(self.seconds)}" if self.seconds else "by an earlier sweep"
+        bound = "" if self.best_bound is None else f", best bound {self.best_bound:.3f} nats a frame"
+        return f"{self.path.name} {self.status} at step {self.step} {how}{bound}"
+
+
+class Interrupted(KeyboardInterrupt):
+    """A sweep was stopped by Ctrl-C or SIGTERM. The same sweep, started again, continues.
+
+    Args:
+        results: of the runs that have ended.
+        total: how many runs the sweep has.
+        signal: number of the signal; a command line exits with 128 + signal.
+    """
+
+    def __init__(self, results: Sequence[Result], total: int, signal: int) -> None:
+        ended = sum(result.status in ENDED for result in results)
+        super().__init__(f"interrupted with {ended} of {total} runs finished; the same sweep again continues them")
+        self.results = results
+        self.signal = signal
+
+
+def sweep(
+    methods: Mapping[str, Method] | Sequence[Method],
+    data: Data,
+    out: str | os.PathLike[str],
+    seeds: Sequence[int] = (0, 1, 2),
+    training: Training | None = None,
+    jobs: int = 2,
+) -> list[Result]:
+    """Fits each method with each seed, several runs at a time.
+
+    A run directory has the name of the method, the options in which methods of that name differ, and the seed, such as
+    srnn-z8-seed0. Runs are spread over processes of this machine, or as the caller's `joblib.parallel_config` says;
+    workers on other machines need the file system of `out`. Ctrl-C lets every run write a checkpoint; a second one
+    kills them.
+
+    Args:
+        methods: with their options; a mapping gives them names of its own.
+        data: training and validation windows are taken from it.
+        out: where the run directories go.
+        seeds: of the runs of each method; `training` has none to tell.
+        training: the other options. `progress` shows the runs: a table on a terminal, or else a line as each starts and
+            ends.
+        jobs: runs at a time; a cluster has as many as workers.
+
+    Returns:
+        A result for each run, by seed and then by method, also for those that failed.
+
+    Raises:
+        ValueError: nothing to fit, a run given twice, or a run of other options in its directory.
+        CheckpointError: a damaged run.
+        Interrupted: after Ctrl-C or SIGTERM.
+
+    Example:
+        methods = [dvae.method("srnn", latent=latent) for latent in (8, 16)]
+        results = sweep(methods, Data.open("people.npz"), "runs", training=dvae.Training(steps=4000), jobs=4)
+    """
+    out, training = Path(out), training or Training()
+    if training.devices != 1:
+        raise ValueError(f"devices is {training.devices}; a run of a sweep has one device, fit it alone for more")
+    lease = out.absolute() / f".sweep-{uuid4().hex}"
+    source = data.path if data.path == SIMULATED else os.path.abspath(data.path)
+    runs = [
+        _Run(out.absolute() / f"{name}-seed{seed}", method, data, source, replace(training, seed=seed), lease)
+        for seed in seeds
+        for name, method in _named(methods).items()
+    ]
+    if not runs or len({run.path for run in runs}) < len(runs):
+        raise ValueError(f"a sweep has at least one method and one seed, each once; seeds are {list(seeds)}")
+    results = {run.path: result for run in runs if (result := _earlier(run)) is not None}
+    waiting = [run for run in runs if run.path not in results]
+    notes: list[str] = []
+    received, blind = None, False
+    out.mkdir(parents=True, exist_ok=True)
+    lease.touch()
+    with _Progress(waiting, training) as progress, _Stop(lease) as stop:
+        try:
+            for result in results.values():
+                progress.end(result)
+            with _ignored_signals():
+                ended = Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")(
+                    delayed(_fit)(run) for run in waiting
+                )
+            for result, said in ended:
+                results[result.path] = result
+                notes += said
+                progress.end(result)
+                blind |= result.status == "interrupted" and lease.exists()
+        except KeyboardInterrupt as interrupt:
+            received = getattr(interrupt, "signal", signal.SIGINT)
+        except Exception:
+            if stop.received is None:  # when all processes get the signal, a worker may be gone before it is asked
+                raise
+        finally:
+            lease.unlink(missing_ok=True)
+    for note in dict.fromkeys(notes):
+        warnings.warn(note)
+    given = [replace(results[run.path], path=out / run.path.name) for run in runs if run.path in results]
+    if received := stop.received or received:
+        raise Interrupted(given, len(runs), received)
+    if blind:
+        raise RuntimeError(
+            f"a worker does not see the files in {out.absolute()}; give a directory that all of them see"
+        )
+    return given
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What a worker needs. Its working directory may be another, so paths are absolute."""
+
+    path: Path
+    method: Method
+    data: Data
+    source: str
+    training: Training
+    lease: Path
+    owner: int = field(default_factory=os.getpid)
+
+
+_alone = threading.Lock()  # torch's random state is the process's: threads of one process take turns
+
+
+def _fit(run: _Run) -> tuple[Result, list[str]]:
+    """Fits or resumes a run in a worker; its result, and the warnings."""
+    parent = multiprocessing.parent_process()
+    if parent is not None and parent.pid == run.owner:
+        _ignore_signals()  # from here on: workers that the pool starts later are not among the first ones
+    with _alone, _one_thread(), warnings.catch_warnings(record=True) as caught:
+        begin, status, error = time.monotonic(), "interrupted", ""
+        ended, leased = Fit([], 0, None, None, status, run.path), _Leased(run.lease)
+        try:
+            leased.check()
+            if Run(run.path).exists:
+                ended = resume(run.path, run.source, callbacks=[leased], progress=False)
+            else:
+                training = replace(run.training, progress=False)
+                ended = fit(run.method, run.data, run.path, training, callbacks=[leased])
+            status = ended.status
+        except KeyboardInterrupt as stop:
+            if run.owner == os.getpid() and threading.current_thread() is threading.main_thread():
+                raise  # it is the sweep's own Ctrl-C: with one job, joblib starts no process
+            if leased.orphaned():
+                os._exit(1)  # else it would wait for more work
+            if isinstance(stop, loop.Interrupted):
+                ended = stop.fit
+        except Exception as failure:  # of any type, and it may not survive the way to the sweep's process
+            status, error = "failed", f"{type(failure).__name__}: {failure}"
+        seconds = time.monotonic() - begin
+    result = Result(run.path, run.method, run.training.seed, status, ended.step, ended.best_bound, seconds, error)
+    return result, [str(warning.message) for warning in caught]
+
+
+class _Leased:
+    """A callback that stops the run when the lease is gone, or the process that started this one."""
+
+    def __init__(self, lease: Path) -> None:
+        self.lease, self.next = lease, 0.0
+        self.parent, self.above = multiprocessing.parent_process(), os.getppid()
+
+    def check(self) -> None:
+        if self.orphaned() or not self.lease.exists():
+            raise KeyboardInterrupt
+
+    def orphaned(self) -> bool:
+        """Whether the process that started this one was killed, and could tell nobody."""
+        if self.parent is None or self.parent.pid is None:
+            return False
+        try:
+            os.kill(self.parent.pid, 0)  # asks, and sends nothing; it may also have been killed before this run began
+        except ProcessLookupError:
+            return True
+        return os.getppid() != self.above
+
+    def on_step(self, state: State) -> None:
+        if time.monotonic() > self.next:  # not at every step: the file system may be far away
+            self.next = time.monotonic() + 0.5
+            self.check()
+
+    def on_validation(self, state: State) -> None: ...
+
+    def on_end(self, state: State) -> None: ...
+
+
+class _Stop(loop._Signals):
+    """Ends the lease at the first Ctrl-C or SIGTERM."""
+
+    def __init__(self, lease: Path) -> None:
+        super().__init__()
+        self.lease = lease
+
+    def _remember(self, number: int, frame: FrameType | None) -> None:
+        super()._remember(number, frame)
+        self.lease.unlink(missing_ok=True)
+
+
+@contextmanager
+def _ignored_signals() -> Iterator[None]:
+    """Processes started within it ignore the terminal's Ctrl-C, at which one that waits would break the pool."""
+    before = _ignore_signals()
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+
+
+def _ignore_signals() -> dict[int, Any]:
+    """The handlers until now; none off the main thread, which has no say in it."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    return {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _named(methods: Mapping[str, Method] | Sequence[Method]) -> dict[str, Method]:
+    """Methods by what their run directories are called."""
+    if isinstance(methods, Mapping):
+        named = dict(methods)
+    else:
+        named = {}
+        for method in methods:
+            alike = [other for other in methods if other.name == method.name]
+            options = [option.name for option in fields(method)]
+            varied = [name for name in options if len({repr(getattr(other, name)) for other in alike}) > 1]
+            name = "-".join([method.name, *(_label(option, getattr(method, option)) for option in varied)])
+            if name in named:
+                raise ValueError(f"{name} is given twice; the methods of a sweep differ in their options")
+            named[name] = method
+    for name in named:
+        if not re.fullmatch(r"[\w.=+-]+", name):
+            raise ValueError(f"{name!r} is no name for a directory; name the methods: sweep({{'a': …, 'b': …}}, …)")
+    return named
+
+
+def _label(option: str, value: Any) -> str:
+    return f"z{value}" if option == "latent" else f"{option.replace('_', '-')}={value}"
+
+
+def _earlier(run: _Run) -> Result | None:
+    """The result of a run that an earlier sweep has finished.
+
+    Raises:
+        ValueError: the directory holds a run of other options.
+    """
+    earlier = Run(run.path)
+    if not earlier.exists:
+        if run.path.is_file():
+            raise ValueError(f"{run.path} is a file, where a run is to go; choose another directory for the sweep")
+        return None
+    with _recorded(run.path):
+        config, state = earlier.config, earlier.state
+        there = _options(
+            from_config(config["method"]),
+            Protocol(**_tuples(config["protocol"])),
+            Training(**{name: option_from_config(value) for name, value in config["training"].items()}),
+            config["data"]["fingerprint"],
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the run itself tells which schedules it makes shorter
+        training = clamp(run.training, run.training.steps)
+    here = _options(run.method, run.data.protocol, training, run.data.motion.fingerprint())
+    if changed := [name for name in {**there, **here} if there.get(name) != here.get(name)]:
+        name = changed[0]
+        others = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
+        raise ValueError(
+            f"{run.path} holds a run of other options: its {name} is {there.get(name)!r}, the sweep's "
+            f"{here.get(name)!r}{others}; give the sweep those options, or another directory"
+        )
+    if state["status"] not in ENDED:
+        return None
+    return Result(run.path, run.method, run.training.seed, state["status"], state["step"], state["best_bound"])
+
+
+def _options(method: Method, protocol: Protocol, training: Training, fingerprint: str) -> dict[str, Any]:
+    """All that makes a run what it is, by what to call it. The method tells the self-feeding of the training."""
+    same = replace(training, self_feeding=0.0, progress=True)
+    return {
+        **method.config(),
+        **{f"protocol's {name}": value for name, value in asdict(protocol).items()},
+        **{option.name: getattr(same, option.name) for option in fields(same) if option.name != "self_feeding"},
+        "data's fingerprint": fingerprint,
+    }
+
+
+class _Log:
+    """What the log of a run tells, while another process writes it."""
+
+    def __init__(self, run: Path) -> None:
+        self.path = run / "log.jsonl"
+        self.name = run.name
+        self.begins = f"continues after step {Run(run).state['step']}" if Run(run).exists else "starts"
+        self.begin: float | None = None
+        self.step = 0
+        self.bound: float | None = None
+        self._before, self._read = self._stamp(), 0
+
+    def look(self) -> bool:
+        """Reads what is new; whether the run has just begun."""
+        began = self.begin is None and self._stamp() != self._before  # both fit and resume begin with a new file
+        if began:
+            self.begin = time.monotonic()
+        if self.begin is not None:
+            with suppress(OSError), self.path.open("rb") as file:
+                file.seek(self._read)
+                whole, end, _ = file.read().rpartition(b"\n")
+                self._read += len(whole + end)
+                for row in map(json.loads, whole.splitlines()):
+                    self.step = row["step"]
+                    self.bound = row.get("validation/self_fed/bound", row.get("validation/bound", self.bound))
+        return began
+
+    def _stamp(self) -> tuple[int, int] | None:
+        with suppress(OSError):
+            status = self.path.stat()
+            return status.st_ino, status.st_mtime_ns
+        return None
+
+
+class _Progress:
+    """A line as each run ends. Meanwhile, a live table of the runs; away from a terminal, a line as each starts."""
+
+    def __init__(self, runs: Sequence[_Run], training: Training) -> None:
+        self.console = Console(stderr=True, quiet=not training.progress)
+        self.steps, self.total = training.steps, len(runs)
+        self.logs = {run.path: _Log(run.path) for run in runs}
+        live = self.console.is_terminal and not self.console.is_jupyter
+        self._live = Live(console=self.console, auto_refresh=False, transient=True) if live else None
+        self._lock, self._closed = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> _Progress:
+        if self._live is not None:
+            self._live.start()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closed.set()
+        self._thread.join()
+        if self._live is not None:
+            self._live.stop()
+
+    def end(self, result: Result) -> None:
+        """Shows a result, unless it is that of a run that has not begun."""
+        with self._lock:
+            self._look()
+            log = self.logs.pop(result.path, None)
+            if result.status != "interrupted" or (log is not None and log.begin is not None):
+                style = "red" if result.status == "failed" else None
+                self.console.print(str(result), style=style, markup=False, highlight=False, soft_wrap=True)
+            self._refresh()
+
+    def _watch(self) -> None:
+        while not self._closed.wait(0.5):
+            with self._lock:
+                self._look()
+
+    def _look(self) -> None:
+        for log in self.logs.values():
+            if log.look() and self._live is None:
+                self.console.print(f"{log.name} {log.begins}", markup=False, highlight=False, soft_wrap=True)
+        self._refresh()
+
+    def _refresh(self) -> None:
+        if self._live is not None:
+            self._live.update(self._table(), refresh=True)
+
+    def _table(self) -> Table:
+        running = [log for log in self.logs.values() if log.begin is not None]
+        ended, waiting = self.total - len(self.logs), len(self.logs) - len(running)
+        table = Table(caption=f"{ended} of {self.total} runs ended, {waiting} waiting", caption_justify="left")
+        table.add_column("run", overflow="fold")
+        for name in ("step", "bound (nats a frame)", "elapsed"):
+            table.add_column(name, justify="right")
+        for log in running:
+            assert log.begin is not None
+            bound = "" if log.bound is None else f"{log.bound:.3f}"
+            table.add_row(log.name, f"{log.step}/{self.steps}", bound, _clock(time.monotonic() - log.begin))
+        return table
+
+
+def _clock(seconds: float) -> str:
+    return str(timedelta(seconds=round(seconds)))

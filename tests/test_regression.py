@@ -1,0 +1,496 @@
+"""elbo_regression: the rate of its false alarms, its power, its records, and the plugin that brings it."""
+
+import json
+import math
+import re
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from scipy import stats
+
+from dvae import DynamicalVAE, Oracle, networks, twin
+from dvae.testing.regression import Comparison, ElboRegression, Record, measure
+
+pytest_plugins = ["pytester"]
+
+DOCS = Path(__file__).parent.parent / "docs"
+PAIR = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_t)")
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """A linear-Gaussian model, data, and its oracle."""
+    model = twin(*PAIR, {"z": 1, "x": 1}, 3)
+    torch.manual_seed(7)
+    return model, model.sample(4, 3)["x"], Oracle(model, 3)
+
+
+def regression(folder, notes=None, test="test_it", **options):
+    options = {"update": False, "strict": False, "owners": {}, **options}
+    return ElboRegression(folder, test, note=[].append if notes is None else notes.append, **options)
+
+
+def repeated(model, x, times, particles, seed):
+    """Records of independent measurements of the same bounds."""
+    bounds = measure(model.model, model.guide, x.repeat(times, 1, 1), particles, seed)
+    return [Record.of(part, {}) for part in np.split(bounds, times, axis=1)]
+
+
+def worsen(model, by):
+    """The model with a guide whose scales are exp(by) times as large."""
+    other = twin(*PAIR, {"z": 1, "x": 1}, 3)
+    other.load_state_dict(model.state_dict())
+    with torch.no_grad():
+        other.encoder["z"].head.log_scale += by
+    return other
+
+
+# ------------------------------------------------------------------------------------------------- error and power
+
+
+def test_a_bound_is_measured_within_its_error(exact):
+    model, x, oracle = exact
+    record = Record.of(measure(model.model, model.guide, x, 400, seed=1), {})
+    bound = oracle.bound(x).detach().numpy()
+    assert (np.abs(record.bound - bound) < 5 * record.error).all()
+    assert abs(record.mean - bound.mean()) < 5 * record.mean_error
+    assert record.mean_error == pytest.approx(math.sqrt((record.error**2).sum()) / len(x), rel=0.2)
+
+
+def test_the_rate_of_false_alarms_is_alpha(exact):
+    model, x, _ = exact
+    n, alpha = 1000, 0.05
+    pairs = zip(repeated(model, x, n, 30, seed=1), repeated(model, x, n, 30, seed=2), strict=True)
+    found = [Comparison(old, new, alpha) for old, new in pairs]
+    spread = 4 * math.sqrt(alpha * (1 - alpha) / n)
+    assert abs(np.mean([comparison.worse for comparison in found]) - alpha) < spread
+    assert abs(np.mean([comparison.better for comparison in found]) - alpha) < spread
+
+
+@pytest.mark.parametrize("particles", [4, 100])
+@pytest.mark.parametrize("coupling", [-1.0, 0.0, 0.9])
+@pytest.mark.parametrize("noise", [1e-2, 1e2])
+def test_false_alarms_are_as_rare_however_draws_are_coupled_and_sequences_spread(particles, coupling, noise):
+    random = np.random.default_rng(0)
+    n, alpha, size = 2000, 0.05, 5
+    level = random.normal(scale=10.0, size=size)  # of the sequences
+    scale = noise * np.geomspace(1, 30, size)  # of their Monte Carlo errors
+    first, second = random.normal(size=(2, n, particles, size))
+    second = coupling * first + math.sqrt(1 - coupling**2) * second
+    alarms = [
+        Comparison(Record.of(level + scale * a, {}), Record.of(level + scale * b, {}), alpha).worse
+        for a, b in zip(first, second, strict=True)
+    ]
+    assert abs(np.mean(alarms) - alpha) < 4 * math.sqrt(alpha * (1 - alpha) / n)
+
+
+class Poor:
+    """x_i ~ N(z_i, 1) and z_i ~ N(0, 1), with a guide far from the posterior, so that bounds are nearly normal.
+
+    Its draws may have the opposite sign, and take random numbers besides: in the first draw only, or in all.
+    """
+
+    def __init__(self, sign=1, first=False, every=False, mean=0.0):
+        self.sign, self.first, self.every, self.mean = sign, first, every, mean
+
+    def model(self, x):
+        with pyro.plate("sequences", len(x), dim=-1):
+            pyro.sample("x", dist.Normal(pyro.sample("z", dist.Normal(torch.zeros_like(x), 1.0)), 1.0), obs=x)
+
+    def guide(self, x):
+        if self.every or self.first:
+            torch.randn_like(x)
+            self.first = False
+        affine = torch.distributions.transforms.AffineTransform(self.mean, 0.3 * self.sign)
+        with pyro.plate("sequences", len(x), dim=-1):
+            pyro.sample("z", dist.TransformedDistribution(dist.Normal(torch.zeros_like(x), 1.0), [affine]))
+
+    def records(self, times, particles, seed):
+        """Records of independent measurements: of sequences that are alike but for their draws."""
+        bounds = measure(self.model, self.guide, torch.full((4 * times,), 40.0, dtype=torch.float64), particles, seed)
+        return [Record.of(part, {}) for part in np.split(bounds, times, axis=1)]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"sign": -1}, {"every": True}, {"sign": -1, "every": True}, {"sign": -1, "first": True}],
+    ids=["opposed", "other numbers", "opposed and other numbers", "opposed and one number more"],
+)
+def test_false_alarms_are_as_rare_when_a_change_takes_other_random_numbers(change):
+    n, alpha = 2000, 0.05
+    pairs = zip(Poor().records(n, 30, seed=1), Poor(**change).records(n, 30, seed=1), strict=True)
+    found = [Comparison(old, new, alpha) for old, new in pairs]
+    for alarms in ([comparison.worse for comparison in found], [comparison.better for comparison in found]):
+        assert abs(np.mean(alarms) - alpha) < 4 * math.sqrt(alpha * (1 - alpha) / n)
+
+
+def test_one_random_number_more_uncouples_one_draw_only():
+    n, alpha, particles, mean = 2000, 0.05, 30, -0.02
+    old = Poor().records(n, particles, seed=1)
+    same, poor = (Poor(first=True, mean=m).records(n, particles, seed=1) for m in (0.0, mean))
+    for before, after in zip(old, same, strict=True):
+        np.testing.assert_array_equal(after.draws[1:], before.draws[1:])
+        assert after.draws[0] != before.draws[0]
+    # Differences are the fall, but for the first, which has the error e besides: t = particles * fall / |e| + sign(e).
+    scaled = particles * (40 * mean - mean**2) / (math.sqrt(2) * 40 * 0.3 / math.sqrt(4))
+    quantile = stats.t.ppf(1 - alpha, particles - 1)
+    power = stats.norm.cdf(-scaled / (quantile + 1)) + stats.norm.cdf(-scaled / (quantile - 1)) - 1
+    rate = np.mean([Comparison(a, b, alpha).worse for a, b in zip(old, poor, strict=True)])
+    assert abs(rate - power) < 4 * math.sqrt(power * (1 - power) / n)
+    assert power > 0.8
+
+
+def test_the_note_tells_the_fall_that_is_found_nine_times_in_ten(tmp_path, exact):
+    """By simulation of the t-test, for draws that have nothing in common."""
+    model, x, _ = exact
+    notes, particles, n = [], 5, 4000
+    regression(tmp_path, notes).check(model.model, model.guide, x, particles=particles, alpha=0.05)
+    fall = float(re.search(r"a loss of (\S+) would be found with probability 0.9", notes[0])[1])
+    scale = Record.loads((tmp_path / "test_it.json").read_text()).mean_error * math.sqrt(particles)
+    old, new = np.random.default_rng(0).normal(scale=scale, size=(2, n, particles, 1))
+    found = [Comparison(Record.of(a, {}), Record.of(b - fall, {}), 0.05).worse for a, b in zip(old, new, strict=True)]
+    assert 0.88 < np.mean(found) < 0.97
+
+
+def test_a_worse_guide_is_found_as_often_as_its_nats_and_their_error_say(exact):
+    model, x, oracle = exact
+    n, alpha, particles = 500, 0.05, 40
+    poor = worsen(model, 0.15)
+    fall = (Oracle(poor, 3).bound(x) - oracle.bound(x)).mean().item()
+    assert fall < 0
+    pairs = zip(repeated(model, x, n, particles, seed=1), repeated(poor, x, n, particles, seed=2), strict=True)
+    found = [Comparison(old, new, alpha) for old, new in pairs]
+    differences = np.array([comparison.difference for comparison in found])
+    error = differences.std()
+    assert abs(differences.mean() - fall) < 4 * error / math.sqrt(n)
+    assert np.mean([comparison.error for comparison in found]) == pytest.approx(error, rel=0.15)
+    power = stats.nct.cdf(stats.t.ppf(alpha, particles - 1), particles - 1, fall / error)
+    assert 0.2 < power < 0.99
+    rate = np.mean([comparison.worse for comparison in found])
+    assert abs(rate - power) < 4 * math.sqrt(power * (1 - power) / n)
+
+
+def test_coupled_draws_find_a_loss_below_the_error_of_either_bound(tmp_path, exact):
+    model, x, oracle = exact
+    poor = worsen(model, 0.05)
+    fall = (Oracle(poor, 3).bound(x) - oracle.bound(x)).mean().item()
+    old, new = (Record.of(measure(m.model, m.guide, x, 400, seed=3), {}) for m in (model, poor))
+    comparison = Comparison(old, new, 0.001)
+    assert comparison.worse
+    assert abs(fall) < 2 * old.mean_error
+    assert abs(comparison.difference - fall) < 5 * comparison.error
+
+
+def test_rounding_is_no_fall_and_an_exact_bound_needs_no_error():
+    def compare(fall):
+        old = Record.of(np.full((10, 3), -1000.0), {})
+        return Comparison(old, Record.of(np.full((10, 3), -1000.0 - fall), {}), 0.001)
+
+    assert not compare(0.0).worse
+    assert not compare(5e-4).worse
+    assert compare(2e-3).worse
+    assert compare(1e9).worse
+    assert not compare(2e-3).better
+    assert compare(-2e-3).better
+
+
+# ------------------------------------------------------------------------------------------------------- the record
+
+
+def test_the_first_use_writes_and_the_same_model_passes(tmp_path, exact):
+    model, x, _ = exact
+    notes = []
+    for _ in range(3):
+        torch.manual_seed(len(notes))
+        before = torch.get_rng_state()
+        regression(tmp_path / "deep", notes).check(model.model, model.guide, x, particles=20, name="a name/of mine[1]")
+        assert torch.equal(torch.get_rng_state(), before)
+    (file,) = (tmp_path / "deep").iterdir()
+    assert file.name == "a_name_of_mine_1.json"
+    (note,) = notes
+    assert note.startswith("new, to be committed: ")
+    stored = Record.loads(file.read_text())
+    assert stored.dumps() == file.read_text()
+    assert (len(stored.bound), len(stored.draws)) == (4, 20)
+    assert stored.mean == pytest.approx(stored.bound.mean(), abs=1e-5)
+
+
+def test_a_fall_is_told_with_the_worst_sequences(tmp_path, exact):
+    model, x, _ = exact
+    regression(tmp_path).check(model.model, model.guide, x)
+    poor = worsen(model, 1.0)
+    with pytest.raises(AssertionError) as caught:
+        regression(tmp_path).check(poor.model, poor.guide, x)
+    text = str(caught.value)
+    for expected in (
+        "fell significantly",
+        "old  ",
+        "new  ",
+        "difference  -",
+        "standard error",
+        "--update-elbo and commit",
+    ):
+        assert expected in text
+    listed = re.findall(r"^ +(\d) +\S+ +\S+ +(-\S+) +\S+$", text, re.MULTILINE)
+    assert sorted(int(i) for i, _ in listed) == [0, 1, 2, 3]
+    assert [float(d) for _, d in listed] == sorted(float(d) for _, d in listed)
+
+
+def test_an_update_renews_and_a_rise_is_told(tmp_path, exact):
+    model, x, _ = exact
+    poor, notes = worsen(model, 1.0), []
+    regression(tmp_path, notes).check(poor.model, poor.guide, x)
+    regression(tmp_path, notes).check(model.model, model.guide, x)
+    assert re.match(r"better by \S+ ± .*; run with --update-elbo to keep it", notes[1])
+    regression(tmp_path, notes, update=True).check(model.model, model.guide, x)
+    assert notes[2].startswith("renewed, to be committed: ")
+    regression(tmp_path, notes, update=True).check(model.model, model.guide, x)
+    regression(tmp_path, notes).check(model.model, model.guide, x)
+    assert len(notes) == 3
+    with pytest.raises(AssertionError, match="fell significantly"):
+        regression(tmp_path, notes).check(poor.model, poor.guide, x)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda batch: {n: v[:3] for n, v in batch.items()}, r"the shape of lengths was \(4,\), now \(3,\)"),
+        (lambda batch: {**batch, "x": batch["x"].flip(0)}, "x differs in sequence 0, 1, 2, 3"),
+        (lambda batch: {**batch, "x": batch["x"] + 1e-3 * torch.eye(4)[2, :, None, None]}, "x differs in sequence 2;"),
+        (lambda batch: {"x": batch["x"]}, "it holds lengths, x, now there are x"),
+        (lambda batch: {**batch, "lengths": torch.tensor([3, 3, 3, 2])}, "lengths differs in sequence 3"),
+    ],
+)
+def test_other_data_are_refused(tmp_path, exact, change, message):
+    model, x, _ = exact
+    batch = {"x": x, "lengths": torch.tensor([3, 3, 3, 3])}
+    regression(tmp_path).check(model.model, model.guide, batch, particles=5)
+    with pytest.raises(ValueError, match=f"is of other data: .*{message}"):
+        regression(tmp_path).check(model.model, model.guide, change(batch), particles=5)
+
+
+def test_small_sequences_are_known_beside_large_ones(tmp_path, exact):
+    model, x, _ = exact
+    x = x * torch.tensor([1e6, 1.0, 0.0, 1.0], dtype=torch.float64)[:, None, None]
+    regression(tmp_path).check(model.model, model.guide, x, particles=5)
+    regression(tmp_path).check(model.model, model.guide, x.float(), particles=5)
+    other = x * torch.tensor([1.0, 1.001, 1.0, 1.0], dtype=torch.float64)[:, None, None]
+    with pytest.raises(ValueError, match="data differs in sequence 1;"):
+        regression(tmp_path).check(model.model, model.guide, other, particles=5)
+
+
+def test_data_may_differ_in_their_last_digits(tmp_path, exact):
+    model, x, _ = exact
+    regression(tmp_path).check(model.model, model.guide, x)
+    regression(tmp_path).check(model.model, model.guide, x.float())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("", "JSONDecodeError"), ("[]", "TypeError"), ("{}", "KeyError"), ("<<<<<<< HEAD\n{}", "no record of bounds")],
+)
+def test_a_damaged_record_is_refused_and_can_be_renewed(tmp_path, exact, text, message):
+    model, x, _ = exact
+    (tmp_path / "test_it.json").write_text(text)
+    with pytest.raises(ValueError, match=f"damaged .*{message}"):
+        regression(tmp_path).check(model.model, model.guide, x)
+    regression(tmp_path, update=True).check(model.model, model.guide, x)
+    regression(tmp_path).check(model.model, model.guide, x)
+
+
+def test_what_cannot_be_compared_is_refused(tmp_path, exact):
+    model, x, _ = exact
+    check = regression(tmp_path).check
+    with pytest.raises(ValueError, match="particles is at least 2"):
+        check(model.model, model.guide, x, particles=1)
+    with pytest.raises(ValueError, match=r"between 0 and 0.5; got 0.7"):
+        check(model.model, model.guide, x, alpha=0.7)
+    with pytest.raises(AssertionError, match=r"there is no record .*run without --elbo-strict"):
+        regression(tmp_path, strict=True).check(model.model, model.guide, x)
+    assert not list(tmp_path.iterdir())
+    check(model.model, model.guide, x, particles=5)
+    with pytest.raises(ValueError, match=r"is of 5 particles, not of 6: .* pass particles=5"):
+        regression(tmp_path).check(model.model, model.guide, x, particles=6)
+
+
+def test_a_record_has_one_owner(tmp_path, exact):
+    model, x, _ = exact
+    owners = {}
+    mine = regression(tmp_path, test="test_a", owners=owners)
+    mine.check(model.model, model.guide, x, name="same", particles=3)
+    for other in (mine, regression(tmp_path, test="test_b", owners=owners)):
+        with pytest.raises(ValueError, match="already the record of test_a; pass another name="):
+            other.check(model.model, model.guide, x, name="same", particles=3)
+
+
+# ------------------------------------------------------------------------------------------------- pairs of one's own
+
+
+def normal(location, scale, dim=-1):
+    """x_i ~ N(z_i, 1), z_i ~ N(0, 1), and the guide N(location x_i, scale^2)."""
+
+    def model(x):
+        with pyro.plate("sequences", len(x), dim=dim):
+            z = pyro.sample("z", dist.Normal(torch.zeros_like(x), 1.0))
+            pyro.sample("x", dist.Normal(z, 1.0), obs=x)
+
+    def guide(x):
+        with pyro.plate("sequences", len(x), dim=dim):
+            pyro.sample("z", dist.Normal(location * x, scale))
+
+    return model, guide
+
+
+def test_any_pyro_pair_has_its_bound(tmp_path):
+    x = torch.linspace(-1, 2, 6, dtype=torch.float64)
+    record = Record.of(measure(*normal(0.3, 0.9), x, 2000, seed=1), {})
+    posterior, evidence = dist.Normal(x / 2, math.sqrt(0.5)), dist.Normal(torch.zeros_like(x), math.sqrt(2)).log_prob(x)
+    expected = evidence - torch.distributions.kl_divergence(dist.Normal(0.3 * x, 0.9), posterior)
+    assert (np.abs(record.bound - expected.numpy()) < 5 * record.error).all()
+
+
+def test_the_exact_posterior_has_no_monte_carlo_error_and_its_loss_is_seen_at_once(tmp_path):
+    x = torch.linspace(-1, 2, 6, dtype=torch.float64)
+    best = math.sqrt(0.5)
+    regression(tmp_path).check(*normal(0.5, best), x, particles=50)
+    regression(tmp_path).check(*normal(0.5, best), x, particles=50)
+    with pytest.raises(AssertionError, match="fell significantly"):
+        regression(tmp_path).check(*normal(0.5, best * 2), x, particles=50)
+    assert Record.loads((tmp_path / "test_it.json").read_text()).mean_error < 1e-12
+
+
+def test_bounds_are_one_for_each_sequence_and_finite(tmp_path):
+    x = torch.linspace(-1, 2, 6)
+    with pytest.raises(ValueError, match=r"the bound is \(3,\), expected one for each sequence; data have \[2\] rows"):
+        regression(tmp_path).check(
+            lambda x: normal(0.5, 1.0)[0](x[0]), lambda x: normal(0.5, 1.0)[1](x[0]), x.view(2, 3)
+        )
+    bad, unchecked = x.index_fill(0, torch.tensor([1, 4]), torch.inf), {"validate_distributions_torch": False}
+    with (
+        pyro.settings.context(validate_distributions_pyro=False, **unchecked),
+        pytest.raises(ValueError, match="the bound of sequence 1, 4 is not finite"),
+    ):
+        regression(tmp_path).check(*normal(0.0, 1.0), bad)
+    with pytest.raises(ValueError, match="note is str; expected tensors"):
+        regression(tmp_path).check(
+            *[lambda batch, f=f: f(batch["x"]) for f in normal(0.5, 1.0)], {"x": x, "note": "hm"}
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_bounds_are_those_of_evaluation_mode(tmp_path):
+    model = DynamicalVAE(*PAIR, {"z": 1, "x": 1}, networks.Recurrent(3, hidden=(3,)))
+    model.encoder["z"].register_forward_pre_hook(lambda module, _: None if not module.training else 1 / 0)
+    model.train()
+    regression(tmp_path).check(model, model.guide, torch.zeros(2, 3, 1), particles=2)
+    assert all(module.training for module in model.modules())
+
+
+# -------------------------------------------------------------------------------------------------------- the plugin
+
+TEST = """
+import os, pytest, torch
+import pyro, pyro.distributions as dist
+
+def model(x):
+    with pyro.plate("sequences", len(x), dim=-1):
+        pyro.sample("x", dist.Normal(pyro.sample("z", dist.Normal(torch.zeros_like(x), 1.0)), 1.0), obs=x)
+
+def guide(x):
+    with pyro.plate("sequences", len(x), dim=-1):
+        pyro.sample("z", dist.Normal(0.5 * x, float(os.environ["SCALE"])))
+
+class TestPair:
+    @pytest.mark.parametrize("n", [2, 3])
+    def test_bound(self, elbo_regression, n):
+        elbo_regression.check(model, guide, torch.linspace(-1, 1, n))
+"""
+
+
+@pytest.fixture
+def run(pytester, monkeypatch):
+    pytester.makepyfile(test_pair=TEST)
+
+    def run(scale, *options, inside=True):
+        monkeypatch.setenv("SCALE", str(scale))
+        options = ("-p", "dvae.testing.plugin", "-p", "no:cacheprovider", *options)
+        return pytester.runpytest_inprocess(*options) if inside else pytester.runpytest_subprocess(*options)
+
+    return run
+
+
+def test_the_life_of_a_record(pytester, run):
+    result = run(1.5, "--elbo-strict")
+    result.assert_outcomes(failed=2)
+    result = run(1.5)
+    result.assert_outcomes(passed=2)
+    files = [f"elbo_regression/test_pair/TestPair.test_bound_{n}.json" for n in (2, 3)]
+    result.stdout.fnmatch_lines(["*evidence bounds*", *[f"new, to be committed: {file}: *" for file in files]])
+    assert {json.loads((pytester.path / file).read_text())["particles"] for file in files} == {100}
+
+    result = run(1.5, "--elbo-strict")
+    result.assert_outcomes(passed=2)
+    result.stdout.no_fnmatch_line("*evidence bounds*")
+
+    result = run(2.0)
+    result.assert_outcomes(failed=2)
+    result.stdout.fnmatch_lines(
+        ["E*the evidence bound fell significantly", "E*worst of 2 sequences:", "E*--update-elbo*"]
+    )
+    result.stdout.no_fnmatch_line("*regression.py:*")  # the traceback ends at the user's line
+
+    result = run(0.7)
+    result.assert_outcomes(passed=2)
+    result.stdout.fnmatch_lines(["better by * run with --update-elbo to keep it: elbo_regression/*"])
+
+    result = run(2.0, "--update-elbo")
+    result.assert_outcomes(passed=2)
+    result.stdout.fnmatch_lines([f"renewed, to be committed: {file}: *" for file in files])
+    run(2.0).assert_outcomes(passed=2)
+
+
+def test_workers_report_to_the_summary(pytester, run):
+    result = run(1.0, "-n", "1", inside=False)
+    result.assert_outcomes(passed=2)
+    result.stdout.fnmatch_lines(["*evidence bounds*", "new, to be committed: *", "new, to be committed: *"])
+    assert len(list((pytester.path / "elbo_regression" / "test_pair").iterdir())) == 2
+
+
+def test_pytest_finds_the_plugin_and_does_not_wait_for_torch():
+    pytest.importorskip("pytest_dvae", reason="the plugin is found where the package is installed")
+    assert [point.value for point in entry_points(group="pytest11", name="dvae.testing.plugin")] == ["pytest_dvae"]
+    code = "import sys, pytest_dvae; sys.exit('torch' in sys.modules or 'dvae' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# ------------------------------------------------------------------------------------------------- used for real
+
+
+def test_the_price_of_a_mean_field_guide(elbo_regression):
+    """The best mean-field guide of a fixed model: its bound is the same wherever it is computed."""
+    model = twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 6)
+    with torch.no_grad():
+        for parameter in model.generator.parameters():
+            parameter.copy_(torch.linspace(-0.5, 0.7, parameter.numel()).view_as(parameter))
+    oracle = Oracle(model, 6)
+    assert oracle.fit_guide() > 0.01
+    x = torch.cos(torch.arange(8 * 6 * 2, dtype=torch.float64) ** 2).view(8, 6, 2)
+    elbo_regression.check(model.model, model.guide, x, particles=200)
+    record = Record.of(measure(model.model, model.guide, x, 200, seed=1), {})
+    assert abs(record.mean - oracle.bound(x).mean().item()) < 5 * record.mean_error
+
+
+def test_the_documented_examples_run(pytester):
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "testing.md").read_text(encoding="utf-8"), re.DOTALL)
+    pytester.makepyfile(test_documented="\n".join(blocks))
+    # in a process of its own: training loads modules of torch that a process can load only once
+    result = pytester.runpytest_subprocess("-p", "dvae.testing.plugin", "-W", "error")
+    result.assert_outcomes(passed=13)
+    assert len(list(pytester.path.glob("elbo_regression/test_documented/*.json"))) == 2
