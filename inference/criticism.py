@@ -24,7 +24,7 @@ import torch
 from pyro import poutine
 from rich.markup import escape
 from rich.table import Table
-from scipy import special
+from scipy import fft, special
 from torch import Tensor
 
 from ..model import Batch, DynamicalVAE, repeat
@@ -342,13 +342,13 @@ def _ecdf_test(least: np.ndarray, count: int, draws: int) -> np.ndarray:
     within bounds is a chain of convolutions (Säilynoja et al. have binomial steps). `arviz_stats` simulates the same
     probability, but drops the upper tail of every simulation with no rank below some point.
     """
-    step, size = _poisson(count, count / (draws + 1)), 2 * count + 1
-    transform = np.fft.rfft(step, size)
+    step, size = _poisson(count, count / (draws + 1)), fft.next_fast_len(2 * count + 1, real=True)
+    transform = fft.rfft(step, size)
     bound = least[:, None] * (1 + 1e-9)  # tails that are equal but for rounding are equal
     within = np.zeros((len(least), count + 1))
     within[:, 0] = 1
     for tails in _tails(count, draws):
-        moved = np.fft.irfft(np.fft.rfft(within, size) * transform, size)[:, : count + 1]
+        moved = fft.irfft(fft.rfft(within, size) * transform, size)[:, : count + 1]
         within = np.where(tails > bound, moved, 0.0)
     inside = within @ step[::-1] / _poisson(count, count)[-1]
     # Where rounding hides the difference from 1, the sum over points bounds the probability from above.
