@@ -342,9 +342,9 @@ def fit(
             except KeyboardInterrupt:  # the step is complete, so this is as good a place to stop as any
                 signals.received = signal.SIGINT
 
-        if not resume:
+        recorded, state.status = state.status, loop.status()
+        if not resume or state.status not in ("running", recorded):  # a run may be interrupted at its last step
             loop.save()
-        state.status = loop.status()
         while state.status == "running":
             loop.step(source)
             if state.step % training.log_every == 0 or state.step == training.steps:

@@ -356,6 +356,14 @@ def test_a_decay_is_laid_out_over_the_steps_of_the_longer_run(tmp_path):
     assert rates[10:] == pytest.approx([0.02 - 0.002 * i for i in range(10)])
 
 
+def test_a_run_interrupted_at_its_last_step_is_finished_when_resumed(tmp_path):
+    with pytest.raises(Interrupted):
+        run(out=tmp_path, steps=5, callbacks=[At(5, interrupt)])
+    assert Run(tmp_path).state["status"] == "interrupted"
+    assert run(out=tmp_path, steps=5, resume=True).status == "finished"
+    assert Run(tmp_path).state["status"] == "finished"
+
+
 def test_other_training_data_are_not_resumed_on(tmp_path):
     class Windows(Sequences):
         @property
