@@ -40,10 +40,10 @@ class Sequences:
     batch: Batch
 
     def __post_init__(self) -> None:
-        rows = {name: len(value) for name, value in _flat(self.batch).items()}
+        rows = {name: len(value) for name, value in leaves(self.batch).items()}
         if len(set(rows.values())) != 1 or 0 in rows.values():
             raise ValueError(f"every variable needs the same number of sequences, at least one; given {rows}")
-        for name, value in _flat(self.batch).items():
+        for name, value in leaves(self.batch).items():
             if value.is_floating_point():
                 self._check(name, value)
 
@@ -68,7 +68,7 @@ class Sequences:
             )
 
     def __len__(self) -> int:
-        return len(next(iter(_flat(self.batch).values())))
+        return len(next(iter(leaves(self.batch).values())))
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Return `batch_size` different sequences in random order; all of them if there are no more."""
@@ -86,12 +86,12 @@ def each(batch: Mapping[str, Any], change: Callable[[Any], Tensor]) -> Batch:
     return {n: each(v, change) if isinstance(v, Mapping) else change(v) for n, v in batch.items()}
 
 
-def _flat(batch: Batch) -> dict[str, Tensor]:
+def leaves(batch: Batch) -> dict[str, Tensor]:
     """Every tensor by name; those of a mapping under "name/key"."""
     flat = {name: value for name, value in batch.items() if not isinstance(value, Mapping)}
     for name, value in batch.items():
         if isinstance(value, Mapping):
-            flat |= {f"{name}/{key}": inner for key, inner in _flat(value).items()}
+            flat |= {f"{name}/{key}": inner for key, inner in leaves(value).items()}
     return flat
 
 

@@ -117,7 +117,7 @@ class SequenceELBO(ELBO):
             return self._evaluate(model, guide, args, kwargs)
 
     def _evaluate(self, model: Any, guide: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Terms:
-        model_sites, guide_sites = map(_sites, self._get_trace(model, guide, args, kwargs))
+        model_sites, guide_sites = map(sites_of, self._get_trace(model, guide, args, kwargs))
         for name in guide_sites:
             if name not in model_sites:
                 raise ValueError(f"the latent {name} is in the guide but not in the model")
@@ -132,7 +132,7 @@ class SequenceELBO(ELBO):
             elif name in guide_sites:
                 _record(terms, terms.kl, name, _kl(fn, guide_sites[name]["fn"], value, name in closed))
             elif site["is_observed"]:
-                _record(terms, terms.log_likelihood, name, _log_prob(fn, value))
+                _record(terms, terms.log_likelihood, name, site_log_prob(fn, value))
             else:
                 raise ValueError(f"the latent {name} is in the model but not in the guide")
         return terms
@@ -143,7 +143,12 @@ def _traces(model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Tra
     return poutine.trace(poutine.replay(model, trace=drawn)).get_trace(*args, **kwargs), drawn
 
 
-def _sites(trace: Any) -> dict[str, dict[str, Any]]:
+def sites_of(trace: Any) -> dict[str, dict[str, Any]]:
+    """The sample sites of a trace by name.
+
+    Raises:
+        ValueError: a site that a handler has scaled or masked.
+    """
     sites = {
         name: site
         for name, site in trace.nodes.items()
@@ -158,7 +163,7 @@ def _sites(trace: Any) -> dict[str, dict[str, Any]]:
     return sites
 
 
-def _log_prob(fn: Any, value: Tensor) -> Tensor:
+def site_log_prob(fn: Any, value: Tensor) -> Tensor:
     """(B, T) of a local variable, (B,) of a static one."""
     if not isinstance(fn, Sequence):
         return fn.log_prob(value)
@@ -191,7 +196,7 @@ def _kl(p: Any, q: Any, value: Tensor, closed: bool) -> Tensor:
             return kl_divergence(q, p)
         except NotImplementedError:  # no closed form for this pair of families
             pass
-    ours, theirs = _log_prob(q, value), _log_prob(p, value)
+    ours, theirs = site_log_prob(q, value), site_log_prob(p, value)
     if ours.dim() != theirs.dim():  # a guide of the user's own, whose density has no steps
         ours, theirs = (part.sum(-1) if part.dim() == 2 else part for part in (ours, theirs))
     return ours - theirs
@@ -281,10 +286,10 @@ def importance_bound(
 
 
 def _log_weights(model: DynamicalVAE, batch: Batch, options: Mapping[str, Any]) -> Tensor:
-    joint, sites = map(_sites, _traces(model, model.guide, (batch,), options))
+    joint, sites = map(sites_of, _traces(model, model.guide, (batch,), options))
 
     def total(table: Mapping[str, Mapping[str, Any]]) -> Tensor:
-        parts = (_log_prob(s["fn"], s["value"]) for s in table.values() if not isinstance(s["fn"], Unit))
+        parts = (site_log_prob(s["fn"], s["value"]) for s in table.values() if not isinstance(s["fn"], Unit))
         return sum(part.sum(-1) if part.dim() == 2 else part for part in parts)  # type: ignore[return-value]
 
     return total(joint) - total(sites)

@@ -50,18 +50,18 @@ from torch import Tensor, nn
 from .. import distributions
 from ..model import repeat
 from ..networks.base import valid_steps
-from .batches import Batch, _flat, each, sequences
-from .bounds import KHAT_PARTICLES, SequenceELBO, _log_prob, _sites, importance_bound
+from .batches import Batch, each, leaves, sequences
+from .bounds import KHAT_PARTICLES, SequenceELBO, importance_bound, site_log_prob, sites_of
 from .evaluate import (
     METRICS,
     HeldOutWindows,
-    _evaluating,
-    _like,
-    _plain,
-    _refuse_non_finite,
     clustered_variance,
     evaluate,
+    evaluating,
     linearised,
+    on_device_of,
+    plain,
+    refuse_non_finite,
 )
 from .result import Result, progress_bar
 
@@ -344,7 +344,7 @@ class Comparison(Result):
             }
             for name, row in self.rows.items()
         }
-        return json.dumps({"ranking": ranking, **_plain(_lists(document))}, allow_nan=False)
+        return json.dumps({"ranking": ranking, **plain(_lists(document))}, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> "Comparison":
@@ -605,12 +605,12 @@ def compare(
                 for start in bar.track(range(0, count, size), description=f"{escape(label)}, {what}"):
                     yield slice(start, start + size)
 
-            with _evaluating(model, seed):
+            with evaluating(model, seed):
                 pieces = parts("bounds", len(keys), batch_size)
                 found = _bounds(label, model, batch, keys, particles, estimates, pieces)
-            with _evaluating(model, seed):
+            with evaluating(model, seed):
                 found["variances"] = _variances(model, batch, parts("active units", len(keys), batch_size))
-            with _evaluating(model, seed):
+            with evaluating(model, seed):
                 pieces = parts("information", len(chosen), max(1, _PAIRS // max(1, len(chosen))))
                 found["information"] = _information(model, each(batch, itemgetter(chosen)), pieces)
             found["free_running"] = {
@@ -641,7 +641,7 @@ def compare(
             "frames": x.shape[1],
             "coordinates": x.shape[2],
         },
-        protocol=_plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
+        protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
         particles=particles,
         contrasts=len(chosen),
         samples=forecasts,
@@ -668,13 +668,13 @@ def _bounds(
     weighted: list[Tensor] = []
     frames: list[Tensor] = []
     for part in parts:
-        piece = _like(model, dict(each(batch, itemgetter(part))))
+        piece = on_device_of(model, dict(each(batch, itemgetter(part))))
         terms = SequenceELBO().terms(model, piece)
         draws = [importance_bound(model, piece, particles=particles) for _ in range(estimates)]
         values = torch.stack([draw.bound for draw in draws])
         scores = {"ELBO": terms.bound, "importance bound": values.mean(0)}
         for bound in scores.values():
-            _refuse_non_finite(name, "bound", bound.isfinite(), keys[part])
+            refuse_non_finite(name, "bound", bound.isfinite(), keys[part])
         scores["k-hat"] = torch.stack([draw.khat for draw in draws]).mean(0)
         scores |= {f"KL {latent}": kl for latent, kl in terms.kl.items()}
         for latent in terms.kl.keys() & terms.steps.keys():
@@ -697,7 +697,7 @@ def _variances(model: Any, batch: Batch, parts: Iterable[slice]) -> dict[str, np
     """Latent to (D,): the variance over sequences of the posterior mean, pooled over steps."""
     sums: dict[str, Tensor] = {}
     for part in parts:
-        piece = _like(model, dict(each(batch, itemgetter(part))))
+        piece = on_device_of(model, dict(each(batch, itemgetter(part))))
         draws = [_posterior_means(model, piece) for _ in range(_GUIDE_DRAWS)]
         for name in draws[0]:
             means = torch.stack([draw[name] for draw in draws]).double()
@@ -717,7 +717,7 @@ def _variances(model: Any, batch: Batch, parts: Iterable[slice]) -> dict[str, np
 def _posterior_means(model: Any, batch: Batch) -> dict[str, Tensor]:
     """Latent to the means (B, T, D), or (B, 1, D), of its conditionals at a draw from the guide."""
     means = {}
-    for name, site in _sites(poutine.trace(model.guide).get_trace(batch)).items():
+    for name, site in sites_of(poutine.trace(model.guide).get_trace(batch)).items():
         fn, value = site["fn"], site["value"]
         local = isinstance(fn, distributions.Sequence)
         means[name] = fn.elementwise(value).mean if local else fn.mean[:, None]
@@ -726,7 +726,7 @@ def _posterior_means(model: Any, batch: Batch) -> dict[str, Tensor]:
 
 def _information(model: Any, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
     """Latent to (T,), or (1,) of a static one: what it tells of the data, among the M sequences of the batch."""
-    batch = _like(model, dict(batch))
+    batch = on_device_of(model, dict(batch))
     size = _rows(batch)
     drawn = model.guide(batch) if size else {}
     totals: dict[str, Tensor] = {}
@@ -736,8 +736,8 @@ def _information(model: Any, batch: Batch, parts: Iterable[slice]) -> dict[str, 
         values = {name: value[part].repeat_interleave(size, 0) for name, value in drawn.items()}
         guide = poutine.condition(model.guide, data=values)
         trace = poutine.trace(guide).get_trace(repeat(batch, len(rows)))
-        for name, site in _sites(trace).items():
-            density = _log_prob(site["fn"], site["value"]).unflatten(0, (len(rows), size)).double()
+        for name, site in sites_of(trace).items():
+            density = site_log_prob(site["fn"], site["value"]).unflatten(0, (len(rows), size)).double()
             density = density[..., None] if density.dim() == 2 else density
             valid = torch.ones_like(density[0], dtype=torch.bool)
             if "lengths" in batch and density.shape[2] > 1:
@@ -799,7 +799,7 @@ def _rows(batch: Batch) -> int:
 def _fingerprint(batch: Batch) -> str:
     """SHA-256 of every tensor of the batch: its name, shape, type and values."""
     digest = hashlib.sha256()
-    for name, value in sorted(_flat(batch).items()):
+    for name, value in sorted(leaves(batch).items()):
         values = np.ascontiguousarray(value.cpu().numpy())
         digest.update(f"{name} {values.shape} {values.dtype}".encode() + values.tobytes())
     return digest.hexdigest()

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from ..model import Batch, DynamicalVAE, repeat
 from ..motion import Skeleton
-from .evaluate import _evaluating, _hold, _like, _plain
+from .evaluate import evaluating, hold, on_device_of, plain
 from .result import Result, progress_bar
 
 __all__ = [
@@ -295,12 +295,12 @@ def calibrate(
     at_once = max(1, chunk // draws)
     bar = progress_bar(progress)
     ranks = []
-    with _evaluating(model, seed), bar:
+    with evaluating(model, seed), bar:
         parts = range(0, simulations, at_once)
         for start in bar.track(parts, description="simulations"):
             count = min(at_once, simulations - start)
             turn = torch.arange(start, start + count)
-            given = _like(model, {name: value[turn % len(value)] for name, value in contexts.items()})
+            given = on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
             truth = model.sample(count, length, given or None)
             if wrong := [name for name in (*model.latents, *model.observed) if not truth[name].isfinite().all()]:
                 raise FloatingPointError(
@@ -688,7 +688,7 @@ def predictive_checks(
     statistics = dict(statistics) if statistics is not None else motion_statistics(windows.skeleton)
     if not statistics:
         raise ValueError("there is no statistic to check")
-    held = _hold(windows)
+    held = hold(windows)
     seam = min(2, held.observed)
     horizon = held.x.shape[1] - held.observed
 
@@ -725,11 +725,11 @@ def predictive_checks(
             real = measure(held.x[:, first:], "real windows")
             for label, each in models.items():
                 parts: list[dict[str, Tensor]] = []
-                with _evaluating(each, seed):
+                with evaluating(each, seed):
                     starts = range(0, len(held.x), batch_size)
                     for start in bar.track(starts, description=f"{label}, {program}"):
                         part = {name: value[start : start + batch_size] for name, value in held.batch.items()}
-                        x = replicate(each, _like(each, part))
+                        x = replicate(each, on_device_of(each, part))
                         parts.append(measure(x.to(held.x), f"replicates of {label} ({program})"))
                 for name, statistic in statistics.items():
                     replicated = torch.cat([part[name] for part in parts], 1).numpy()
@@ -737,7 +737,7 @@ def predictive_checks(
     return PredictiveChecks(
         checks={(m, p, s): checks[m, p, s] for m in models for p in programs for s in statistics},
         data=held.description(),
-        protocol=_plain(asdict(windows.protocol)),
+        protocol=plain(asdict(windows.protocol)),
         samples=samples,
         emission="drawn" if draw_emission else "mean",
         seed=seed,
@@ -887,10 +887,10 @@ def traverse(
     if unit not in ("prior", "posterior"):
         raise ValueError(f"unit is 'prior' or 'posterior', got {unit!r}")
     _check_path(model, latent, free)
-    data = _like(model, model._mapping(batch))
+    data = on_device_of(model, model._mapping(batch))
     if partial := {"lengths", "mask"} & data.keys():
         raise ValueError(f"a traversal needs complete sequences, but these have {', '.join(sorted(partial))}")
-    with _evaluating(model, seed):
+    with evaluating(model, seed):
         scale = _scale(model, data, latent, unit, draws)[list(chosen)]
         torch.manual_seed(seed)
         inferred = model.guide(data)

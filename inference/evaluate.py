@@ -252,7 +252,7 @@ class Evaluation(Result):
             }
             for name, score in self[method].items()
         }
-        return _plain(row)
+        return plain(row)
 
     def _title(self) -> str:
         name = escape(self.protocol.get("name", ""))
@@ -436,7 +436,7 @@ def evaluate(
         raise ValueError(
             f"batch_size is at least 1 and bound_particles at least 0, not {batch_size} and {bound_particles}"
         )
-    held = _hold(windows)
+    held = hold(windows)
     baselines = _references(held, samples, training_windows) if references else {}
     if clash := models.keys() & baselines.keys():
         raise ValueError(f"a model must not have the name of a reference row: {', '.join(sorted(clash))}")
@@ -452,11 +452,11 @@ def evaluate(
             scores = _free_running(name, forecaster, count, held, parts(name))
             rows[name] = Row(count, held.clip_means(scores))
         for name, each in models.items():
-            with _evaluating(each, seed):
+            with evaluating(each, seed):
                 scores = _free_running(
                     name, _forecaster(each, draw_emission), samples, held, parts(f"{name}, forecasts")
                 )
-            with _evaluating(each, seed):
+            with evaluating(each, seed):
                 scores |= _teacher_forced(name, each, bound_particles, held, parts(f"{name}, bound"))
             equations = {"generative": each.generative.text, "inference": each.inference.text}
             rows[name] = Row(samples, held.clip_means(scores), equations, dict((configs or {}).get(name, {})))
@@ -465,7 +465,7 @@ def evaluate(
         rows=rows,
         clips=held.clips,
         data=held.description(),
-        protocol=_plain(dataclasses.asdict(windows.protocol)),
+        protocol=plain(dataclasses.asdict(windows.protocol)),
         samples=samples,
         emission="drawn" if draw_emission else "mean",
         bound_particles=bound_particles,
@@ -513,7 +513,7 @@ class _Held:
         }
 
 
-def _hold(windows: HeldOutWindows) -> _Held:
+def hold(windows: HeldOutWindows) -> _Held:
     batch = windows.all()
     observed = windows.protocol.observed
     if partial := {"lengths", "mask"} & batch.keys():
@@ -559,7 +559,7 @@ def _free_running(
         expected = (samples, *truth.shape)
         if forecasts.shape != expected:
             raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
-        _refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
+        refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
         forecasts = forecasts.movedim(0, 1)
         scores = {"APD": metrics.average_pairwise_distance(forecasts)}
         scores |= {metric: score(forecasts, truth) for metric, score in _PAIRED.items()}
@@ -576,19 +576,19 @@ def _teacher_forced(name: str, model: Any, particles: int, held: _Held, parts: I
     """Bounds and KL terms `(N,)`, in nats per frame."""
     found = []
     for part in parts:
-        batch = _like(model, {variable: value[part] for variable, value in held.batch.items()})
+        batch = on_device_of(model, {variable: value[part] for variable, value in held.batch.items()})
         terms = SequenceELBO().terms(model, batch)
         scores = {"ELBO": terms.per_frame}
         scores |= {f"KL {latent}": kl / terms.frames for latent, kl in terms.kl.items()}
         if particles:
             weighted = importance_bound(model, batch, particles=particles)
             scores |= {"importance bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
-        _refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), held.keys[part])
+        refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), held.keys[part])
         found.append({metric: values.cpu() for metric, values in scores.items()})
     return _concatenate(found)
 
 
-def _refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:
+def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:
     """Raise for the first window whose entry in `finite` (B,) is False."""
     if not finite.all():
         split, clip, start = keys[int(finite.logical_not().nonzero()[0])]
@@ -606,11 +606,11 @@ def _bone_length_error(windows: Any, observed: Tensor, forecasts: Tensor) -> Ten
 
 def _forecaster(model: Any, draw_emission: bool) -> Forecaster:
     return lambda observed, horizon, samples: model.forecast(
-        _like(model, observed), horizon, samples, draw_emission=draw_emission
+        on_device_of(model, observed), horizon, samples, draw_emission=draw_emission
     )["x"]
 
 
-def _like(model: nn.Module, batch: Batch) -> Batch:
+def on_device_of(model: nn.Module, batch: Batch) -> Batch:
     """The batch on the device and in the floating type of the model's parameters."""
     parameter = next(model.parameters())
 
@@ -625,7 +625,7 @@ def _concatenate(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
 
 
 @contextmanager
-def _evaluating(model: nn.Module, seed: int) -> Iterator[None]:
+def evaluating(model: nn.Module, seed: int) -> Iterator[None]:
     """Evaluation mode, no gradients and draws from `seed`; mode and random state are restored."""
     device = next(model.parameters()).device
     training = model.training
@@ -643,12 +643,12 @@ def _reading(name: str) -> Metric:
     return METRICS[name] if name in METRICS else Metric("nats/frame", "teacher-forced", "")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """The value as JSON holds it: tuples become lists, and numbers that are not finite None."""
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -196,7 +196,7 @@ def resume(
         CheckpointError: no run, a damaged one, or one whose data have changed.
     """
     run = load(path, data)
-    with _recorded(path):
+    with reading_config(path):
         recorded = Run(path).config["training"]
         training = Training(**{name: option_from_config(value) for name, value in recorded.items()})
     steps = options.get("steps", training.steps)
@@ -223,10 +223,10 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
     Raises:
         CheckpointError: no run, a damaged one, or one whose data have changed.
     """
-    with _recorded(path):
+    with reading_config(path):
         config = Run(path).config
         method, source = from_config(config["method"]), config["data"]
-        protocol = Protocol(**_tuples(config["protocol"]))
+        protocol = Protocol(**tuples(config["protocol"]))
         recorded, expected, skip_bad = source["path"], source["fingerprint"], source["skip_bad"]
         if not isinstance(recorded, str) or not isinstance(expected, str):
             raise TypeError(f"path and fingerprint of the data are texts, not {recorded!r} and {expected!r}")
@@ -243,14 +243,14 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
             f"{where} has changed since {path} was fitted on it: its fingerprint is {found[:12]}…, the run's "
             f"{expected[:12]}…; restore the file, or fit again"
         )
-    with _recorded(path):  # the data are those of the run: if they do not fit, the config is not
+    with reading_config(path):  # the data are those of the run: if they do not fit, the config is not
         model = method.build({"x": opened.windows("train").size})
     load_weights(model, path)
     return Loaded(Path(path), method, model.eval(), opened)
 
 
 @contextmanager
-def _recorded(path: str | os.PathLike[str]) -> Iterator[None]:
+def reading_config(path: str | os.PathLike[str]) -> Iterator[None]:
     """What fails within it is the config of a run."""
     try:
         yield
@@ -263,5 +263,6 @@ def _recorded(path: str | os.PathLike[str]) -> Iterator[None]:
         ) from error
 
 
-def _tuples(options: Mapping[str, Any]) -> dict[str, Any]:
+def tuples(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as JSON gives them back, with tuples in place of its lists."""
     return {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}

@@ -40,7 +40,7 @@ from ..inference.schedules import clamp
 from ..inference.schedules import from_config as option_from_config
 from ..motion import Protocol
 from .method import Method, from_config
-from .runs import SIMULATED, Data, _recorded, _tuples, fit, resume
+from .runs import SIMULATED, Data, fit, reading_config, resume, tuples
 
 ENDED = ("finished", "stopped early")
 
@@ -331,11 +331,11 @@ def _earlier(run: _Run) -> Result | None:
         if run.path.is_file():
             raise ValueError(f"{run.path} is a file, where a run is to go; choose another directory for the sweep")
         return None
-    with _recorded(run.path):
+    with reading_config(run.path):
         config, state = earlier.config, earlier.state
         there = _options(
             from_config(config["method"]),
-            Protocol(**_tuples(config["protocol"])),
+            Protocol(**tuples(config["protocol"])),
             Training(**{name: option_from_config(value) for name, value in config["training"].items()}),
             config["data"]["fingerprint"],
         )
