@@ -49,7 +49,7 @@ def tables(comparison: dvae.Comparison) -> str:
         )
     for name in sorted(ranking, key=lambda name: comparison[name]["energy score"].mean):
         scores = comparison[name]
-        metrics = {"ADE": 3, "FDE": 3, "APD": 2, "energy score": 2}
+        metrics = {"ADE": 3, "FDE": 3, "MMADE": 3, "MMFDE": 3, "APD": 2, "energy score": 2}
         free.append([name, *(with_errors(scores[metric], decimals) for metric, decimals in metrics.items())])
     bound = f"importance bound, K = {comparison.particles}"
     latents = "KL in nats a frame, active units"
@@ -58,7 +58,7 @@ def tables(comparison: dvae.Comparison) -> str:
             f"Teacher-forced, nats a frame ({len(comparison.keys)} windows):\n",
             table(["", bound, "difference to the best", "ELBO", "k-hat > 0.7", latents], forced),
             f"Free-running, {comparison.samples} forecasts a window, metres:\n",
-            table(["", "ADE ↓", "FDE ↓", "APD", "energy score ↓"], free),
+            table(["", "ADE ↓", "FDE ↓", "MMADE ↓", "MMFDE ↓", "APD", "energy score ↓"], free),
         ]
     )
 

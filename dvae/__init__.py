@@ -16,7 +16,7 @@ import pyro
 # Without it a second model silently receives the first one's parameters from Pyro's global store.
 pyro.settings.set(module_local_params=True)
 
-from . import heads, motion, networks, priors  # noqa: E402
+from . import energies, heads, motion, networks, priors  # noqa: E402
 from .graph import Audit, audit  # noqa: E402
 from .inference.bounds import SequenceELBO, Terms, importance_bound  # noqa: E402
 from .inference.compare import Comparison, compare  # noqa: E402
@@ -48,6 +48,7 @@ __all__ = [
     "audit",
     "calibrate",
     "compare",
+    "energies",
     "evaluate",
     "fit",
     "heads",

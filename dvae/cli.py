@@ -38,6 +38,7 @@ from .models.method import Method
 from .models.sweep import ENDED
 from .models.sweep import Interrupted as SweepInterrupted
 from .models.sweep import sweep as sweep_methods
+from .notation import Factorization
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,8 +58,19 @@ else:
         namespace={"__doc__": Method.__doc__},
     )
     ProtocolName = tyro.extras.literal_type_from_choices(motion.PROTOCOLS)
+
+    def shown(kind: type[Method]) -> type[Method]:
+        """The method, of whose options those are hidden that do not apply to it."""
+        hints = get_type_hints(kind)
+        hidden = [
+            (option.name, Annotated[hints[option.name], tyro.conf.Suppress], option.default)
+            for option in fields(kind)
+            if option.name in kind.unused
+        ]
+        return make_dataclass(kind.__name__, hidden, bases=(kind,), frozen=True, namespace={"__doc__": kind.__doc__})
+
     MethodChoice = tyro.extras.subcommand_type_from_defaults(
-        {name: kind() for name, kind in methods().items()},
+        {name: shown(kind)() for name, kind in methods().items()},
         descriptions={name: kind.source for name, kind in methods().items()},
         prefix_names=False,
     )
@@ -116,22 +128,33 @@ def show(
             kind = method_by_name(method)
         if _asks_for_equations(kind):
             raise UsageError(f"{method} has no equations of its own; give --generative and --inference")
-        generative, inference = kind.generative, kind.inference
-    if not generative or not inference:
+        pair = kind.equations()
+        observed = [name for name in pair[0].variables if name not in pair[1].variables]
+    elif generative and inference:
+        with _arguments():
+            pair = Factorization.parse(generative), Factorization.parse(inference)
+        observed = ["x"]
+    else:
         raise UsageError("give the name of a method, or both --generative and --inference")
     with _arguments():
-        found = audit(generative, inference)
-    OUT.print(f"{found.generative}\n{found.inference}", highlight=False, markup=False, soft_wrap=True)
-    OUT.print(found.table())
-    OUT.print(found.verdict)
+        found = audit(*pair, observed=observed)
+    OUT.print(str(found.generative), highlight=False, markup=False, soft_wrap=True)
+    if found.inference.factors:
+        OUT.print(str(found.inference), highlight=False, markup=False, soft_wrap=True)
+        OUT.print(found.table())
+        OUT.print(found.verdict)
+    else:
+        OUT.print("nothing is latent: there is no guide, and the bound is the log evidence")
     if out is not None:
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(2 * (0.85 * steps + 1.6), 4.2), layout="constrained")
-        model, guide = figure.subplots(1, 2)
-        found.generative.draw(steps, ax=model).set_title("model")
-        title = "guide" if found.exact else "guide (dashed: what the exact posterior also reads)"
-        found.draw(steps, ax=guide).set_title(title)
+        graphs = 2 if found.inference.factors else 1
+        figure = Figure(figsize=(graphs * (0.85 * steps + 1.6), 4.2 if graphs == 2 else 1.6), layout="constrained")
+        model, *guide = figure.subplots(1, graphs, squeeze=False)[0]
+        found.generative.draw(steps, ax=model, observed=observed).set_title("model")
+        for axes in guide:
+            title = "guide" if found.exact else "guide (dashed: what the exact posterior also reads)"
+            found.draw(steps, ax=axes).set_title(title)
         _save_figure(figure, out)
 
 
@@ -183,7 +206,7 @@ def fit(
     if Run(out).exists:
         raise ValueError(f"{out} already holds a run; continue it with: dvae resume {out}, or choose another directory")
     with _arguments():
-        method.build({"x": 1})  # wrong equations and options are found before the data are read
+        method.check()  # wrong equations and options are found before the data are read
         training = Training(
             steps=steps,
             batch_size=batch_size,
@@ -284,7 +307,7 @@ def sweep(
         sizes: list[dict[str, int]] = [{"latent": size} for size in latent] or [{}]
         chosen = [method_by_name(name, **given, **size) for name in method for size in sizes]
         for each in chosen:
-            each.build({"x": 1})
+            each.check()
         training = Training(
             steps=steps,
             batch_size=batch_size,
@@ -313,6 +336,7 @@ def evaluate(
     data: str | None = None,
     samples: int = 50,
     bound_particles: int = 0,
+    pose_prior: Path | None = None,
     seed: int = 0,
     batch_size: int = 32,
     out: Path | None = None,
@@ -327,6 +351,7 @@ def evaluate(
         data: where the data lie now, if the path in the runs no longer leads there.
         samples: forecasts of each window, K.
         bound_particles: particles of the importance-weighted bound; 0 leaves it out.
+        pose_prior: run of a pose-prior, by which to score the poses of the forecasts.
         seed: of the draws.
         batch_size: windows forecast at once.
         out: file to write instead of evaluation.json in each run.
@@ -348,6 +373,7 @@ def evaluate(
         seed=seed,
         batch_size=batch_size,
         bound_particles=bound_particles,
+        pose_prior=None if pose_prior is None else _pose_prior(pose_prior, data, windows.skeleton),
         training_windows=loaded[0].data.windows("train+validation"),
         configs={name: Run(each.path).config for name, each in zip(names, loaded, strict=True)},
     )
@@ -396,7 +422,7 @@ def criticise(
     _at_least(19, samples=samples)
     _check_file(out, "out")
     _check_figure(figure, "figure")
-    loaded = runs.load(run, data)
+    loaded = _load(run, data)
     _note_unfinished([loaded])
     windows = loaded.data.windows("test")
     steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
@@ -501,6 +527,7 @@ def forecast(
     clip: str | None = None,
     horizon: int | None = None,
     samples: int = 10,
+    fix: tuple[str, ...] = (),
     seed: int = 0,
     data: str | None = None,
     figure: Path | None = None,
@@ -508,7 +535,8 @@ def forecast(
     """Forecast the test windows, or those of one clip, many times each.
 
     The npz holds, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
-    (windows, frames, joints, 3), and `split`, `clip` and `start` of each window.
+    (windows, frames, joints, 3), `split`, `clip` and `start` of each window, and the skeleton. `dvae animate` plays
+    it, `dvae.motion.Forecasts.load` reads it.
 
     Args:
         run: the run directory.
@@ -516,6 +544,7 @@ def forecast(
         clip: name of a clip, or split/name where the name is not unique; of any split.
         horizon: frames to forecast; by default those of the protocol.
         samples: forecasts of each window.
+        fix: parts of the body, such as lower, or static latents, of which all forecasts of a window share one draw.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there.
         figure: save a figure of the first window's futures.
@@ -523,45 +552,96 @@ def forecast(
     _at_least(1, samples=samples, horizon=horizon)
     _check_file(out, "out")
     _check_figure(figure, "figure")
-    loaded = runs.load(run, data)
-    protocol = loaded.data.protocol
-    if clip is None:
-        windows = loaded.data.windows("test")
-    else:
-        chosen = motion.MotionSet([_clip(loaded.data.motion, clip)], loaded.data.motion.skeleton, loaded.data.path)
-        anywhere = replace(protocol, split_by="split", test=tuple(chosen.splits), train=())
-        windows = motion.windows(chosen, anywhere, "test")
-    x = windows.all()["x"]
-    past, future = x[:, : protocol.observed], x[:, protocol.observed :]
-    horizon = horizon or protocol.predicted
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        parts = [loaded.model.forecast({"x": part}, horizon, samples)["x"] for part in past.split(64)]
-    forecasts = windows.positions(torch.cat(parts, dim=1))
-    observed, truth = windows.positions(past), windows.positions(future[:, :horizon])
-    split, name, start = zip(*windows.keys, strict=True)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with out.open("wb") as file:  # an open file: numpy would append .npz to a name
-        np.savez_compressed(
-            file,
-            forecasts=forecasts.numpy(),
-            observed=observed.numpy(),
-            truth=truth.numpy(),
-            split=np.array(split),
-            clip=np.array(name),
-            start=np.array(start),
-        )
-    ERROR.print(f"wrote {out}: {samples} futures of {horizon} frames for each of {len(x)} windows")
+    loaded = _load(run, data)
+    windows = _windows_of(loaded, clip)
+    futures = _forecasts(loaded, windows, range(len(windows)), samples, seed, horizon, fix)
+    futures.save(out)
+    frames = futures.forecasts.shape[2]
+    ERROR.print(f"wrote {out}: {samples} futures of {frames} frames for each of {len(windows)} windows")
     if figure is not None:
-        from matplotlib.figure import Figure
+        _save_futures(futures, figure)
 
-        from .motion.plot import futures
 
-        known = truth[0] if truth.shape[1] == horizon else None
-        drawing = Figure(figsize=(9, 2.6), layout="constrained")
-        axes = futures(windows.skeleton, observed[0], forecasts[:, 0], known, ax=drawing.subplots())
-        axes.set_title(f"{split[0]}/{name[0]} from frame {start[0]}: {samples} futures", fontsize=9)
-        _save_figure(drawing, figure)
+@app.command(help="Play forecasts beside what happened, or a clip, as moving skeletons.")
+def animate(
+    source: Annotated[str, tyro.conf.Positional],
+    out: Path,
+    clip: str | None = None,
+    window: int | None = None,
+    samples: int | None = None,
+    fix: tuple[str, ...] = (),
+    seed: int = 0,
+    data: str | None = None,
+    every: int | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Play forecasts beside what happened, or a clip, as moving skeletons.
+
+    The page is one file that any browser shows, without a network: to play, to scrub, to turn with the mouse.
+
+    Args:
+        source: a run directory, a file that `dvae forecast` wrote, a motion file, or "simulated".
+        out: the html file to write.
+        clip: name of a clip, or split/name where the name is not unique. Without it, futures are those of any test
+            window, and a motion file shows its first clip.
+        window: which of the windows of futures, from 0; by default the one that moves most.
+        samples: futures side by side; by default 5, or as many as the file has.
+        fix: parts of the body, such as lower, or static latents, of which all of a run's futures share one draw.
+        seed: of a run's draws.
+        data: where a run's data lie now, if the path in the run no longer leads there.
+        every: frames from one that is shown to the next; by default about 25 a second are shown.
+        figure: save a figure of the futures, too.
+    """
+    from .motion.plot import animate as animation
+    from .motion.plot import save_html
+
+    _at_least(1, samples=samples, every=every)
+    _at_least(0, window=window)
+    _check_file(out, "out")
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"--out {out}: what is written is a page; end its name in .html")
+    _check_figure(figure, "figure")
+    if Path(source).is_dir():
+        loaded = _load(Path(source), data)
+        windows = _windows_of(loaded, clip)
+        chosen = _liveliest(windows.positions(windows.all()["x"]).numpy(), window)
+        futures = _forecasts(loaded, windows, [chosen], samples or 5, seed, fix=fix)
+    elif fix:
+        raise UsageError(f"--fix is about the futures that a run draws; {source} is no run directory")
+    elif data is not None:
+        raise UsageError(f"--data tells where the data of a run lie; {source} is no run directory")
+    elif source != runs.SIMULATED and motion.is_forecasts(source):
+        stored = motion.Forecasts.load(source)
+        known = [n for n, key in enumerate(stored.keys) if clip in (None, key[1], f"{key[0]}/{key[1]}")]
+        if not known:
+            raise ValueError(f"{source} has no window of a clip {clip!r}")
+        if samples is not None and samples > len(stored.forecasts):
+            raise UsageError(f"--samples {samples}: {source} has {len(stored.forecasts)} of each window")
+        chosen = _liveliest(np.concatenate([stored.observed, stored.truth], 1)[known], window)
+        futures = stored.window(known[chosen], samples or 5)
+    elif window is not None or samples is not None or figure is not None:
+        raise UsageError(f"--window, --samples and --figure are about futures; {source} has none")
+    else:
+        clips = motion.simulate() if source == runs.SIMULATED else motion.load(source)
+        shown = clips.clips[0] if clip is None else _clip(clips, clip)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        save_html(animation(clips.skeleton, shown.positions, every=every, title="/".join(shown.key)), out)
+        ERROR.print(f"wrote {out}: {'/'.join(shown.key)}, {shown.frames} frames")
+        return
+    page = animation(
+        futures.skeleton,
+        futures.observed[0],
+        futures.forecasts[:, 0],
+        futures.truth[0],
+        fixed=_alike(futures),
+        every=every,
+        title=_title(futures),
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_html(page, out)
+    ERROR.print(f"wrote {out}: window {chosen}, {_title(futures)}")
+    if figure is not None:
+        _save_futures(futures, figure)
 
 
 @data_app.command(name="info")
@@ -679,13 +759,31 @@ def _asks_for_equations(kind: Method | type[Method]) -> bool:
 
 
 def _report(result: Fit) -> None:
-    best = (
-        ""
-        if result.best_bound is None
-        else f", best bound {result.best_bound:.3f} nats a frame at step {result.best_step}"
-    )
-    OUT.print(f"{result.status} at step {result.step}{best}", highlight=False, soft_wrap=True)
-    OUT.print(f"score it with: dvae evaluate {result.run}", highlight=False, soft_wrap=True)
+    found = ", ".join(filter(None, [f"{result.status} at step {result.step}", result.best]))
+    OUT.print(found, highlight=False, soft_wrap=True)
+    assert result.run is not None
+    forecasts = methods()[Run(result.run).config["method"]["method"]].forecasts
+    score = f"score it with: dvae evaluate {result.run}"
+    score = score if forecasts else f"score the poses of forecasts with: dvae evaluate RUN --pose-prior {result.run}"
+    OUT.print(score, highlight=False, soft_wrap=True)
+
+
+def _pose_prior(path: Path, data: str | None, skeleton: motion.Skeleton) -> Any:
+    """The pose prior of a run, for poses of a skeleton."""
+    model = runs.load(path, data).model
+    if not hasattr(model, "flow") or model.skeleton != skeleton:
+        raise UsageError(f"--pose-prior {path} is no run of a pose-prior of the skeleton {skeleton.name!r}")
+    return model
+
+
+def _load(path: Path, data: str | None) -> runs.Loaded:
+    """A run of a method that forecasts."""
+    loaded = runs.load(path, data)
+    if not loaded.method.forecasts:
+        raise ValueError(
+            f"{path} is a fitted {loaded.method.name}, which forecasts nothing; its bounds are in {path / 'log.jsonl'}"
+        )
+    return loaded
 
 
 def _on_the_same_windows(paths: Sequence[Path], data: str | None) -> tuple[list[runs.Loaded], motion.Windows]:
@@ -693,10 +791,10 @@ def _on_the_same_windows(paths: Sequence[Path], data: str | None) -> tuple[list[
     twice, count = Counter(map(str, paths)).most_common(1)[0]
     if count > 1:
         raise UsageError(f"a run is named twice: {twice}")
-    first = runs.load(paths[0], data)
+    first = _load(paths[0], data)
     windows, loaded = first.data.windows("test"), [first]
     for path in paths[1:]:
-        other = runs.load(path, data)
+        other = _load(path, data)
         if other.data.windows("test").fingerprint != windows.fingerprint:
             raise ValueError(
                 f"{other.path} has other test windows ({other.data.path}, {other.data.protocol.name}) than "
@@ -791,6 +889,83 @@ def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
         keys = " or ".join("/".join(clip.key) for clip in found)
         raise ValueError(f"{name!r} is the name of {len(found)} clips; say {keys}")
     return found[0]
+
+
+def _windows_of(loaded: runs.Loaded, clip: str | None) -> motion.Windows:
+    """The test windows of a run's data, or all windows of one clip, of any split."""
+    if clip is None:
+        return loaded.data.windows("test")
+    chosen = motion.MotionSet([_clip(loaded.data.motion, clip)], loaded.data.motion.skeleton, loaded.data.path)
+    anywhere = replace(loaded.data.protocol, split_by="split", test=tuple(chosen.splits), train=())
+    return motion.windows(chosen, anywhere, "test")
+
+
+def _forecasts(
+    loaded: runs.Loaded,
+    windows: motion.Windows,
+    chosen: Sequence[int],
+    samples: int,
+    seed: int,
+    horizon: int | None = None,
+    fix: Sequence[str] = (),
+) -> motion.Forecasts:
+    """Futures of some of the windows; those of a window share one draw of what is fixed."""
+    free = {*getattr(loaded.model, "parts", ()), *_statics(loaded.model)}
+    if unknown := [name for name in fix if name not in free]:
+        raise UsageError(
+            f"--fix {' '.join(unknown)}: {loaded.path} has "
+            + (f"{', '.join(sorted(free))} to fix" if free else "nothing to fix, no parts and no static latents")
+        )
+    observed, horizon = loaded.data.protocol.observed, horizon or loaded.data.protocol.predicted
+    x, keys = windows.all()["x"][list(chosen)], windows.keys
+    past, future = x[:, :observed], x[:, observed:][:, :horizon]
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        whole = max(horizon, loaded.data.protocol.predicted) if fix else horizon  # parts are fixed as a whole
+        parts = []
+        for part in past.split(64):
+            once = loaded.model.forecast({"x": part}, whole, 1) if fix else {}
+            held = {"fix": {name: once[name][0] for name in fix}} if fix else {}
+            parts.append(loaded.model.forecast({"x": part}, whole, samples, **held)["x"][:, :, :horizon])
+    positions = [windows.positions(frames).numpy() for frames in (torch.cat(parts, dim=1), past, future)]
+    return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], *positions)
+
+
+def _statics(model: Any) -> list[str]:
+    return [name for name in model.latents if not model.generative.local(name)]
+
+
+def _alike(futures: motion.Forecasts) -> list[int]:
+    """The joints but the root that move alike in all futures of the first window, where there are several."""
+    sampled = futures.forecasts[:, 0]
+    alike = (sampled == sampled[:1]).all((0, 1, 3)) & (len(sampled) > 1)
+    return [joint for joint in np.flatnonzero(alike).tolist() if joint != futures.skeleton.root]
+
+
+def _liveliest(positions: np.ndarray, window: int | None) -> int:
+    """The window that was asked for, or the one of (N, T, J, 3) whose joints move fastest."""
+    if window is None:
+        return int(np.linalg.norm(np.diff(positions, axis=1), axis=-1).mean((1, 2)).argmax())
+    if window >= len(positions):
+        raise UsageError(f"--window {window}: they go from 0 to {len(positions) - 1}")
+    return window
+
+
+def _title(futures: motion.Forecasts) -> str:
+    split, clip, start = futures.keys[0]
+    return f"{split}/{clip} from frame {start}: {len(futures.forecasts)} futures"
+
+
+def _save_futures(futures: motion.Forecasts, path: Path) -> None:
+    """A figure of the first window's futures."""
+    from matplotlib.figure import Figure
+
+    from .motion.plot import futures as draw
+
+    drawing = Figure(figsize=(9, 2.6), layout="constrained")
+    axes = draw(futures.skeleton, futures.observed[0], futures.forecasts[:, 0], futures.truth[0], ax=drawing.subplots())
+    axes.set_title(_title(futures), fontsize=9)
+    _save_figure(drawing, path)
 
 
 def _save_figure(figure: Figure, path: Path) -> None:

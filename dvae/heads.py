@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import pyro.distributions as dist
 import torch
@@ -26,6 +26,9 @@ class Head(nn.Module):
     Args:
         residual: the location is an offset from the variable's own previous value.
     """
+
+    deterministic: ClassVar[bool] = False
+    """Whether the variable is a function of its parents, without a density."""
 
     def __init__(self, residual: bool = False):
         super().__init__()
@@ -206,6 +209,43 @@ class StudentTHead(Head):
         return loc + scale * noise * torch.rsqrt(2 * gamma / df)
 
 
+@dataclass(frozen=True)
+class Delta:
+    """A point mass: a data variable that is a function of its parents, the features themselves.
+
+    It has no density, so that there is no likelihood and no bound: data enter such a model as its history, and through
+    energies.
+    """
+
+    def build(self, features: int, size: int, local: bool = True) -> Head:
+        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
+        if features != size:
+            raise ValueError(f"a Delta of size {size} takes so many features, but the network gives {features}")
+        return DeltaHead()
+
+
+class DeltaHead(Head):
+    """See `Delta`."""
+
+    deterministic = True
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Head.forward`."""
+        return (features,)
+
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        """See `Head.distribution`."""
+        return dist.Delta(parameters[0])
+
+    def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
+        """See `Head.noise`; there is none."""
+        return like.new_empty(()).expand(*shape)
+
+    def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
+        """See `Head.draw`."""
+        return parameters[0]
+
+
 class StandardNormal(Head):
     """N(0, I), the prior of a variable without parents; it reads no features."""
 
@@ -222,4 +262,4 @@ class StandardNormal(Head):
         return loc, torch.ones_like(loc)
 
 
-__all__ = ["FixedNormal", "Head", "HeadSpec", "Normal", "StandardNormal", "StudentT"]
+__all__ = ["Delta", "FixedNormal", "Head", "HeadSpec", "Normal", "StandardNormal", "StudentT"]

@@ -8,14 +8,16 @@ with different things known.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
 from typing import Any
 
 import pyro
+import pyro.distributions as dist
 import torch
 from pyro import poutine
 from torch import Tensor, nn
+from torch.nn import functional
 
 from .conditional import Conditional
 from .heads import HeadSpec, Normal
@@ -26,6 +28,8 @@ from .priors import Prior
 from .rollout import Rollout, SelfFeeding, like
 
 _COUNT = itertools.count()
+WHOLE = "x"
+"""Name of the array that the parts of a model with parts are coordinates of."""
 
 Batch = Tensor | Mapping[str, Tensor]
 MaskFunction = Callable[[int], Any]
@@ -36,13 +40,18 @@ class DynamicalVAE(nn.Module):
 
     Args:
         generative: such as "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", as text or a `Factorization`.
-        inference: such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)".
+        inference: such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)". None for no inference network: the guide is
+            the prior, so that every KL term is exactly zero.
         sizes: dimension of every variable, context included.
         network: description of the networks, or a mapping from factors to descriptions. Its keys are "p(x)" for one
             factor, "p" for all generative ones, "q" for the guide's, and "default".
         heads: the same for the heads; `heads.Normal()` where nothing is said.
         priors: static latent without parents to its prior, in place of N(0, I).
         observed: names of the data variables; every other variable with a generative factor is a latent.
+        parts: data variable to its coordinates of one array x, which then stands for all of them in batches and
+            forecasts. Every coordinate belongs to one part.
+        history: name of a context variable that is the data x themselves. Its relation is a mask of one's own, such as
+            h_{1:O}, that hides the frames to be generated.
         masks: relations of one's own, name to function of T (see `Factorization.parse`).
 
     Raises:
@@ -57,18 +66,25 @@ class DynamicalVAE(nn.Module):
     def __init__(
         self,
         generative: str | Factorization,
-        inference: str | Factorization,
+        inference: str | Factorization | None,
         sizes: Mapping[str, int],
         network: NetworkSpec | Mapping[str, NetworkSpec] | None = None,
         heads: HeadSpec | Mapping[str, HeadSpec] | None = None,
         priors: Mapping[str, Prior] | None = None,
         observed: tuple[str, ...] = ("x",),
         masks: Mapping[str, MaskFunction] | None = None,
+        parts: Mapping[str, Collection[int]] | None = None,
+        history: str | None = None,
     ):
         super().__init__()
         self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
         self.generative = _factorization(generative, masks)
-        self.inference = _factorization(inference, masks)
+        self.parts = {name: tuple(places) for name, places in (parts or {}).items()}
+        self.history = history
+        observed = tuple(self.parts) or observed
+        self.inference = (
+            self.generative.prior_guide(observed) if inference is None else _factorization(inference, masks)
+        )
         self.sizes = dict(sizes)
         self.latents, self.observed, self.context = check_pair(self.generative, self.inference, observed, sizes)
         for name, size in self.sizes.items():
@@ -81,8 +97,12 @@ class DynamicalVAE(nn.Module):
         keys = {f"{f.kind}({f.child})" for f in (*self.generative.factors, *self.inference.factors)}
         for key in {*self.networks, *self.heads} - keys - {"p", "q", "default"}:
             raise ValueError(f"no factor {key!r}; keys are {', '.join(sorted(keys))}, 'p', 'q' and 'default'")
+        self._check_parts()
         self.generator: Any = self._conditionals(self.generative)
-        self.encoder: Any = self._conditionals(self.inference)
+        if inference is None:  # the very modules of the prior, which are not to be registered twice
+            object.__setattr__(self, "encoder", {name: self.generator[name] for name in self.latents})
+        else:
+            self.encoder: Any = self._conditionals(self.inference)
         self.priors = nn.ModuleDict(dict(priors or {}))
         for name, prior in (priors or {}).items():
             factor = self.generative.factor(name)
@@ -109,6 +129,31 @@ class DynamicalVAE(nn.Module):
             }
         )
 
+    def _check_parts(self) -> None:
+        places = sorted(place for part in self.parts.values() for place in part)
+        if places != list(range(len(places))):
+            raise ValueError(f"the parts must share the coordinates 0, 1, ... of x among them, once each; got {places}")
+        for name, part in self.parts.items():
+            if len(part) != self.sizes[name]:
+                raise ValueError(f"the part {name} has {len(part)} coordinates, but its size is {self.sizes[name]}")
+        if self.parts and WHOLE in self.sizes:
+            raise ValueError(f"with parts, {WHOLE!r} is the name of the whole; no variable can have it")
+        if self.history is not None and self.history not in self.context:
+            raise ValueError(f"history={self.history!r}, but the context is {', '.join(self.context) or 'none'}")
+        for factor in self.generative.factors:
+            read = None if self.history is None else factor.parent(self.history)
+            relation = None if read is None else read.relation
+            if relation is not None and relation.intervals is not None and relation.directions & {0, 1}:
+                raise ValueError(
+                    f"{factor} reads the data themselves at t or later, as {self.history} is their history; read "
+                    f"{self.history}_{{<t}}, or a mask of your own that hides the frames to be generated"
+                )
+
+    @property
+    def likelihood(self) -> bool:
+        """Whether the data have a density given the latents; without it there is no bound (see `heads.Delta`)."""
+        return not any(self.generator[name].head.deterministic for name in self.observed)
+
     # The Pyro program ----------------------------------------------------------------------------------------------
 
     def model(
@@ -120,6 +165,7 @@ class DynamicalVAE(nn.Module):
         prefix: Mapping[str, Tensor] | None = None,
         mean_emission: bool = False,
         self_feeding: SelfFeeding | float | None = None,
+        draws: Mapping[str, int] | None = None,
     ) -> dict[str, Tensor]:
         """The generative program p. Teacher-forced where the data are given, free where they are not.
 
@@ -133,6 +179,8 @@ class DynamicalVAE(nn.Module):
             prefix: name to the first values (B, O, D) of a latent.
             mean_emission: a free run sets the data variables to their means and does not draw them.
             self_feeding: scheduled sampling of the data's history; a probability, or `SelfFeeding`.
+            draws: variable to a number n: from there on the program goes on n times for each sequence, with a draw
+                of this variable each. Later variables have n times as many rows, draw by draw.
 
         Returns:
             Name to value of every variable.
@@ -149,15 +197,23 @@ class DynamicalVAE(nn.Module):
         rollout.prefix = {**rollout.prefix, **(prefix or {})}
         rollout.mean_emission = mean_emission
         rollout.feeding = SelfFeeding(self_feeding) if isinstance(self_feeding, int | float) else self_feeding
-        with pyro.plate("sequences", rollout.batch, dim=-1):
-            for block in self.generative.blocks:
-                for name in block.names:
-                    law = self._prior(name, rollout.batch) if name in self.priors else rollout.law(name)
-                    data = rollout.values.get(name)
-                    rollout.know(name, pyro.sample(name, law, obs=data, infer=_note(self.generative)))
+        for block in self.generative.blocks:
+            for name in block.names:
+                rollout = rollout.fork((draws or {}).get(name, 1))
+                with rollout.plate:
+                    rollout.know(name, self._site(name, rollout))
         return dict(rollout.values)
 
-    def guide(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
+    def _site(self, name: str, rollout: Rollout) -> Tensor:
+        data = rollout.values.get(name)
+        if self.generator[name].head.deterministic:  # a deterministic site in Pyro's sense, with no density to score
+            value = rollout.draw(name) if data is None else data
+            infer: Any = {**_note(self.generative, rollout), "_deterministic": True}
+            return pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 1).mask(False), obs=value, infer=infer)
+        law = self._prior(name, rollout.batch) if name in self.priors else rollout.law(name)
+        return pyro.sample(name, law, obs=data, infer=_note(self.generative, rollout))
+
+    def guide(self, batch: Batch, *, draws: Mapping[str, int] | None = None, **_: Any) -> dict[str, Tensor]:
         """The inference program q, with the arguments of `model`.
 
         Returns:
@@ -170,10 +226,15 @@ class DynamicalVAE(nn.Module):
                 raise ValueError(
                     f"the guide reads {name}, but the batch holds {', '.join(rollout.values) or 'nothing'}"
                 )
-        with pyro.plate("sequences", rollout.batch, dim=-1):
-            for name in self.latents:
-                rollout.know(name, pyro.sample(name, rollout.law(name), infer=_note(self.inference)))
-        return {name: rollout.values[name] for name in self.latents}
+        values = {}
+        for name in self.latents:
+            rollout = rollout.fork((draws or {}).get(name, 1))
+            with rollout.plate:
+                own = name in self.priors and self.encoder[name] is self.generator[name]
+                law = self._prior(name, rollout.batch) if own else rollout.law(name)
+                values[name] = pyro.sample(name, law, infer=_note(self.inference, rollout))
+                rollout.know(name, values[name])
+        return values
 
     def forward(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
         """`model`, so that the module itself is the Pyro model of `elbo(model, model.guide)`."""
@@ -231,11 +292,17 @@ class DynamicalVAE(nn.Module):
             Name to draws (n, T, D), or (n, D) of a static latent.
         """
         with self._evaluating():
-            return self.model(batch, length=length, size=n)
+            return self._with_whole(self.model(batch, length=length, size=n))
 
     @torch.no_grad()
     def forecast(
-        self, batch: Batch, horizon: int, samples: int = 1, *, draw_emission: bool = False
+        self,
+        batch: Batch,
+        horizon: int,
+        samples: int = 1,
+        *,
+        draw_emission: bool = False,
+        fix: Mapping[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
         """Continues observed sequences: latents of the past from the guide, then the model runs free.
 
@@ -245,12 +312,15 @@ class DynamicalVAE(nn.Module):
             samples: S, continuations of each sequence.
             draw_emission: draw the data from their distribution instead of taking its mean, as the papers of human
                 motion do. Predictive densities need the draws.
+            fix: what is the same in all samples: the future (B, H, D) of a data variable, or the value (B, D) of a
+                static latent, such as one sample of an earlier forecast. What is not fixed is drawn given it.
 
         Returns:
-            Name to (S, B, H, D) for the data, (S, B, O + H, D) for local and (S, B, D) for static latents.
+            Name to (S, B, H, D) for the data, (S, B, O + H, D) for local and (S, B, D) for static latents; with parts,
+            the whole too.
 
         Raises:
-            ValueError: a ragged batch, or a local context that ends before the horizon.
+            ValueError: a ragged batch, a local context that ends before the horizon, or a fixed value that cannot be.
         """
         data = self._mapping(batch)
         if "lengths" in data:
@@ -259,35 +329,69 @@ class DynamicalVAE(nn.Module):
             )
         if horizon < 1 or samples < 1:
             raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
-        past = data[self.observed[0]].shape[1]
-        data = {name: repeat(value, samples) for name, value in data.items()}
+        past = data[self.history or self.observed[0]].shape[1]
+        fixed = self._fixed(fix or {}, data, horizon)
+        data, fixed = ({name: repeat(value, samples) for name, value in each.items()} for each in (data, fixed))
         seen = {
             name: value[:, :past] if name in self.context and value.dim() == 3 else value
             for name, value in data.items()
         }
         with self._evaluating():
-            latents = self.guide(seen)
+            latents = poutine.condition(self.guide, {n: v for n, v in fixed.items() if n in self.latents})(seen)
             statics = {name: value for name, value in latents.items() if not self.generative.local(name)}
             program = poutine.condition(self.model, data=statics) if statics else self.model
             prefix = {name: value for name, value in latents.items() if name not in statics}
+            data |= {name: value for name, value in fixed.items() if name in self.observed}
             out = program(data, length=past + horizon, prefix=prefix, mean_emission=not draw_emission)
         out = {name: out[name].unflatten(0, (samples, -1)) for name in (*self.observed, *self.latents)}
-        return {name: value[:, :, past:] if name in self.observed else value for name, value in out.items()}
+        return self._with_whole({n: v[:, :, past:] if n in self.observed else v for n, v in out.items()})
+
+    def _fixed(self, fix: Mapping[str, Tensor], data: Mapping[str, Tensor], horizon: int) -> dict[str, Tensor]:
+        """The values of `forecast(fix=...)`, those of data over past and future."""
+        fixed, size = {}, len(data[self.history or self.observed[0]])
+        free = {*self.observed, *(name for name in self.latents if not self.generative.local(name))}
+        for name, given in fix.items():
+            if name not in free or free & set(self.observed) <= set(fix):
+                raise ValueError(
+                    f"cannot fix {', '.join(fix)}; some of {', '.join(sorted(free))} can be, but not all of the data"
+                )
+            value = torch.as_tensor(given).to(like(self))
+            shape = (size, horizon, self.sizes[name]) if name in self.observed else (size, self.sizes[name])
+            if value.shape != shape:
+                raise ValueError(f"the fixed {name} has shape {tuple(value.shape)}, expected {shape}")
+            if name in self.observed:
+                past = data[name] if name in data else data[str(self.history)][..., list(self.parts[name])]
+                value = torch.cat([past, value], dim=1)
+            fixed[name] = value
+        return fixed
+
+    def _with_whole(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The values, and the whole that their parts make."""
+        if not self.parts:
+            return values
+        places = torch.tensor([place for part in self.parts.values() for place in part])
+        whole = torch.cat([values[name] for name in self.parts], dim=-1)
+        return {**values, WHOLE: whole[..., places.argsort().to(whole.device)]}
 
     @torch.no_grad()
     def reconstruct(self, batch: Batch, samples: int = 1) -> dict[str, Tensor]:
         """Means of the data given latents from the guide, teacher-forced; missing entries are filled in so.
 
         Returns:
-            Name to (S, B, T, D) for every data variable.
+            Name to (S, B, T, D) for every data variable, and the whole where these are parts.
         """
         data = {name: repeat(value, samples) for name, value in self._mapping(batch).items()}
         with self._evaluating():
             latents = self.guide(data)
             rollout = self._rollout(self.generative, self.generator, data, None, 1)
             rollout.values.update(latents)
-            means = {name: rollout.evaluate(name, rollout.values[name]).mean for name in self.observed}
-        return {name: mean.unflatten(0, (samples, -1)) for name, mean in means.items()}
+            means = {}
+            for name in self.generative.variables:
+                if name in self.observed and name not in rollout.values:  # a function of its parents
+                    rollout.know(name, rollout.draw(name))
+                if name in self.observed:
+                    means[name] = rollout.evaluate(name, rollout.values[name]).mean
+        return self._with_whole({name: mean.unflatten(0, (samples, -1)) for name, mean in means.items()})
 
     @torch.no_grad()
     def log_joint(self, batch: Batch, latents: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -322,13 +426,14 @@ class DynamicalVAE(nn.Module):
         if batch is None:
             return {}
         if not isinstance(batch, Mapping):
-            if len(self.observed) > 1:
+            if len(self.observed) > 1 and not self.parts:
                 raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
-            batch = {self.observed[0]: batch}
-        unknown = [name for name in batch if name not in (*self.sizes, "lengths", "mask")]
+            batch = {WHOLE if self.parts else self.observed[0]: batch}
+        names = (*([WHOLE] if self.parts else []), *self.sizes)
+        unknown = [name for name in batch if name not in (*names, "lengths", "mask")]
         if unknown:
             raise ValueError(
-                f"the batch holds {', '.join(unknown)}; expected some of {', '.join(self.sizes)}, 'lengths', 'mask'"
+                f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
             )
         dtype = like(self).dtype
 
@@ -338,7 +443,26 @@ class DynamicalVAE(nn.Module):
             tensor = torch.as_tensor(value)
             return tensor.to(dtype) if tensor.is_floating_point() else tensor
 
-        return tensors(batch)
+        values = tensors(batch)
+        whole = values.pop(WHOLE, None) if self.parts else values.get(self.observed[0])
+        if whole is not None and self.parts:
+            values = {**self._apart(whole), **values}
+            if isinstance(mask := values.get("mask"), Tensor):
+                values["mask"] = {name: mask[..., list(places)] for name, places in self.parts.items()}
+        if whole is not None and self.history is not None:
+            values.setdefault(self.history, whole)
+        return values
+
+    def _apart(self, whole: Tensor) -> dict[str, Tensor]:
+        """The parts of the data that a program can be given: those with a density."""
+        size = sum(map(len, self.parts.values()))
+        if whole.dim() != 3 or whole.shape[-1] != size:
+            raise ValueError(f"{WHOLE} has shape {tuple(whole.shape)}, expected (B, T, {size})")
+        return {
+            name: whole[..., list(places)]
+            for name, places in self.parts.items()
+            if not self.generator[name].head.deterministic
+        }
 
     def _rollout(
         self,
@@ -368,6 +492,10 @@ class DynamicalVAE(nn.Module):
                 raise ValueError(f"the batch holds different numbers of steps: {_shapes(local)}")
         if length < 1:
             raise ValueError(f"length is at least 1, got {length}")
+        if self.history in local and local[self.history].shape[1] < length:  # the mask hides what is not there yet
+            gap = length - local[self.history].shape[1]
+            values[self.history] = local[self.history] = functional.pad(local[self.history], (0, 0, 0, gap))
+            steps = {v.shape[1] for v in local.values()}
         prefix = {name: v for name, v in local.items() if v.shape[1] < length}
         if not steps <= set(range(1, length + 1)) or not set(prefix) <= set(self.observed):
             raise ValueError(
@@ -444,9 +572,9 @@ def _factorization(equations: str | Factorization, masks: Mapping[str, MaskFunct
     return equations if isinstance(equations, Factorization) else Factorization.parse(equations, masks=masks or {})
 
 
-def _note(factorization: Factorization) -> Any:
-    """What a site says of its program: bounds decide from it where a KL term may be analytic."""
-    return {"program": factorization}
+def _note(factorization: Factorization, rollout: Rollout) -> Any:
+    """What a site says of its program: bounds decide from it where a KL term may be analytic, and average draws."""
+    return {"program": factorization, "run": rollout}
 
 
 def _by_factor(given: Any, default: Any, what: str) -> dict[str, Any]:

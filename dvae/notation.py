@@ -21,7 +21,7 @@ import html
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
@@ -393,6 +393,11 @@ class Factorization:
             if factor.child == name:
                 return factor
         raise ValueError(f"no factor for {name!r} in {self.text!r}; there are factors for {_names(self.variables)}")
+
+    def prior_guide(self, observed: Iterable[str] = ("x",)) -> Factorization:
+        """The prior as a guide: the factors of the latents, as q. Without latents it has no factor."""
+        observed = tuple(observed)
+        return Factorization("q", tuple(replace(f, kind="q") for f in self.factors if f.child not in observed))
 
     def local(self, name: str) -> bool:
         """True for a variable with one value per time step, False for one per sequence."""

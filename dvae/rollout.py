@@ -7,10 +7,12 @@ known. A `Rollout` holds what is known in one run; every site of the Pyro progra
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
+import pyro
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
@@ -56,6 +58,7 @@ class Rollout:
         prefix: name to (B, O, D) first values of a variable that is then drawn on.
         mean_emission: data variables are not drawn but set to their means.
         feeding: self-feeding of the data's history, or None.
+        draws: how many rows each sequence of the data has by now (see `fork`).
     """
 
     factorization: Factorization
@@ -69,6 +72,7 @@ class Rollout:
     prefix: Mapping[str, Tensor] = field(default_factory=dict)
     mean_emission: bool = False
     feeding: SelfFeeding | None = None
+    draws: int = 1
 
     def __post_init__(self) -> None:
         _check_custom_masks(self.factorization, self.length)
@@ -77,6 +81,29 @@ class Rollout:
         self._evaluated: dict[str, tuple[Tensor, Parameters]] = {}
         self._history: dict[str, Tensor] | None = None
         self._valid = None if self.lengths is None else valid_steps(self.lengths, self.length)[..., None]
+
+    @cached_property
+    def plate(self) -> Any:
+        """Pyro's plate over the rows."""
+        return pyro.plate("sequences" if self.draws == 1 else f"sequences x {self.draws}", self.batch, dim=-1)
+
+    def fork(self, n: int) -> Rollout:
+        """The run with every row n times over, draw by draw: what is known so far is shared by n continuations."""
+        if n == 1:
+            return self
+
+        def again(values: Any) -> Any:
+            return {name: value.repeat(n, *[1] * (value.dim() - 1)) for name, value in values.items()}
+
+        return replace(
+            self,
+            batch=n * self.batch,
+            draws=n * self.draws,
+            values=again(self.values),
+            lengths=None if self.lengths is None else self.lengths.repeat(n),
+            observed=again(self.observed),
+            prefix=again(self.prefix),
+        )
 
     def law(self, name: str) -> TorchDistribution:
         """The distribution of a variable, for its Pyro site."""

@@ -47,6 +47,11 @@ class Terms:
     steps: dict[str, Tensor] = field(default_factory=dict)
 
     @property
+    def likelihood(self) -> bool:
+        """Whether there is a likelihood. Where energies take its place, `bound` is minus the KL terms alone."""
+        return bool(self.log_likelihood)
+
+    @property
     def bound(self) -> Tensor:
         """(B,) the unweighted evidence lower bound; energies are not part of it."""
         return sum(self.log_likelihood.values()) - sum(self.kl.values())  # type: ignore[return-value]
@@ -124,15 +129,17 @@ class SequenceELBO(ELBO):
         closed = _closed_forms(model_sites, guide_sites)
         terms = Terms({}, {}, {}, torch.empty(0))
         for name, site in model_sites.items():
-            fn, value = site["fn"], site["value"]
-            if isinstance(fn, Sequence):
-                terms.frames = _frames(fn.rollout)
+            fn, value, run = site["fn"], site["value"], site["infer"].get("run")
+            if run is not None:
+                terms.frames = _frames(run)
             if isinstance(fn, Unit):
                 terms.energies[name] = -fn.log_prob(value)
             elif name in guide_sites:
-                _record(terms, terms.kl, name, _kl(fn, guide_sites[name]["fn"], value, name in closed))
+                _record(terms, terms.kl, name, _kl(fn, guide_sites[name]["fn"], value, name in closed), run)
+            elif site["infer"].get("_deterministic"):
+                continue
             elif site["is_observed"]:
-                _record(terms, terms.log_likelihood, name, site_log_prob(fn, value))
+                _record(terms, terms.log_likelihood, name, site_log_prob(fn, value), run)
             else:
                 raise ValueError(f"the latent {name} is in the model but not in the guide")
         return terms
@@ -202,18 +209,22 @@ def _kl(p: Any, q: Any, value: Tensor, closed: bool) -> Tensor:
     return ours - theirs
 
 
-def _record(terms: Terms, table: dict[str, Tensor], name: str, value: Tensor) -> None:
+def _record(terms: Terms, table: dict[str, Tensor], name: str, value: Tensor, run: Rollout | None) -> None:
+    if run is not None and run.draws > 1:
+        value = value.unflatten(0, (run.draws, -1)).mean(0)
     if value.dim() == 2:
+        if not len(terms.frames):  # a program of the user's own, that says nothing of its length
+            terms.frames = value.new_full((len(value),), float(value.shape[1]))
         terms.steps[name] = value
         value = value.sum(-1)
     table[name] = value
 
 
 def _frames(rollout: Rollout) -> Tensor:
-    some = next(iter(rollout.values.values()))
+    some, rows = next(iter(rollout.values.values())), rollout.batch // rollout.draws
     if rollout.lengths is None:
-        return some.new_full((rollout.batch,), float(rollout.length))
-    return rollout.lengths.to(some.dtype)
+        return some.new_full((rows,), float(rollout.length))
+    return rollout.lengths[:rows].to(some.dtype)
 
 
 def _mean(draws: list[Terms]) -> Terms:
@@ -224,6 +235,19 @@ def _mean(draws: list[Terms]) -> Terms:
         }
 
     return Terms(average("log_likelihood"), average("kl"), average("energies"), draws[0].frames, average("steps"))
+
+
+def require_likelihood(model: Any) -> None:
+    """Refuse a model whose data are functions of its latents.
+
+    Raises:
+        ValueError: it has no likelihood, and so no bound.
+    """
+    if not getattr(model, "likelihood", True):
+        raise ValueError(
+            f"{model.generative} has no likelihood: its data are functions of its latents, trained by energies; there "
+            "is no bound and nothing to calibrate. Judge its forecasts, with dvae.evaluate"
+        )
 
 
 KHAT_PARTICLES = 25
@@ -268,6 +292,7 @@ def importance_bound(
     """
     if particles < 1:
         raise ValueError(f"particles is at least 1, got {particles}")
+    require_likelihood(model)
     data = model._mapping(batch)
     size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
     weights: list[Tensor] = []

@@ -51,7 +51,7 @@ from .. import distributions
 from ..model import repeat
 from ..networks.base import valid_steps
 from .batches import Batch, each, leaves, sequences
-from .bounds import KHAT_PARTICLES, SequenceELBO, importance_bound, site_log_prob, sites_of
+from .bounds import KHAT_PARTICLES, SequenceELBO, importance_bound, require_likelihood, site_log_prob, sites_of
 from .evaluate import (
     METRICS,
     HeldOutWindows,
@@ -73,7 +73,7 @@ ACTIVE = 0.01
 KHAT = 0.7
 """Pareto shape above which an importance-weighted bound is unreliable (Vehtari et al.)."""
 
-SHOWN = ("ADE", "FDE", "energy score")
+SHOWN = ("ADE", "FDE", "MMADE", "MMFDE", "energy score")
 """Free-running scores of the table."""
 
 _GUIDE_DRAWS = 8  # over which posterior means are averaged; the noise that this leaves is taken out
@@ -475,7 +475,8 @@ class Comparison(Result):
     def _free_running_table(self) -> Table:
         table = Table(
             title=f"free-running, K = {self.samples}, {self.emission} emission",
-            caption="mean ± standard error over windows (clustered by clip) ± over seeds",
+            caption="mean ± standard error over windows (clustered by clip) ± over seeds\n"
+            "MM: over the futures of all windows in almost the same pose, itself included",
         )
         table.add_column("", overflow="fold")
         for metric in SHOWN:
@@ -770,6 +771,8 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[Any]]:
     for name, versions in found.items():
         if wrong := [each for each in versions if not hasattr(each, "guide")]:
             raise TypeError(f"{name!r} holds a {type(wrong[0]).__name__}; expected a DynamicalVAE for each seed")
+        for version in versions:
+            require_likelihood(version)
         first = versions[0]
         for other in versions[1:]:
             ours, theirs = map(_kind, (first, other))

@@ -29,6 +29,7 @@ from torch import Tensor
 
 from ..model import Batch, DynamicalVAE, repeat
 from ..motion import Skeleton
+from .bounds import require_likelihood
 from .evaluate import evaluating, hold, on_device_of, plain
 from .result import Result, progress_bar
 
@@ -276,6 +277,7 @@ def calibrate(
         raise ValueError(
             f"length, simulations, draws and chunk are at least 1, got {length}, {simulations}, {draws} and {chunk}"
         )
+    require_likelihood(model)
     kept = list(range(1, length + 1)) if steps is None else list(steps)
     if not kept or len(set(kept)) < len(kept) or not set(kept) <= set(range(1, length + 1)):
         raise ValueError(f"steps are different numbers from 1 to {length}, got {kept}")
@@ -688,6 +690,8 @@ def predictive_checks(
     statistics = dict(statistics) if statistics is not None else motion_statistics(windows.skeleton)
     if not statistics:
         raise ValueError("there is no statistic to check")
+    for each in models.values():
+        require_likelihood(each)
     held = hold(windows)
     seam = min(2, held.observed)
     horizon = held.x.shape[1] - held.observed

@@ -29,6 +29,7 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor, nn
 
+from ..energies import pose_prior_energy
 from . import metrics
 from .batches import each
 from .bounds import SequenceELBO, importance_bound
@@ -42,6 +43,7 @@ __all__ = [
     "Row",
     "Score",
     "evaluate",
+    "multimodal_truths",
     "nearest_neighbours",
     "zero_velocity",
 ]
@@ -67,6 +69,7 @@ METRICS: dict[str, Metric] = {
     },
     "variogram score": Metric("m", "free-running"),
     "bone-length error": Metric("relative", "free-running"),
+    "pose NLL": Metric("nats", "free-running"),
     "ELBO": Metric("nats/frame", "teacher-forced", "higher"),
     "importance bound": Metric("nats/frame", "teacher-forced", "higher"),
     "k-hat": Metric("", "teacher-forced"),
@@ -126,6 +129,8 @@ class Evaluation(Result):
         clips: `{"split/clip": number of its windows}`, in the order of `Row.clip_means`.
         data: fingerprint, windows, frames and coordinates of a window, joints where there is a skeleton.
         protocol: the fields of the windows' protocol.
+        multimodal: the ground truth of the multimodal errors: threshold of last poses, whether a window's own future
+            is among its truths, and how many windows have no other (the public code of GSPS scores none of these).
         samples: K, the number of forecasts asked of every method.
         emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it.
         bound_particles: particles of the importance bound, 0 where it was not computed.
@@ -136,6 +141,7 @@ class Evaluation(Result):
     clips: dict[str, int]
     data: dict[str, Any]
     protocol: dict[str, Any]
+    multimodal: dict[str, Any]
     samples: int
     emission: str
     bound_particles: int
@@ -161,7 +167,7 @@ class Evaluation(Result):
     def table(self) -> Table:
         """Metrics down, methods across: mean ± standard error, the two programs apart."""
         arrow = {"lower": " ↓", "higher": " ↑", "": ""}
-        table = Table(title=self._title(), caption="mean ± standard error over windows, clustered by clip")
+        table = Table(title=self._title(), caption=self._caption())
         table.add_column("", no_wrap=True)  # on a narrow terminal the numbers wrap, never the names
         for method, row in self.rows.items():
             table.add_column(f"{escape(method)}\nK = {row.samples}", justify="right")
@@ -253,6 +259,11 @@ class Evaluation(Result):
             for name, score in self[method].items()
         }
         return plain(row)
+
+    def _caption(self) -> str:
+        closer = f"all windows whose last poses are closer than {self.multimodal['threshold']:g} m, itself included"
+        alone = f"{self.multimodal['alone']} of {self.data['windows']} have no other"
+        return f"mean ± standard error over windows, clustered by clip\nMM: over the futures of {closer}; {alone}"
 
     def _title(self) -> str:
         name = escape(self.protocol.get("name", ""))
@@ -348,6 +359,51 @@ def clustered_variance(deviations: np.ndarray) -> float:
     return clips / (clips - 1) * float((deviations**2).sum()) if clips > 1 else math.nan
 
 
+_FOUND: dict[tuple[str, int, float, bool], list[Tensor]] = {}
+_KEPT = 8  # sets of windows whose multimodal truths are remembered
+
+
+def multimodal_truths(windows: HeldOutWindows, threshold: float | None = None, itself: bool = True) -> list[Tensor]:
+    """Multimodal ground truth: for every window, those that were in almost the same pose when their future began.
+
+    Two windows belong together when their last observed poses are at a Euclidean distance *below* the threshold, over
+    all coordinates. By default as in the evaluation of DLow (Yuan and Kitani 2020): a window belongs to itself, and one
+    that nobody joins keeps its single truth and is scored like the others, as every evaluation here does. (GSPS leaves
+    such windows out of every metric, so that its published numbers are on a subset.) The truths of the last few sets
+    are remembered, by their fingerprint.
+
+    Args:
+        windows: N windows; the protocol says what is observed.
+        threshold: largest distance (exclusive), in the unit of the data; by default the protocol's, 0.5 m in the
+            papers.
+        itself: whether a window is among its own truths. Without, it may have none, and its multimodal errors are
+            undefined.
+
+    Returns:
+        N index tensors `(M_n,)`, ascending; `futures[truths[n]]` are the truths `(M_n, T, D)` of window n.
+
+    Raises:
+        ValueError: a threshold that is not positive.
+    """
+    observed = windows.protocol.observed
+    threshold = windows.protocol.multimodal_threshold if threshold is None else threshold
+    if not threshold > 0:
+        raise ValueError(f"the multimodal threshold is a distance and must be positive, but is {threshold}")
+    key = windows.fingerprint, observed, threshold, itself
+    if key not in _FOUND:
+        poses = windows.all()["x"][:, observed - 1].double()
+        found: list[Tensor] = []
+        for rows in torch.arange(len(poses)).split(512):
+            # Matrix-product distances would cancel right at the threshold, where the comparison is strict.
+            close = torch.cdist(poses[rows], poses, compute_mode="donot_use_mm_for_euclid_dist") < threshold
+            close[torch.arange(len(rows)), rows] = itself
+            found += [row.nonzero()[:, 0] for row in close]
+        while len(_FOUND) >= _KEPT:
+            del _FOUND[next(iter(_FOUND))]  # the oldest
+        _FOUND[key] = found
+    return list(_FOUND[key])
+
+
 def zero_velocity(observed: Tensor, horizon: int) -> Tensor:
     """The last pose repeated: the forecast that any method should beat.
 
@@ -398,6 +454,7 @@ def evaluate(
     bound_particles: int = 0,
     references: bool = True,
     training_windows: HeldOutWindows | None = None,
+    pose_prior: Any = None,
     configs: Mapping[str, Mapping[str, Any]] | None = None,
     progress: bool = True,
 ) -> Evaluation:
@@ -418,6 +475,8 @@ def evaluate(
         bound_particles: particles of the importance-weighted bound and its k-hat; 0 leaves both out.
         references: whether to add the reference rows.
         training_windows: where the nearest neighbours are taken from; without it that row is left out.
+        pose_prior: a fitted pose prior, to score single poses of the forecasts: minus the mean log density of the
+            flow's z, without the log-determinant (the NLL of GSPS, arXiv:2108.08422).
         configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
         progress: whether to show a progress bar.
 
@@ -436,7 +495,7 @@ def evaluate(
         raise ValueError(
             f"batch_size is at least 1 and bound_particles at least 0, not {batch_size} and {bound_particles}"
         )
-    held = hold(windows)
+    held = dataclasses.replace(hold(windows), pose_prior=pose_prior)
     baselines = _references(held, samples, training_windows) if references else {}
     if clash := models.keys() & baselines.keys():
         raise ValueError(f"a model must not have the name of a reference row: {', '.join(sorted(clash))}")
@@ -456,8 +515,9 @@ def evaluate(
                 scores = _free_running(
                     name, _forecaster(each, draw_emission), samples, held, parts(f"{name}, forecasts")
                 )
-            with evaluating(each, seed):
-                scores |= _teacher_forced(name, each, bound_particles, held, parts(f"{name}, bound"))
+            if getattr(each, "likelihood", True):
+                with evaluating(each, seed):
+                    scores |= _teacher_forced(name, each, bound_particles, held, parts(f"{name}, bound"))
             equations = {"generative": each.generative.text, "inference": each.inference.text}
             rows[name] = Row(samples, held.clip_means(scores), equations, dict((configs or {}).get(name, {})))
 
@@ -466,6 +526,11 @@ def evaluate(
         clips=held.clips,
         data=held.description(),
         protocol=plain(dataclasses.asdict(windows.protocol)),
+        multimodal={
+            "threshold": windows.protocol.multimodal_threshold,
+            "itself": True,
+            "alone": sum(len(truths) == 1 for truths in held.truths),
+        },
         samples=samples,
         emission="drawn" if draw_emission else "mean",
         bound_particles=bound_particles,
@@ -481,7 +546,8 @@ class _Held:
     batch: Batch
     observed: int
     keys: list[tuple[str, str, int]]
-    admissible: list[Tensor]
+    truths: list[Tensor]
+    pose_prior: Any = None
 
     @property
     def x(self) -> Tensor:
@@ -523,9 +589,7 @@ def hold(windows: HeldOutWindows) -> _Held:
             f"windows of {batch['x'].shape[1]} frames, {observed} of them observed, leave nothing to "
             "observe or nothing to predict"
         )
-    last = batch["x"][:, observed - 1]
-    admissible = metrics.multimodal_truths(last, windows.protocol.multimodal_threshold)
-    return _Held(windows, batch, observed, list(windows.keys), admissible)
+    return _Held(windows, batch, observed, list(windows.keys), multimodal_truths(windows))
 
 
 def _references(
@@ -564,10 +628,12 @@ def _free_running(
         scores = {"APD": metrics.average_pairwise_distance(forecasts)}
         scores |= {metric: score(forecasts, truth) for metric, score in _PAIRED.items()}
         for metric, score in _MULTIMODAL.items():
-            pairs = zip(forecasts, held.admissible[part], strict=True)
+            pairs = zip(forecasts, held.truths[part], strict=True)
             scores[metric] = torch.stack([score(window, held.futures[others]) for window, others in pairs])
         if hasattr(held.windows, "skeleton"):
             scores["bone-length error"] = _bone_length_error(held.windows, batch["x"][:, : held.observed], forecasts)
+        if held.pose_prior is not None:
+            scores["pose NLL"] = _pose_nll(held.pose_prior, batch["x"][:, : held.observed], forecasts)
         found.append(scores)
     return _concatenate(found)
 
@@ -602,6 +668,14 @@ def _bone_length_error(windows: Any, observed: Tensor, forecasts: Tensor) -> Ten
     """Mean of |length / observed length - 1| over samples, frames and bones: (B,) from (B, K, T, D)."""
     lengths, reference = (windows.skeleton.bone_lengths(windows.positions(poses)) for poses in (forecasts, observed))
     return (lengths / reference.mean(1)[:, None, None] - 1).abs().mean((1, 2, 3))
+
+
+@torch.no_grad()
+def _pose_nll(prior: Any, observed: Tensor, forecasts: Tensor) -> Tensor:
+    """(B,) from (B, O, D) and (B, K, T, D)."""
+    past = observed[:, None].expand(-1, forecasts.shape[1], -1, -1)
+    motion = prior.facing(torch.cat([past, forecasts], 2))[:, :, observed.shape[1] :]
+    return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)
 
 
 def _forecaster(model: Any, draw_emission: bool) -> Forecaster:

@@ -181,7 +181,8 @@ class Fit:
         history: the rows of the log, in nats per frame (see `trackers`).
         step: the last step.
         best_step: the step of the best unweighted validation bound; None without validation data.
-        best_bound: that bound, in nats per frame; of the self-fed program in a run with self-feeding.
+        best_bound: that bound, in nats per frame; of the self-fed program in a run with self-feeding. A model without a
+            likelihood has no bound: minus its objective stands here.
         status: "finished", "stopped early" or "interrupted".
         run: the run directory, if there is one.
     """
@@ -193,26 +194,44 @@ class Fit:
     status: str
     run: Path | None
 
+    @property
+    def best(self) -> str:
+        """What is best, where, in words; empty without validation data."""
+        if self.best_bound is None:
+            return ""
+        if any("validation/loss" in row for row in self.history):
+            return f"lowest validation loss {-self.best_bound:.4f} at step {self.best_step}"
+        return f"best bound {self.best_bound:.3f} nats a frame at step {self.best_step}"
+
     def series(self, name: str) -> tuple[list[int], list[float]]:
         """Return the steps and values of one number of the log, such as "kl/z" or "validation/bound"."""
         rows = [row for row in self.history if name in row]
         return [row["step"] for row in rows], [row[name] for row in rows]
 
     def plot(self) -> "Figure":
-        """Draw the learning curves: the bound, and the KL of each latent, in nats per frame."""
+        """Draw the learning curves: the bound, and the KL of each latent, in nats per frame.
+
+        Of a model without a likelihood, the loss and its energies, per frame.
+        """
         from matplotlib import pyplot as plt
 
-        figure, (bound, divergence) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
-        bound.plot(*self.series("bound"), color="0.7", label="training batch")
+        names = sorted({name for row in self.history for name in row})
+        likelihood = any(name.startswith("log_likelihood/") for name in names)
+        score, start, unit = ("bound", "kl/", "nats per frame") if likelihood else ("loss", "energy/", "per frame")
+        figure, (whole, terms) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
+        whole.plot(*self.series(score), color="0.7", label="training batch")
         if self.best_step is not None:
-            bound.plot(*self.series("validation/bound"), marker=".", label="validation")
-            bound.axvline(self.best_step, color="0.3", linestyle=":", label=f"best: step {self.best_step}")
-        bound.set(xlabel="step", ylabel="bound (nats per frame)")
-        bound.legend()
-        for name in sorted({name for row in self.history for name in row if name.startswith("kl/")}):
-            divergence.plot(*self.series(name), label=name.removeprefix("kl/"))
-            divergence.legend()
-        divergence.set(xlabel="step", ylabel="KL (nats per frame)")
+            whole.plot(*self.series(f"validation/{score}"), marker=".", label="validation")
+            whole.axvline(self.best_step, color="0.3", linestyle=":", label=f"best: step {self.best_step}")
+        whole.set(xlabel="step", ylabel=f"{score} ({unit})")
+        whole.legend()
+        for name in names:
+            if name.startswith(start):
+                terms.plot(*self.series(name), label=name.removeprefix(start))
+                terms.legend()
+        terms.set(xlabel="step", ylabel="KL (nats per frame)" if likelihood else "energies (per frame)")
+        if not likelihood:
+            terms.set_yscale("log")  # their scales differ by orders of magnitude; weights make up for it
         return figure
 
 
@@ -460,12 +479,15 @@ class _Loop:
 
         A run with self-feeding learns to run on its own output, which costs it bound on the true past. There
         the best is by the bound of the self-fed program, once the schedule has reached its last value.
+
+        A model without a likelihood has no bound; there the best is by the objective.
         """
         state = self.state
         row = self._score(data, 0.0)
-        score, counts = row["bound"], True
+        score, counts = -row["loss"] if "loss" in row else row["bound"], True
         if self.final_feeding:
-            row["self_fed/bound"] = score = self._score(data, self.final_feeding)["bound"]
+            fed = self._score(data, self.final_feeding)
+            row["self_fed/bound"], score = fed["bound"], -fed["loss"] if "loss" in fed else fed["bound"]
             counts = self._rates["self_feeding"] == self.final_feeding
         if counts:
             state.waited += 1
@@ -478,12 +500,16 @@ class _Loop:
     def _score(self, data: Sequences, feeding: float) -> dict[str, float]:
         """The unweighted terms on held-out data, per frame, with the same draws each time."""
         sums = dict[str, Tensor]()
+        objective = _stage(self.plan, self.state.step).objective
         self.module.eval()
         with _forked_random_state(self.fabric.device), torch.no_grad():
             torch.manual_seed(self.training.seed)
             for batch in data.split(self.training.batch_size):
                 terms = self._terms(batch, f"validation after step {self.state.step}", feeding)
-                for name, value in _sums(terms).items():
+                found = _sums(terms)
+                if not terms.likelihood:
+                    found["loss"] = objective(terms, self.state.step).double() * found["frames"]
+                for name, value in found.items():
                     sums[name] = sums[name] + value if name in sums else value
         self.module.train()
         # one verdict for every process, whatever the rounding on its device

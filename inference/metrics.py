@@ -31,7 +31,6 @@ __all__ = [
     "median_multimodal_final_displacement_error",
     "multimodal_average_displacement_error",
     "multimodal_final_displacement_error",
-    "multimodal_truths",
     "variogram_score",
 ]
 
@@ -86,7 +85,7 @@ def multimodal_average_displacement_error(samples: Array, truths: Array) -> Tens
 
     Args:
         samples: `(..., K, T, D)`.
-        truths: `(..., M, T, D)`, the futures that `multimodal_truths` finds, the true one among them.
+        truths: `(..., M, T, D)`, the futures that `evaluate.multimodal_truths` finds, the true one among them.
 
     Returns:
         `(...)`, in the unit of the data.
@@ -107,38 +106,6 @@ def median_multimodal_average_displacement_error(samples: Array, truths: Array) 
 def median_multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
     """MMFDEm: the FDEm to each of M admissible futures, averaged over them. Shapes as in MMADE."""
     return _per_window(lambda x, y: _median(_cross(x[:, -1:], y[:, -1:])).mean(), *_multimodal(samples, truths))
-
-
-def multimodal_truths(last_observed: Array, threshold: float) -> list[Tensor]:
-    """For every window, the windows that were in almost the same pose when their future began.
-
-    Two windows belong together when their last observed poses are at a Euclidean distance *below* the
-    threshold, over all coordinates. A window always belongs to itself, and a window that nobody joins keeps
-    its single truth and is scored like the others. (DLow does so; GSPS leaves such windows out of every
-    metric, so that its published numbers are on a subset.)
-
-    Args:
-        last_observed: `(N, D)`, the last observed pose of each window.
-        threshold: largest distance (exclusive), in the unit of the data; 0.5 m in the papers.
-
-    Returns:
-        N index tensors `(M_n,)`, ascending; `futures[indices[n]]` are the truths `(M_n, T, D)` of window n.
-
-    Raises:
-        ValueError: poses that are not `(N, D)`, or a threshold that is not positive.
-    """
-    poses = torch.as_tensor(last_observed)
-    if poses.ndim != 2:
-        raise ValueError(f"last observed poses must be (N, D), one row per window, but have shape {_shape(poses)}")
-    if not threshold > 0:
-        raise ValueError(f"the multimodal threshold is a distance and must be positive, but is {threshold}")
-    poses = poses.double()
-    found: list[Tensor] = []
-    for block in poses.split(512):
-        # Matrix-product distances would cancel right at the threshold, where the comparison is strict.
-        close = torch.cdist(block, poses, compute_mode="donot_use_mm_for_euclid_dist") < threshold
-        found += [row.nonzero()[:, 0] for row in close]
-    return found
 
 
 def energy_score(samples: Array, truth: Array) -> Tensor:

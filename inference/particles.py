@@ -28,6 +28,7 @@ from ..networks.rows import Rows, pick, select
 from ..notation import Factor, Parent
 from ..rollout import Rollout, like
 from .batches import each
+from .bounds import require_likelihood
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,7 @@ def particle_bound(
         raise ValueError(f"particles is a whole number, at least 1, not {particles!r}")
     if not 0 <= resample_below <= 1:
         raise ValueError(f"resample_below is a share of the particles, between 0 and 1, got {resample_below}")
+    require_likelihood(model)
     data = model._mapping(batch)
     needed = (*model.observed, *model.context)
     if missing := [name for name in needed if name not in data]:

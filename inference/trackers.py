@@ -167,8 +167,12 @@ class Terminal:
         self.console.print(f"step {self._step}/{self.steps}  {self._text()}", highlight=False, soft_wrap=True)
 
     def _text(self) -> str:
-        names = [name for name in self._latest if name.startswith(("log_likelihood/", "kl/"))]
-        names += [name for name in ("bound", "validation/bound") if name in self._latest]
-        return "  ".join(
-            f"{name.replace('log_likelihood', 'log p').replace('/', ' ')} {self._latest[name]:.3f}" for name in names
+        likelihood = not any(name.startswith("energy/") for name in self._latest) or any(
+            name.startswith("log_likelihood/") for name in self._latest
         )
+        terms = ("log_likelihood/", "kl/", "energy/") if likelihood else ("energy/",)
+        names = [name for name in self._latest if name.startswith(terms)]
+        score = "bound" if likelihood else "loss"
+        names += [name for name in (score, f"validation/{score}") if name in self._latest]
+        said = [n.replace("log_likelihood", "log p").removeprefix("energy/").replace("/", " ") for n in names]
+        return "  ".join(f"{text} {self._latest[name]:.3f}" for text, name in zip(said, names, strict=True))

@@ -10,11 +10,16 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any, ClassVar, Literal
 
+import torch
+from torch import nn
+
 from ..heads import FixedNormal, HeadSpec, Normal, StudentT
+from ..inference.batches import Source
 from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.schedules import Cosine, Linear, Logistic, Schedule
 from ..model import DynamicalVAE
+from ..motion import Windows
 from ..networks import NetworkSpec
 from ..notation import Factor, Factorization
 from ..priors import FlowPrior, MixturePrior, Prior, VampPrior
@@ -52,6 +57,9 @@ class Method:
     source: ClassVar[str]
     generative: ClassVar[str]
     inference: ClassVar[str]
+    unused: ClassVar[frozenset[str]] = frozenset()  # options that do not apply; the command line does not show them
+    likelihood: ClassVar[bool] = True  # without it, the best weights are by the objective in place of a bound
+    forecasts: ClassVar[bool] = True  # whether its models forecast motion, which evaluation and comparison ask for
 
     latent: int = 16
     emission: Literal["fixed", "normal", "student"] = "fixed"
@@ -75,6 +83,10 @@ class Method:
             raise ValueError(f"free_bits is {self.free_bits}; it must be finite and at least 0")
         if not 0 <= self.self_feeding <= 1:
             raise ValueError(f"self_feeding is {self.self_feeding}; it must be a probability, between 0 and 1")
+
+    def equations(self) -> tuple[Factorization, Factorization]:
+        """The generative model and the guide."""
+        return Factorization.parse(self.generative), Factorization.parse(self.inference)
 
     def sizes(self) -> dict[str, int]:
         """Sizes of the latents."""
@@ -104,7 +116,7 @@ class Method:
         """
         if self.prior == "standard":
             return {}
-        p, q = Factorization.parse(self.generative), Factorization.parse(self.inference)
+        p, q = self.equations()
         guides = {
             f.child: q.factor(f.child) for f in p.factors if f.child in q.variables and not (f.local or f.parents)
         }
@@ -130,6 +142,36 @@ class Method:
         sizes = {**self.sizes(), **data}
         return DynamicalVAE(self.generative, self.inference, sizes, self.networks(), self.heads(), self.priors(sizes))
 
+    def suited(self, windows: Windows) -> Method:
+        """The method with what its options leave open chosen for these windows; itself, where nothing is open."""
+        return self
+
+    def check(self) -> None:
+        """Refuses options that do not fit together, before any data are read.
+
+        Raises:
+            ValueError: saying which.
+        """
+        self.build({"x": 1})
+
+    def build_for(self, windows: Windows) -> nn.Module:
+        """The model for these windows; `build`, where it needs to know no more than their size."""
+        return self.build({"x": windows.size})
+
+    def prepare(self, model: nn.Module, windows: Windows) -> None:
+        """What a model takes from the training windows before it is fitted; its weights keep it.
+
+        Raises:
+            ValueError: the pseudo-sequences of a prior are longer than the windows.
+        """
+        for prior in getattr(model, "priors", {}).values():
+            if isinstance(prior, VampPrior):
+                prior.start_at(windows.sample(prior.components, torch.default_generator))
+
+    def batches(self, windows: Windows) -> Source:
+        """Where training draws its batches from: the windows, and what the objective needs beside them."""
+        return windows
+
     def objective(self) -> Objective:
         """What training minimises."""
         weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0
@@ -141,7 +183,7 @@ class Method:
 
     def feeding(self, steps: int) -> Schedule | float:
         """Probability of self-feeding over a run of `steps`; 0 for a model that reads no data, where nothing is fed."""
-        p, q = Factorization.parse(self.generative), Factorization.parse(self.inference)
+        p, q = self.equations()
         reads = {parent.name for factor in p.factors for parent in factor.parents}
         if not self.self_feeding or not reads & (set(p.variables) - set(q.variables)):
             return 0.0
@@ -155,7 +197,7 @@ class Method:
 @cache
 def methods() -> dict[str, type[Method]]:
     """Every known method by name: those of this package and of installed packages (entry points "dvae.methods")."""
-    from . import dkf, dsae, equations, hit_dvae, kvae, rvae, srnn, storn, vae, vrnn
+    from . import dkf, dsae, equations, gsps, hit_dvae, kvae, pose_prior, rvae, srnn, storn, vae, vrnn
 
     own: list[type[Method]] = [
         vae.VAE,
@@ -168,6 +210,8 @@ def methods() -> dict[str, type[Method]]:
         dsae.DSAE,
         kvae.KVAE,
         hit_dvae.HiTDVAE,
+        gsps.GSPS,
+        pose_prior.PosePrior,
         equations.Equations,
     ]
     table = {method.name: method for method in own}

@@ -23,9 +23,7 @@ from ..inference.fit import Callback, Fit, Training
 from ..inference.fit import fit as fit_model
 from ..inference.schedules import from_config as option_from_config
 from ..inference.trackers import Tracker
-from ..model import DynamicalVAE
 from ..motion import PROTOCOLS, MotionSet, Protocol, Windows
-from ..priors import VampPrior
 from .method import Method, from_config
 
 SIMULATED = "simulated"
@@ -108,7 +106,7 @@ class Loaded:
 
     path: Path
     method: Method
-    model: DynamicalVAE
+    model: Any
     data: Data
 
 
@@ -154,15 +152,14 @@ def fit(
             f"write dvae.method({method.name!r}, self_feeding=…)"
         )
     train, validation = data.windows("train"), data.windows("validation")
+    method = method.suited(train)
     with torch.random.fork_rng():
         torch.manual_seed(training.seed)
-        model = method.build({"x": train.size})
-        for prior in model.priors.values():
-            if isinstance(prior, VampPrior):
-                prior.start_at(train.sample(prior.components, torch.default_generator))
+        model = method.build_for(train)
+        method.prepare(model, train)
     return fit_model(
         model,
-        train,
+        method.batches(train),
         validation,
         stages=method.stages(training.steps),
         out=out,
@@ -202,7 +199,7 @@ def resume(
     steps = options.get("steps", training.steps)
     return fit_model(
         run.model,
-        run.data.windows("train"),
+        run.method.batches(run.data.windows("train")),
         run.data.windows("validation"),
         stages=run.method.stages(steps),
         out=path,
@@ -244,7 +241,7 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
             f"{expected[:12]}…; restore the file, or fit again"
         )
     with reading_config(path):  # the data are those of the run: if they do not fit, the config is not
-        model = method.build({"x": opened.windows("train").size})
+        model = method.build_for(opened.windows("train"))
     load_weights(model, path)
     return Loaded(Path(path), method, model.eval(), opened)
 

@@ -89,7 +89,7 @@ def test_scores_are_those_of_an_evaluation_on_the_same_windows():
     result = run({"a": model}, windows, samples=4, seed=3, particles=32)
     same = {"samples": 4, "seed": 3, "bound_particles": 32, "references": False, "progress": False}
     expected = evaluate({"a": model}, windows, **same)["a"]
-    for metric in ("ELBO", "importance bound", "KL z", "ADE", "FDE", "energy score"):
+    for metric in ("ELBO", "importance bound", "KL z", "ADE", "FDE", "MMADE", "MMFDE", "energy score"):
         ours = result["a"][metric]
         assert (ours.mean, ours.sequences) == pytest.approx((expected[metric].mean, expected[metric].standard_error))
     khat = result.rows["a"].bounds["k-hat"]

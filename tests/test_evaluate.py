@@ -9,6 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import nn
 
 from dvae import motion
@@ -20,6 +22,7 @@ from dvae.inference.evaluate import (
     Row,
     Score,
     evaluate,
+    multimodal_truths,
     nearest_neighbours,
     zero_velocity,
 )
@@ -180,6 +183,54 @@ def test_multimodal_errors_average_over_every_window_in_the_same_pose():
     assert still["MMADE"].mean == pytest.approx(expected.item(), abs=1e-6)
 
 
+# Multimodal ground truth
+
+
+def in_poses(poses, **options):
+    """Windows of two frames whose last observed poses these are."""
+    return ArrayWindows(torch.stack([poses, poses], 1), 1, **options)
+
+
+def test_like_windows_are_strictly_below_the_threshold_and_include_the_window_itself():
+    windows = in_poses(torch.tensor([[0.0, 0.0], [0.5, 0.0], [0.25, 0.0], [9.0, 9.0]]))
+    assert [found.tolist() for found in multimodal_truths(windows)] == [[0, 2], [1, 2], [0, 1, 2], [3]]
+    assert [found.tolist() for found in multimodal_truths(windows, itself=False)] == [[2], [2], [0, 1], []]
+    assert [found.tolist() for found in multimodal_truths(windows, 0.6)] == [[0, 1, 2], [0, 1, 2], [0, 1, 2], [3]]
+
+
+@settings(max_examples=10)
+@given(st.integers(1, 700), st.integers(0, 99), st.booleans())
+def test_likeness_of_windows_is_symmetric_in_every_block(count, seed, itself):
+    found = multimodal_truths(in_poses(draw(count, 2, seed=seed)), 0.4, itself)
+    pairs = {(i, j) for i, others in enumerate(found) for j in others.tolist()}
+    assert len(found) == count
+    assert all((j, i) in pairs for i, j in pairs)
+    assert sum(i == j for i, j in pairs) == (count if itself else 0)
+
+
+def test_multimodal_truths_are_those_of_all_pairs():
+    windows = in_poses(draw(40, 3))
+    poses = windows.all()["x"][:, 0]
+    expected = [[j for j in range(40) if (poses[i] - poses[j]).norm() < 0.9] for i in range(40)]
+    assert [found.tolist() for found in multimodal_truths(windows, 0.9)] == expected
+
+
+def test_multimodal_truths_are_remembered_by_data_and_options_and_belong_to_the_caller(monkeypatch):
+    x = draw(5, FRAMES, SIZE)
+    first = multimodal_truths(ArrayWindows(x, OBSERVED))
+    others = multimodal_truths(ArrayWindows(x, OBSERVED + 1), 1.0), multimodal_truths(ArrayWindows(x + x[:1], OBSERVED))
+    first.clear()
+    monkeypatch.setattr(ArrayWindows, "all", None)  # what is asked again needs no data
+    again = multimodal_truths(ArrayWindows(x.clone(), OBSERVED), 0.5)
+    assert len(again) == 5
+    assert all(len(found) == 5 for found in others)
+
+
+def test_a_threshold_is_a_distance():
+    with pytest.raises(ValueError, match="must be positive, but is 0"):
+        multimodal_truths(array_windows(), 0)
+
+
 # Standard errors
 
 
@@ -255,6 +306,9 @@ def test_the_record_says_what_was_measured_and_comes_back_from_json(model, tmp_p
     }
     assert (document["samples"], document["seed"], document["bound_particles"]) == (5, 5, 3)
     assert document["protocol"] == {"observed": OBSERVED, "multimodal_threshold": 0.5}
+    alone = sum(len(found) == 1 for found in multimodal_truths(windows))
+    assert document["multimodal"] == {"threshold": 0.5, "itself": True, "alone": alone}
+    assert f"{alone} of 12 have no other" in str(result)
     row = document["rows"]["dkf"]
     assert row["config"] == {"width": 8}
     assert row["equations"]["generative"] == model.generative.text

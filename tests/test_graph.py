@@ -198,7 +198,8 @@ def test_the_page_of_audits_lists_what_its_script_does():
 
 
 def test_the_page_of_audits_has_every_method_of_the_family():
-    published = {(m.generative, m.inference) for name, m in dvae.methods().items() if name != "equations"}
+    family = [m for name, m in dvae.methods().items() if m.likelihood and m.forecasts and name != "equations"]
+    published = {(m.generative, m.inference) for m in family}
     assert published <= {(p, q) for (p,), (q,), *_ in DOCUMENTED.values()}
 
 

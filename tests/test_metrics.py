@@ -20,7 +20,6 @@ from dvae.inference.metrics import (
     median_multimodal_final_displacement_error,
     multimodal_average_displacement_error,
     multimodal_final_displacement_error,
-    multimodal_truths,
     variogram_score,
 )
 
@@ -154,21 +153,6 @@ def test_variogram_score_sees_lost_dependence_and_not_a_common_offset():
     torch.testing.assert_close(variogram_score(common + 7, truth), variogram_score(common, truth))
 
 
-def test_like_windows_are_strictly_below_the_threshold_and_include_the_window_itself():
-    poses = torch.tensor([[0.0, 0.0], [0.5, 0.0], [0.25, 0.0], [9.0, 9.0]])
-    assert [found.tolist() for found in multimodal_truths(poses, 0.5)] == [[0, 2], [1, 2], [0, 1, 2], [3]]
-
-
-@settings(max_examples=10, deadline=None)
-@given(st.integers(1, 700), st.integers(0, 99))
-def test_likeness_of_windows_is_symmetric_in_every_block(count, seed):
-    found = multimodal_truths(draw(count, 2, seed=seed), 0.4)
-    pairs = {(i, j) for i, others in enumerate(found) for j in others.tolist()}
-    assert len(found) == count
-    assert all((j, i) in pairs for i, j in pairs)
-    assert all((i, i) in pairs for i in range(count))
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -179,8 +163,6 @@ def test_likeness_of_windows_is_symmetric_in_every_block(count, seed):
         (lambda: multimodal_average_displacement_error(draw(5, 4, 3), draw(4, 3)), "differ from them in M"),
         (lambda: multimodal_final_displacement_error(draw(5, 4, 3), draw(0, 4, 3)), "M at least 1"),
         (lambda: variogram_score(draw(5, 4, 3), draw(4, 3), order=0), "order of a variogram"),
-        (lambda: multimodal_truths(draw(4, 3, 2), 0.5), r"\(N, D\)"),
-        (lambda: multimodal_truths(draw(4, 3), 0), "must be positive"),
     ],
 )
 def test_what_does_not_fit_is_refused(call, message):
@@ -189,5 +171,5 @@ def test_what_does_not_fit_is_refused(call, message):
 
 
 def test_all_scores_are_public():
-    public = {metrics.average_pairwise_distance, metrics.multimodal_truths, *PAIRED, *MULTIMODAL}
+    public = {metrics.average_pairwise_distance, *PAIRED, *MULTIMODAL}
     assert {getattr(metrics, name) for name in metrics.__all__} == public

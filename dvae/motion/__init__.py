@@ -1,10 +1,13 @@
 """Motion capture: skeletons, files, windows and protocols, and a simulator of people."""
 
+from .angles import AngleLimits, estimate_angle_limits
 from .data import Clip, MotionSet
+from .forecasts import Forecasts, is_forecasts
 from .formats import load, save
 from .protocols import PROTOCOLS, Protocol, Windows, windows
 from .simulate import simulate
-from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
+from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, face_forward, rotate_about_up
+from .truths import PseudoTruths, WithPseudoTruths
 
 __all__ = [
     "HUMAN36M",
@@ -12,11 +15,18 @@ __all__ = [
     "HUMANEVA",
     "PROTOCOLS",
     "WALKER",
+    "AngleLimits",
     "Clip",
+    "Forecasts",
     "MotionSet",
     "Protocol",
+    "PseudoTruths",
     "Skeleton",
     "Windows",
+    "WithPseudoTruths",
+    "estimate_angle_limits",
+    "face_forward",
+    "is_forecasts",
     "load",
     "rotate_about_up",
     "save",

@@ -13,7 +13,8 @@ import io
 import pickle
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -168,13 +169,20 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Member:
     return _Member(info.filename.removesuffix(".npy"), shape, fortran_order, dtype, file.read())
 
 
+def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
+    """The arrays of an npz file by name, none of them pickled.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged or no npz, or holds pickled objects.
+    """
+    with _reading(path):
+        return {member.name: member.array() for member in _members(path)}
+
+
 def _read_clips(path: Path) -> list[tuple[str, str, np.ndarray]]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(info.file_size for info in archive.infolist())
-            if unpacked > LARGEST:
-                raise ValueError(f"it would unpack to {unpacked:,} bytes, at most {LARGEST:,} are read")
-            members = [_read_member(archive, info) for info in archive.infolist() if not info.is_dir()]
+    with _reading(path):
+        members = _members(path)
         if [member.name for member in members] == ["positions_3d"]:
             return _nested_clips(members[0])
         clips = []
@@ -182,6 +190,21 @@ def _read_clips(path: Path) -> list[tuple[str, str, np.ndarray]]:
             split, slash, name = member.name.rpartition("/")
             clips.append((split if slash else "all", name, member.array()))
         return clips
+
+
+def _members(path: str | Path) -> list[_Member]:
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(info.file_size for info in archive.infolist())
+        if unpacked > LARGEST:
+            raise ValueError(f"it would unpack to {unpacked:,} bytes, at most {LARGEST:,} are read")
+        return [_read_member(archive, info) for info in archive.infolist() if not info.is_dir()]
+
+
+@contextmanager
+def _reading(path: str | Path) -> Iterator[None]:
+    """Whatever fails within it names the file."""
+    try:
+        yield
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise ValueError(f"{path}: damaged, truncated or not an npz archive ({error})") from error
     except ValueError as error:

@@ -1,22 +1,53 @@
-"""Figures of skeletons: a pose, and observed motion with its possible futures."""
+"""Figures of skeletons: a pose, observed motion with its possible futures, and both in motion."""
 
 from __future__ import annotations
 
-from math import pi
+from collections.abc import Collection, Sequence
+from math import ceil, pi
+from os import PathLike
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+import plotly.graph_objects as go
 import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex
 
 from .skeleton import Skeleton, rotate_about_up
 
-PAST, TRUTH = "black", "#1a7f37"
+PAST, TRUTH, FIXED = "black", "#1a7f37", "#4a4f57"
 
 SPACING = 1.15
 """Metres between the skeletons of a figure."""
+
+ABREAST, MARGIN = 6, 0.15
+"""Skeletons in a row of an animation, and metres around all of them."""
+
+ELEVATION = 0.2
+"""Radians by which the viewer of an animation looks down."""
+
+_PLAYER = """
+const figure = document.getElementById('{plot_id}'), scene = figure._fullLayout.scene._scene;
+const [place, update] = [scene.setViewport, scene.updateFx];
+const {w, h} = figure._fullLayout._size, narrow = w / h / 2, {x, y, z} = scene.fullSceneLayout.aspectratio;
+if (narrow < 1) Plotly.relayout(figure, {'scene.aspectratio': {x: x * narrow, y: y * narrow, z: z * narrow}});
+let turning = false, drag = scene.fullSceneLayout.dragmode, due = 0;
+figure.addEventListener('pointerdown', () => { turning = true; }, true);
+for (const end of ['pointerup', 'pointercancel']) window.addEventListener(end, () => { turning = false; }, true);
+scene.setViewport = layout => { if (!turning) place.call(scene, layout); };
+scene.updateFx = (mode, hover) => { if (mode !== drag) update.call(scene, drag = mode, hover); };
+figure.on('plotly_animating', () => { due = performance.now(); });
+figure.on('plotly_animatingframe', () => {
+  const spacing = figure.layout.meta.milliseconds, queue = figure._transitionData._frameQueue;
+  const late = Math.max(0, Math.floor((performance.now() - due) / spacing));
+  queue.splice(0, Math.min(late, queue.length - 1));
+  due += (late + 1) * spacing;
+});
+"""
+"""What plotly lacks: the scene fits a narrow window, can be turned while it plays, and keeps its speed on a slow
+machine by leaving frames out."""
 
 
 def pose(
@@ -64,7 +95,7 @@ def futures(
         skeleton: the tree.
         observed: (O, J, 3) in metres, numpy or torch.
         samples: (K, H, J, 3) in metres.
-        truth: (H, J, 3) in metres, where it is known.
+        truth: (F, J, 3) in metres, where it is known; F is at most H.
         frames: how many future frames are drawn, the last always among them.
         ax: where to draw; a new figure without it.
         view: radians between the last observed heading and the viewer.
@@ -75,17 +106,8 @@ def futures(
     Raises:
         ValueError: the shapes do not fit each other or the skeleton, or there is nothing to draw.
     """
-    past, future = np.asarray(observed, np.float64), np.asarray(samples, np.float64)
-    real = None if truth is None else np.asarray(truth, np.float64)
-    joint = (skeleton.joints, 3)
-    fits = past.ndim == 3 and past.shape[1:] == joint and future.ndim == 4 and future.shape[2:] == joint
-    if not fits or not past.size or not future.size or (real is not None and real.shape != future.shape[1:]):
-        raise ValueError(
-            f"expected observed (O, J, 3), samples (K, H, J, 3) and truth (H, J, 3) with J = {joint[0]}, "
-            f"got {past.shape}, {future.shape} and {None if real is None else real.shape}"
-        )
-    sided = bool(skeleton.left and skeleton.right)
-    azimuth = view - (float(skeleton.heading(torch.from_numpy(past[-1]))) if sided else 0.0)
+    past, future, real = _checked(skeleton, observed, samples, truth)
+    azimuth = view - _heading(skeleton, past[-1])
     now, horizon = len(past) - 1, future.shape[1]
     ahead = np.unique(np.linspace(0, horizon, frames + 1)[1:].round().clip(1)).astype(int)
     shown = [*sorted({0, now}), *(now + ahead)]
@@ -96,14 +118,14 @@ def futures(
         pelvic = poses - poses[..., skeleton.root : skeleton.root + 1, :]
         pose(ax, pelvic, skeleton, at=(column * SPACING, 0.0), azimuth=azimuth, **line)
 
-    colours = plt.get_cmap("turbo")(np.linspace(0.05, 0.95, len(future))).repeat(len(skeleton.edges), axis=0)
+    colours = _colours(len(future)).repeat(len(skeleton.edges), axis=0)
     opacity = float(np.clip(6 / len(future), 0.15, 0.9))
     for column, frame in enumerate(shown):
         if frame <= now:
             draw(past[frame], column, colors=PAST, linewidths=1.8)
             continue
         draw(future[:, frame - now - 1], column, colors=colours, linewidths=1.2, alpha=opacity)
-        if real is not None:
+        if real is not None and frame - now <= len(real):
             draw(real[frame - now - 1], column, colors=TRUTH, linewidths=1.8)
 
     ax.autoscale_view()
@@ -115,3 +137,215 @@ def futures(
     for spine in ax.spines.values():
         spine.set_visible(False)
     return ax
+
+
+def animate(
+    skeleton: Skeleton,
+    observed: Any,
+    samples: Any = None,
+    truth: Any = None,
+    *,
+    names: Sequence[str] = (),
+    fixed: Collection[int] = (),
+    every: int | None = None,
+    view: float = pi / 5,
+    title: str = "",
+) -> go.Figure:
+    """Skeletons that move side by side, to play, scrub and turn: what happened, and sampled futures.
+
+    Everybody repeats the observed motion in black and goes on in the colours of `futures`, seen from the same side.
+    Time zero is the last observed pose.
+
+    A notebook shows the figure; `save_html` writes it to a file.
+
+    Args:
+        skeleton: the tree.
+        observed: (O, J, 3) in metres, numpy or torch.
+        samples: (K, H, J, 3) in metres; without them the observed motion is played alone, from time zero.
+        truth: (F, J, 3) in metres, where it is known; F is at most H.
+        names: what to call the K samples; by default they are numbered.
+        fixed: joints that move alike in all samples; bones that end in them are drawn dark and thick.
+        every: frames from one that is shown to the next, the last observed always among them; by default so that
+            about 25 a second are shown. The speed is the motion's own.
+        view: radians between the last observed heading and the viewer, before the scene is turned.
+        title: above the figure.
+
+    Returns:
+        A plotly figure in metres: x to the viewer's right, y away from the viewer, z up. A skeleton is a trace of
+        polylines with gaps between them; with fixed joints, one trace for the other bones and one for these.
+
+    Raises:
+        ValueError: the shapes do not fit each other or the skeleton, there is nothing to draw, a position is not
+            finite, or names, fixed or every do not fit the motion.
+    """
+    if samples is None:
+        motion = np.asarray(observed)
+        observed, samples, names = motion[:1], motion[None, 1:], names or [""]
+    past, future, real = _checked(skeleton, observed, samples, truth)
+    fixed = set(map(int, fixed))
+    names = names or [f"sample {k + 1}" for k in range(len(future))]
+    every = max(1, round(skeleton.fps / 25)) if every is None else every
+    if len(names) != len(future):
+        raise ValueError(f"{len(names)} names for {len(future)} samples; give each its own")
+    if strangers := fixed - set(range(skeleton.joints)):
+        raise ValueError(f"fixed names joints {sorted(strangers)}; they go from 0 to {skeleton.joints - 1}")
+    if every < 1:
+        raise ValueError(f"every is {every}; show each frame with 1, each second one with 2")
+
+    people = list(zip(names, map(to_hex, _colours(len(future))), future, strict=True))
+    if real is not None:
+        people.insert(0, ("truth", TRUTH, real))
+    if not all(np.isfinite(positions).all() for positions in (past, *(ahead for _, _, ahead in people))):
+        raise ValueError("observed, samples or truth have NaN or infinite positions, which cannot be drawn")
+    motion = np.full((len(people), len(past) + future.shape[1], skeleton.joints, 3), np.nan)
+    for k, (_, _, ahead) in enumerate(people):  # a truth that ends early leaves NaN, which plotly does not draw
+        motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
+    turn = torch.tensor(view - _heading(skeleton, past[-1]), dtype=torch.float64)
+    motion = rotate_about_up(torch.from_numpy(motion), turn, skeleton.up).numpy()
+    if skeleton.up == "y":  # plotly turns a scene about z
+        motion = motion[..., [0, 2, 1]] * [1, -1, 1]
+    low, high = np.nanmin(motion, (0, 1, 2)), np.nanmax(motion, (0, 1, 2))
+    columns = ceil(len(people) / ceil(len(people) / ABREAST))
+    row, column = np.divmod(np.arange(len(people)), columns)
+    step = np.maximum(high - low + 0.4, SPACING)
+    places = np.stack([column * step[0], 0.0 * row, -row * step[2]], axis=-1)  # rows one above the other
+    gap = np.full((*motion.shape[:2], 1, 3), np.nan)
+    motion = np.concatenate([motion + places[:, None, None], gap], axis=2).astype(np.float32)
+
+    drawn = []
+    for k, (_, colour, ahead) in enumerate(people):
+        shared = set() if ahead is real else fixed
+        drawn.append((k, colour, _polylines(skeleton, set(range(skeleton.joints)) - shared), 6))
+        if shared:
+            drawn.append((k, FIXED, _polylines(skeleton, shared), 9))
+    now = len(past) - 1
+    shown = range(now % every, motion.shape[1], every)
+
+    def traces(frame: int) -> list[dict[str, Any]]:
+        """What changes from frame to frame."""
+        return [
+            {
+                "type": "scatter3d",
+                **dict(zip("xyz", motion[k, frame, path].T, strict=True)),
+                "line": {"color": PAST if frame <= now else colour},
+            }
+            for k, colour, path, _ in drawn
+        ]
+
+    first = traces(shown[0])
+    for trace, (k, _, _, width) in zip(first, drawn, strict=True):
+        trace |= {"mode": "lines", "name": people[k][0], "hoverinfo": "skip"}
+        trace["line"]["width"] = width
+    floors = np.unique(places[:, 2]) + low[2]
+    labels = [
+        {"text": name, "font": {"size": 14}, "showarrow": False, "x": x, "y": y, "z": z + high[2] + MARGIN}
+        for (name, _, _), (x, y, z) in zip(people, places, strict=True)
+    ]
+    low, high = low + places.min(0) - MARGIN, high + places.max(0) + MARGIN
+    size = high - low
+    height = size[2] * np.cos(ELEVATION) + size[1] * np.sin(ELEVATION)
+    # an orthographic scene is 2 high, and as wide as the window makes it, here taken for 2:1; what lies behind the eye
+    # is not seen, from wherever it looks
+    ratio = 1.9 * size / max(height, size[0] / 2)
+    far = float(np.linalg.norm(ratio))
+    axes = {
+        # what lies on the limits of a range would be cut away in part
+        f"{axis}axis": {"visible": False, "range": [low[i] - 0.01, high[i] + 0.01]}
+        for i, axis in enumerate("xyz")
+    }
+    return go.Figure(
+        data=[*first, *(_floor(low[:2], high[:2], height) for height in floors)],
+        frames=[go.Frame(name=str(f), data=traces(f), traces=list(range(len(drawn)))) for f in shown],
+        layout={
+            "title": {"text": title, "x": 0.5, "font": {"size": 16}},
+            "template": "none",
+            "showlegend": False,
+            "margin": {"l": 0, "r": 0, "t": 40 if title else 0, "b": 110},
+            "scene": {
+                **axes,
+                "aspectmode": "manual",
+                "aspectratio": dict(zip("xyz", ratio, strict=True)),
+                "annotations": labels,
+                "dragmode": "turntable",
+                "camera": {
+                    "eye": {"x": 0.0, "y": -far * np.cos(ELEVATION), "z": far * np.sin(ELEVATION)},
+                    "projection": {"type": "orthographic"},
+                },
+            },
+            **_player({str(f): (f - now) / skeleton.fps for f in shown}, 1000 * every / skeleton.fps),
+        },
+    )
+
+
+def save_html(figure: go.Figure, path: str | PathLike[str]) -> None:
+    """Write the figure of `animate` as one HTML file, which needs no network and plays at the motion's own speed."""
+    figure.write_html(path, auto_play=False, post_script=_PLAYER, config={"displaylogo": False})
+
+
+def _player(seconds: dict[str, float], spacing: float) -> dict[str, Any]:
+    """The part of a layout that plays frames, which are given by name and time, some milliseconds apart."""
+
+    def go_to(frames: list[str | None] | None, milliseconds: float = 0) -> dict[str, Any]:
+        speed = {"duration": milliseconds, "redraw": True}
+        options = {"frame": speed, "transition": {"duration": 0}, "mode": "immediate", "fromcurrent": frames is None}
+        return {"method": "animate", "args": [frames, options]}
+
+    # half a refresh of a display less: a frame that waited its whole time would often miss the refresh
+    play = {"label": "Play", **go_to(None, max(spacing - 8, 0))}
+    corner = {"y": 0, "yanchor": "top", "xanchor": "left"}
+    buttons = [play, {"label": "Pause", **go_to([None])}]
+    steps = [{"label": f"{time:.2f}", **go_to([name])} for name, time in seconds.items()]
+    return {
+        "meta": {"milliseconds": spacing},
+        "updatemenus": [{"type": "buttons", "showactive": False, "buttons": buttons, "x": 0.01, **corner}],
+        "sliders": [{"steps": steps, "currentvalue": {"suffix": " s"}, "x": 0.12, "len": 0.86, **corner}],
+    }
+
+
+def _floor(low: np.ndarray, high: np.ndarray, height: float) -> dict[str, Any]:
+    """A trace: a grid of half metres between two corners (2,)."""
+    x, y = (np.unique([a, *np.arange(ceil(2 * a) / 2, b, 0.5), b]) for a, b in zip(low, high, strict=True))
+    rows = [[(x[0], b, height), (x[-1], b, height)] for b in y]
+    columns = [[(a, y[0], height), (a, y[-1], height)] for a in x]
+    lines = np.array([[*ends, (np.nan,) * 3] for ends in rows + columns]).reshape(-1, 3)
+    line = {"color": "#d5d8dd", "width": 1}
+    return {
+        **{"type": "scatter3d", "name": "floor", "mode": "lines", "line": line, "hoverinfo": "skip"},
+        **dict(zip("xyz", lines.T, strict=True)),
+    }
+
+
+def _colours(samples: int) -> np.ndarray:
+    """(K, 4): a colour for each sample."""
+    return plt.get_cmap("turbo")(np.linspace(0.05, 0.95, samples))
+
+
+def _heading(skeleton: Skeleton, positions: np.ndarray) -> float:
+    """Where the person of a pose (J, 3) faces; zero where the skeleton does not tell left from right."""
+    return float(skeleton.heading(torch.from_numpy(positions))) if skeleton.left and skeleton.right else 0.0
+
+
+def _polylines(skeleton: Skeleton, joints: Collection[int]) -> list[int]:
+    """The bones that end in the given joints as polylines: indices of joints, J between two polylines."""
+    path: list[int] = []
+    for parent, joint in skeleton.edges:
+        if joint in joints:
+            path += [joint] if path and path[-1] == parent else [skeleton.joints, parent, joint]
+    return path[1:]
+
+
+def _checked(
+    skeleton: Skeleton, observed: Any, samples: Any, truth: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Observed motion, samples and truth as arrays that fit each other."""
+    past, future = np.asarray(observed, np.float64), np.asarray(samples, np.float64)
+    real = None if truth is None else np.asarray(truth, np.float64)
+    joint = (skeleton.joints, 3)
+    fits = past.ndim == 3 and past.shape[1:] == joint and future.ndim == 4 and future.shape[2:] == joint
+    knows = real is None or (real.ndim == 3 and real.shape[1:] == joint and len(real) <= future.shape[1])
+    if not (fits and knows and past.size and future.size):
+        raise ValueError(
+            f"expected observed (O, J, 3), samples (K, H, J, 3) and truth (up to H, J, 3) with J = {joint[0]}, "
+            f"got {past.shape}, {future.shape} and {None if real is None else real.shape}"
+        )
+    return past, future, real

@@ -274,6 +274,16 @@ class Windows:
             x[block] = self._cut(clips[block], starts[block])
         return {"x": x}
 
+    def poses(self) -> Tensor:
+        """Every frame of the clips, once, as a window that starts there has it: (N, D) float32."""
+        root = self.skeleton.root
+        joints = self._frames - self._frames[:, root : root + 1]
+        if self.protocol.heading:
+            joints = rotate_about_up(joints, -self.skeleton.heading(joints)[:, None], self.skeleton.up)
+        if self.protocol.root == "drop":
+            joints = torch.cat([joints[:, :root], joints[:, root + 1 :]], 1)
+        return joints.flatten(1)
+
     def labels(self, name: str) -> list[str]:
         """The label of every listed window's clip; empty text where a clip lacks it.
 

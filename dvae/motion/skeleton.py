@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import lru_cache
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,29 @@ class Skeleton:
         parents, children = (list(ends) for ends in zip(*self.edges, strict=True))
         return ((positions[..., children, :] - positions[..., parents, :]) ** 2).sum(-1) ** 0.5
 
+    def limbs(self, poses: Tensor) -> Tensor:
+        """Vectors from parent to child in metres: poses (..., D) -> (..., J - 1, 3), as in `edges`.
+
+        Args:
+            poses: joint positions one after another, D = 3 J; or without the root, which is the origin,
+                D = 3 (J - 1).
+
+        Raises:
+            ValueError: D is neither.
+        """
+        incidence = differences(self, tuple(self.edges), poses.shape[-1], poses.dtype, poses.device)
+        with torch.autocast(poses.device.type, enabled=False):  # differences of positions need all their digits
+            return (poses @ incidence).unflatten(-1, (-1, 3))
+
+    def directions(self, poses: Tensor) -> Tensor:
+        """Unit vectors along the limbs: poses (..., D) -> (..., 3 (J - 1)), zero for a limb without length.
+
+        Raises:
+            ValueError: D is as `limbs` does not take it.
+        """
+        limbs = self.limbs(poses)
+        return (limbs * inverse_lengths(limbs)[..., None]).flatten(-2)
+
     def heading(self, positions: Tensor) -> Tensor:
         """Angle about the up axis, in radians, from which a person faces.
 
@@ -189,6 +213,44 @@ class Skeleton:
         Path(path).write_text(json.dumps(fields, indent=2) + "\n", encoding="utf-8")
 
 
+SHORTEST = 1e-6
+"""A vector shorter than this, in metres, has no direction."""
+
+
+def inverse_lengths(vectors: Tensor, dim: int = -1) -> Tensor:
+    """One over the lengths of vectors along a dimension; zero, and without gradient, where one has no length."""
+    squares = vectors.square().sum(dim)  # linalg.vector_norm is ten times slower over three numbers
+    return squares.clamp_min(SHORTEST**2).rsqrt().masked_fill(squares < SHORTEST**2, 0)
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)  # whoever asks first, others will differentiate through it
+def differences(
+    skeleton: Skeleton, pairs: tuple[tuple[int, int], ...], size: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """The matrix (D, 3 P) with which poses (..., D) become the vectors from joint to joint of P pairs.
+
+    Coordinates are ordered as in poses, xyz of the first pair first. One matrix product is ten times as fast as
+    to gather both ends and subtract (measured: 200,000 poses of 48 numbers, forward and backward).
+
+    Raises:
+        ValueError: D is neither 3 J nor 3 (J - 1), the root at the origin and left out.
+    """
+    joints = skeleton.joints
+    if size not in (3 * joints, 3 * (joints - 1)):
+        raise ValueError(
+            f"poses have {size} numbers, expected {3 * joints} ({joints} joints of skeleton {skeleton.name!r}) or "
+            f"{3 * (joints - 1)} (without the root)"
+        )
+    incidence = torch.zeros(joints, len(pairs), dtype=dtype, device=device)
+    for pair, (start, end) in enumerate(pairs):
+        incidence[start, pair] -= 1
+        incidence[end, pair] += 1
+    if size < 3 * joints:
+        incidence = torch.cat([incidence[: skeleton.root], incidence[skeleton.root + 1 :]])
+    return torch.kron(incidence, torch.eye(3, dtype=dtype, device=device))
+
+
 def rotate_about_up(positions: Tensor, angle: Tensor, up: str) -> Tensor:
     """Rotate positions (..., 3) about the up axis by angles in radians that broadcast against (...)."""
     vertical = "xyz".index(up)
@@ -198,6 +260,25 @@ def rotate_about_up(positions: Tensor, angle: Tensor, up: str) -> Tensor:
     rotated[..., first] = cos * positions[..., first] - sin * positions[..., second]
     rotated[..., second] = sin * positions[..., first] + cos * positions[..., second]
     return rotated
+
+
+def face_forward(x: Tensor, skeleton: Skeleton, frame: int) -> tuple[Tensor, Tensor]:
+    """Windows turned about the up axis so that one of their frames has heading zero.
+
+    Args:
+        x: (..., T, D), D = 3 J, or 3 (J - 1) without the root, which is the origin.
+        skeleton: the tree, with left and right.
+        frame: which frame.
+
+    Returns:
+        The windows (..., T, D), and the headings (...) that they had.
+    """
+    joints = x.unflatten(-1, (-1, 3))
+    pose, root = joints[..., frame, :, :], skeleton.root
+    if pose.shape[-2] < skeleton.joints:
+        pose = torch.cat([pose[..., :root, :], torch.zeros_like(pose[..., :1, :]), pose[..., root:, :]], -2)
+    heading = skeleton.heading(pose)
+    return rotate_about_up(joints, -heading[..., None, None], skeleton.up).flatten(-2), heading
 
 
 HUMAN36M = Skeleton(

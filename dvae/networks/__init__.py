@@ -3,7 +3,8 @@
 from .attention import Attention
 from .base import Input, Network, NetworkSpec
 from .dense import Dense
+from .graphconv import GraphConv
 from .linear import Linear
 from .recurrent import Recurrent
 
-__all__ = ["Attention", "Dense", "Input", "Linear", "Network", "NetworkSpec", "Recurrent"]
+__all__ = ["Attention", "Dense", "GraphConv", "Input", "Linear", "Network", "NetworkSpec", "Recurrent"]

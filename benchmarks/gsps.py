@@ -1,0 +1,94 @@
+"""Speed of GSPS at the Human3.6M preset: `python benchmarks/gsps.py`, or `make bench`.
+
+    step      a training step (windows and their pseudo ground truths, forward, backward, Adam; 16 windows of 25 + 100
+              frames, 10 x 10 futures each), in units of one 2048 x 2048 x 2048 float32 product timed beside it. The
+              public implementation takes 56.
+    energies  of that, the energies of futures that are there, forward and backward
+    prior     the pose prior's energy, with the reflections of its layers one after the other over all at once
+    memory    the most that the process held, in GB; the public implementation 6.7
+    futures   50 futures of 16 windows, in the same unit
+
+Motion is simulated, on the same tree of joints. Times are the least of several, in turns with what they compare to.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+from dataclasses import replace
+
+import torch
+from speed import seconds, training_step
+
+import dvae
+from dvae import motion
+from dvae.distributions.flow import QRFlow
+from dvae.models.gsps import PUBLISHED, GSPSModel
+
+TARGETS = {"step": ("at most", 28.0), "prior": ("at least", 3.0), "memory": ("at most", 6.7)}
+
+
+def sequential(flow: QRFlow, x: torch.Tensor) -> torch.Tensor:
+    """What the flow makes of x, by one reflection after the other."""
+    for layer, (upper, bias) in enumerate(zip(flow.factors()[1], flow.bias, strict=True)):
+        if layer:
+            x = torch.where(x < 0, flow.log_slope[layer - 1].exp() * x, x)
+        x = x @ upper.T
+        for v in flow.reflections[layer].flip(0):
+            x = x - (2 / (v @ v)) * torch.outer(x @ v, v)
+        x = x + bias
+    return x
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    torch.manual_seed(0)
+
+    protocol = replace(motion.PROTOCOLS["simulated"], observed=25, predicted=100)
+    windows = motion.windows(motion.simulate(), protocol, "train")
+    method = dvae.method("gsps", **PUBLISHED["human36m"], pose_prior=0.01)
+    model = method.build_for(windows).train()
+    assert isinstance(model, GSPSModel)
+    method.prepare(model, windows)
+    source, generator = method.batches(windows), torch.Generator().manual_seed(0)
+    elbo, objective, square = dvae.SequenceELBO(), method.objective(), torch.randn(2048, 2048)
+    step = training_step(model, lambda: objective(elbo.terms(model, source.sample(16, generator)), 0))
+    for _ in range(5):
+        step()
+    batch = source.sample(16, generator)
+    with torch.no_grad():
+        values = model.model(batch)
+    drawn = {name: values[name].requires_grad_() for name in ("lower", "upper")}
+
+    def scored() -> None:
+        futures = model._with_whole(dict(drawn))
+        sum(energy.sum() for energy in model.energies(futures, batch["x"], batch).values()).backward()
+
+    past = batch["x"][:, :25]
+    futures = lambda: model.forecast(past, 100, 50)  # noqa: E731
+    product, *times = seconds(lambda: square @ square, step, scored, futures, repeat=5)
+    found = dict(zip(("step", "energies", "futures"), (time / product for time in times), strict=True))
+
+    flow, poses = model.pose_prior.flow, torch.randn(53_000, 48, requires_grad=True)
+    both = seconds(
+        *(lambda f=f: f().square().sum().backward() for f in (lambda: sequential(flow, poses), lambda: flow(poses)[0])),
+        repeat=3,
+    )
+    found["prior"] = both[0] / both[1]
+    found["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    missed = False
+    for name, value in found.items():
+        side, bound = TARGETS.get(name, ("", float("nan")))
+        met = not side or (value <= bound if side == "at most" else value >= bound)
+        missed |= not met
+        print(f"{name:10s} {value:6.2f}   " + (f"{side:8s} {bound:5.2f}   {'ok' if met else 'MISSED'}" if side else ""))
+    if missed:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

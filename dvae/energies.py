@@ -1,0 +1,277 @@
+"""Energies: what makes samples of motion bad, as pure functions, lower where samples are better.
+
+They are no likelihoods: a model takes them in through `pyro.factor`, and an objective weighs them (`Evidence`'s
+`energy_weights`). Source: GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422), with the normalisation of its public
+code.
+
+Shapes everywhere: samples (S, B, T, D), S samples for each of B sequences, T frames of D coordinates in metres; the
+result is (B,), and its mean over the batch is the paper's term. Which frames count is up to the caller, who passes
+these frames alone. Gradients flow to the samples. Every function raises ValueError for shapes that do not fit.
+"""
+
+from collections.abc import Callable
+from math import log, pi
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import Function, once_differentiable
+
+from .motion.angles import AngleLimits, angle_names, cosines
+from .motion.skeleton import Skeleton
+
+__all__ = [
+    "best_of_many",
+    "history_error",
+    "joint_angles",
+    "limb_length",
+    "multimodal_best_of_many",
+    "pairwise_diversity",
+    "pose_prior_energy",
+]
+
+BLOCK = 2**18
+"""Numbers that are worked on at once on a CPU, so that what is made of them stays in cache."""
+
+
+def best_of_many(samples: Tensor, truth: Tensor) -> Tensor:
+    """Squared error of the best sample: min_s sum_{t,d} (x_s - x)^2. GSPS's reconstruction term L_r.
+
+    Args:
+        samples: (S, B, T, D).
+        truth: (B, T, D).
+
+    Returns:
+        (B,), square metres.
+    """
+    _check(samples, truth=(truth, samples.shape[1:]))
+    with torch.no_grad():
+        best = torch.stack([(sample - truth).square().sum((1, 2)) for sample in samples]).argmin(0)
+    return (_chosen(samples, best, torch.arange(len(best), device=best.device)) - truth).square().sum((1, 2))
+
+
+def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> Tensor:
+    """Squared error of the best sample for each admissible future: min_s sum_{t,d} (x_s - y_m)^2, pooled.
+
+    e_b = (B / M) sum over the valid futures of b, with M valid futures in the whole batch, so that the mean over
+    the batch is the mean over all valid futures. GSPS's multimodal reconstruction term L_mm.
+
+    Args:
+        samples: (S, B, T, D).
+        pseudo: (B, M, T, D), the admissible futures; invalid ones are not read.
+        valid: (B, M) bool.
+
+    Returns:
+        (B,), square metres; zeros where no future is valid.
+    """
+    _check(samples)
+    _, sequences, *frame_shape = samples.shape
+    futures = pseudo.shape[1] if pseudo.dim() == 4 else "M"
+    _check(samples, pseudo=(pseudo, (sequences, futures, *frame_shape)), valid=(valid, (sequences, futures)))
+    if valid.dtype != torch.bool:
+        raise ValueError(f"valid has dtype {valid.dtype}, expected torch.bool")
+    sequence, future = valid.nonzero(as_tuple=True)
+    truths = pseudo[sequence, future]
+    with torch.no_grad():  # ||x - y||^2 - ||y||^2 = ||x||^2 - 2 x y, relative to one sample lest digits cancel
+        offsets = (samples - samples[:1]).transpose(0, 1).flatten(2)
+        targets = (pseudo - samples[0, :, None]).masked_fill(~valid[..., None, None], 0).flatten(2)
+        distances = offsets.square().sum(2)[:, None] - 2 * targets @ offsets.mT
+        best = distances[sequence, future].argmin(1)
+    errors = (_chosen(samples, best, sequence) - truths).square().sum((1, 2))
+    return errors.new_zeros(sequences).index_add(0, sequence, errors) * (sequences / max(len(sequence), 1))
+
+
+def _chosen(samples: Tensor, sample: Tensor, sequence: Tensor) -> Tensor:
+    """samples[sample, sequence], (N, T, D)."""
+    return samples.flatten(0, 1).index_select(0, sample * samples.shape[1] + sequence)
+
+
+def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
+    """How alike the samples are: mean over the pairs i < j of exp(-||vec(x_i) - vec(x_j)||_1 / scale).
+
+    GSPS's diversity term L_div takes it of each body part alone, among samples that share the earlier parts.
+
+    Args:
+        samples: (S, B, T, D).
+        scale: alpha, metres; the distance is the sum over all T D coordinates.
+
+    Returns:
+        (B,), from 0 to 1 (all samples equal); zeros where there is no pair.
+    """
+    _check(samples)
+    if not scale > 0:
+        raise ValueError(f"scale is {scale}, expected a distance above 0, in metres")
+    pairs = torch.combinations(torch.arange(len(samples), device=samples.device))
+    one = torch.eye(len(samples)).to(samples)
+    differences = one[pairs[:, 0]] - one[pairs[:, 1]]  # as a matrix product, a third faster than by indices
+
+    def energy(x: Tensor) -> Tensor:
+        with torch.autocast(x.device.type, enabled=False):
+            apart = (differences @ x.flatten(1)).view(len(pairs), *x.shape[1:])
+        return (-apart.abs().sum((2, 3)) / scale).exp().sum(0) / max(len(pairs), 1)
+
+    return _InBlocks.apply(energy, samples)
+
+
+def history_error(samples: Tensor, history: Tensor) -> Tensor:
+    """Squared error of the observed frames as samples repeat them: mean_{t,s} sum_d (x_s - x)^2. GSPS's L_x.
+
+    Args:
+        samples: (S, B, O, D), the O observed frames.
+        history: (B, O, D).
+
+    Returns:
+        (B,), square metres.
+    """
+    _check(samples, history=(history, samples.shape[1:]))
+    return (samples - history).square().sum(3).mean((0, 2))
+
+
+def limb_length(samples: Tensor, reference: Tensor, skeleton: Skeleton) -> Tensor:
+    """Squared errors of limb lengths: mean_{t,s} sum_limbs (length - reference length)^2. GSPS's L_limb.
+
+    GSPS takes all frames, the repeated history too, and the first observed pose for reference.
+
+    Args:
+        samples: (S, B, T, D).
+        reference: (B, D), a pose of each sequence; a constant.
+        skeleton: the joints; D = 3 J, or 3 (J - 1) without the root.
+
+    Returns:
+        (B,), square metres.
+    """
+    _check(samples, reference=(reference, (*samples.shape[1:2], *samples.shape[3:])))
+
+    def lengths(poses: Tensor) -> Tensor:
+        return skeleton.limbs(poses).square().sum(-1).clamp_min(1e-30).sqrt()  # the gradient at 0 is 0, not NaN
+
+    def energy(poses: Tensor, expected: Tensor) -> Tensor:
+        return (lengths(poses) - expected[:, None]).square().sum(3).mean((0, 2))
+
+    return _InBlocks.apply(energy, samples, lengths(reference.detach()))
+
+
+class _InBlocks(Function):
+    """energy(samples, *constants) of a few sequences at a time, and its gradient in the same pass.
+
+    What is made of the samples on the way to an energy is several times their size: in blocks it stays in cache and
+    takes no memory (measured: half the time of limb lengths, a fifth of pairwise distances).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, energy: Callable[..., Tensor], samples: Tensor, *constants: Tensor) -> Tensor:
+        differentiate = ctx.needs_input_grad[1]
+        numbers = max(samples[:, :1].numel(), 1)
+        size = max(BLOCK // numbers, 1) if samples.device.type == "cpu" else samples.shape[1]
+        values, gradients = [], []
+        for block, *others in zip(samples.split(size, 1), *(c.split(size) for c in constants), strict=True):
+            with torch.set_grad_enabled(differentiate):
+                block = block.detach().requires_grad_(differentiate)
+                value = energy(block, *others)
+                if differentiate:
+                    gradients += torch.autograd.grad(value.sum(), block)
+            values.append(value.detach())
+        ctx.constants = len(constants)
+        ctx.save_for_backward(*([torch.cat(gradients, 1)] if differentiate else []))
+        return torch.cat(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        return None, gradient * outputs[0][:, None, None], *[None] * ctx.constants
+
+
+def joint_angles(samples: Tensor, limits: AngleLimits, skeleton: Skeleton) -> Tensor:
+    """Squared excess of the joint angles over their limits, in cosines. GSPS's L_a.
+
+    sum_angles [mean_{cos < low} (cos - low)^2 if low >= -.98] + [mean_{cos > high} (cos - high)^2 if high <= .98]
+
+    where a mean is over the violating entries of the whole batch, left and right, and not over all. A sequence's
+    energy is its share of that, times B.
+
+    Args:
+        samples: (S, B, T, D), of GSPS the predicted frames.
+        limits: as `motion.estimate_angle_limits` returns them.
+        skeleton: one of `motion.angles.ANGLES`; D = 3 J, or 3 (J - 1) without the root.
+
+    Returns:
+        (B,), without unit; zeros where no limit is exceeded.
+    """
+    _check(samples)
+    names = angle_names(skeleton)
+    if limits.names != names:
+        raise ValueError(
+            f"limits of the angles {', '.join(dict.fromkeys(limits.names))}; expected those of skeleton "
+            f"{skeleton.name!r}, {', '.join(dict.fromkeys(names))}: estimate them from its poses"
+        )
+    low, high = limits.low.to(samples), limits.high.to(samples)
+    low, high = low.masked_fill(low < -0.98, -torch.inf), high.masked_fill(high > 0.98, torch.inf)
+    same = torch.tensor([[name == other for other in names] for name in names]).to(samples)
+    return _JointAngles.apply(samples, low, high, same, skeleton)
+
+
+class _JointAngles(Function):
+    """In blocks; and differentiates only the poses that exceed a limit, which are few once a model has learnt."""
+
+    @staticmethod
+    def forward(ctx: Any, samples: Tensor, low: Tensor, high: Tensor, same: Tensor, skeleton: Skeleton) -> Tensor:
+        sequences, frames = samples.shape[1:3]
+        excess = []
+        for block in samples.flatten(0, 2).split(_poses_at_once(samples)):
+            cos = cosines(block, skeleton)
+            excess.append(torch.where(cos < low, cos - low, torch.where(cos > high, cos - high, 0)))
+        over = torch.cat(excess)
+        below, above = ((side.sum(0).to(same) @ same).clamp_min(1) for side in (over < 0, over > 0))
+        share = sequences * over / torch.where(over < 0, below, above)
+        ctx.skeleton = skeleton
+        ctx.save_for_backward(samples, 2 * share)
+        return (over * share).sum(1).view(-1, sequences, frames).sum((0, 2))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
+        samples, slopes = ctx.saved_tensors
+        _, sequences, frames, _ = samples.shape
+        poses = samples.flatten(0, 2)
+        gradient = torch.zeros_like(poses)
+        for rows in slopes.any(1).nonzero()[:, 0].split(_poses_at_once(samples)):
+            slope = slopes[rows] * outputs[0][rows // frames % sequences, None]
+            with torch.enable_grad():
+                chosen = poses[rows].requires_grad_()
+                (gradient[rows],) = torch.autograd.grad(cosines(chosen, ctx.skeleton), chosen, slope)
+        return gradient.view(samples.shape), None, None, None, None
+
+
+def _poses_at_once(samples: Tensor) -> int:
+    return max(BLOCK // samples.shape[3], 1) if samples.device.type == "cpu" else max(samples[..., 0].numel(), 1)
+
+
+def pose_prior_energy(samples: Tensor, prior: Callable[[Tensor], tuple[Tensor, Tensor]], skeleton: Skeleton) -> Tensor:
+    """How far the poses are from a prior's centre: -mean_{t,s} sum log N(z; 0, 1), z of unit limb directions.
+
+    GSPS's L_nf. The log-determinant of the prior's flow is left out, as there, so that this is no density.
+
+    Args:
+        samples: (S, B, T, D); GSPS takes every third predicted frame, from a random one of the first three.
+        prior: a function of directions (..., 3 (J - 1)), zeros for limbs without length, that returns z of the same
+            shape and a log-determinant (...).
+        skeleton: the joints; D = 3 J, or 3 (J - 1) without the root.
+
+    Returns:
+        (B,), nats.
+    """
+    _check(samples)
+    z, _ = prior(skeleton.directions(samples))
+    return 0.5 * (z.square().sum(3).mean((0, 2)) + z.shape[3] * log(2 * pi))
+
+
+def _check(samples: Tensor, **others: tuple[Tensor, tuple[Any, ...]]) -> None:
+    if samples.dim() != 4 or not samples.numel():
+        raise ValueError(f"samples have shape {tuple(samples.shape)}, expected (S, B, T, D) with no size 0")
+    for name, (tensor, expected) in others.items():
+        if tensor.shape != tuple(expected):
+            raise ValueError(
+                f"{name} has shape {tuple(tensor.shape)}, expected ({', '.join(map(str, expected))}) beside samples "
+                f"{tuple(samples.shape)}"
+            )

@@ -1,0 +1,368 @@
+"""Joint angles: cosines between vectors of a pose, as data for each skeleton, and the limits that real poses keep.
+
+Source: the angle loss of GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422) and, for Human3.6M and HumanEva-I,
+the angles of its public code. A vector is the position of a joint relative to the root, `"LHip"`, a difference of
+joints, `("LKnee", "-", "LHip")`, or a cross product of vectors, `(first, "x", second)`. Every angle between a
+vector and a plane is the cosine with the plane's normal, so that knees that bend forwards differ from knees that
+bend backwards. Cosines do not change when a pose is turned or scaled, nor when it is mirrored and its sides swapped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import Function, once_differentiable
+
+from .skeleton import Skeleton, differences, inverse_lengths
+
+Vector: TypeAlias = "str | tuple[Vector, str, Vector]"
+
+BLOCK = 4096
+"""Poses whose limits are estimated at once, so that their vectors stay in cache."""
+
+
+@dataclass(frozen=True)
+class Angle:
+    """The cosine of the angle between two vectors.
+
+    Args:
+        name: what to call it; angles of the same name, those of left and right, share their limits.
+        first, second: the vectors.
+        when: (u, v, sign): only poses in which the inner product of u and v is negative (sign -1), or not
+            negative (sign 1), have this angle.
+    """
+
+    name: str
+    first: Vector
+    second: Vector
+    when: tuple[Vector, Vector, Literal[-1, 1]] | None = None
+
+    def mirrored(self) -> Angle:
+        """The same angle of the other side of the body."""
+        when = self.when and (_mirrored(self.when[0]), _mirrored(self.when[1]), self.when[2])
+        return Angle(self.name, _mirrored(self.first), _mirrored(self.second), when)
+
+
+def _mirrored(vector: Vector) -> Vector:
+    """Left for right; a reflection turns cross products round."""
+    if isinstance(vector, str):
+        return {"L": "R", "R": "L"}.get(vector[0], vector[0]) + vector[1:]
+    a, operation, b = vector
+    return (_mirrored(b), "x", _mirrored(a)) if operation == "x" else (_mirrored(a), "-", _mirrored(b))
+
+
+def _sides(*left: Angle) -> Iterator[Angle]:
+    for angle in left:
+        yield from (angle, angle.mirrored())
+
+
+_L_THIGH, _R_THIGH = ("LKnee", "-", "LHip"), ("RKnee", "-", "RHip")
+_L_UPPER_ARM, _R_UPPER_ARM = ("LElbow", "-", "LShoulder"), ("RElbow", "-", "RShoulder")
+
+
+def _human36m() -> Iterator[Angle]:
+    hips = (("Thorax", "-", "RHip"), "x", ("Thorax", "-", "LHip"))
+    head_top, head, chest = ("Head", "-", "Neck"), ("Neck", "-", "Thorax"), ("Thorax", "-", "Spine")
+    shoulder, leg_plane = ("LShoulder", "-", "Thorax"), (_L_THIGH, "x", "LHip")
+    forwards = ("LHip", ("Spine", "x", leg_plane))
+    yield from _sides(
+        Angle("Spine2Hip", "LHip", "Spine"),
+        Angle("Leg2HipPlane", ("LHip", "x", _L_THIGH), ("LFoot", "-", "LKnee")),
+        Angle("Shoulder2Hip", shoulder, "LHip"),
+        Angle("Leg2ShoulderPlane", ("RShoulder", "x", "LShoulder"), "LKnee"),
+        Angle("Spine2HipPlane1", leg_plane, "Spine", (*forwards, -1)),
+        Angle("Spine2HipPlane2", leg_plane, "Spine", (*forwards, 1)),
+        Angle("Shoulder2Neck", shoulder, ("Spine", "-", "Thorax")),
+    )
+    yield Angle("Shoulder2Shoulder", ("RShoulder", "-", "Thorax"), shoulder)
+    yield Angle("Neck2Spine", chest, "Spine")
+    yield Angle("ShoulderPlane2HipPlane", hips, ("LShoulder", "x", "RShoulder"))
+    yield Angle("Head2Neck", chest, head)
+    yield Angle("Head2HeadTop", head_top, head)
+    yield Angle("HeadVerticalPlane2HipPlane", ((head_top, "x", head), "x", ("Head", "-", "Thorax")), hips)
+
+
+def _humaneva() -> Iterator[Angle]:
+    hips = ("LHip", "x", "RHip")
+    shoulder, other_shoulder = ("LShoulder", "-", "Thorax"), ("RShoulder", "-", "Thorax")
+    leg_plane = (_L_THIGH, "x", ("RHip", "-", "LHip"))
+    yield Angle("LHip2RHip", "LHip", "RHip")
+    yield Angle("Neck2HipPlane", hips, "Thorax")
+    yield Angle("Head2Neck", ("Head", "-", "Thorax"), "Thorax")
+    yield Angle("Shoulder2Shoulder", shoulder, other_shoulder)
+    yield Angle(
+        "ShoulderPlane2HipPlane",
+        (("LHip", "-", "Thorax"), "x", ("RHip", "-", "Thorax")),
+        ("LShoulder", "x", "RShoulder"),
+    )
+    yield from _sides(
+        Angle("Shoulder2Neck", shoulder, "Thorax"),
+        Angle("Leg2HipPlane", hips, _L_THIGH),
+        Angle("Foot2LegPlane", leg_plane, ("LAnkle", "-", "LKnee")),
+        Angle("ForeArm2ShoulderPlane", (_L_UPPER_ARM, "x", shoulder), ("LWrist", "-", "LElbow")),
+    )
+
+
+def _trunk_and_limbs(head: Vector) -> Iterator[Angle]:
+    """A set for skeletons with ankles and toes, and with Spine, Chest and Neck between pelvis and head."""
+    trunk, across_hips = ("Neck", "-", "Spine"), ("LHip", "-", "RHip")
+    hips, shoulders = (across_hips, "x", "Spine"), ("LShoulder", "-", "RShoulder")
+    chest = (shoulders, "x", ("Neck", "-", "Chest"))  # normals point to the front
+    shank, foot = ("LAnkle", "-", "LKnee"), ("LToe", "-", "LAnkle")
+    yield Angle("Trunk2Pelvis", trunk, "Spine")
+    yield Angle("Trunk2HipPlane", trunk, hips)
+    yield Angle("Chest2Spine", ("Neck", "-", "Chest"), ("Chest", "-", "Spine"))
+    yield Angle("Shoulders2Hips", shoulders, across_hips)
+    yield Angle("Head2Trunk", head, trunk)
+    yield Angle("Head2ChestPlane", head, chest)
+    yield from _sides(
+        Angle("Trunk2Hip", trunk, across_hips),
+        Angle("Thigh2Spine", _L_THIGH, "Spine"),
+        Angle("Thigh2HipPlane", _L_THIGH, hips),
+        Angle("Thigh2Hips", _L_THIGH, across_hips),
+        Angle("Shank2Thigh", shank, _L_THIGH),
+        Angle("Shank2ThighPlane", shank, (across_hips, "x", _L_THIGH)),
+        Angle("Foot2Shank", foot, shank),
+        Angle("Foot2ThighPlane", foot, (across_hips, "x", _L_THIGH)),
+        Angle("Head2Shoulder", head, shoulders),
+        Angle("Arm2Trunk", _L_UPPER_ARM, ("Neck", "-", "Chest")),
+        Angle("Arm2Shoulders", _L_UPPER_ARM, shoulders),
+        Angle("Arm2ChestPlane", _L_UPPER_ARM, chest),
+        Angle("Forearm2Arm", ("LWrist", "-", "LElbow"), _L_UPPER_ARM),
+    )
+
+
+ANGLES: dict[str, tuple[Angle, ...]] = {
+    "human36m": tuple(_human36m()),
+    "walker": tuple(_human36m()),
+    "humaneva": tuple(_humaneva()),
+    "cmu21": tuple(_trunk_and_limbs(("Head", "-", "UpperNeck"))),
+    "bandai21": (
+        *_trunk_and_limbs(("Head", "-", "Neck")),
+        *_sides(Angle("Shoulder2Chest", ("LShoulder", "-", "LClavicle"), ("Neck", "-", "Chest"))),
+    ),
+}
+"""The angles of a skeleton by its name. Human3.6M and HumanEva-I: those of GSPS; cmu21 and bandai21: ours."""
+
+
+@dataclass(frozen=True, eq=False)
+class AngleLimits:
+    """Between which cosines the angles of real poses lie.
+
+    Args:
+        names: the angles' names as in `ANGLES`, A of them.
+        low, high: (A,) smallest and largest cosine.
+
+    Raises:
+        ValueError: the sizes differ, or a lower limit is above the upper one.
+    """
+
+    names: tuple[str, ...]
+    low: Tensor
+    high: Tensor
+
+    def __post_init__(self) -> None:
+        sizes = (len(self.names),)
+        if self.low.shape != sizes or self.high.shape != sizes:
+            raise ValueError(
+                f"{len(self.names)} angles with limits of shapes {tuple(self.low.shape)} and "
+                f"{tuple(self.high.shape)}, expected {sizes} twice"
+            )
+        crossed = [name for name, low, high in zip(*self._columns(), strict=True) if not low <= high]
+        if crossed:
+            raise ValueError(f"lower limits above the upper ones, or no numbers: {', '.join(dict.fromkeys(crossed))}")
+
+    def _columns(self) -> tuple[tuple[str, ...], list[float], list[float]]:
+        return self.names, self.low.tolist(), self.high.tolist()
+
+
+def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
+    """The cosines of all angles of `ANGLES[skeleton.name]`.
+
+    An angle that a pose does not have (see `Angle.when`) is NaN: it compares false with every limit, and no
+    gradient flows from it. A vector without length (below 1e-6) has cosine 0 with every other, and no gradient.
+
+    Args:
+        poses: (..., D) metres, D = 3 J, or 3 (J - 1) without the root.
+        skeleton: one of `ANGLES`.
+
+    Returns:
+        (..., A).
+
+    Raises:
+        ValueError: D is neither, or the skeleton has no angles.
+    """
+    plan = _plan(skeleton, poses.device)
+    matrix = differences(skeleton, plan.differences, poses.shape[-1], poses.dtype, poses.device)
+    return _Cosines.apply(poses.reshape(-1, poses.shape[-1]), matrix, plan).reshape(*poses.shape[:-1], len(plan.first))
+
+
+class _Cosines(Function):
+    """With its derivative by hand, which takes half the time of the recorded one.
+
+    Poses run along the last axis, so that every operation is one over long contiguous rows. With f and s the vectors
+    of a cosine c, of lengths |f| and |s|: dc/df = s / (|f| |s|) - c f / |f|^2. For a x b, with the gradient g of the
+    product: b x g for a, and g x a for b.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, poses: Tensor, matrix: Tensor, plan: _Plan) -> Tensor:
+        vectors = poses.new_empty(plan.vectors, 3, len(poses))
+        made = len(plan.differences)
+        with torch.autocast(poses.device.type, enabled=False):
+            torch.mm(matrix.T, poses.T, out=vectors[:made].flatten(0, 1))
+        for first, second in plan.crosses:
+            vectors[made : made + len(first)] = _cross(vectors.index_select(0, first), vectors.index_select(0, second))
+            made += len(first)
+        inverse = inverse_lengths(vectors, dim=1)
+        cos = (vectors.index_select(0, plan.first) * vectors.index_select(0, plan.second)).sum(1)
+        cos.mul_(inverse.index_select(0, plan.first)).mul_(inverse.index_select(0, plan.second))
+        if len(plan.partial):
+            inner = (vectors[plan.u] * vectors[plan.v]).sum(1)
+            absent = (inner < 0) != plan.negative[:, None]
+            cos[plan.partial] = cos[plan.partial].masked_fill(absent, torch.nan)
+        ctx.plan = plan
+        ctx.save_for_backward(matrix, vectors, inverse, cos)
+        return cos.T
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
+        matrix, vectors, inverse, cos = ctx.saved_tensors
+        plan: _Plan = ctx.plan
+        slope = outputs[0].T.masked_fill(cos.isnan(), 0)
+        along = slope * cos.nan_to_num()
+        scale = torch.zeros_like(inverse).index_add_(0, plan.first, along).index_add_(0, plan.second, along)
+        gradient = vectors * (-scale * inverse.square())[:, None]
+        slope = (slope * inverse.index_select(0, plan.first) * inverse.index_select(0, plan.second))[:, None]
+        gradient.index_add_(0, plan.first, slope * vectors.index_select(0, plan.second))
+        gradient.index_add_(0, plan.second, slope * vectors.index_select(0, plan.first))
+        made = len(vectors)
+        for first, second in reversed(plan.crosses):
+            product = gradient[made - len(first) : made]
+            gradient.index_add_(0, first, _cross(vectors.index_select(0, second), product))
+            gradient.index_add_(0, second, _cross(product, vectors.index_select(0, first)))
+            made -= len(first)
+        with torch.autocast(matrix.device.type, enabled=False):
+            return (matrix @ gradient[:made].flatten(0, 1)).T, None, None
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """(V, 3, N) twice -> (V, 3, N)."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
+
+
+def estimate_angle_limits(poses: Tensor, skeleton: Skeleton, quantile: float = 0.0) -> AngleLimits:
+    """The limits that poses keep, left and right together.
+
+    Args:
+        poses: (..., D) metres, as of `cosines`.
+        skeleton: one of `ANGLES`.
+        quantile: the part of the poses beyond each limit. 0 is the smallest and the largest cosine, as in the
+            paper: one outlier frame widens them; .001 forgets such frames.
+
+    Returns:
+        The limits; an angle that none of the poses has is free, from -1 to 1.
+
+    Raises:
+        ValueError: there is no pose, the quantile is not in [0, .5), or as `cosines`.
+    """
+    if not 0 <= quantile < 0.5:
+        raise ValueError(f"quantile is {quantile}, expected the part beyond each limit, from 0 to below .5")
+    if not poses.numel():
+        raise ValueError(f"no poses in a tensor of shape {tuple(poses.shape)}: limits need at least one")
+    with torch.no_grad():
+        blocks = poses.flatten(end_dim=-2).split(BLOCK) if poses.dim() > 1 else (poses[None],)
+        cos = torch.cat([cosines(block, skeleton) for block in blocks])
+    names = angle_names(skeleton)
+    low, high = torch.full_like(cos[:1], -1.0)[0], torch.ones_like(cos[0])
+    for name in set(names):
+        same = [column for column, other in enumerate(names) if other == name]
+        found = cos[:, same][~cos[:, same].isnan()]
+        if len(found):
+            low[same], high[same] = (float(q) for q in np.quantile(found.cpu().numpy(), [quantile, 1 - quantile]))
+    return AngleLimits(names, low, high)
+
+
+def angle_names(skeleton: Skeleton) -> tuple[str, ...]:
+    """Names of the A angles of a skeleton in the order of `cosines`; left and right have the same.
+
+    Raises:
+        ValueError: the skeleton has no angles.
+    """
+    return tuple(angle.name for angle in _angles(skeleton))
+
+
+def _angles(skeleton: Skeleton) -> tuple[Angle, ...]:
+    if skeleton.name not in ANGLES:
+        raise ValueError(f"no joint angles for skeleton {skeleton.name!r}: there are some for {', '.join(ANGLES)}")
+    return ANGLES[skeleton.name]
+
+
+class _Plan(NamedTuple):
+    """Which vectors to make, and between which of them the cosines are, all by index."""
+
+    vectors: int
+    differences: tuple[tuple[int, int], ...]
+    crosses: list[tuple[Tensor, Tensor]]
+    """The vectors that each round of cross products appends."""
+    first: Tensor
+    second: Tensor
+    partial: Tensor
+    """The angles that some poses do not have, and when: u v < 0, or not."""
+    u: Tensor
+    v: Tensor
+    negative: Tensor
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)  # as of `differences`
+def _plan(skeleton: Skeleton, device: torch.device) -> _Plan:
+    angles = _angles(skeleton)
+    needed: dict[Vector, int] = {}  # vector -> how deep its cross products are nested
+    for angle in angles:
+        for vector in (angle.first, angle.second, *(angle.when or ())[:2]):
+            _depth(vector, needed)
+    vectors = sorted(needed, key=needed.__getitem__)
+    place = {vector: i for i, vector in enumerate(vectors)}
+
+    def places(chosen: list[Vector]) -> Tensor:
+        return torch.tensor([place[vector] for vector in chosen], dtype=torch.long, device=device)
+
+    rounds = [[vector for vector in vectors if needed[vector] == depth] for depth in range(max(needed.values()) + 1)]
+    operands = [[vector for vector in crosses if not isinstance(vector, str)] for crosses in rounds[1:]]
+    partial = [(i, angle.when) for i, angle in enumerate(angles) if angle.when]
+    return _Plan(
+        len(vectors),
+        tuple(_joints(vector, skeleton) for vector in rounds[0]),
+        [(places([a for a, _, _ in crosses]), places([b for _, _, b in crosses])) for crosses in operands],
+        places([angle.first for angle in angles]),
+        places([angle.second for angle in angles]),
+        torch.tensor([i for i, _ in partial], dtype=torch.long, device=device),
+        places([u for _, (u, _, _) in partial]),
+        places([v for _, (_, v, _) in partial]),
+        torch.tensor([sign < 0 for _, (_, _, sign) in partial], dtype=torch.bool, device=device),
+    )
+
+
+def _depth(vector: Vector, needed: dict[Vector, int]) -> int:
+    if vector not in needed:
+        crosses = not isinstance(vector, str) and vector[1] == "x"
+        needed[vector] = 1 + max(_depth(vector[0], needed), _depth(vector[2], needed)) if crosses else 0
+    return needed[vector]
+
+
+def _joints(vector: Vector, skeleton: Skeleton) -> tuple[int, int]:
+    """(from, to) of a position or a difference."""
+    start, end = (skeleton.names[skeleton.root], vector) if isinstance(vector, str) else (vector[2], vector[0])
+    lacking = [name for name in (start, end) if name not in skeleton.names]
+    if lacking:
+        raise ValueError(f"skeleton {skeleton.name!r} has no joint {lacking[0]!r}, which its angles read")
+    return skeleton.names.index(start), skeleton.names.index(end)

@@ -1,0 +1,69 @@
+"""Parts of the body: legs, arms and torso of the skeletons that are known by name, and unions of them."""
+
+from __future__ import annotations
+
+from .skeleton import Skeleton
+
+_HUMAN36M = {
+    "right_leg": ("RHip", "RKnee", "RFoot"),
+    "left_leg": ("LHip", "LKnee", "LFoot"),
+    "torso": ("Spine", "Thorax", "Neck", "Head"),
+    "left_arm": ("LShoulder", "LElbow", "LWrist"),
+    "right_arm": ("RShoulder", "RElbow", "RWrist"),
+}
+_LEGS = {f"{side}_leg": tuple(f"{side[0].upper()}{j}" for j in ("Hip", "Knee", "Ankle")) for side in ("right", "left")}
+_FEET = {leg: (*joints, f"{joints[0][0]}Toe") for leg, joints in _LEGS.items()}
+_ARMS = {
+    f"{side}_arm": tuple(f"{side[0].upper()}{j}" for j in ("Shoulder", "Elbow", "Wrist")) for side in ("left", "right")
+}
+
+LIMBS: dict[str, dict[str, tuple[str, ...]]] = {
+    "human36m": _HUMAN36M,
+    "walker": _HUMAN36M,
+    "humaneva": {**_LEGS, "torso": ("Thorax", "Head"), **_ARMS},
+    "cmu21": {**_FEET, "torso": ("Spine", "Chest", "Neck", "UpperNeck", "Head", "HeadTop"), **_ARMS},
+    "bandai21": {
+        **_FEET,
+        "torso": ("Spine", "Chest", "Neck", "Head"),
+        **{arm: (f"{joints[0][0]}Clavicle", *joints) for arm, joints in _ARMS.items()},
+    },
+}
+"""Skeleton to its five parts, every joint but the root in one of them."""
+
+UNIONS = {"lower": ("right_leg", "left_leg"), "upper": ("torso", "left_arm", "right_arm")}
+
+
+def body_parts(skeleton: Skeleton, parts: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
+    """The joints of each part.
+
+    Args:
+        skeleton: the tree.
+        parts: each a name, such as "lower", "upper", "torso", "left_arm", or a name and what is in it,
+            "name=member+member", where a member is such a part or a joint.
+
+    Returns:
+        Part to its joints, as places among all joints but the root, ascending.
+
+    Raises:
+        ValueError: a part that is not known, or joints that are in no part or in several.
+    """
+    limbs = LIMBS.get(skeleton.name, {})
+    joints = [name for j, name in enumerate(skeleton.names) if j != skeleton.root]
+    found: dict[str, tuple[int, ...]] = {}
+    for text in parts:
+        name, _, members = text.partition("=")
+        if not name.isidentifier() or name in found:
+            raise ValueError(f"parts have names of their own, such as lower and upper; got {', '.join(parts)}")
+        names: list[str] = []
+        for member in (members or name).split("+"):
+            for one in UNIONS.get(member, (member,)):
+                if one not in limbs and one not in joints:
+                    known = ", ".join([*(UNIONS if limbs else ()), *limbs, *joints])
+                    raise ValueError(f"skeleton {skeleton.name!r} has no part or joint {one!r}; it has {known}")
+                names += limbs.get(one, (one,))
+        found[name] = tuple(sorted(joints.index(one) for one in names))
+    everything = sorted(place for places in found.values() for place in places)
+    if everything != list(range(len(joints))):
+        wrong = [name for place, name in enumerate(joints) if everything.count(place) != 1]
+        raise ValueError(f"every joint but the root is in one part; {', '.join(wrong)} are in none or in several")
+    return found

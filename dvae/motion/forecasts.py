@@ -1,0 +1,113 @@
+"""Forecasts of motion, and their file, which says all that it takes to draw and to score them."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .formats import read_arrays
+from .skeleton import Skeleton
+
+
+def is_forecasts(path: str | Path) -> bool:
+    """Whether a file is an npz with a member `forecasts`."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return "forecasts.npy" in archive.namelist()
+
+
+@dataclass(frozen=True, eq=False)
+class Forecasts:
+    """Sampled futures of windows beside what was observed and what happened, in metres.
+
+    Args:
+        skeleton: the tree.
+        keys: (split, clip, first frame) of the N windows.
+        forecasts: (S, N, H, J, 3), S futures of each window.
+        observed: (N, O, J, 3).
+        truth: (N, F, J, 3), what came after the observed frames; F is at most H.
+
+    Raises:
+        ValueError: the shapes do not fit each other or the skeleton, or there is nothing.
+    """
+
+    skeleton: Skeleton
+    keys: Sequence[tuple[str, str, int]]
+    forecasts: np.ndarray
+    observed: np.ndarray
+    truth: np.ndarray
+
+    def __post_init__(self) -> None:
+        windows, joint = len(self.keys), (self.skeleton.joints, 3)
+        shapes = [array.shape for array in (self.forecasts, self.observed, self.truth)]
+        of_windows = [self.forecasts.shape[1:], *shapes[1:]]
+        fit = all(len(s) == 4 and s[0] == windows and s[2:] == joint for s in of_windows) and self.forecasts.size
+        if not fit or not self.observed.size or shapes[2][1] > shapes[0][2]:
+            raise ValueError(
+                f"expected forecasts (S, {windows}, H, {joint[0]}, 3), observed ({windows}, O, {joint[0]}, 3) and "
+                f"truth ({windows}, up to H, {joint[0]}, 3), got {shapes[0]}, {shapes[1]} and {shapes[2]}"
+            )
+
+    def window(self, n: int, samples: int | None = None) -> Forecasts:
+        """The first of the futures, or all, of window n alone."""
+        one = slice(n, n + 1)
+        future = self.forecasts[:samples, one]
+        return Forecasts(self.skeleton, self.keys[one], future, self.observed[one], self.truth[one])
+
+    def save(self, path: str | Path) -> None:
+        """Write an npz of plain arrays.
+
+        Its members are `forecasts`, `observed`, `truth`; `split`, `clip` and `start` of each window; and the
+        skeleton as in its JSON file: `name`, `joint_names`, `parents`, `joints_left`, `joints_right`, `up_axis`,
+        `fps`.
+        """
+        split, clip, start = zip(*self.keys, strict=True)
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        with Path(path).open("wb") as file:  # an open file: numpy would append .npz to a name
+            np.savez_compressed(
+                file,
+                forecasts=self.forecasts,
+                observed=self.observed,
+                truth=self.truth,
+                split=np.array(split),
+                clip=np.array(clip),
+                start=np.array(start),
+                name=np.array(self.skeleton.name),
+                joint_names=np.array(self.skeleton.names),
+                parents=np.array(self.skeleton.parents),
+                joints_left=np.array(self.skeleton.left, int),
+                joints_right=np.array(self.skeleton.right, int),
+                up_axis=np.array(self.skeleton.up),
+                fps=np.array(self.skeleton.fps),
+            )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Forecasts:
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is damaged, lacks a member, or its arrays do not fit each other.
+        """
+        arrays = read_arrays(path)
+        try:
+            skeleton = Skeleton(
+                names=arrays["joint_names"].tolist(),
+                parents=arrays["parents"].tolist(),
+                left=arrays["joints_left"].tolist(),
+                right=arrays["joints_right"].tolist(),
+                up=arrays["up_axis"].item(),
+                fps=arrays["fps"].item(),
+                name=arrays["name"].item(),
+            )
+            keys = list(zip(*(arrays[name].tolist() for name in ("split", "clip", "start")), strict=True))
+            return cls(skeleton, keys, arrays["forecasts"], arrays["observed"], arrays["truth"])
+        except KeyError as error:
+            raise ValueError(f"{path} lacks {error}: `dvae forecast` writes files with all that is needed") from error
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}: {error}") from error

@@ -1,0 +1,254 @@
+"""The pose prior of GSPS: a density of single poses, as the directions of their limbs.
+
+    p(d_t),        d_t = the unit vectors along all limbs, from parent to child
+
+It has no latents and no time: every frame is a pose of its own, and the flow's density is exact, so that the bound is
+the log evidence. Others are trained with it: poses that it finds unlikely cost energy (`energies.pose_prior_energy`).
+
+Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the flow of its public code (see `distributions.flow`). Ours:
+
+* Training poses get noise of 2 mm. Where a body part is rigid, as the hips are, its limbs' directions hardly vary, and
+  the density rises without bound as a flow narrows down on them. In bandai2 eight of sixty dimensions have no more than
+  the rounding of the file, 0.1 mm. Fitted without noise, errors of 1 mm raise the energy of a test pose from 117 nats
+  to 4300; with it, from 90 to 92, errors of 2 cm to 2300, and lower legs bent the wrong way to 1000.
+* The flow reads whitened directions, which changes what it learns first and not what it can learn. In nats a training
+  (test) pose of bandai2 it is at 80.7 (67.1) after 1000 steps, and at 73.7 (62.0) from raw directions as in the paper;
+  a normal with full covariance has 76.0 (63.8), and the raw flow comes near to it in 8000 steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from math import pi
+from typing import Any, ClassVar
+
+import pyro
+import torch
+from torch import Tensor, nn
+
+from ..distributions import QRFlow
+from ..inference.batches import Batch
+from ..inference.fit import fit
+from ..inference.objectives import Evidence, Objective
+from ..inference.result import progress_bar
+from ..model import DynamicalVAE
+from ..motion import Skeleton, Windows, face_forward, rotate_about_up
+from ..notation import Factorization
+from .method import Method
+
+
+@dataclass(frozen=True)
+class PosePrior(Method):
+    """See the file. Options of every method that say something of latents, emissions or motion have no effect.
+
+    Args:
+        layers: of the flow.
+        noise: standard deviation in metres of the noise that training poses get at each coordinate; the paper has none.
+        turned: turn every training window about the up axis by a uniform angle, for a prior that does not mind
+            which way people face. Where the windows' heading is fixed there is no need.
+        heading: turn every window about the up axis so that its last observed frame has heading zero; a prior for
+            models that see their windows so.
+        whiten: standardise directions with their mean and covariance over training poses before the flow reads them;
+            the paper does not, and needs a learning rate of .01.
+    """
+
+    name: ClassVar[str] = "pose-prior"
+    source: ClassVar[str] = "Mao, Liu and Salzmann, 2021, arXiv 2108.08422"
+    generative: ClassVar[str] = "p(d_t)"
+    inference: ClassVar[str] = ""
+    unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method))
+    forecasts: ClassVar[bool] = False
+
+    layers: int = 3
+    noise: float = 0.002
+    turned: bool = False
+    heading: bool = False
+    whiten: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.layers < 1:
+            raise ValueError(f"layers is {self.layers}; it must be at least 1")
+        if not 0 <= self.noise < 1:
+            raise ValueError(f"noise is {self.noise}; it must be a length in metres, from 0 to below 1")
+        if self.turned and self.heading:
+            raise ValueError("heading fixes the direction that turned would draw; choose one")
+
+    def equations(self) -> tuple[Factorization, Factorization]:
+        """See `Method.equations`; the guide has no factor."""
+        return Factorization.parse(self.generative), Factorization("q", ())
+
+    def check(self) -> None:
+        """See `Method.check`; all its options were checked when they were given."""
+
+    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
+        """A pose prior cannot be built from sizes alone.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError("a pose prior needs to know the skeleton; use build_for(windows)")
+
+    def build_for(self, windows: Windows) -> PosePriorModel:
+        """The model for poses of the windows' skeleton."""
+        return PosePriorModel(windows.skeleton, self.layers, windows.protocol.observed - 1 if self.heading else None)
+
+    def prepare(self, model: nn.Module, windows: Windows) -> None:
+        """See `Method.prepare`: takes mean and covariance of the directions from the poses of 1024 windows."""
+        if self.whiten:
+            assert isinstance(model, PosePriorModel)
+            x = self.batches(windows).sample(1024, torch.default_generator)["x"]
+            model.flow.whiten(model.skeleton.directions(model.facing(x).double()))
+
+    def batches(self, windows: Windows) -> Poses:
+        """See `Method.batches`: windows, turned and with noise."""
+        return Poses(windows, self.noise, self.turned)
+
+    def objective(self) -> Objective:
+        """Minus the log density, in nats per pose."""
+        return Evidence()
+
+    def feeding(self, steps: int) -> float:
+        """0: nothing is fed to a model without time."""
+        return 0.0
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Training windows whose poses are varied.
+
+    Args:
+        windows: to draw from.
+        noise: see `PosePrior`.
+        turned: see `PosePrior`.
+    """
+
+    windows: Windows
+    noise: float
+    turned: bool
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the windows."""
+        return self.windows.fingerprint
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draws windows as `Windows.sample` does, turned and with noise: {"x": (B, T, D)}."""
+        x = self.windows.sample(batch_size, generator)["x"]
+        if self.turned:
+            angle = 2 * pi * torch.rand(len(x), 1, 1, generator=generator)
+            x = rotate_about_up(x.unflatten(-1, (-1, 3)), angle, self.windows.skeleton.up).flatten(-2)
+        if self.noise:
+            x = x + self.noise * torch.randn(x.shape, generator=generator)
+        return {"x": x}
+
+
+class PosePriorModel(nn.Module):
+    """The density of poses.
+
+    Args:
+        skeleton: of J joints.
+        layers: of the flow.
+        forward_at: frame of heading zero in windows, which are turned so; None to take them as they are.
+    """
+
+    def __init__(self, skeleton: Skeleton, layers: int = 3, forward_at: int | None = None):
+        super().__init__()
+        self.skeleton, self.forward_at = skeleton, forward_at
+        self.flow = QRFlow(3 * (skeleton.joints - 1), layers)
+
+    def model(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
+        """The Pyro program: one site d, batch (B, T), event (3 (J - 1),), observed at the poses' directions.
+
+        Args:
+            batch: holds x (B, T, D), D as in `Skeleton.limbs`.
+
+        Raises:
+            ValueError: padded sequences or missing entries, of which there are none in windows of motion.
+        """
+        if extra := {"lengths", "mask"} & set(batch):
+            raise ValueError(f"a pose prior reads whole poses in every frame; leave {' and '.join(sorted(extra))} out")
+        d = self.skeleton.directions(self.facing(batch["x"]))
+        with pyro.plate("sequences", d.shape[0], dim=-2), pyro.plate("frames", d.shape[1], dim=-1):
+            return {"d": pyro.sample("d", self.flow.distribution(), obs=d)}
+
+    def guide(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
+        """Nothing is latent."""
+        return {}
+
+    def forward(self, given: Batch | Tensor, **options: Any) -> Any:
+        """On a batch, the program, which bounds take; on directions (..., 3 (J - 1)), see `QRFlow.forward`."""
+        return self.model(given, **options) if isinstance(given, Mapping) else self.flow(given)
+
+    def facing(self, x: Tensor) -> Tensor:
+        """Windows (..., T, D) as the density reads them."""
+        return x if self.forward_at is None else face_forward(x, self.skeleton, self.forward_at)[0]
+
+    def log_prob(self, poses: Tensor) -> Tensor:
+        """Log density (...) of the limb directions of poses (..., D), in nats.
+
+        Raises:
+            ValueError: poses of another skeleton.
+        """
+        return self.flow.distribution().log_prob(self.skeleton.directions(poses))
+
+    @torch.no_grad()
+    def sample(self, count: int) -> Tensor:
+        """Draws limb directions (count, 3 (J - 1)). The density is over all vectors, so their lengths vary about 1."""
+        return self.flow.distribution().sample((count,))
+
+
+def fit_pose_prior(
+    windows: Windows, steps: int = 1000, seed: int = 0, progress: bool = True, **options: Any
+) -> PosePriorModel:
+    """Fits a pose prior quietly, on the CPU, in about ten seconds.
+
+    Args:
+        windows: training windows.
+        steps: optimiser steps.
+        seed: of the fit; the caller's random state is left as it was.
+        progress: show a bar.
+        **options: of `PosePrior`.
+
+    Returns:
+        The model, in evaluation mode, with its last weights.
+    """
+    method = PosePrior(**options)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = method.build_for(windows)
+        method.prepare(model, windows)
+    fit(
+        model,
+        method.batches(windows),
+        steps=steps,
+        seed=seed,
+        learning_rate=1e-2,
+        decay=0.8,
+        weight_decay=1e-3,
+        accelerator="cpu",
+        progress=False,
+        trackers=[_Bar(steps, progress)],
+    )
+    return model
+
+
+class _Bar:
+    """A tracker that shows how far a fit is, and no numbers."""
+
+    def __init__(self, steps: int, shown: bool) -> None:
+        self.bar = progress_bar(shown)
+        self.task = self.bar.add_task("pose prior", total=steps)
+
+    def start(self, step: int) -> None:
+        """Show the bar."""
+        self.bar.start()
+
+    def log(self, step: int, row: Mapping[str, float]) -> None:
+        """Move it on."""
+        self.bar.update(self.task, completed=step)
+
+    def close(self) -> None:
+        """Take it away."""
+        self.bar.stop()

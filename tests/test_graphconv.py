@@ -1,0 +1,161 @@
+"""The graph convolutional generator: the transform against scipy, the layers against the published definition."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.fft import dct
+
+import dvae
+from dvae.distributions.dct import cosine_basis
+from dvae.networks import GraphConv
+from dvae.networks.base import Input
+from dvae.notation import Relation
+
+OBSERVED, LENGTH, JOINTS = 4, 9, 5
+EVERYTHING = {"h": range(JOINTS), "lower": (0, 3), "upper": (1, 2, 4)}
+FIRST = Relation.custom("1:O", lambda T: np.arange(T)[None] < OBSERVED)
+ALL = Relation.parse("1:T")
+
+
+def network(child="upper", **options):
+    options = {"coefficients": 3, "width": 6, "blocks": 2, **options}
+    inputs = [Input("h", 15, FIRST), Input("lower", 6, ALL), Input("b", 2)]
+    return GraphConv(EVERYTHING, child, LENGTH, **options).build(inputs, True, 3 * len(EVERYTHING[child])).double()
+
+
+def parents(batch=3):
+    sizes = {"h": (batch, LENGTH, 15), "lower": (batch, LENGTH, 6), "b": (batch, 2)}
+    return {name: torch.randn(shape, dtype=torch.float64) for name, shape in sizes.items()}
+
+
+def test_the_basis_is_scipys_orthonormal_transform():
+    values = np.random.default_rng(0).normal(size=(7, 3))
+    assert np.allclose(cosine_basis(7, 7).numpy() @ values, dct(values, axis=0, norm="ortho"), atol=1e-14, rtol=0)
+    rows = cosine_basis(7, 4)
+    assert torch.allclose(rows @ rows.T, torch.eye(4, dtype=torch.float64), atol=1e-14, rtol=0)
+
+
+@pytest.mark.parametrize("coefficients", [0, 8])
+def test_a_sequence_has_as_many_coefficients_as_steps(coefficients):
+    with pytest.raises(ValueError, match="7 steps has 1 to 7 coefficients"):
+        cosine_basis(7, coefficients)
+
+
+def published(net, values):
+    """The card's definition, step by step: padded history, transformed, with the earlier part in its place."""
+    batch, C = len(values["b"]), net.spec.coefficients
+    padded = values["h"].clone()
+    padded[:, OBSERVED:] = padded[:, OBSERVED - 1 : OBSERVED]
+
+    def transformed(x):  # (B, T, 3 joints) -> (B, joints, 3 C), xyz-major
+        coefficients = torch.from_numpy(dct(x.detach().numpy(), axis=1, norm="ortho")[:, :C])
+        return coefficients.unflatten(-1, (-1, 3)).permute(0, 2, 3, 1).flatten(2)
+
+    y = transformed(padded)
+    y[:, list(EVERYTHING["lower"])] = transformed(values["lower"])
+    y = torch.cat([y, values["b"][:, None].expand(-1, JOINTS, -1)], dim=-1)
+
+    def convolve(layer, x):
+        out = torch.stack([layer.adjacency @ (row @ layer.weight) for row in x])
+        out = out if layer.bias is None else out + layer.bias
+        if layer.norm is None:
+            return out
+        flat = out.reshape(batch, -1)
+        mean, variance = flat.mean(0), flat.var(0, correction=0)
+        normal = (flat - mean) / (variance + layer.norm.eps).sqrt()
+        return torch.tanh((normal * layer.norm.weight + layer.norm.bias).view(out.shape))
+
+    hidden = convolve(net.first, y)
+    for first, second in net.rest:
+        hidden = hidden + convolve(second, convolve(first, hidden))
+    out = (convolve(net.last, hidden) + y)[:, list(EVERYTHING["upper"]), : 3 * C]
+    time = cosine_basis(LENGTH, C).T @ out.unflatten(-1, (3, C)).permute(0, 3, 1, 2).flatten(2)
+    return time
+
+
+def test_the_network_is_the_published_one():
+    net, values = network().train(), parents()
+    assert torch.allclose(net(values, LENGTH), published(net, values), atol=1e-10, rtol=0)
+
+
+def test_an_earlier_part_within_the_kept_coefficients_comes_through_unchanged():
+    """The transform of D' c is c: what the part before made is what the next one reads."""
+    net, values = network(), parents()
+    slow = cosine_basis(LENGTH, 3)
+    values["lower"] = slow.T @ torch.randn(3, 3, 6, dtype=torch.float64)
+    found = net._coefficients(values)[:, [0, 3]].unflatten(-1, (3, 3))
+    back = slow.T @ found.permute(0, 3, 1, 2).flatten(2)
+    assert torch.allclose(back, values["lower"], atol=1e-12, rtol=0)
+
+
+def test_it_reads_the_observed_steps_alone():
+    net, values = network().eval(), parents(1)
+    jacobian = torch.autograd.functional.jacobian(lambda h: net({**values, "h": h}, LENGTH), values["h"])
+    read = (jacobian != 0).any(2).any(1).any(-1)[0, 0]
+    assert read.tolist() == [True] * OBSERVED + [False] * (LENGTH - OBSERVED)
+
+
+@pytest.mark.parametrize("observed", [1, LENGTH])
+def test_one_step_or_all_may_be_observed(observed):
+    inputs = [Input("h", 15, Relation.custom("1:O", lambda T: np.arange(T)[None] < observed))]
+    net = GraphConv(EVERYTHING, "lower", LENGTH, 3, 6, 1).build(inputs, True, 6).double().eval()
+    h = torch.randn(2, LENGTH, 15, dtype=torch.float64)
+    stays = h.clone()
+    stays[:, observed:] = h[:, observed - 1 : observed]
+    coefficients = (cosine_basis(LENGTH, 3) @ stays).transpose(1, 2).unflatten(1, (-1, 3)).flatten(2)
+    assert torch.allclose(net._coefficients({"h": h}), coefficients, atol=1e-12, rtol=0)
+
+
+def test_step_by_step_is_all_at_once():
+    net, values = network().eval(), parents()
+    state = net.start(values, 3, LENGTH)
+    steps = [net.step(state, t, {})[0] for t in range(LENGTH)]
+    assert torch.equal(torch.stack(steps, 1), net(values, LENGTH))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda: network()(parents(), LENGTH - 1), "was given 8 steps; it makes sequences of its length"),
+        (lambda: network()(parents(), LENGTH, torch.tensor([9, 9, 3])), "of a ragged batch"),
+        (lambda: network(coefficients=10), "9 steps has 1 to 9 coefficients"),
+        (lambda: network().start({"h": parents()["h"]}, 3, LENGTH), "cannot be in a loop with lower, b"),
+        (lambda: GraphConv(EVERYTHING, "lower", 9, 3).build([Input("h", 15, ALL)], True, 5), "not of size 5"),
+        (lambda: GraphConv(EVERYTHING, "lower", 9, 3).build([Input("h", 12, ALL)], True, 6), "h has size 12"),
+        (
+            lambda: GraphConv(EVERYTHING, "upper", 9, 3).build([Input("lower", 6, ALL)], True, 9),
+            "starts from a parent that holds every joint",
+        ),
+        (
+            lambda: GraphConv(EVERYTHING, "lower", 9, 3).build([Input("h", 15, Relation.parse("<t"))], True, 6),
+            r"not h at \{<t\}",
+        ),
+    ],
+)
+def test_what_it_cannot_do(change, message):
+    with pytest.raises(ValueError, match=message):
+        change()
+
+
+def test_it_generates_in_a_model_of_ones_own():
+    """The network with a likelihood: any factorization takes it."""
+    model = dvae.DynamicalVAE(
+        "p(a) p(lower_t | h_{1:O}, a) p(upper_t | h_{1:O}, lower_{1:T})",
+        "q(a | lower_{1:T}, upper_{1:T})",
+        {"a": 2, "h": 15, "lower": 6, "upper": 9},
+        {f"p({name})": GraphConv(EVERYTHING, name, LENGTH, 3, 6, 1) for name in ("lower", "upper")},
+        {
+            "default": dvae.heads.Normal(),
+            "p(lower)": dvae.heads.FixedNormal(0.1),
+            "p(upper)": dvae.heads.FixedNormal(0.1),
+        },
+        parts={"lower": [0, 1, 2, 9, 10, 11], "upper": [3, 4, 5, 6, 7, 8, 12, 13, 14]},
+        history="h",
+        masks={"1:O": lambda T: np.arange(T)[None] < OBSERVED},
+    )
+    x = torch.randn(4, LENGTH, 15)
+    assert model.likelihood
+    assert torch.isfinite(dvae.SequenceELBO().terms(model, x).bound).all()
+    forecast = model.forecast(x[:, :OBSERVED], LENGTH - OBSERVED, 2)
+    assert forecast["x"].shape == (2, 4, LENGTH - OBSERVED, 15)
+    assert torch.equal(forecast["x"][..., model.parts["lower"]], forecast["lower"])

@@ -1,0 +1,222 @@
+"""The pose prior as a method: what it reads of poses, how it is fitted, kept, read back, and what it refuses."""
+
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.distributions import MultivariateNormal
+
+import dvae
+from dvae import motion
+from dvae.cli import main
+from dvae.models import from_config, runs
+from dvae.models.pose_prior import PosePrior, PosePriorModel, fit_pose_prior
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+CHAIN = motion.Skeleton(("root", "middle", "end"), (-1, 0, 1), name="chain")
+SHORT = replace(motion.PROTOCOLS["simulated"], observed=4, predicted=6)
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "people.npz"
+    motion.save(path, motion.simulate(clips=14, frames=90, seed=1))
+    return path
+
+
+@pytest.fixture(scope="module")
+def train(people):
+    return motion.windows(motion.load(people), SHORT, "train")
+
+
+@pytest.fixture(scope="module")
+def run(people, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "prior"
+    assert main(["fit", "pose-prior", "--data", str(people), "--out", str(out), "--steps", "12", *SMALL]) == 0
+    return out
+
+
+SMALL = ["--batch-size", "4", "--validate-every", "4", "--noise", "0.005"]
+
+
+def model(skeleton=motion.WALKER):
+    return PosePriorModel(skeleton).double()
+
+
+def test_it_reads_the_unit_vectors_of_limbs():
+    poses = torch.tensor([[0.0, 2.0, 0.0, 3.0, 2.0, 4.0]], dtype=torch.float64)  # of the middle and the end
+    expected = torch.tensor([[0.0, 1.0, 0.0, 0.6, 0.0, 0.8]], dtype=torch.float64)
+    prior = model(CHAIN)
+    torch.testing.assert_close(prior.skeleton.directions(poses), expected)
+    moved = torch.cat([torch.ones(1, 3), poses.unflatten(-1, (2, 3)).add(1)[0].flatten()[None]], -1)
+    torch.testing.assert_close(prior.skeleton.directions(moved), expected)
+    with pytest.raises(ValueError, match="poses have 7 numbers"):
+        prior.skeleton.directions(torch.zeros(1, 7))
+
+
+def test_it_does_not_see_how_long_limbs_are(train):
+    prior = model()
+    limbs = prior.skeleton.limbs(train.all()["x"][0].double())
+    stretch = torch.rand(limbs.shape[:-1], dtype=torch.float64)[..., None] + 0.5
+    joints = {prior.skeleton.root: torch.zeros(len(limbs), 3, dtype=torch.float64)}
+    edges = {child: (parent, n) for n, (parent, child) in enumerate(prior.skeleton.edges)}
+    for joint in prior.skeleton.order[1:]:
+        parent, limb = edges[joint]
+        joints[joint] = joints[parent] + (stretch * limbs)[:, limb]
+    stretched = torch.cat([joints[j] for j in range(prior.skeleton.joints)], -1)
+    expected = prior.log_prob(train.all()["x"][0].double())
+    torch.testing.assert_close(prior.log_prob(stretched), expected, rtol=0, atol=1e-9)
+
+
+def test_limbs_without_length_are_no_trouble():
+    poses = torch.tensor([[0.0, 1.0, 0.0, 0.0, 1.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    prior = model(CHAIN)
+    assert prior.skeleton.directions(poses).tolist() == [[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]]
+    prior.log_prob(poses).sum().backward()
+    assert torch.isfinite(poses.grad).all()
+
+
+def test_every_frame_is_a_pose_of_its_own(train):
+    prior, x = model(), train.all()["x"][:3].double()
+    terms = dvae.SequenceELBO().terms(prior, {"x": x})
+    expected = prior.log_prob(x)
+    assert expected.shape == x.shape[:2]
+    torch.testing.assert_close(terms.steps["d"], expected)
+    torch.testing.assert_close(terms.bound, expected.sum(1))
+    assert terms.frames.tolist() == [10, 10, 10]
+    assert terms.kl == {}
+    z, log_det = prior(prior.skeleton.directions(x))
+    noise = torch.distributions.Normal(0.0, 1.0).log_prob(z).sum(-1)
+    torch.testing.assert_close(noise + log_det, expected)
+    with pytest.raises(ValueError, match="leave lengths out"):
+        dvae.SequenceELBO().terms(prior, {"x": x, "lengths": torch.tensor([1, 2, 3])})
+
+
+def test_draws_are_of_its_density(train):
+    prior = fit_pose_prior(train, steps=20)
+    torch.manual_seed(0)
+    draws = prior.sample(2000)
+    torch.manual_seed(0)
+    assert torch.equal(prior.sample(2000), draws)
+    z, _ = prior(draws)
+    assert z.shape == (2000, 48)
+    assert abs(z.mean()) < 5 / z.numel() ** 0.5
+    assert abs(z.square().mean() - 1) < 5 * (2 / z.numel()) ** 0.5
+
+
+def test_training_poses_are_turned_and_get_noise(train):
+    x = train.sample(200, torch.Generator().manual_seed(3))["x"].unflatten(-1, (-1, 3))
+    plain = PosePrior(noise=0.0).batches(train).sample(200, torch.Generator().manual_seed(3))["x"]
+    assert torch.equal(plain, x.flatten(-2))
+    noisy = PosePrior(noise=0.004).batches(train).sample(200, torch.Generator().manual_seed(3))["x"]
+    error = noisy - plain
+    assert error.std().item() == pytest.approx(0.004, rel=0.02)
+    assert abs(error.mean()) < 5 * 0.004 / error.numel() ** 0.5
+    turned = PosePrior(noise=0.0, turned=True).batches(train).sample(200, torch.Generator().manual_seed(3))["x"]
+    old, new = (torch.complex(poses[..., 2], poses[..., 0]) for poses in (x, turned.unflatten(-1, (-1, 3))))
+    angles = (new * old.conj()).sum((1, 2)).angle()  # of whole windows, about y
+    again = motion.rotate_about_up(x, angles[:, None, None], "y").flatten(-2)
+    torch.testing.assert_close(turned, again, rtol=0, atol=1e-5)
+    assert torch.polar(torch.ones(200), angles).mean().abs() < 3 / 200**0.5  # in all directions
+
+
+def test_with_a_fixed_heading_it_does_not_mind_which_way_people_face(train):
+    x = train.all()["x"][:5].double()
+    angle = torch.linspace(0, 6, 5, dtype=torch.float64)[:, None, None]
+    turned = motion.rotate_about_up(x.unflatten(-1, (-1, 3)), angle, "y").flatten(-2)
+    for heading in (False, True):
+        prior = PosePrior(heading=heading).build_for(train).double()
+        plain, other = (dvae.SequenceELBO().terms(prior, {"x": each}).bound for each in (x, turned))
+        assert torch.allclose(plain, other, rtol=0, atol=1e-8) == heading
+
+
+def test_a_fitted_prior_is_read_back_and_goes_on(run, people, tmp_path):
+    loaded = dvae.load(run)
+    assert isinstance(loaded.model, PosePriorModel)
+    assert loaded.method == dvae.method("pose-prior", noise=0.005)
+    assert not torch.equal(loaded.model.flow.whitening, torch.eye(48))
+    x = loaded.data.windows("test").all()["x"]
+    assert torch.isfinite(loaded.model.log_prob(x)).all()
+    training = dvae.Training(steps=12, batch_size=4, validate_every=4, decay=0.5, progress=False)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    method, data = dvae.method("pose-prior", noise=0.005), runs.Data.open(people)
+    runs.fit(method, data, whole, training)
+    assert torch.equal(dvae.load(whole).model.log_prob(x), loaded.model.log_prob(x))
+    runs.fit(method, data, parts, replace(training, steps=8))
+    assert main(["resume", str(parts), "--steps", "12"]) == 0
+    rates = [json.loads(line) for line in (parts / "log.jsonl").read_text().splitlines()]
+    assert max(row["step"] for row in rates) == 12
+
+
+def test_it_says_what_it_is(run, capsys, tmp_path):
+    assert main(["list"]) == 0
+    assert "p(d_t)" in capsys.readouterr().out
+    assert main(["show", "pose-prior", "--out", str(tmp_path / "graph.png")]) == 0
+    assert "p(d_{1:T}) = ∏_t p(d_t)\nnothing is latent" in capsys.readouterr().out
+    assert main(["fit", "pose-prior", "--help"]) == 0
+    assert "--whiten" in capsys.readouterr().out
+    assert main(["resume", str(run), "--steps", "13"]) == 0
+    assert "dvae evaluate RUN --pose-prior" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["evaluate", "compare", "criticise", "forecast"])
+def test_it_forecasts_nothing(command, run, tmp_path, capsys):
+    out = ["--out", str(tmp_path / "futures.npz")] if command == "forecast" else []
+    assert main([command, str(run), *out]) == 1
+    assert "is a fitted pose-prior, which forecasts nothing" in " ".join(capsys.readouterr().err.split())
+
+
+def test_it_survives_its_configuration():
+    method = PosePrior(layers=2, noise=0.0, turned=True, whiten=False)
+    assert from_config(json.loads(json.dumps(method.config()))) == method
+    assert method.feeding(100) == 0
+    assert method.objective() == dvae.Evidence()
+
+
+@pytest.mark.parametrize(
+    ("run", "message"),
+    [
+        (lambda: PosePrior(layers=0), "layers is 0; it must be at least 1"),
+        (lambda: PosePrior(noise=-0.1), "noise is -0.1; it must be a length in metres"),
+        (lambda: PosePrior(noise=float("nan")), "noise is nan"),
+        (lambda: PosePrior(turned=True, heading=True), "heading fixes the direction that turned would draw"),
+        (lambda: PosePrior().build({"x": 48}), r"needs to know the skeleton; use build_for\(windows\)"),
+    ],
+)
+def test_what_it_refuses(run, message):
+    with pytest.raises(ValueError, match=message):
+        run()
+
+
+def test_a_quick_fit_repeats_and_leaves_the_random_state(train):
+    state = torch.get_rng_state()
+    first, second, other = (fit_pose_prior(train, steps=5, seed=seed).state_dict() for seed in (0, 0, 1))
+    assert torch.equal(torch.get_rng_state(), state)
+    assert all(torch.equal(value, second[name]) for name, value in first.items())
+    assert any(not torch.equal(value, other[name]) for name, value in first.items())
+    copy.deepcopy(fit_pose_prior(train, steps=1))
+
+
+def gain(windows, steps):
+    """Nats by which a fitted prior exceeds the normal with mean and covariance of such poses, on other draws."""
+    prior = fit_pose_prior(windows, steps=steps)
+    batches = PosePrior().batches(windows)
+    first, second = (
+        prior.skeleton.directions(batches.sample(1024, torch.Generator().manual_seed(seed))["x"].double()).flatten(0, 1)
+        for seed in (1, 2)
+    )
+    normal = MultivariateNormal(first.mean(0), first.T.cov())
+    with torch.no_grad():
+        return (prior.flow.distribution().log_prob(second) - normal.log_prob(second)).mean()
+
+
+@pytest.mark.data
+def test_on_real_poses_it_is_at_least_the_normal_in_closed_form():
+    file = DATA / "bandai" / "bandai2.npz"
+    if not file.exists():
+        pytest.skip("the real motion capture is not beside the project")
+    windows = motion.windows(motion.load(file), motion.PROTOCOLS["bandai2-by-style"], "train")
+    assert gain(windows, steps=200) > 0
