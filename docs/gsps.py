@@ -53,14 +53,16 @@ def control(path: str, samples: int = 50) -> str:
     return table(["", "APD lower", "APD upper"], rows)
 
 
+def _same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
+    return evaluation.data, evaluation.samples, evaluation.seed, evaluation.pose_prior
+
+
 if __name__ == "__main__":
     run, *files = sys.argv[1:]
     found = {Path(file).stem: dvae.Evaluation.load(file) for file in files}
     first = next(iter(found.values()))
-    if any(
-        (other.data, other.samples, other.seed) != (first.data, first.samples, first.seed) for other in found.values()
-    ):
-        sys.exit("these evaluations are not of the same windows, samples and seed")
+    if any(_same(each) != _same(first) for each in found.values()):
+        sys.exit("these evaluations differ in windows, samples, seed or pose prior")
     references = {name: row for name, row in first.rows.items() if name != "gsps"}
     rows = references | {name.replace("-", " "): each.rows["gsps"] for name, each in found.items()}
     evaluation = replace(first, rows=rows)

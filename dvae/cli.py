@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     MethodOptions = Any
 else:
     SweptMethod = tyro.extras.literal_type_from_choices(
-        [name for name, kind in methods().items() if "generative" not in {option.name for option in fields(kind)}]
+        [n for n, kind in methods().items() if kind.forecasts and "generative" not in {o.name for o in fields(kind)}]
     )
     MethodOptions = make_dataclass(
         "MethodOptions",
@@ -327,7 +327,8 @@ def sweep(
             f"{len(failed)} of {len(results)} runs failed, the same command tries them again\n"
             + "\n".join(map(str, failed))
         )
-    OUT.print(f"all {len(results)} runs have ended; compare them with: dvae compare {out}/*", soft_wrap=True)
+    how = "compare" if all(each.likelihood for each in chosen) else "evaluate"
+    OUT.print(f"all {len(results)} runs have ended; {how} them with: dvae {how} {out}/*", soft_wrap=True)
 
 
 @app.command(help="Score runs on test windows.")

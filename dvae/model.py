@@ -142,11 +142,11 @@ class DynamicalVAE(nn.Module):
             raise ValueError(f"history={self.history!r}, but the context is {', '.join(self.context) or 'none'}")
         for factor in self.generative.factors:
             read = None if self.history is None else factor.parent(self.history)
-            relation = None if read is None else read.relation
-            if relation is not None and relation.intervals is not None and relation.directions & {0, 1}:
+            if read is not None and (read.relation is None or read.relation.intervals is not None):
                 raise ValueError(
-                    f"{factor} reads the data themselves at t or later, as {self.history} is their history; read "
-                    f"{self.history}_{{<t}}, or a mask of your own that hides the frames to be generated"
+                    f"{factor} reads {read}, but {self.history} is the data themselves, of which a forecast has the "
+                    f"past alone; give {self.history} a mask of your own that hides the frames to be made, such as "
+                    f'{self.history}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
                 )
 
     @property
@@ -179,13 +179,14 @@ class DynamicalVAE(nn.Module):
             prefix: name to the first values (B, O, D) of a latent.
             mean_emission: a free run sets the data variables to their means and does not draw them.
             self_feeding: scheduled sampling of the data's history; a probability, or `SelfFeeding`.
-            draws: variable to a number n: from there on the program goes on n times for each sequence, with a draw
+            draws: latent to a number n: from there on the program goes on n times for each sequence, with a draw
                 of this variable each. Later variables have n times as many rows, draw by draw.
 
         Returns:
             Name to value of every variable.
         """
         self._register()
+        self._check_draws(draws or {})
         rollout = self._rollout(self.generative, self.generator, batch, length, size)
         for name, value in (prefix or {}).items():
             if name not in self.latents or value.dim() != 3 or value.shape[1] > rollout.length:
@@ -220,6 +221,7 @@ class DynamicalVAE(nn.Module):
             Name to value of every latent.
         """
         self._register()
+        self._check_draws(draws or {})
         rollout = self._rollout(self.inference, self.encoder, batch, None, 1)
         for name in self.observed:
             if name not in rollout.values and any(name in c.parents for c in self.encoder.values()):
@@ -277,6 +279,16 @@ class DynamicalVAE(nn.Module):
                         sofar[name].append(pyro.sample(f"{name}_{t + 1}", at_t, obs=data))
                 known |= {name: torch.stack(values, 1) for name, values in sofar.items()}
 
+    def _check_draws(self, draws: Mapping[str, int]) -> None:
+        ours = [name for block in self.generative.blocks for name in block.names if name in draws]
+        if set(draws) - set(self.latents) or ours != [name for name in self.latents if name in draws]:
+            raise ValueError(
+                f"draws are of latents that model and guide draw in the same order; got {', '.join(draws)}, where the "
+                f"guide draws {', '.join(self.latents) or 'nothing'} and the model {', '.join(ours) or 'none of them'}"
+            )
+        if any(count < 1 for count in draws.values()):
+            raise ValueError(f"draws are numbers from 1, got {dict(draws)}")
+
     # What is done with it ------------------------------------------------------------------------------------------
 
     @torch.no_grad()
@@ -313,7 +325,8 @@ class DynamicalVAE(nn.Module):
             draw_emission: draw the data from their distribution instead of taking its mean, as the papers of human
                 motion do. Predictive densities need the draws.
             fix: what is the same in all samples: the future (B, H, D) of a data variable, or the value (B, D) of a
-                static latent, such as one sample of an earlier forecast. What is not fixed is drawn given it.
+                static latent, such as one sample of an earlier forecast. Later variables read it; latents are not
+                inferred from it.
 
         Returns:
             Name to (S, B, H, D) for the data, (S, B, O + H, D) for local and (S, B, D) for static latents; with parts,
@@ -445,12 +458,16 @@ class DynamicalVAE(nn.Module):
 
         values = tensors(batch)
         whole = values.pop(WHOLE, None) if self.parts else values.get(self.observed[0])
+        mask = values.get("mask")
+        if isinstance(mask, Mapping):
+            mask = mask.get(WHOLE if self.parts else self.observed[0])
         if whole is not None and self.parts:
             values = {**self._apart(whole), **values}
-            if isinstance(mask := values.get("mask"), Tensor):
+            if mask is not None:
                 values["mask"] = {name: mask[..., list(places)] for name, places in self.parts.items()}
         if whole is not None and self.history is not None:
-            values.setdefault(self.history, whole)
+            seen = whole if mask is None or mask.shape != whole.shape else whole.masked_fill(~mask, 0)
+            values.setdefault(self.history, seen)
         return values
 
     def _apart(self, whole: Tensor) -> dict[str, Tensor]:
@@ -493,7 +510,13 @@ class DynamicalVAE(nn.Module):
         if length < 1:
             raise ValueError(f"length is at least 1, got {length}")
         if self.history in local and local[self.history].shape[1] < length:  # the mask hides what is not there yet
-            gap = length - local[self.history].shape[1]
+            past = local[self.history].shape[1]
+            gap = length - past
+            for factor in factorization.factors:
+                if factor.parent(self.history) is not None and factor.mask(self.history, length)[:, past:].any():
+                    raise ValueError(
+                        f"{factor} reads more than the first {past} frames of {self.history}, which are all there are"
+                    )
             values[self.history] = local[self.history] = functional.pad(local[self.history], (0, 0, 0, gap))
             steps = {v.shape[1] for v in local.values()}
         prefix = {name: v for name, v in local.items() if v.shape[1] < length}

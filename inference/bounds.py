@@ -54,7 +54,8 @@ class Terms:
     @property
     def bound(self) -> Tensor:
         """(B,) the unweighted evidence lower bound; energies are not part of it."""
-        return sum(self.log_likelihood.values()) - sum(self.kl.values())  # type: ignore[return-value]
+        none = torch.zeros_like(self.frames)
+        return sum(self.log_likelihood.values(), none) - sum(self.kl.values(), none)
 
     @property
     def per_frame(self) -> Tensor:

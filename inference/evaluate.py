@@ -135,6 +135,7 @@ class Evaluation(Result):
         emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it.
         bound_particles: particles of the importance bound, 0 where it was not computed.
         seed: the seed of every method's draws.
+        pose_prior: SHA-256 of the weights of the pose prior that scored the poses, if one did.
     """
 
     rows: dict[str, Row]
@@ -146,6 +147,7 @@ class Evaluation(Result):
     emission: str
     bound_particles: int
     seed: int
+    pose_prior: str | None = None
 
     def __getitem__(self, method: str) -> dict[str, Score]:
         return {name: self._score(np.array(means)) for name, means in self._row(method).clip_means.items()}
@@ -535,6 +537,7 @@ def evaluate(
         emission="drawn" if draw_emission else "mean",
         bound_particles=bound_particles,
         seed=seed,
+        pose_prior=None if pose_prior is None else _hash(pose_prior),
     )
 
 
@@ -670,9 +673,21 @@ def _bone_length_error(windows: Any, observed: Tensor, forecasts: Tensor) -> Ten
     return (lengths / reference.mean(1)[:, None, None] - 1).abs().mean((1, 2, 3))
 
 
+def _hash(module: nn.Module) -> str:
+    digest = hashlib.sha256()
+    for name, value in module.state_dict().items():
+        digest.update(name.encode() + value.cpu().numpy().tobytes())
+    return digest.hexdigest()
+
+
 @torch.no_grad()
 def _pose_nll(prior: Any, observed: Tensor, forecasts: Tensor) -> Tensor:
     """(B,) from (B, O, D) and (B, K, T, D)."""
+    if prior.forward_at not in (None, observed.shape[1] - 1):
+        raise ValueError(
+            f"the pose prior reads windows turned at their frame {prior.forward_at + 1}, but here "
+            f"{observed.shape[1]} frames are observed; fit one under this protocol"
+        )
     past = observed[:, None].expand(-1, forecasts.shape[1], -1, -1)
     motion = prior.facing(torch.cat([past, forecasts], 2))[:, :, observed.shape[1] :]
     return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)

@@ -487,7 +487,9 @@ class _Loop:
         score, counts = -row["loss"] if "loss" in row else row["bound"], True
         if self.final_feeding:
             fed = self._score(data, self.final_feeding)
-            row["self_fed/bound"], score = fed["bound"], -fed["loss"] if "loss" in fed else fed["bound"]
+            what = "loss" if "loss" in fed else "bound"
+            row[f"self_fed/{what}"] = fed[what]
+            score = -fed[what] if what == "loss" else fed[what]
             counts = self._rates["self_feeding"] == self.final_feeding
         if counts:
             state.waited += 1
@@ -731,7 +733,7 @@ def _forked_random_state(device: torch.device) -> Iterator[None]:
 def _sums(terms: Terms) -> dict[str, Tensor]:
     """Each term summed over the sequences of a batch, and the number of frames."""
     named = {
-        "bound": terms.bound,
+        **({"bound": terms.bound} if terms.likelihood else {}),
         **{f"log_likelihood/{name}": value for name, value in terms.log_likelihood.items()},
         **{f"kl/{name}": value for name, value in terms.kl.items()},
         **{f"energy/{name}": value for name, value in terms.energies.items()},

@@ -24,6 +24,7 @@ from dataclasses import dataclass, fields, replace
 from itertools import accumulate
 from math import prod
 from operator import mul
+from string import ascii_lowercase
 from typing import Any, ClassVar
 
 import numpy as np
@@ -191,12 +192,12 @@ class GSPS(Method):
         return replace(self, **{n: self._spread(n, v) for n, v in chosen.items() if getattr(self, n) is None})
 
     def _spread(self, name: str, value: Any) -> Any:
-        """A preset for two parts, for the parts that there are: as many futures as of two, shared among them."""
+        """A preset for two parts, for the parts that there are: with no more futures, if each has two draws."""
         count = len(self.parts)
         if not isinstance(value, tuple) or count == len(value):
             return value
         if name == "draws":
-            return (max(2, round(prod(value) ** (1 / count))),) * count
+            return (max(2, int(prod(value) ** (1 / count))),) * count
         return (sum(value) / count,) * count
 
     def build_for(self, windows: Windows) -> GSPSModel:
@@ -220,12 +221,13 @@ class GSPS(Method):
             ValueError: a pose prior of another skeleton.
         """
         assert isinstance(model, GSPSModel)
+        method = model.method
         if model.limits is not None:
-            limits = estimate_angle_limits(windows.poses(), windows.skeleton, self.angle_quantile)
+            limits = estimate_angle_limits(windows.poses(), windows.skeleton, method.angle_quantile)
             model.angle_low.copy_(limits.low)
             model.angle_high.copy_(limits.high)
         if model.pose_prior is not None:
-            model.pose_prior.load_state_dict(self._fitted_prior(windows).state_dict())
+            model.pose_prior.load_state_dict(method._fitted_prior(windows).state_dict())
 
     def _fitted_prior(self, windows: Windows) -> nn.Module:
         if not self.pose_prior_run:
@@ -261,13 +263,20 @@ class GSPS(Method):
         return WithPseudoTruths(windows, truths)
 
     def objective(self) -> Objective:
-        """The weighted energies, summed; in `Evidence`'s unit, per frame."""
+        """The weighted energies, summed; in `Evidence`'s unit, per frame.
+
+        Raises:
+            ValueError: weights that are still open, which the skeleton decides.
+        """
+        if self.diversity is None:
+            raise ValueError("the weights depend on the skeleton; take those of method.suited(windows)")
         weights = {name: getattr(self, name) for name in WEIGHTS}
-        diversity = _each(self.diversity or SCALED["diversity"], self.parts)
+        diversity = _each(self.diversity, self.parts)
         weights |= {f"diversity_{name}": weight for name, weight in zip(self.names, diversity, strict=True)}
         return Evidence(energy_weights={name: weight for name, weight in weights.items() if weight})
 
 
+HISTORY = "h"
 WEIGHTS = ("reconstruction", "multimodal", "history", "limb", "angles", "pose_prior")
 
 
@@ -293,20 +302,20 @@ class GSPSModel(DynamicalVAE):
         count = skeleton.joints - 1
         parts = {name: [3 * joint + axis for joint in held for axis in range(3)] for name, held in joints.items()}
         codes = _codes(list(parts))
-        everything = {"h": range(count), **joints}
+        everything = {HISTORY: range(count), **joints}
         assert method.coefficients is not None
         assert method.width is not None
         super().__init__(
             part_by_part(list(parts), lambda _: observed),
             None,
-            {"h": 3 * count, **dict.fromkeys(codes, method.latent), **{name: len(p) for name, p in parts.items()}},
+            {HISTORY: 3 * count, **dict.fromkeys(codes, method.latent), **{name: len(p) for name, p in parts.items()}},
             network={
                 f"p({name})": GraphConv(everything, name, length, method.coefficients, method.width, method.blocks)
                 for name in parts
             },
             heads={f"p({name})": Delta() for name in parts},
             parts=parts,
-            history="h",
+            history=HISTORY,
         )
         self.method, self.skeleton, self.frames, self.length = method, skeleton, observed, length
         self.draws = dict(zip(codes, _each(method.draws, method.parts), strict=True))
@@ -319,27 +328,34 @@ class GSPSModel(DynamicalVAE):
         self.pose_prior = PosePriorModel(skeleton).requires_grad_(False) if method.pose_prior else None
 
     def model(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
-        """See `DynamicalVAE.model`; on whole windows, with energies."""
-        if not self._whole(batch):
-            return super().model(batch, **options)
+        """See `DynamicalVAE.model`; of whole windows, with energies. Values are as the networks see them, turned."""
+        if not self._whole(batch, options):
+            return super().model(_without_futures(batch), **options)
         assert isinstance(batch, Mapping)
+        values = self._with_whole(super().model(_without_futures(batch), **{"draws": self.draws, **options}))
         truth = self.turned(batch[WHOLE])[0]
-        values = self._with_whole(super().model({WHOLE: truth}, draws=self.draws))
-        size = len(truth)
-        with pyro.plate("windows", size, dim=-1):
+        with pyro.plate("windows", len(truth), dim=-1):
             for name, energy in self.energies(values, truth, batch).items():
                 pyro.factor(name, -energy)
         return values
 
     def guide(self, batch: Batch, **options: Any) -> dict[str, Tensor]:
         """See `DynamicalVAE.guide`."""
-        if not self._whole(batch):
-            return super().guide(batch, **options)
-        assert isinstance(batch, Mapping)
-        return super().guide({WHOLE: batch[WHOLE]}, draws=self.draws)
+        draws = {"draws": self.draws} if self._whole(batch, options) else {}
+        return super().guide(_without_futures(batch), **{**draws, **options})
 
-    def _whole(self, batch: Batch | None) -> bool:
-        return isinstance(batch, Mapping) and WHOLE in batch and batch[WHOLE].shape[1] == self.length
+    def _whole(self, batch: Batch | None, options: Mapping[str, Any]) -> bool:
+        """Whether there is a truth to score futures by: the program is asked for no more than what the batch holds."""
+        given = batch[WHOLE] if isinstance(batch, Mapping) and WHOLE in batch else None
+        return given is not None and given.shape[1] == self.length and options.get("length") is None
+
+    def _mapping(self, batch: Batch | None) -> dict[str, Any]:
+        """The history turned, wherever a batch comes from."""
+        values = super()._mapping(batch)
+        given = batch if not isinstance(batch, Mapping) else batch.get(WHOLE)
+        if given is not None:
+            values[HISTORY] = self.turned(values[HISTORY])[0]
+        return values
 
     def energies(self, values: Mapping[str, Tensor], truth: Tensor, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The energies of futures that were drawn together, (B,) each; those of weight 0 are left out.
@@ -358,7 +374,7 @@ class GSPSModel(DynamicalVAE):
         if method.multimodal:
             found["multimodal"] = truth.new_zeros(size)
             if "pseudo" in batch:
-                others = batch["pseudo"][:, :, past:]
+                others = self.turned(batch["pseudo"])[0][:, :, past:]
                 found["multimodal"] = energies.multimodal_best_of_many(future, others, batch["valid"])
         if method.history:
             found["history"] = energies.history_error(samples[:, :, :past], truth[:, :past])
@@ -368,7 +384,7 @@ class GSPSModel(DynamicalVAE):
             limits = AngleLimits(self.limits, self.angle_low, self.angle_high)
             found["angles"] = energies.joint_angles(future, limits, self.skeleton)
         if self.pose_prior is not None:
-            offset = int(torch.randint(3, ()))  # every third frame, another third at every step
+            offset = int(torch.randint(min(3, future.shape[2]), ()))  # every third frame, another third at every step
             found["pose_prior"] = energies.pose_prior_energy(future[:, :, offset::3], self.pose_prior, self.skeleton)
         draws = list(self.draws.values())
         names = list(self.parts)
@@ -396,43 +412,63 @@ class GSPSModel(DynamicalVAE):
         Raises:
             ValueError: other observed frames than the networks see, or a horizon beyond what they make.
         """
-        x = self._mapping(batch)[str(self.history)]
+        x = super()._mapping(batch)[HISTORY]
         most = self.length - self.frames
         if x.shape[1] != self.frames or not 1 <= horizon <= most:
             raise ValueError(
                 f"this model sees {self.frames} frames and makes up to {most} more, but was given {x.shape[1]} frames "
                 f"and asked for {horizon}"
             )
-        given = dict(fix or {})
+        given = {name: torch.as_tensor(value).to(x) for name, value in (fix or {}).items()}
         for name in given.keys() & self.parts.keys():
-            if given[name].shape[1:2] != (most,):
+            if given[name].shape != (len(x), most, self.sizes[name]):
                 raise ValueError(
-                    f"the fixed {name} has shape {tuple(given[name].shape)}; it must have all {most} frames"
+                    f"the fixed {name} has shape {tuple(given[name].shape)}; it must have all {most} frames, "
+                    f"{(len(x), most, self.sizes[name])}"
                 )
-        turned, heading = self.turned(x)
-        turn = None if heading is None else heading[:, None]
-        held = {
-            n: self._rotated(v, None if turn is None else -turn) if n in self.parts else v for n, v in given.items()
-        }
-        out = super().forecast({WHOLE: turned}, most, samples, fix=held)
-        for name in (WHOLE, *self.parts):
-            out[name] = self._rotated(out[name], turn)
+        heading = self.turned(x)[1]
+        back = None if heading is None else -heading
+        held = {name: self._rotated(v, back) if name in self.parts else v for name, v in given.items()}
+        out = self._back(super().forecast(batch, most, samples, fix=held), heading)
         for name, value in given.items():  # turning there and back rounds
-            out[name] = value.to(out[name]).expand_as(out[name])
+            out[name] = value.expand_as(out[name])
         out = self._with_whole(out)
         return {name: value[:, :, :horizon] if name in (WHOLE, *self.parts) else value for name, value in out.items()}
 
+    @torch.no_grad()
+    def sample(self, n: int = 1, length: int | None = None, batch: Batch | None = None) -> dict[str, Tensor]:
+        """See `DynamicalVAE.sample`; the batch holds what was observed."""
+        if batch is None:
+            raise ValueError("this model goes on from a history; give it as batch")
+        return self._back(super().sample(n, self.length if length is None else length, batch), self._heading(batch))
+
+    @torch.no_grad()
+    def reconstruct(self, batch: Batch, samples: int = 1) -> dict[str, Tensor]:
+        """See `DynamicalVAE.reconstruct`."""
+        return self._back(super().reconstruct(batch, samples), self._heading(batch))
+
+    def _heading(self, batch: Batch) -> Tensor | None:
+        return self.turned(super()._mapping(batch)[HISTORY])[1]
+
+    def _back(self, values: dict[str, Tensor], heading: Tensor | None) -> dict[str, Tensor]:
+        """Motion as the networks make it, turned back."""
+        return {n: self._rotated(v, heading) if n in (WHOLE, *self.parts) else v for n, v in values.items()}
+
     def turned(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Windows (B, T or O, D) as the networks see them, and the headings (B,) that they had; None if they stay."""
-        if not self.method.heading:
-            return x, None
-        return face_forward(x, self.skeleton, self.frames - 1)
+        """Windows (..., T, D) as the networks see them, and the headings (...) that they had; None if they stay."""
+        return face_forward(x, self.skeleton, self.frames - 1) if self.method.heading else (x, None)
 
     def _rotated(self, x: Tensor, angle: Tensor | None) -> Tensor:
-        """(..., B, T, D) turned about the up axis by (B, 1)."""
+        """(..., B, T, D) turned about the up axis by (B,)."""
         if angle is None:
             return x
-        return rotate_about_up(x.unflatten(-1, (-1, 3)), angle[..., None], self.skeleton.up).flatten(-2)
+        joints = rotate_about_up(x.unflatten(-1, (-1, 3)), angle[:, None, None], self.skeleton.up)
+        return joints.flatten(-2)
+
+
+def _without_futures(batch: Any) -> Any:
+    """The batch without the pseudo ground truths, which are no variables of the model."""
+    return {n: v for n, v in batch.items() if n not in ("pseudo", "valid")} if isinstance(batch, Mapping) else batch
 
 
 def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factorization:
@@ -445,8 +481,9 @@ def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factor
 
 
 def _codes(parts: Sequence[str]) -> list[str]:
-    """The names of the parts' latents: a, b, ..."""
-    return [chr(ord("a") + i) for i in range(len(parts))]
+    """The names of the parts' latents: a, b, ..., but for names that are taken."""
+    free = (letter for letter in ascii_lowercase if letter not in {HISTORY, WHOLE, *parts})
+    return [code for code, _ in zip(free, parts, strict=False)]
 
 
 def _each(values: Sequence[Any] | None, parts: Sequence[str]) -> Sequence[Any]:

@@ -202,7 +202,7 @@ class PosePriorModel(nn.Module):
 def fit_pose_prior(
     windows: Windows, steps: int = 1000, seed: int = 0, progress: bool = True, **options: Any
 ) -> PosePriorModel:
-    """Fits a pose prior quietly, on the CPU, in about ten seconds.
+    """Fits a pose prior quietly, on the CPU, in about fifteen seconds.
 
     Args:
         windows: training windows.
@@ -215,7 +215,7 @@ def fit_pose_prior(
         The model, in evaluation mode, with its last weights.
     """
     method = PosePrior(**options)
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng():
         torch.manual_seed(seed)
         model = method.build_for(windows)
         method.prepare(model, windows)

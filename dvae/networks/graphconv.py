@@ -102,15 +102,22 @@ class GraphConvNetwork(Network):
                 f"GraphConv(length={self.spec.length}) was given {length} steps{ragged}; it makes sequences of its "
                 "length"
             )
-        known = self._coefficients(parents)
+        if self.training and len(parents[self.trajectories[0][0]]) == 1:
+            raise ValueError(
+                "GraphConv normalises over the batch, which in training needs more than one row; take a larger batch "
+                "or more draws"
+            )
+        with torch.autocast(self.last.weight.device.type, enabled=False):  # positions need all their digits
+            known = self._coefficients(parents)
         static = [parents[name][:, None].expand(-1, known.shape[1], -1) for name in self.statics]
         joined = torch.cat([known, *static], dim=-1)
         hidden = self.first(joined)
         for block in self.rest:
             hidden = hidden + block(hidden)
         made = (self.last(hidden) + joined)[:, self.own, : self.inner]  # (B, own joints, 3 C)
-        made = made.unflatten(-1, (3, -1)).flatten(1, 2)
-        return (made @ self._transform(length, made)).transpose(1, 2)
+        made = made.unflatten(-1, (3, -1)).flatten(1, 2).to(known.dtype)
+        with torch.autocast(made.device.type, enabled=False):
+            return (made @ self._transform(length, made)).transpose(1, 2)
 
     def _coefficients(self, parents: Mapping[str, Tensor]) -> Tensor:
         """(B, joints, 3 C): coefficients of x, then of y, then of z."""
@@ -154,7 +161,8 @@ class _Convolution(nn.Module):
         self.norm: Any = nn.BatchNorm1d(joints * out) if normalised else None
 
     def forward(self, nodes: Tensor) -> Tensor:
-        out: Tensor = _Mix.apply(self.adjacency, nodes @ self.weight)
+        nodes = nodes @ self.weight
+        out: Tensor = _Mix.apply(self.adjacency.to(nodes.dtype), nodes)  # under autocast the product has another type
         if self.bias is not None:
             out = out + self.bias
         return out if self.norm is None else torch.tanh(self.norm(out.flatten(1)).view(out.shape))
