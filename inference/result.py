@@ -39,7 +39,7 @@ class Result:
         lines = "\n".join(
             line.rstrip() for line in console.export_html(inline_styles=True, code_format="{code}").split("\n")
         )
-        return f'<pre style="line-height:normal">{lines}</pre>'
+        return f'<pre style="line-height:normal; font-family:monospace">{lines}</pre>'
 
 
 def progress_bar(shown: bool) -> Progress:
