@@ -10,6 +10,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
+from itertools import accumulate
+from operator import mul
 from typing import Any
 
 import pyro
@@ -280,11 +282,12 @@ class DynamicalVAE(nn.Module):
                 known |= {name: torch.stack(values, 1) for name, values in sofar.items()}
 
     def _check_draws(self, draws: Mapping[str, int]) -> None:
-        ours = [name for block in self.generative.blocks for name in block.names if name in draws]
-        if set(draws) - set(self.latents) or ours != [name for name in self.latents if name in draws]:
+        ours = [name for block in self.generative.blocks for name in block.names if name in self.latents]
+        rows = [dict(zip(o, accumulate((draws.get(n, 1) for n in o), mul), strict=True)) for o in (ours, self.latents)]
+        if set(draws) - set(self.latents) or rows[0] != rows[1]:
             raise ValueError(
-                f"draws are of latents that model and guide draw in the same order; got {', '.join(draws)}, where the "
-                f"guide draws {', '.join(self.latents) or 'nothing'} and the model {', '.join(ours) or 'none of them'}"
+                f"draws are of latents, in one order for model and guide; got {', '.join(draws)}, where the model "
+                f"draws {', '.join(ours) or 'nothing'} and the guide {', '.join(self.latents) or 'nothing'}"
             )
         if any(count < 1 for count in draws.values()):
             raise ValueError(f"draws are numbers from 1, got {dict(draws)}")

@@ -159,3 +159,54 @@ def test_it_generates_in_a_model_of_ones_own():
     forecast = model.forecast(x[:, :OBSERVED], LENGTH - OBSERVED, 2)
     assert forecast["x"].shape == (2, 4, LENGTH - OBSERVED, 15)
     assert torch.equal(forecast["x"][..., model.parts["lower"]], forecast["lower"])
+
+
+def generator(**options):
+    """GSPS's form with a likelihood, for sequences that stand for parts and history at once."""
+    equations = "p(a) p(lower_t | h_{1:O}, a) p(upper_t | h_{1:O}, lower_{1:T}, a)"
+    return dvae.DynamicalVAE(
+        equations,
+        None,
+        {"a": 2, "h": 15, "lower": 6, "upper": 9},
+        {f"p({name})": GraphConv(EVERYTHING, name, LENGTH, 3, 6, 1) for name in ("lower", "upper")},
+        {f"p({name})": dvae.heads.FixedNormal(0.1) for name in ("lower", "upper")},
+        parts={"lower": [0, 1, 2, 9, 10, 11], "upper": [3, 4, 5, 6, 7, 8, 12, 13, 14]},
+        history="h",
+        masks={"1:O": lambda T: np.arange(T)[None] < OBSERVED},
+        **options,
+    ).double()
+
+
+def test_a_history_hides_what_its_data_hide():
+    model, x = generator().eval(), torch.randn(3, LENGTH, 15, dtype=torch.float64)
+    seen = torch.rand(x.shape) < 0.7
+    bounds = []
+    for hidden in (0.0, 77.0, torch.nan):
+        torch.manual_seed(0)
+        batch = {"x": torch.where(seen, x, hidden), "mask": seen}
+        bounds.append(dvae.SequenceELBO().terms(model, batch).bound)
+    assert torch.isfinite(bounds[0]).all()
+    assert torch.equal(bounds[0], bounds[1])
+    assert torch.equal(bounds[0], bounds[2])
+
+
+def test_a_history_is_refused_where_a_forecast_would_not_have_it():
+    with pytest.raises(ValueError, match="a forecast has the past alone"):
+        dvae.DynamicalVAE("p(z) p(x_t | h_{<t}, z)", "q(z | x_{1:T})", {"z": 1, "x": 2, "h": 2}, history="h")
+    with pytest.raises(ValueError, match="more than the first 3 frames of h"):
+        generator().forecast(torch.randn(2, 3, 15), LENGTH - 3)
+
+
+def test_draws_come_in_one_order():
+    model = dvae.DynamicalVAE("p(a) p(b) p(x_t | a, b)", "q(b | x_{1:T}) q(a | b, x_{1:T})", {"a": 1, "b": 1, "x": 2})
+    for draws in ({"a": 2, "b": 3}, {"b": 3}):
+        with pytest.raises(ValueError, match="in one order for model and guide"):
+            model.guide(torch.randn(2, 3, 2), draws=draws)
+    model = dvae.DynamicalVAE("p(a) p(b) p(x_t | a, b)", "q(a | x_{1:T}) q(b | a, x_{1:T})", {"a": 1, "b": 1, "x": 2})
+    terms = dvae.SequenceELBO().terms(model, torch.randn(2, 3, 2), draws={"b": 3})
+    assert terms.kl["a"].shape == terms.kl["b"].shape == (2,)
+
+
+def test_one_row_has_no_batch_to_normalise_over():
+    with pytest.raises(ValueError, match="needs more than one row"):
+        network().train()(parents(1), LENGTH)
