@@ -74,7 +74,7 @@ SCALED: dict[str, Any] = {
     "coefficients": 8,
     "width": 128,
     "draws": (4, 4),
-    "diversity": (5.0, 10.0),
+    "diversity": (2.0, 4.0),
     "diversity_scale": (15.0, 50.0),
     "pseudo_minimum": 0.02,
     "pool_stride": 10,
