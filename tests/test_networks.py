@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvae.networks import Attention, Dense, Input, Linear, Recurrent
+from dvae.networks import Attention, Dense, FrameGraph, Input, Linear, PoseGraph, Recurrent, SelfAttention
 from dvae.networks.base import computing_once, shift
 from dvae.networks.recurrent import tie
 from dvae.notation import Relation
@@ -27,6 +27,8 @@ NETWORKS = {
     ),
     "attention": Attention(8, heads=2),
     "attention, two layers": Attention(8, heads=4, layers=2, feedforward=6),
+    "attention, extracted": Attention(8, heads=2, nearest=False, extract={"z": PoseGraph(2), "x": (3,), "w": (4,)}),
+    "lstm, poses": Recurrent(4, extract={"z": PoseGraph(2), "x": PoseGraph(2)}, hidden=(5,)),
     "dense": Dense((5, 4)),
 }
 RELATIONS = [
@@ -119,6 +121,83 @@ def test_a_static_child_reads_what_its_mask_shows(kind, relation):
     assert network(parents, T).shape == (3, network.features)
     one = {name: value[:1] for name, value in parents.items()}
     assert np.array_equal(reads(network, one, "z"), relation.mask(T)[:1])
+
+
+ENCODERS = {
+    "whole": ({"x": "1:T", "u": "1:T", "w": None}, set()),
+    "past": ({"x": "<=t", "w": None}, set()),
+    "future": ({"x": ">=t", "u": ">=t"}, set()),
+    "whole, then its own past": ({"x": "1:T", "w": None, "z": "<t"}, {"z"}),
+    "whole, then what another sight shows": ({"x": "1:T", "u": "<=t", "c": "t-1", "z": "<t"}, {"u", "z"}),
+}
+
+
+def encoder_inputs(pair):
+    return [Input(name, 3, relation and Relation.parse(relation)) for name, relation in ENCODERS[pair][0].items()]
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+@pytest.mark.parametrize("pair", ENCODERS)
+def test_an_encoder_obeys_its_masks_step_by_step_and_in_ragged_batches(pair, layers):
+    inputs, live = encoder_inputs(pair), ENCODERS[pair][1]
+    network = SelfAttention(8, heads=4, layers=layers, extract={"x": PoseGraph(2)}).build(inputs, True, 2).double()
+    parents = draw(inputs, 1)
+    for parent in inputs:
+        if parent.relation is not None:
+            assert np.array_equal(
+                reads(network, parents, parent.name), np.broadcast_to(parent.relation.mask(T), (T, T))
+            )
+    lengths = torch.tensor([3, T, 1])
+    for ragged in (None, lengths):
+        parents = draw(inputs, 3, lengths=ragged)
+        together = network(parents, T, ragged)
+        counted = torch.ones(3, T, 1) if ragged is None else (torch.arange(T) < lengths[:, None])[..., None]
+        alone = by_steps(network, parents, live, 1, ragged)
+        torch.testing.assert_close(alone * counted, together * counted, rtol=0, atol=1e-10)
+    for i, n in enumerate(lengths.tolist()):
+        single = network({k: v[i : i + 1, :n] if v.dim() == 3 else v[i : i + 1] for k, v in parents.items()}, n)
+        torch.testing.assert_close(together[i : i + 1, :n], single, rtol=0, atol=1e-10)
+
+
+def test_an_encoder_tells_past_from_future():
+    network = SelfAttention(8, heads=2).build([Input("x", 3, Relation.parse("1:T"))], True, 2).double()
+    x = torch.zeros(2, T, 3, dtype=torch.float64)
+    x[0, 1], x[1, 3] = 1, 1  # the same before and after the third frame
+    assert (network({"x": x}, T)[0, 2] - network({"x": x}, T)[1, 2]).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("steps", [1, 3, 4, 6])
+def test_a_frame_graph_reads_the_first_frames_and_in_training_a_window_anywhere(steps):
+    network = FrameGraph(4, width=5, blocks=2, extract={"x": PoseGraph(2)})
+    network = network.build([Input("x", 3, Relation.parse("1:T"))], False, 2).double()
+    x = torch.randn(64, steps, 3, dtype=torch.float64)
+    read = torch.autograd.functional.jacobian(lambda x: network.eval()({"x": x}, steps), x[:1])[0, :, 0]
+    assert read.abs().amax((0, 2)).bool().tolist() == [t < 4 for t in range(steps)]
+    starts = {s: network.eval()({"x": x[:, s:]}, steps - s) for s in range(max(1, steps - 3))}
+    trained = network.train()({"x": x}, steps)
+    chosen = [{s for s, found in starts.items() if torch.equal(found[i], row)} for i, row in enumerate(trained)]
+    assert set.union(*chosen) == set(starts)
+    assert all(chosen)
+    lengths = torch.randint(1, steps + 1, (64,))
+    ragged = network.eval()({"x": x}, steps, lengths)
+    for i, n in enumerate(lengths.tolist()):
+        torch.testing.assert_close(ragged[i : i + 1], network({"x": x[i : i + 1, :n]}, n), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("size", "features"), [(6, 4), (4, 8)])
+def test_pose_features_are_the_published_convolutions_frame_by_frame(size, features):
+    module = PoseGraph(2).build(size).double()
+    poses = torch.randn(3, 5, size, dtype=torch.float64)
+
+    def convolution(layer, nodes):
+        mixed = torch.einsum("ij,...jf,of->...io", layer.adjacency, nodes, layer.weight)
+        return torch.tanh(mixed + layer.bias)
+
+    nodes = convolution(module.first, poses.unflatten(-1, (features // 2, -1)))
+    for block in module.blocks:
+        nodes = nodes + convolution(block[1], convolution(block[0], nodes))
+    assert module.features == features
+    torch.testing.assert_close(module(poses), nodes.flatten(-2), rtol=0, atol=1e-12)
 
 
 def test_a_custom_mask_is_that_of_the_length_at_hand():
@@ -341,6 +420,8 @@ def test_shift_reads_zero_outside_of_the_sequence(steps, lag):
     ("spec", "relation", "message"),
     [
         (Attention(width=10, heads=4), "<t", "width 10 is not a multiple of heads 4"),
+        (SelfAttention(), "<t", r"SelfAttention encodes .* but the parents are z at {<t}; use networks.Attention"),
+        (FrameGraph(3), "1:T", "FrameGraph sums up parents read over"),
         (Recurrent(cell="rnn"), "<t", "unknown cell 'rnn'; known: gru, lstm"),
         (Dense(), "<t", r"Dense reads single steps of its parents, but z is read at \{<t\}; use networks.Recurrent"),
     ],

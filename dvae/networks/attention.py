@@ -12,21 +12,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .base import ACTIVATIONS, Hoisted, Input, Join, Network, at, valid_steps
+from ..notation import Relation
+from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, at, valid_steps
 from .dense import part
-from .rows import select
+from .extract import Extract, Extractors
+from .rows import Rows, select
 
 
 @dataclass(frozen=True)
 class Attention:
     """Pointwise parents form the query; parents read over a range are keys and values under their mask.
 
-    A learned start token is always visible, because a first step has no past. The nearest visible frame of each range
-    joins the query, which otherwise could not tell where in a motion it is.
+    A learned start token is always visible, because a first step has no past.
 
     Args:
         width: of queries, keys and values.
@@ -34,6 +36,10 @@ class Attention:
         layers: cross-attention layers over the same keys.
         feedforward: width of the perceptron after each attention; 0 for four times the width.
         activation: of the perceptrons.
+        nearest: the nearest visible frame of each range joins the query, which then knows where in a motion it is
+            before it attends to more.
+        extract: what comes before all else, by parent: widths of a perceptron, or the description of another module,
+            such as `PoseGraph()`.
     """
 
     width: int = 64
@@ -41,12 +47,30 @@ class Attention:
     layers: int = 1
     feedforward: int = 0
     activation: str = "gelu"
+    nearest: bool = True
+    extract: Extract = field(default_factory=dict)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> AttentionNetwork:
         """The network of a factor with these parents."""
-        if self.width % self.heads:
-            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
         return AttentionNetwork(self, inputs, local)
+
+
+@dataclass(frozen=True)
+class SelfAttention(Attention):
+    """A transformer's encoder: every frame is a token, of the parents in it and of static ones, and sees the others.
+
+    It is for a local variable that reads parents over {1:T}; over {<=t} or {>=t} it looks to one side. What else the
+    factor reads, such as its own past, is attended to after the encoder, as in `Attention`, with the frame's token in
+    the query. Heads take turns to look back and ahead: to the other side, distances count four times.
+    """
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> SelfAttentionNetwork:  # type: ignore[override]
+        """The network of a factor with these parents.
+
+        Raises:
+            ValueError: there is nothing to encode.
+        """
+        return SelfAttentionNetwork(self, inputs, local)
 
 
 class Layer(nn.Module):
@@ -54,6 +78,8 @@ class Layer(nn.Module):
 
     def __init__(self, spec: Attention):
         super().__init__()
+        if spec.width % spec.heads:
+            raise ValueError(f"width {spec.width} is not a multiple of heads {spec.heads}")
         self.heads = spec.heads
         inner = spec.feedforward or 4 * spec.width
         self.norm_query = nn.LayerNorm(spec.width)
@@ -89,9 +115,10 @@ class AttentionNetwork(Network):
     def __init__(self, spec: Attention, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, spec.width)
         self.heads = spec.heads
+        self.extractors = Extractors(self.inputs, spec.extract, spec.activation)
         self.points: list[tuple[Input, int | None]] = []
         self.ranged: list[Input] = []
-        for parent in self.inputs:
+        for parent in map(self.extractors.seen, self.inputs):
             lags = parent.lags
             if parent.relation is None:
                 self.points.append((parent, None))
@@ -99,7 +126,7 @@ class AttentionNetwork(Network):
                 self.points.append((parent, lags[0]))
             else:
                 self.ranged.append(parent)
-                if local and parent.relation.intervals is not None:
+                if spec.nearest and local and parent.relation.intervals is not None:
                     nearest = min(
                         (max(low, min(high, 0)) for low, high in parent.relation.intervals),
                         key=lambda lag: (abs(lag), lag),
@@ -113,8 +140,7 @@ class AttentionNetwork(Network):
         self.origin = nn.Parameter(torch.randn(spec.width) / math.sqrt(spec.width))
         self.layers = nn.ModuleList(Layer(spec) for _ in range(spec.layers if self.ranged else 0))
         self.norm = nn.LayerNorm(spec.width)
-        slopes = torch.tensor([2.0 ** (-8 * (h + 1) / spec.heads) for h in range(spec.heads)])
-        self.register_buffer("slopes", slopes, persistent=False)
+        self.register_buffer("slopes", _slopes(spec.heads), persistent=False)
 
     def bias(self, parent: Input, length: int) -> Tensor:
         """(heads, T, T) or (1, 1, T) for a static child: minus slope times distance where visible, else -inf."""
@@ -129,6 +155,7 @@ class AttentionNetwork(Network):
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """See `Network.forward`."""
         batch = next(iter(parents.values())).shape[0]
+        parents = self.extractors.of(parents, lengths)
         stream = self.queries(parents, batch, length)
         if self.ranged:
             tokens, bias = self.tokens(self.ranged, parents, batch, length, lengths)
@@ -170,6 +197,7 @@ class AttentionNetwork(Network):
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """See `Network.start`."""
+        given = self.extractors.of(given, lengths)
         known = {i: part(given[p.name], lag) for i, (p, lag) in enumerate(self.points) if p.name in given}
         queries = self.point.hoist(known, batch, length) if self.point is not None else None
         fixed = [p for p in self.ranged if p.name in given]
@@ -195,10 +223,13 @@ class AttentionNetwork(Network):
             length=length,
             masks={p.name: p.relation.mask(length).tolist() for p in live if p.relation is not None},
             caches=[Cache(layer.project(tokens), room=length * len(live)) for layer in self.layers],
+            extracted=self.extractors.start(length),
+            lengths=lengths,
         )
 
     def step(self, state: Attending, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         """See `Network.step`."""
+        drawn = self.extractors.drawn(state.extracted, drawn, state.lengths)
         stream = self.origin.expand(state.batch, -1)
         if state.queries is not None and self.point is not None:
             parts = [at(drawn[p.name], t + lag, stream, p.size) for p, lag in state.points if lag is not None]
@@ -219,6 +250,101 @@ class AttentionNetwork(Network):
             for layer, cache in zip(self.layers, state.caches, strict=True):
                 stream = layer(stream, cache.keys, cache.values, bias)
         return self.norm(stream[:, 0]), state
+
+
+class SelfAttentionNetwork(Network):
+    """See `SelfAttention`."""
+
+    slopes: Tensor
+    layers: Any
+
+    def __init__(self, spec: SelfAttention, inputs: Sequence[Input], local: bool):
+        super().__init__(inputs, local, spec.width)
+        self.extractors = Extractors(self.inputs, spec.extract, spec.activation)
+        frames = [parent for parent in self.inputs if local and _closed(parent)]
+        self.encoded = [p for p in frames if _sight(p) == _sight(frames[0])]
+        self.statics = [parent for parent in self.inputs if parent.relation is None]
+        rest = [parent for parent in self.inputs if parent not in (*self.encoded, *self.statics)]
+        if not self.encoded:
+            raise ValueError(
+                "SelfAttention encodes parents of a local variable that are read at {1:T}, {<=t} or {>=t}, but the "
+                f"parents are {', '.join(f'{p.name} at {p.relation.name}' for p in rest if p.relation) or 'static'}; "
+                "use networks.Attention for this factor"
+            )
+        tokens = [self.extractors.seen(parent).size for parent in (*self.encoded, *self.statics)]
+        self.embed = nn.Linear(sum(tokens), spec.width)
+        self.layers = nn.ModuleList(Layer(spec) for _ in range(spec.layers))
+        self.norm = nn.LayerNorm(spec.width)
+        self.register_buffer("slopes", _slopes(spec.heads), persistent=False)
+        then = replace(spec, extract={n: e for n, e in spec.extract.items() if n in [p.name for p in rest]})
+        token = Input(ENCODED, spec.width, Relation.parse("t"))
+        self.after = AttentionNetwork(then, [token, *rest], local) if rest else None
+
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """See `Network.forward`."""
+        encoded = self.encode(parents, length, lengths)
+        return encoded if self.after is None else self.after({ENCODED: encoded, **parents}, length, lengths)
+
+    def encode(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None) -> Tensor:
+        """The frames' tokens (B, T, W) after the encoder."""
+        values = self.extractors.of(parents, lengths)
+        stream = self.embed(torch.cat(aligned([values[p.name] for p in (*self.encoded, *self.statics)]), dim=-1))
+        bias = self.bias(length)
+        if lengths is not None:
+            bias = bias.masked_fill(~valid_steps(lengths, length)[:, None, None], -math.inf)
+            own = torch.eye(length, dtype=torch.bool, device=bias.device)
+            bias = bias.masked_fill(own, 0.0)  # padding sees itself: softmax over nothing is NaN
+        for layer in self.layers:
+            stream = layer(stream, *layer.project(layer.norm_query(stream)), bias)
+        return self.norm(stream)
+
+    def bias(self, length: int) -> Tensor:
+        """(1, heads, T, T): minus slope times distance where visible, else -inf."""
+        mask = torch.as_tensor(_mask(self.encoded[0], length), device=self.slopes.device)
+        steps = torch.arange(length, device=self.slopes.device, dtype=self.slopes.dtype)
+        ahead = steps[None, :] - steps[:, None]
+        looks_ahead = torch.arange(len(self.slopes), device=self.slopes.device)[:, None, None] % 2 == 1
+        away = ((ahead < 0) == looks_ahead) & mask.T.logical_and(mask).all()  # only where both sides are seen
+        distance = ahead.abs() * torch.where(away, 4, 1)
+        return (-self.slopes[:, None, None] * distance).masked_fill(~mask, -math.inf)[None]
+
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """See `Network.start`."""
+        if missing := [p.name for p in (*self.encoded, *self.statics) if p.name not in given]:
+            raise ValueError(f"SelfAttention encodes all frames at once; it cannot be in a loop with {missing[0]}")
+        encoded = self.encode(given, length, lengths)
+        if self.after is None:
+            return encoded.unbind(1)
+        return self.after.start({ENCODED: encoded, **given}, batch, length, lengths)
+
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        """See `Network.step`."""
+        return (state[t], state) if self.after is None else self.after.step(state, t, drawn)
+
+
+ENCODED = "encoded frame"
+"""How an encoder's output is called among the parents of what comes after it."""
+
+
+def _slopes(heads: int) -> Tensor:
+    return torch.tensor([2.0 ** (-8 * (h + 1) / heads) for h in range(heads)])
+
+
+def _mask(parent: Input, length: int) -> np.ndarray:
+    assert parent.relation is not None
+    return parent.relation.mask(length) & np.ones((length, 1), dtype=bool)
+
+
+def _sight(parent: Input) -> bytes:
+    return _mask(parent, 6).tobytes()
+
+
+def _closed(parent: Input) -> bool:
+    """Whether frames that exchange what they see see no more for it, themselves included."""
+    if parent.relation is None or parent.relation.intervals is None or parent.relation.pointwise:
+        return False
+    mask = _mask(parent, 6)
+    return bool(mask.diagonal().all() and not ((mask.astype(int) @ mask > 0) & ~mask).any())
 
 
 class Cache:
@@ -268,6 +394,8 @@ class Attending:
     length: int
     masks: dict[str, list[list[bool]]]
     caches: list[Cache]
+    extracted: dict[str, Rows]
+    lengths: Tensor | None
     seen: dict[int, None] = field(default_factory=dict)
     """Live tokens in the order of the cache: the step, plus T times the parent's place."""
     in_order: bool = True
@@ -281,6 +409,8 @@ class Attending:
             queries=select(self.queries, rows),
             batch=len(rows),
             caches=select(self.caches, rows),
+            extracted=select(self.extracted, rows),
+            lengths=None if self.lengths is None else self.lengths[rows],
             seen=dict(self.seen),
             rows=rows if self.rows is None else self.rows.index_select(0, rows),
         )

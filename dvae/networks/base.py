@@ -262,7 +262,7 @@ class Join(nn.Module):
     def _join(self, parts: Sequence[Tensor]) -> Tensor:
         if len(parts) == 1:
             return parts[0]
-        parts = _aligned(parts)
+        parts = aligned(parts)
         return torch.stack(parts).mean(0) if self.mean else torch.cat(parts, dim=-1)
 
     def hoist(self, known: Mapping[int, Tensor], batch: int, length: int, through: nn.Linear | None = None) -> Hoisted:
@@ -276,7 +276,7 @@ class Join(nn.Module):
         layer = self.first or through
         if layer is None:
             none = self.like.new_empty(batch, length, 0)
-            return Hoisted(torch.cat(_aligned([none, *known.values()]), dim=-1), [], known)
+            return Hoisted(torch.cat(aligned([none, *known.values()]), dim=-1), [], known)
         if self.mean:
             weights = [layer.weight / len(self.sizes)] * len(self.sizes)
         else:
@@ -284,7 +284,7 @@ class Join(nn.Module):
         base = layer.bias.expand(batch, length, -1)
         if known:
             matrix = torch.cat([weights[i] for i in known], dim=1)
-            base = functional.linear(torch.cat(_aligned(list(known.values())), dim=-1), matrix, layer.bias)
+            base = functional.linear(torch.cat(aligned(list(known.values())), dim=-1), matrix, layer.bias)
             base = base if base.dim() == 3 else base[:, None].expand(-1, length, -1)
         return Hoisted(base, [weight for i, weight in enumerate(weights) if i not in known], known)
 
@@ -312,7 +312,7 @@ def perceptron(widths: Sequence[int], activation: str) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def _aligned(parts: Sequence[Tensor]) -> list[Tensor]:
+def aligned(parts: Sequence[Tensor]) -> list[Tensor]:
     """The parts with a time axis, static ones repeated; as they are where none has one."""
     steps = max((part.shape[1] for part in parts if part.dim() == 3), default=None)
     if steps is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -24,9 +24,9 @@ from .base import (
     perceptron,
     reverse,
     shift,
-    valid_steps,
 )
 from .dense import part
+from .extract import Extract, Extractors
 from .rows import Rows, select
 
 CELLS: dict[str, type[nn.GRU] | type[nn.LSTM]] = {"gru": nn.GRU, "lstm": nn.LSTM}
@@ -50,8 +50,8 @@ class Recurrent:
         hidden: widths of the perceptron that joins the states and the pointwise parents; () for none, the features
             are then their concatenation.
         activation: "tanh", "relu", "gelu" or "elu".
-        extract: widths of a perceptron on a parent, by its name, that comes before all else; () for none. Outside the
-            sequence what it gives is 0.
+        extract: what comes before all else, by parent: widths of a perceptron, or the description of another module,
+            such as `PoseGraph()`. Outside the sequence what it gives is 0.
         separate: a forward and a backward state for each parent, in place of one for all.
         apart: a parent read over {<=t} enters the forward network up to t-1, and joins with its value at t.
         stack: the backward network reads the forward states too, and alone joins. Only for parents read over {1:T}.
@@ -64,7 +64,7 @@ class Recurrent:
     embed: int = 0
     hidden: tuple[int, ...] = (64,)
     activation: str = "tanh"
-    extract: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    extract: Extract = field(default_factory=dict)
     separate: bool = False
     apart: bool = False
     stack: bool = False
@@ -226,19 +226,11 @@ class RecurrentNetwork(Network):
 
     def __init__(self, spec: Recurrent, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, 0)
-        self.extractors = nn.ModuleDict(
-            {
-                p.name: perceptron((p.size, *spec.extract[p.name]), spec.activation)
-                for p in inputs
-                if spec.extract.get(p.name)
-            }
-        )
+        self.extractors = Extractors(self.inputs, spec.extract, spec.activation)
         past: list[tuple[Input, int]] = []
         future: list[tuple[Input, int]] = []
         self.points: list[tuple[Input, int | None]] = []
-        for parent in self.inputs:
-            if spec.extract.get(parent.name):
-                parent = replace(parent, size=spec.extract[parent.name][-1])
+        for parent in map(self.extractors.seen, self.inputs):
             if parent.relation is None:
                 self.points.append((parent, None))
                 continue
@@ -282,23 +274,9 @@ class RecurrentNetwork(Network):
     def _memories(self) -> list[Memory]:
         return list(self.memories)  # type: ignore[arg-type]
 
-    def _extract(self, parents: Mapping[str, Tensor], lengths: Tensor | None) -> dict[str, Tensor]:
-        """What the memories and the join read of the parents."""
-
-        def features(name: str) -> Tensor:
-            found = self.extractors[name](parents[name])
-            if lengths is None or found.dim() == 2:
-                return found
-            return found * valid_steps(lengths, found.shape[1])[..., None]
-
-        values = dict(parents)
-        for name in self.extractors.keys() & parents.keys():
-            values[name] = once(self.extractors[name], [parents[name], lengths], partial(features, name))
-        return values
-
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """See `Network.forward`."""
-        values = self._extract(parents, lengths)
+        values = self.extractors.of(parents, lengths)
         states = [memory(values, parents, lengths) for memory in self._memories()]
         if not self.local:
             states = [
@@ -310,7 +288,7 @@ class RecurrentNetwork(Network):
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """See `Network.start`."""
-        values = self._extract(given, lengths)
+        values = self.extractors.of(given, lengths)
         known: dict[int, Tensor] = {}
         memories: list[tuple[Memory, MemoryState]] = []
         for i, memory in enumerate(self._memories()):
@@ -325,31 +303,19 @@ class RecurrentNetwork(Network):
             elif lag is not None:
                 live.append((parent, lag))
         hoisted = self.join.hoist(known, batch, length)
-        extracted = {name: Rows([None] * length) for name in self.extractors}
-        return RecurrentState(hoisted, memories, live, extracted, dict(given), lengths)
+        return RecurrentState(hoisted, memories, live, self.extractors.start(length), dict(given), lengths)
 
     def step(self, state: RecurrentState, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         """See `Network.step`."""
-        values = {name: self._drawn(name, state, value) for name, value in drawn.items()}
+        values = self.extractors.drawn(state.extracted, drawn, state.lengths)
         parts = [memory.step(memory_state, t, values) for memory, memory_state in state.memories]
         like = parts[0] if parts else state.hoisted.like
         parts += [at(values[parent.name], t + lag, like, parent.size) for parent, lag in state.live]
         return self.join.add(state.hoisted, t, parts), state
 
-    def _drawn(self, name: str, state: RecurrentState, values: Sequence[Tensor]) -> Sequence[Tensor]:
-        """The draws so far, each passed once through the parent's extractor."""
-        if name not in self.extractors:
-            return values
-        seen = state.extracted[name]
-        for s in range(len(values)):
-            if seen.missing(s) and values[s] is not None:
-                features = self.extractors[name](values[s])
-                seen[s] = features if state.lengths is None else features * (s < state.lengths)[:, None]
-        return seen
-
     def chain(self, state: RecurrentState) -> Chain | None:
         """See `Network.chain`."""
-        if len(state.memories) + len(state.live) != 1:
+        if len(state.memories) + len(state.live) != 1 or not all(map(_is_perceptron, self.extractors.values())):
             return None
         before: tuple[tuple[Tensor, Tensor], ...] = ()
         if not state.memories:
@@ -426,6 +392,10 @@ def tie(first: Any, *others: Any) -> None:
         for name, _ in first.past.reads:
             if name in first.extractors:
                 other.extractors[name] = first.extractors[name]
+
+
+def _is_perceptron(module: Any) -> bool:
+    return isinstance(module, nn.Sequential)
 
 
 def _shape(network: Any) -> dict[str, Any]:

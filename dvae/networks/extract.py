@@ -1,0 +1,82 @@
+"""Extractors: features of a parent at single steps, before a network reads it over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Protocol
+
+from torch import Tensor, nn
+
+from .base import Input, once, perceptron, valid_steps
+from .rows import Rows
+
+
+class ExtractorSpec(Protocol):
+    """A description of an extractor: a frozen dataclass that `build`s one for a parent of dimension `size`."""
+
+    def build(self, size: int) -> Any:
+        """A module from (..., size) to (..., F), with F as its attribute `features`."""
+        ...
+
+
+Extract = Mapping[str, "tuple[int, ...] | ExtractorSpec"]
+"""Name of a parent to the widths of a perceptron on it, or to the description of another module; () for none."""
+
+
+class Extractors(nn.ModuleDict):
+    """The extractors of a network by parent. Outside the sequence what they give is 0.
+
+    Args:
+        inputs: the network's parents.
+        extract: see `Extract`.
+        activation: of perceptrons.
+    """
+
+    def __init__(self, inputs: Sequence[Input], extract: Extract, activation: str):
+        super().__init__()
+        self.sizes: dict[str, int] = {}
+        for parent in inputs:
+            spec = extract.get(parent.name)
+            if isinstance(spec, tuple) and spec:
+                self[parent.name], self.sizes[parent.name] = perceptron((parent.size, *spec), activation), spec[-1]
+            elif spec:
+                module = spec.build(parent.size)  # type: ignore[union-attr]
+                self[parent.name], self.sizes[parent.name] = module, module.features
+
+    def seen(self, parent: Input) -> Input:
+        """The parent as the network reads it."""
+        return replace(parent, size=self.sizes[parent.name]) if parent.name in self else parent
+
+    def of(self, parents: Mapping[str, Tensor], lengths: Tensor | None) -> dict[str, Tensor]:
+        """What the network reads of its parents (B, T, D) or (B, D)."""
+
+        def features(name: str) -> Tensor:
+            found = self[name](parents[name])
+            if lengths is None or found.dim() == 2:
+                return found
+            return found * valid_steps(lengths, found.shape[1])[..., None]
+
+        own = {
+            name: once(self[name], [parents[name], lengths], partial(features, name)) for name in self.keys() & parents
+        }
+        return {**parents, **own}
+
+    def start(self, length: int) -> dict[str, Rows]:
+        """Where `drawn` keeps what it finds in a loop."""
+        return {name: Rows([None] * length) for name in self}
+
+    def drawn(
+        self, kept: Mapping[str, Rows], drawn: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
+    ) -> dict[str, Sequence[Tensor]]:
+        """The draws of a loop so far as the network reads them; each passes through its extractor once."""
+        found = dict(drawn)
+        for name in self.keys() & drawn:
+            seen = kept[name]
+            for s, value in enumerate(drawn[name]):
+                if seen.missing(s) and value is not None:
+                    features = self[name](value)
+                    seen[s] = features if lengths is None else features * (s < lengths)[:, None]
+            found[name] = seen
+        return found

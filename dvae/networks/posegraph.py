@@ -1,0 +1,162 @@
+"""PoseGraph and FrameGraph: graph convolutions over the joints of one pose, and over the frames of a short motion.
+
+    H' = act(A H W + b)
+
+A is a free matrix over the nodes, learned, one per layer (Mao et al., 2019, arXiv 1908.05436). HiT-DVAE (Bie et al.,
+2022, arXiv 2204.01565) has the first before all its factors and sums up a motion by the second. Ours: poses are not
+normalised over the batch, which would let other frames into the features of one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from .base import Input, Network
+from .extract import Extract, Extractors
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """Features of poses, frame by frame: an extractor of `Attention`, `SelfAttention`, `FrameGraph` and `Recurrent`.
+
+    A node is a joint, of three coordinates; where the size is no multiple of three, a coordinate.
+
+    Args:
+        width: features of a node.
+        blocks: residual blocks, of two convolutions each.
+    """
+
+    width: int = 8
+    blocks: int = 1
+
+    def build(self, size: int) -> PoseFeatures:
+        """The module for poses (..., size)."""
+        return PoseFeatures(self, size)
+
+
+class PoseFeatures(nn.Module):
+    """See `PoseGraph`: (..., D) to (..., nodes * width)."""
+
+    def __init__(self, spec: PoseGraph, size: int):
+        super().__init__()
+        coordinates = 1 if size % 3 else 3
+        nodes = size // coordinates
+        self.features = nodes * spec.width
+        self.first = PoseConvolution(nodes, coordinates, spec.width)
+        self.blocks = nn.ModuleList(
+            nn.Sequential(*(PoseConvolution(nodes, spec.width, spec.width) for _ in range(2)))
+            for _ in range(spec.blocks)
+        )
+
+    def forward(self, poses: Tensor) -> Tensor:
+        """Features of each pose."""
+        features = self.first(poses)
+        for block in self.blocks:
+            features = features + block(features)
+        return features
+
+
+class PoseConvolution(nn.Module):
+    """tanh(A H W + b) of (..., nodes * features), node by node, as one product with the Kronecker product of A and W.
+
+    On a CPU that is faster than a product with each for every pose, as long as the features are few.
+    """
+
+    def __init__(self, nodes: int, features: int, out: int):
+        super().__init__()
+        self.adjacency = nn.Parameter(torch.eye(nodes) + _uniform(nodes, nodes) / math.sqrt(nodes))
+        self.weight = nn.Parameter(_uniform(out, features) * math.sqrt(3 / features))
+        self.bias = nn.Parameter(_uniform(out) / math.sqrt(features))
+
+    def forward(self, poses: Tensor) -> Tensor:
+        """(..., nodes * out)."""
+        weight = torch.kron(self.adjacency, self.weight)
+        return torch.tanh(functional.linear(poses, weight, self.bias.repeat(len(self.adjacency))))
+
+
+@dataclass(frozen=True)
+class FrameGraph:
+    """The summary of a motion for a static variable: graph convolutions over the frames of a window.
+
+    A parent is read over {1:T}, but the graph has a fixed number of frames. In training the window starts anywhere,
+    anew for every sequence at every evaluation; else it is the first frames. A shorter sequence stays in its last one.
+
+    Args:
+        frames: nodes of the graph.
+        width: features of a frame.
+        blocks: residual blocks, of two convolutions each.
+        extract: what comes before all else, by parent, as in `Attention`.
+    """
+
+    frames: int
+    width: int = 64
+    blocks: int = 4
+    extract: Extract = field(default_factory=dict)
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> FrameGraphNetwork:
+        """The network of a factor with these parents.
+
+        Raises:
+            ValueError: a local child, or parents that are not read over {1:T}.
+        """
+        if local or any(p.relation is None or not p.relation.mask(6)[:1].all() for p in inputs):
+            raise ValueError(
+                "FrameGraph sums up parents read over {1:T} for a static variable; use networks.SelfAttention or "
+                "networks.Attention for this factor"
+            )
+        return FrameGraphNetwork(self, inputs, size)
+
+
+class FrameGraphNetwork(Network):
+    """See `FrameGraph`; the features are those of all frames, one after the other."""
+
+    def __init__(self, spec: FrameGraph, inputs: Sequence[Input], size: int):
+        super().__init__(inputs, False, spec.frames * spec.width)
+        self.frames = spec.frames
+        self.extractors = Extractors(self.inputs, spec.extract, "tanh")
+        into = sum(self.extractors.seen(parent).size for parent in self.inputs)
+        self.first = FrameConvolution(spec.frames, into, spec.width)
+        self.blocks: Any = nn.ModuleList(
+            nn.Sequential(*(FrameConvolution(spec.frames, spec.width, spec.width) for _ in range(2)))
+            for _ in range(spec.blocks)
+        )
+
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """See `Network.forward`; (B, frames * width)."""
+        values = self.extractors.of(parents, lengths)
+        motion = torch.cat([values[parent.name] for parent in self.inputs], dim=-1)
+        last = motion.new_full((len(motion),), length - 1, dtype=torch.long) if lengths is None else lengths - 1
+        first = torch.zeros_like(last)
+        if self.training:
+            room = (last + 2 - self.frames).clamp_min(1)  # of starts whose window ends with the sequence
+            first = (torch.rand(len(motion), device=motion.device) * room).long()
+        window = (first[:, None] + torch.arange(self.frames, device=motion.device)).minimum(last[:, None])
+        features = self.first(motion.gather(1, window[..., None].expand(-1, -1, motion.shape[-1])))
+        for block in self.blocks:
+            features = features + block(features)
+        return features.flatten(1)
+
+
+class FrameConvolution(nn.Module):
+    """tanh(LN(A H W + b)) over (B, frames, features)."""
+
+    def __init__(self, frames: int, features: int, out: int):
+        super().__init__()
+        self.adjacency = nn.Parameter(torch.eye(frames) + _uniform(frames, frames) / math.sqrt(frames))
+        self.linear = nn.Linear(features, out)
+        self.norm = nn.LayerNorm(out)
+
+    def forward(self, motion: Tensor) -> Tensor:
+        """(B, frames, out)."""
+        return torch.tanh(self.norm(self.adjacency @ self.linear(motion)))
+
+
+def _uniform(*shape: int) -> Tensor:
+    return 2 * torch.rand(shape) - 1
