@@ -338,6 +338,7 @@ def evaluate(
     samples: int = 50,
     bound_particles: int = 0,
     pose_prior: Path | None = None,
+    classifier: tuple[Path, ...] = (),
     seed: int = 0,
     batch_size: int = 32,
     out: Path | None = None,
@@ -353,6 +354,7 @@ def evaluate(
         samples: forecasts of each window, K.
         bound_particles: particles of the importance-weighted bound; 0 leaves it out.
         pose_prior: run of a pose-prior, by which to score the poses of the forecasts.
+        classifier: runs of action-classifiers of different labels, by which to score what the forecasts show.
         seed: of the draws.
         batch_size: windows forecast at once.
         out: file to write instead of evaluation.json in each run.
@@ -375,6 +377,7 @@ def evaluate(
         batch_size=batch_size,
         bound_particles=bound_particles,
         pose_prior=None if pose_prior is None else _pose_prior(pose_prior, data, windows.skeleton),
+        classifiers=_classifiers(classifier, data, windows),
         training_windows=loaded[0].data.windows("train+validation"),
         configs={name: Run(each.path).config for name, each in zip(names, loaded, strict=True)},
     )
@@ -763,10 +766,8 @@ def _report(result: Fit) -> None:
     found = ", ".join(filter(None, [f"{result.status} at step {result.step}", result.best]))
     OUT.print(found, highlight=False, soft_wrap=True)
     assert result.run is not None
-    forecasts = methods()[Run(result.run).config["method"]["method"]].forecasts
-    score = f"score it with: dvae evaluate {result.run}"
-    score = score if forecasts else f"score the poses of forecasts with: dvae evaluate RUN --pose-prior {result.run}"
-    OUT.print(score, highlight=False, soft_wrap=True)
+    use = methods()[Run(result.run).config["method"]["method"]].use
+    OUT.print(use.format(run=result.run), highlight=False, soft_wrap=True)
 
 
 def _pose_prior(path: Path, data: str | None, skeleton: motion.Skeleton) -> Any:
@@ -775,6 +776,25 @@ def _pose_prior(path: Path, data: str | None, skeleton: motion.Skeleton) -> Any:
     if not hasattr(model, "flow") or model.skeleton != skeleton:
         raise UsageError(f"--pose-prior {path} is no run of a pose-prior of the skeleton {skeleton.name!r}")
     return model
+
+
+def _classifiers(paths: Sequence[Path], data: str | None, windows: motion.Windows) -> dict[str, Any]:
+    """The action classifiers of runs by their label, fitted under the protocol of the windows."""
+    found: dict[str, Any] = {}
+    for path in paths:
+        loaded = runs.load(path, data)
+        if loaded.method.name != "action-classifier":
+            raise UsageError(f"--classifier {path} is a fitted {loaded.method.name}, no action-classifier")
+        if loaded.model.label in found:
+            raise UsageError(f"--classifier {path} is the second of the label {loaded.model.label!r}; give one of them")
+        if loaded.data.windows("test").fingerprint != windows.fingerprint:
+            raise UsageError(
+                f"--classifier {path} was fitted on other data or under another protocol ({loaded.data.path}, "
+                f"{loaded.data.protocol.name}) than the runs ({windows.protocol.name}); it may have seen test clips"
+            )
+        _note_unfinished([loaded])
+        found[loaded.model.label] = loaded.model
+    return found
 
 
 def _load(path: Path, data: str | None) -> runs.Loaded:

@@ -44,7 +44,7 @@ class Conditional(nn.Module):
         if self.head.residual and not self._reads_previous():
             raise ValueError(
                 f"{factor} has a residual head, which adds {factor.child}_{{t-1}}, but it does not read that; "
-                f"add {factor.child}_{{t-1}} or {factor.child}_{{<t}} to its parents, or use residual=False"
+                f"add {factor.child}_{{t-1}} or {factor.child}_{{<t}} to its parents, or use residual=0"
             )
 
     def _reads_previous(self) -> bool:

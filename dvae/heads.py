@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import pyro.distributions as dist
 import torch
@@ -24,15 +24,25 @@ class Head(nn.Module):
     """Features to the parameters of a distribution whose first parameter is its location.
 
     Args:
-        residual: the location is an offset from the variable's own previous value.
+        residual: share of the variable's own previous value that its location keeps, so that features give the rest:
+            1 (True) for an offset. Below 1 a free run forgets where it was, and cannot drift without bound.
+
+    Raises:
+        ValueError: a share that is not between 0 and 1.
     """
 
     deterministic: ClassVar[bool] = False
     """Whether the variable is a function of its parents, without a density."""
 
-    def __init__(self, residual: bool = False):
+    def __init__(self, residual: float = False):
         super().__init__()
-        self.residual = residual
+        if not 0 <= residual <= 1:
+            raise ValueError(f"residual is {residual}; it is a share of the previous value, from 0 to 1")
+        self.residual = float(residual)
+
+    def moved(self, loc: Tensor, previous: Tensor | None) -> Tensor:
+        """The location from what the features give and the variable's own previous value."""
+        return loc if previous is None else torch.add(loc, previous, alpha=self.residual)
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         """Parameters (..., D) from features and the variable's own previous value, where the head is residual.
@@ -73,11 +83,11 @@ class Normal:
 
     Args:
         min_scale: the scale stays above it; a likelihood whose scale can vanish has no maximum.
-        residual: the location is an offset from the variable's own previous value.
+        residual: see `Head`.
     """
 
     min_scale: float = 1e-3
-    residual: bool = False
+    residual: float = False
 
     def build(self, features: int, size: int, local: bool = True) -> Head:
         """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
@@ -97,7 +107,7 @@ class NormalHead(Head):
         loc, raw = self.out(features).chunk(2, dim=-1)
         # contiguous: on a slice, softplus is not vectorised and takes nine times as long
         scale = functional.softplus(raw.contiguous()) + self.min_scale
-        return loc if previous is None else loc + previous, scale
+        return self.moved(loc, previous), scale
 
 
 @dataclass(frozen=True)
@@ -109,14 +119,17 @@ class FixedNormal:
         learned: one learned scale per dimension.
         project: a linear layer from features to location; False takes the features themselves.
         steps: with `learned`, one scale per time step too, for up to so many steps. For a local variable only.
-        residual: the location is an offset from the variable's own previous value.
+        residual: see `Head`.
+        fitted: what the density's gradient reaches: "both", or the "scale" alone, where the location learns from
+            energies in its place.
     """
 
     scale: float = 1.0
     learned: bool = False
     project: bool = True
     steps: int = 0
-    residual: bool = False
+    residual: float = False
+    fitted: Literal["both", "scale"] = "both"
 
     def build(self, features: int, size: int, local: bool = True) -> Head:
         """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
@@ -145,6 +158,12 @@ class FixedNormalHead(Head):
         else:
             self.register_buffer("log_scale", log_scale)
         self.steps = spec.steps
+        self.fitted = spec.fitted
+
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        """See `Head.distribution`."""
+        loc, scale = parameters
+        return super().distribution((loc.detach() if self.fitted == "scale" else loc, scale))
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         """See `Head.forward`."""
@@ -157,7 +176,7 @@ class FixedNormalHead(Head):
                     f"FixedNormal(steps={self.steps}) was given {needed} steps; build it with steps={needed}"
                 )
             scale = scale[: loc.shape[1]] if t is None else scale[t]
-        return loc if previous is None else loc + previous, scale.expand_as(loc)
+        return self.moved(loc, previous), scale.expand_as(loc)
 
 
 @dataclass(frozen=True)
@@ -167,12 +186,12 @@ class StudentT:
     Args:
         df: degrees of freedom, the initial ones; learned, one per dimension, and kept above 2.
         min_scale: the scale stays above it.
-        residual: the location is an offset from the variable's own previous value.
+        residual: see `Head`.
     """
 
     df: float = 5.0
     min_scale: float = 1e-3
-    residual: bool = False
+    residual: float = False
 
     def build(self, features: int, size: int, local: bool = True) -> Head:
         """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
@@ -193,7 +212,7 @@ class StudentTHead(Head):
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         """See `Head.forward`."""
         loc, raw = self.out(features).chunk(2, dim=-1)
-        loc = loc if previous is None else loc + previous
+        loc = self.moved(loc, previous)
         df = functional.softplus(self.raw_df) + 2
         return loc, functional.softplus(raw.contiguous()) + self.min_scale, df.expand_as(loc)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
+from dataclasses import replace
 from itertools import accumulate
 from operator import mul
 from typing import Any
@@ -81,6 +82,7 @@ class DynamicalVAE(nn.Module):
         super().__init__()
         self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
         self.generative = _factorization(generative, masks)
+        self.feeding = SelfFeeding(0.0)
         self.parts = {name: tuple(places) for name, places in (parts or {}).items()}
         self.history = history
         observed = tuple(self.parts) or observed
@@ -180,7 +182,8 @@ class DynamicalVAE(nn.Module):
             size: B, where the batch does not tell.
             prefix: name to the first values (B, O, D) of a latent.
             mean_emission: a free run sets the data variables to their means and does not draw them.
-            self_feeding: scheduled sampling of the data's history; a probability, or `SelfFeeding`.
+            self_feeding: scheduled sampling of the data's history: a `SelfFeeding`, or a probability, in the way of the
+                model's attribute `feeding`.
             draws: latent to a number n: from there on the program goes on n times for each sequence, with a draw
                 of this variable each. Later variables have n times as many rows, draw by draw.
 
@@ -199,13 +202,31 @@ class DynamicalVAE(nn.Module):
             self._check(name, value)
         rollout.prefix = {**rollout.prefix, **(prefix or {})}
         rollout.mean_emission = mean_emission
-        rollout.feeding = SelfFeeding(self_feeding) if isinstance(self_feeding, int | float) else self_feeding
+        if isinstance(self_feeding, int | float):
+            self_feeding = replace(self.feeding, probability=self_feeding)
+        rollout.feeding = self_feeding
         for block in self.generative.blocks:
             for name in block.names:
                 rollout = rollout.fork((draws or {}).get(name, 1))
                 with rollout.plate:
                     rollout.know(name, self._site(name, rollout))
+        penalties = self.penalties(rollout, batch, draws or {})
+        with pyro.plate("windows", rollout.batch // rollout.draws, dim=-1) if penalties else nullcontext():
+            for name, energy in penalties.items():
+                pyro.factor(name, -energy)
         return dict(rollout.values)
+
+    def penalties(self, rollout: Rollout, batch: Batch | None, draws: Mapping[str, int]) -> Mapping[str, Tensor]:
+        """Energies that the program adds at its end as `pyro.factor` sites; none, unless a subclass has some.
+
+        Args:
+            rollout: the run, with the value of every variable, and `evaluate` for the conditionals.
+            batch, draws: as the program was given them.
+
+        Returns:
+            Name to (B,), positive where it costs.
+        """
+        return {}
 
     def _site(self, name: str, rollout: Rollout) -> Tensor:
         data = rollout.values.get(name)

@@ -30,16 +30,20 @@ class SelfFeeding:
 
     Args:
         probability: of each frame, independently.
-        passes: None runs through time, exactly and without a gradient. A number of passes approximates that in
-            parallel: in each, all means are computed at once from the last pass's history (T passes are exact).
+        passes: None runs through time, exactly. A number of passes approximates that in parallel: in each, all means
+            are computed at once from the last pass's history (T passes are exact).
+        gradient: whether gradients flow through the means that are fed, and so back in time.
+        start: frames at the beginning that stay as they are, such as those that a forecast will have observed.
     """
 
     probability: float
     passes: int | None = None
+    gradient: bool = False
+    start: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.probability <= 1 or (self.passes is not None and self.passes < 1):
-            raise ValueError(f"expected a probability in [0, 1] and at least one pass, got {self}")
+        if not 0 <= self.probability <= 1 or (self.passes is not None and self.passes < 1) or self.start < 0:
+            raise ValueError(f"expected a probability in [0, 1], at least one pass and a start from 0, got {self}")
 
 
 @dataclass
@@ -135,12 +139,14 @@ class Rollout:
 
     def evaluate(self, name: str, value: Tensor) -> TorchDistribution:
         """The conditionals of a local variable at all steps, over (B, T, D)."""
-        head = self.conditionals[name].head
-        if name in self._evaluated and self._evaluated[name][0] is value:
-            return head.distribution(self._evaluated[name][1])
-        history = self.history()
-        known = {**self.values, name: value, **history}
-        return head.distribution(self.conditionals[name](known, self.batch, self.length, self.lengths))
+        return self.conditionals[name].head.distribution(self.parameters(name, value))
+
+    def parameters(self, name: str, value: Tensor) -> Parameters:
+        """Those of `evaluate`, (B, T, D) each, of which the first is the location; computed once for a value."""
+        if name not in self._evaluated or self._evaluated[name][0] is not value:
+            known = {**self.values, name: value, **self.history()}
+            self._evaluated[name] = (value, self.conditionals[name](known, self.batch, self.length, self.lengths))
+        return self._evaluated[name][1]
 
     def draw(self, name: str) -> Tensor:
         """A draw (B, T, D) of a local variable, and with it of the variables that its loop interleaves it with."""
@@ -156,7 +162,8 @@ class Rollout:
         """What the model reads as the data's past where it may not read them: its own means."""
         if self._history is None:
             hidden = self._hidden()
-            with torch.no_grad():
+            gradient = self.feeding is not None and self.feeding.gradient and torch.is_grad_enabled()
+            with torch.set_grad_enabled(gradient):
                 self._history = self._feed(hidden) if hidden else {}
         return self._history
 
@@ -166,6 +173,7 @@ class Rollout:
         if self.feeding is not None and self.feeding.probability:
             frames = torch.rand(self.batch, self.length, 1, device=next(iter(self.values.values())).device)
             fed = frames < self.feeding.probability
+            fed[:, : self.feeding.start] = False
             for name in self.data & self.values.keys():
                 hidden[name] = fed | hidden[name] if name in hidden else fed
         return hidden

@@ -143,6 +143,9 @@ class SequenceELBO(ELBO):
                 _record(terms, terms.log_likelihood, name, site_log_prob(fn, value), run)
             else:
                 raise ValueError(f"the latent {name} is in the model but not in the guide")
+        found = [*terms.log_likelihood.values(), *terms.kl.values(), *terms.energies.values()]
+        if found and not len(terms.frames):  # nothing has steps: a sequence counts once
+            terms.frames = torch.ones_like(found[0])
         return terms
 
 

@@ -6,9 +6,17 @@ futures on its own, and the futures are compared with the true one (`dvae.infere
 nats per frame. The errors of the motion papers are energies, not likelihoods; the bound is one.
 
 Every evaluation carries two reference rows that any method should beat: zero velocity (the last pose
-repeated) and nearest neighbours (the futures of the K training windows with the closest last poses). All rows
-score the same windows, and windows of one clip overlap, so standard errors are clustered by clip and
+repeated) and nearest neighbours (the futures of the K training windows with the closest last poses). With
+classifiers of actions there is a third, real motion: the true futures, which no method should be expected to beat.
+All rows score the same windows, and windows of one clip overlap, so standard errors are clustered by clip and
 `Evaluation.difference` is paired.
+
+A classifier adds two scores under its name (Bie et al. 2022, arXiv:2204.01565). *ACC* is the share of the K futures
+that it gives the window's true class. *FID* is the Fréchet distance between its features of the true futures and of
+all K generated ones of all windows together. It is a number of the whole set, so that its standard error is
+a jackknife over clips: each clip stands with its pseudo-value d + (1/w - 1) (d - d'), d' the distance without the clip
+and w the clip's share of the windows (Busing, Meijer and van der Leeden 1999). Of a mean over windows, pseudo-values
+are the means of the clips, and from there on both kinds of scores are treated alike.
 """
 
 import dataclasses
@@ -17,7 +25,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -49,7 +57,7 @@ __all__ = [
 ]
 
 Batch = dict[str, Tensor]
-Forecaster = Callable[[Batch, int, int], Tensor]  # observed batch, horizon, samples -> (K, B, H, D)
+Forecaster = Callable[[slice], Tensor]  # which windows -> (K, B, H, D)
 
 
 @dataclass(frozen=True)
@@ -70,10 +78,14 @@ METRICS: dict[str, Metric] = {
     "variogram score": Metric("m", "free-running"),
     "bone-length error": Metric("relative", "free-running"),
     "pose NLL": Metric("nats", "free-running"),
+    "ACC": Metric("share", "free-running", "higher"),
+    "FID": Metric("", "free-running"),
     "ELBO": Metric("nats/frame", "teacher-forced", "higher"),
     "importance bound": Metric("nats/frame", "teacher-forced", "higher"),
     "k-hat": Metric("", "teacher-forced"),
+    "KL": Metric("nats/frame", "teacher-forced", ""),
 }
+"""By name; ACC and FID stand before the name of a classifier, KL before that of a latent."""
 
 _PAIRED = {
     "ADE": metrics.average_displacement_error,
@@ -93,7 +105,7 @@ _MULTIMODAL = {
 
 @dataclass(frozen=True)
 class Score:
-    """Mean over windows and its standard error, clustered by clip (NaN where there is a single clip)."""
+    """Mean over windows, or FID, and its standard error, clustered by clip (NaN where there is a single clip)."""
 
     mean: float
     standard_error: float
@@ -110,7 +122,10 @@ class Score:
 
 @dataclass(frozen=True)
 class Row:
-    """One method: its number of samples, what it is, and each metric's mean over each clip's windows."""
+    """One method: its number of samples, what it is, and each metric's mean over each clip's windows.
+
+    Of FID it is each clip's pseudo-value (see the file), of ACC NaN where the classifier does not know a clip's class.
+    """
 
     samples: int
     clip_means: dict[str, tuple[float, ...]]
@@ -136,6 +151,8 @@ class Evaluation(Result):
         bound_particles: particles of the importance bound, 0 where it was not computed.
         seed: the seed of every method's draws.
         pose_prior: SHA-256 of the weights of the pose prior that scored the poses, if one did.
+        classifiers: by name, those that scored actions: label, classes, SHA-256 of the weights, and how many windows
+            are of no class that it knows; ACC is over the others.
     """
 
     rows: dict[str, Row]
@@ -148,9 +165,10 @@ class Evaluation(Result):
     bound_particles: int
     seed: int
     pose_prior: str | None = None
+    classifiers: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __getitem__(self, method: str) -> dict[str, Score]:
-        return {name: self._score(np.array(means)) for name, means in self._row(method).clip_means.items()}
+        return {name: self._score(name, np.array(means)) for name, means in self._row(method).clip_means.items()}
 
     def difference(self, first: str, second: str, metric: str) -> Score:
         """Paired difference of two methods in a metric, first minus second, with its standard error.
@@ -164,7 +182,7 @@ class Evaluation(Result):
             if metric not in row.clip_means:
                 raise KeyError(f"{method!r} has no score {metric!r}; it has {', '.join(row.clip_means)}")
             means.append(np.array(row.clip_means[metric]))
-        return self._score(means[0] - means[1])
+        return self._score(metric, means[0] - means[1])
 
     def table(self) -> Table:
         """Metrics down, methods across: mean ± standard error, the two programs apart."""
@@ -190,7 +208,8 @@ class Evaluation(Result):
     def metrics(self) -> list[str]:
         """Names of all metrics that at least one method has, in the order of the table."""
         found = {name for row in self.rows.values() for name in row.clip_means}
-        return [name for name in METRICS if name in found] + sorted(found - set(METRICS))
+        order = list(METRICS)
+        return sorted(found, key=lambda name: (order.index(_kind(name)), name))
 
     def plot(self, metrics: Sequence[str] | None = None) -> matplotlib.figure.Figure:
         """One panel per metric, one dot per method with a bar of one standard error to each side."""
@@ -210,6 +229,7 @@ class Evaluation(Result):
             panel.set_yticks(range(len(scores)), list(scores))
             panel.set_ylim(len(scores) - 0.5, -0.5)
             panel.tick_params(labelsize=8)
+            panel.locator_params(axis="x", nbins=4)  # more would overlap where values agree in many digits
             panel.grid(axis="x", alpha=0.3)
         for panel in panels[len(names) :]:
             panel.set_axis_off()
@@ -245,8 +265,9 @@ class Evaluation(Result):
             raise KeyError(f"no method {method!r} in this evaluation; it has {', '.join(self.rows)}")
         return self.rows[method]
 
-    def _score(self, clip_means: np.ndarray) -> Score:
-        mean, deviations = linearised(clip_means, np.array(list(self.clips.values())))
+    def _score(self, metric: str, clip_means: np.ndarray) -> Score:
+        scored = ~np.isnan(clip_means) if _kind(metric) == "ACC" else slice(None)
+        mean, deviations = linearised(clip_means[scored], np.array(list(self.clips.values()))[scored])
         return Score(float(mean), math.sqrt(clustered_variance(deviations)))
 
     def _document(self, method: str) -> dict[str, Any]:
@@ -265,7 +286,13 @@ class Evaluation(Result):
     def _caption(self) -> str:
         closer = f"all windows whose last poses are closer than {self.multimodal['threshold']:g} m, itself included"
         alone = f"{self.multimodal['alone']} of {self.data['windows']} have no other"
-        return f"mean ± standard error over windows, clustered by clip\nMM: over the futures of {closer}; {alone}"
+        lines = ["mean ± standard error over windows, clustered by clip", f"MM: over the futures of {closer}; {alone}"]
+        for name, used in self.classifiers.items():
+            unknown = f"; {used['unknown']} of {self.data['windows']} windows are of no class it knows"
+            lines.append(
+                f"ACC, FID {escape(name)}: classifier {used['weights'][:12]}" + (unknown if used["unknown"] else "")
+            )
+        return "\n".join(lines)
 
     def _title(self) -> str:
         name = escape(self.protocol.get("name", ""))
@@ -457,6 +484,7 @@ def evaluate(
     references: bool = True,
     training_windows: HeldOutWindows | None = None,
     pose_prior: Any = None,
+    classifiers: Mapping[str, Any] | None = None,
     configs: Mapping[str, Mapping[str, Any]] | None = None,
     progress: bool = True,
 ) -> Evaluation:
@@ -479,6 +507,8 @@ def evaluate(
         training_windows: where the nearest neighbours are taken from; without it that row is left out.
         pose_prior: a fitted pose prior, to score single poses of the forecasts: minus the mean log density of the
             flow's z, without the log-determinant (the NLL of GSPS, arXiv:2108.08422).
+        classifiers: `{name: fitted action classifier}`, to score futures by what they show: "ACC name" and "FID name",
+            and a reference row of real motion. Fitted under the same protocol, they saw no test clip.
         configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
         progress: whether to show a progress bar.
 
@@ -487,7 +517,8 @@ def evaluate(
 
     Raises:
         ValueError: windows that are ragged, masked or leave nothing to predict; a forecast of the wrong
-            shape; a model with the name of a reference row; fewer than one sample.
+            shape; a model with the name of a reference row; fewer than one sample; windows whose skeleton or
+            labels are not those of a classifier, or too few for normal fits to their features.
         FloatingPointError: a forecast or bound that is not finite, naming method and window.
     """
     models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
@@ -498,30 +529,34 @@ def evaluate(
             f"batch_size is at least 1 and bound_particles at least 0, not {batch_size} and {bound_particles}"
         )
     held = dataclasses.replace(hold(windows), pose_prior=pose_prior)
+    held = dataclasses.replace(
+        held, judges={name: _judge(name, each, held, seed, batch_size) for name, each in (classifiers or {}).items()}
+    )
     baselines = _references(held, samples, training_windows) if references else {}
     if clash := models.keys() & baselines.keys():
         raise ValueError(f"a model must not have the name of a reference row: {', '.join(sorted(clash))}")
 
     rows: dict[str, Row] = {}
-    with progress_bar(progress) as bar:
+    with progress_bar(progress) as bar, ExitStack() as stack:
+        for judge in held.judges.values():
+            stack.enter_context(evaluating(judge.model, seed))
 
         def parts(label: str) -> Iterator[slice]:
             for start in bar.track(range(0, len(held.keys), batch_size), description=escape(label)):
                 yield slice(start, start + batch_size)
 
         for name, (count, forecaster) in baselines.items():
-            scores = _free_running(name, forecaster, count, held, parts(name))
-            rows[name] = Row(count, held.clip_means(scores))
+            rows[name] = Row(count, _free_running(name, forecaster, count, held, parts(name)))
         for name, each in models.items():
             with evaluating(each, seed):
-                scores = _free_running(
-                    name, _forecaster(each, draw_emission), samples, held, parts(f"{name}, forecasts")
-                )
+                forecaster = _forecaster(each, held, samples, draw_emission)
+                means = _free_running(name, forecaster, samples, held, parts(f"{name}, forecasts"))
             if getattr(each, "likelihood", True):
                 with evaluating(each, seed):
-                    scores |= _teacher_forced(name, each, bound_particles, held, parts(f"{name}, bound"))
+                    scores = _teacher_forced(name, each, bound_particles, held, parts(f"{name}, bound"))
+                    means |= held.clip_means(scores)
             equations = {"generative": each.generative.text, "inference": each.inference.text}
-            rows[name] = Row(samples, held.clip_means(scores), equations, dict((configs or {}).get(name, {})))
+            rows[name] = Row(samples, means, equations, dict((configs or {}).get(name, {})))
 
     return Evaluation(
         rows=rows,
@@ -538,6 +573,7 @@ def evaluate(
         bound_particles=bound_particles,
         seed=seed,
         pose_prior=None if pose_prior is None else _hash(pose_prior),
+        classifiers={name: judge.record() for name, judge in held.judges.items()},
     )
 
 
@@ -551,6 +587,7 @@ class _Held:
     keys: list[tuple[str, str, int]]
     truths: list[Tensor]
     pose_prior: Any = None
+    judges: dict[str, "_Judge"] = field(default_factory=dict)
 
     @property
     def x(self) -> Tensor:
@@ -559,6 +596,9 @@ class _Held:
     @property
     def futures(self) -> Tensor:
         return self.x[:, self.observed :]
+
+    def past(self, part: slice) -> Batch:
+        return {**{name: value[part] for name, value in self.batch.items()}, "x": self.x[part, : self.observed]}
 
     @property
     def clips(self) -> dict[str, int]:
@@ -571,15 +611,62 @@ class _Held:
         found = {"fingerprint": self.windows.fingerprint, "windows": count, "frames": frames}
         return {**found, "coordinates": coordinates, **joints}
 
+    @property
+    def places(self) -> list[int]:
+        """The clip of every window, as its place in `clips`."""
+        places = {clip: place for place, clip in enumerate(self.clips)}
+        return [places[f"{split}/{clip}"] for split, clip, _ in self.keys]
+
     def clip_means(self, scores: dict[str, Tensor]) -> dict[str, tuple[float, ...]]:
         """Means over the windows of each clip, from scores `(N,)`."""
-        places = {clip: place for place, clip in enumerate(self.clips)}
-        clip = [places[f"{split}/{clip}"] for split, clip, _ in self.keys]
+        clip = self.places
         counts = np.bincount(clip)
         return {
             name: tuple((np.bincount(clip, weights=values.double().numpy()) / counts).tolist())
             for name, values in scores.items()
         }
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """A classifier, the class of each window (N,), -1 where it knows none, and its features (N, F) of their futures."""
+
+    model: Any
+    classes: Tensor
+    real: Tensor
+
+    def record(self) -> dict[str, Any]:
+        unknown = int((self.classes < 0).sum())
+        described = {"label": self.model.label, "classes": list(self.model.classes)}
+        return {**described, "weights": _hash(self.model), "unknown": unknown}
+
+
+def _judge(name: str, classifier: Any, held: _Held, seed: int, batch_size: int) -> _Judge:
+    skeleton, clips = getattr(held.windows, "skeleton", None), held.clips
+    if skeleton != classifier.skeleton or held.x.shape[2] != classifier.size:
+        given = "no skeleton" if skeleton is None else f"the skeleton {skeleton.name!r}"
+        raise ValueError(
+            f"the classifier {name} was fitted to the skeleton {classifier.skeleton.name!r} and frames of "
+            f"{classifier.size} numbers; these windows have {given} and {held.x.shape[2]}"
+        )
+    try:
+        labels = held.windows.labels(classifier.label)  # type: ignore[attr-defined]
+    except KeyError as error:
+        raise ValueError(f"the classifier {name} tells {classifier.label}s apart, but {error.args[0]}") from error
+    if len(held.keys) - (max(clips.values()) if len(clips) > 1 else 0) < 2:
+        raise ValueError(
+            f"FID {name} needs normal fits to the features of at least two windows, also without any one clip; these "
+            f"are {len(held.keys)} windows of {len(clips)} clips"
+        )
+    classes = [classifier.classes.index(label) if label in classifier.classes else -1 for label in labels]
+    with evaluating(classifier, seed):
+        real = torch.cat([_features(classifier, futures) for futures in held.futures.split(batch_size)])
+    return _Judge(classifier, torch.tensor(classes), real.double().cpu())
+
+
+def _features(classifier: Any, futures: Tensor) -> Tensor:
+    """(..., F) from (..., H, D), on the device of the classifier."""
+    return classifier.features(on_device_of(classifier, {"x": futures})["x"])
 
 
 def hold(windows: HeldOutWindows) -> _Held:
@@ -599,30 +686,29 @@ def _references(
     held: _Held, samples: int, training_windows: HeldOutWindows | None
 ) -> dict[str, tuple[int, Forecaster]]:
     """Number of forecasts and forecaster of each reference row."""
-    rows: dict[str, tuple[int, Forecaster]] = {
-        "zero velocity": (1, lambda observed, horizon, samples: zero_velocity(observed["x"], horizon))
-    }
+    horizon = held.futures.shape[1]
+    rows: dict[str, tuple[int, Forecaster]] = {}
+    if held.judges:
+        rows["real motion"] = 1, lambda part: held.futures[part][None]
+    rows["zero velocity"] = 1, lambda part: zero_velocity(held.past(part)["x"], horizon)
     if training_windows is not None:
-        training = training_windows.all()["x"]
+        training = training_windows.all()["x"][:, : held.observed + horizon]
         neighbours = min(samples, len(training))
         rows["nearest neighbours"] = (
             neighbours,
-            lambda observed, horizon, samples: nearest_neighbours(
-                observed["x"], training[:, : held.observed + horizon], samples
-            ),
+            lambda part: nearest_neighbours(held.past(part)["x"], training, neighbours),
         )
     return rows
 
 
 def _free_running(
     name: str, forecaster: Forecaster, samples: int, held: _Held, parts: Iterator[slice]
-) -> dict[str, Tensor]:
-    """Scores `(N,)` of free-running forecasts."""
-    found = []
+) -> dict[str, tuple[float, ...]]:
+    """Scores of free-running forecasts, by clip."""
+    found, features = [], []
     for part in parts:
-        batch = {variable: value[part] for variable, value in held.batch.items()}
-        truth = held.futures[part]
-        forecasts = forecaster({**batch, "x": batch["x"][:, : held.observed]}, truth.shape[1], samples).cpu()
+        past, truth = held.past(part)["x"], held.futures[part]
+        forecasts = forecaster(part).cpu()
         expected = (samples, *truth.shape)
         if forecasts.shape != expected:
             raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
@@ -634,11 +720,61 @@ def _free_running(
             pairs = zip(forecasts, held.truths[part], strict=True)
             scores[metric] = torch.stack([score(window, held.futures[others]) for window, others in pairs])
         if hasattr(held.windows, "skeleton"):
-            scores["bone-length error"] = _bone_length_error(held.windows, batch["x"][:, : held.observed], forecasts)
+            scores["bone-length error"] = _bone_length_error(held.windows, past, forecasts)
         if held.pose_prior is not None:
-            scores["pose NLL"] = _pose_nll(held.pose_prior, batch["x"][:, : held.observed], forecasts)
+            scores["pose NLL"] = _pose_nll(held.pose_prior, past, forecasts)
+        seen = {label: _features(judge.model, forecasts) for label, judge in held.judges.items()}
+        for label, judge in held.judges.items():
+            if (judge.classes >= 0).any():
+                scores[f"ACC {label}"] = _accuracy(judge.model.logits(seen[label]).cpu(), judge.classes[part])
         found.append(scores)
-    return _concatenate(found)
+        features.append({label: values.double().cpu() for label, values in seen.items()})
+    places = torch.tensor(held.places)
+    pooled = {
+        f"FID {label}": frechet_pseudo_values(held.judges[label].real, values, places)
+        for label, values in _concatenate(features).items()
+    }
+    return held.clip_means(_concatenate(found)) | pooled
+
+
+def _accuracy(logits: Tensor, classes: Tensor) -> Tensor:
+    """Share of right answers (B,) in (B, K, C); NaN where the class is unknown, -1."""
+    right = (logits.argmax(-1) == classes[:, None]).double().mean(1)
+    return right.masked_fill(classes < 0, math.nan)
+
+
+def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tuple[float, ...]:
+    """The Fréchet distance between two sets of features, as a pseudo-value of each clip (see the file).
+
+    They are moved by one constant so that their mean over windows is the distance as it is defined: the mean of plain
+    pseudo-values is one that is corrected for bias.
+
+    Args:
+        real: `(N, F)`, of the true futures.
+        generated: `(N, K, F)`, of the generated ones.
+        places: `(N,)`, the clip of every window, from 0 to C - 1.
+    """
+    centre = real.mean(0)  # far from 0, second moments would cancel
+    sets = _moments_without_clips(real[:, None] - centre, places), _moments_without_clips(generated - centre, places)
+    distance = metrics.gaussian_frechet_distance(*sets[0], *sets[1])
+    shares = places.bincount().double() / len(places)
+    without = distance[1:] if len(shares) > 1 else distance
+    pseudo = distance[0] + (1 / shares - 1) * (distance[0] - without)
+    return tuple((pseudo - (shares * pseudo).sum() + distance[0]).tolist())
+
+
+def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Means (1 + C, F) and covariances (1 + C, F, F) of (N, K, F), of all windows and without each of C > 1 clips."""
+
+    def sums(values: Tensor) -> Tensor:
+        by_clip = values.new_zeros(int(places.max()) + 1, *values.shape[1:]).index_add_(0, places, values)
+        whole = by_clip.sum(0, keepdim=True)
+        return torch.cat([whole, whole - by_clip]) if len(by_clip) > 1 else whole
+
+    count = sums(features.new_full((len(features), 1), features.shape[1]))
+    mean = sums(features.sum(1)) / count
+    squares = sums(features.mT @ features)
+    return mean, (squares - count[..., None] * mean[:, :, None] * mean[:, None]) / (count[..., None] - 1)
 
 
 def _teacher_forced(name: str, model: Any, particles: int, held: _Held, parts: Iterator[slice]) -> dict[str, Tensor]:
@@ -693,9 +829,10 @@ def _pose_nll(prior: Any, observed: Tensor, forecasts: Tensor) -> Tensor:
     return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)
 
 
-def _forecaster(model: Any, draw_emission: bool) -> Forecaster:
-    return lambda observed, horizon, samples: model.forecast(
-        on_device_of(model, observed), horizon, samples, draw_emission=draw_emission
+def _forecaster(model: Any, held: _Held, samples: int, draw_emission: bool) -> Forecaster:
+    horizon = held.futures.shape[1]
+    return lambda part: model.forecast(
+        on_device_of(model, held.past(part)), horizon, samples, draw_emission=draw_emission
     )["x"]
 
 
@@ -728,8 +865,12 @@ def evaluating(model: nn.Module, seed: int) -> Iterator[None]:
 
 
 def _reading(name: str) -> Metric:
-    """How to read a metric; every latent has a `KL` of its own."""
-    return METRICS[name] if name in METRICS else Metric("nats/frame", "teacher-forced", "")
+    return METRICS[_kind(name)]
+
+
+def _kind(name: str) -> str:
+    """The name of a metric in `METRICS`."""
+    return name if name in METRICS else name.partition(" ")[0]
 
 
 def plain(value: Any) -> Any:

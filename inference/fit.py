@@ -185,6 +185,7 @@ class Fit:
             likelihood has no bound: minus its objective stands here.
         status: "finished", "stopped early" or "interrupted".
         run: the run directory, if there is one.
+        per: what bounds are per: a frame, unless the model has another word in `per`.
     """
 
     history: list[dict[str, Any]]
@@ -193,6 +194,7 @@ class Fit:
     best_bound: float | None
     status: str
     run: Path | None
+    per: str = "frame"
 
     @property
     def best(self) -> str:
@@ -201,7 +203,7 @@ class Fit:
             return ""
         if any("validation/loss" in row for row in self.history):
             return f"lowest validation loss {-self.best_bound:.4f} at step {self.best_step}"
-        return f"best bound {self.best_bound:.3f} nats a frame at step {self.best_step}"
+        return f"best bound {self.best_bound:.3f} nats a {self.per} at step {self.best_step}"
 
     def series(self, name: str) -> tuple[list[int], list[float]]:
         """Return the steps and values of one number of the log, such as "kl/z" or "validation/bound"."""
@@ -217,7 +219,8 @@ class Fit:
 
         names = sorted({name for row in self.history for name in row})
         likelihood = any(name.startswith("log_likelihood/") for name in names)
-        score, start, unit = ("bound", "kl/", "nats per frame") if likelihood else ("loss", "energy/", "per frame")
+        score, start = ("bound", "kl/") if likelihood else ("loss", "energy/")
+        unit = f"nats per {self.per}" if likelihood else f"per {self.per}"
         figure, (whole, terms) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
         whole.plot(*self.series(score), color="0.7", label="training batch")
         if self.best_step is not None:
@@ -379,7 +382,8 @@ def fit(
         call("on_end")
         if loop.best is not None:
             model.load_state_dict(loop.best)
-    result = Fit(memory.rows, state.step, state.best_step, state.best_bound, state.status, run.path if run else None)
+    path, per = run.path if run else None, getattr(model, "per", Fit.per)
+    result = Fit(memory.rows, state.step, state.best_step, state.best_bound, state.status, path, per)
     if state.status == "interrupted":
         raise Interrupted(result, signals.received or signal.SIGINT)
     return result
@@ -441,7 +445,7 @@ class _Loop:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         where = f"step {state.step + 1}"
-        terms = self._terms(source.sample(training.batch_size, self.generator), where, feeding)
+        terms = self._terms(source.sample(training.batch_size, self.generator), stage.objective, where, feeding)
         loss = stage.objective(terms, state.step)
         self.optimizer.zero_grad()
         self.fabric.backward(loss)
@@ -480,7 +484,7 @@ class _Loop:
         A run with self-feeding learns to run on its own output, which costs it bound on the true past. There
         the best is by the bound of the self-fed program, once the schedule has reached its last value.
 
-        A model without a likelihood has no bound; there the best is by the objective.
+        A model without a likelihood has no bound; there, and where the objective says so, the best is by the objective.
         """
         state = self.state
         row = self._score(data, 0.0)
@@ -507,9 +511,9 @@ class _Loop:
         with _forked_random_state(self.fabric.device), torch.no_grad():
             torch.manual_seed(self.training.seed)
             for batch in data.split(self.training.batch_size):
-                terms = self._terms(batch, f"validation after step {self.state.step}", feeding)
+                terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
                 found = _sums(terms)
-                if not terms.likelihood:
+                if not terms.likelihood or getattr(objective, "select", "bound") == "loss":
                     found["loss"] = objective(terms, self.state.step).double() * found["frames"]
                 for name, value in found.items():
                     sums[name] = sums[name] + value if name in sums else value
@@ -583,11 +587,13 @@ class _Loop:
         if BEST in stored["fingerprints"]:
             self.best = load_tensors(self.run.read(BEST))
 
-    def _terms(self, batch: Batch, where: str, feeding: float = 0.0) -> Terms:
-        """Terms of a batch, on the device and in the precision of the model."""
+    def _terms(self, batch: Batch, objective: Objective, where: str, feeding: float = 0.0) -> Terms:
+        """Terms of a batch that the objective needs, on the device and in the precision of the model."""
         dtype = self.parameters[0].dtype
         placed = each(batch, lambda v: v.to(dtype) if v.is_floating_point() else v)
-        program = {"self_feeding": feeding} if feeding else {}
+        program: dict[str, Any] = {"self_feeding": feeding} if feeding else {}
+        if draws := getattr(objective, "draws", None):
+            program["draws"] = draws
         try:
             return Terms(**self.module(self.fabric.to_device(placed), program))
         except ValueError as error:

@@ -4,7 +4,8 @@ The motion errors follow the evaluation code of DLow (Yuan and Kitani 2020, arXi
 Liu and Salzmann 2021, arXiv:2108.08422); the median versions are those of HiT-DVAE (Bie et al. 2022,
 arXiv:2204.01565). They reward the best (or the median) of K samples and are not proper: a forecaster gains by
 spreading its samples. The energy score (Gneiting and Raftery 2007, section 4.3) and the variogram score
-(Scheuerer and Hamill 2015) stand beside them.
+(Scheuerer and Hamill 2015) stand beside them. The Fréchet distance compares two sets of motions by features
+of them, and has shapes of its own.
 
 Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`,
 or `(..., M, T, D)` where M futures are admissible; the result has the leading shape `(...)`. Torch tensors
@@ -25,6 +26,8 @@ __all__ = [
     "average_pairwise_distance",
     "energy_score",
     "final_displacement_error",
+    "frechet_distance",
+    "gaussian_frechet_distance",
     "median_average_displacement_error",
     "median_final_displacement_error",
     "median_multimodal_average_displacement_error",
@@ -163,6 +166,57 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
         return total / max(1, frames * size * (size - 1) // 2)
 
     return _per_window(score, *_paired(samples, truth))
+
+
+def frechet_distance(features: Array, other: Array) -> Tensor:
+    """Fréchet distance between normal fits to two sets of features: FID (Heusel et al. 2017, arXiv:1706.08500).
+
+    See `gaussian_frechet_distance`; covariances are unbiased (divided by N - 1), in double precision. It is biased
+    upward in small sets, and compares distributions: it does not see which features belong to which window.
+
+    Args:
+        features: `(N, F)`, N at least 2.
+        other: `(M, F)`, M at least 2.
+
+    Returns:
+        A scalar, in the square of the features' unit.
+    """
+    sets = [torch.as_tensor(each).double() for each in (features, other)]
+    if any(each.ndim != 2 or len(each) < 2 for each in sets) or sets[0].shape[1] != sets[1].shape[1]:
+        raise ValueError(
+            "the Fréchet distance needs features (N, F) and (M, F), N and M at least 2, not "
+            f"{_shape(sets[0])} and {_shape(sets[1])}"
+        )
+    moments = [moment for each in sets for moment in (each.mean(0), each.T.cov().reshape(2 * [each.shape[1]]))]
+    return gaussian_frechet_distance(*moments)
+
+
+def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tensor, other_covariance: Tensor) -> Tensor:
+    """Squared Fréchet (2-Wasserstein) distance between two normal distributions (Dowson and Landau 1982).
+
+    |m - n|^2 + tr(C + D - 2 (C D)^1/2), where tr (C D)^1/2 is the sum of the singular values of C^1/2 D^1/2. What is
+    below the rounding error of the traces is 0.
+
+    Args:
+        mean: `(..., F)`.
+        covariance: `(..., F, F)`, symmetric and positive semidefinite.
+        other_mean: like `mean`.
+        other_covariance: like `covariance`.
+
+    Returns:
+        `(...)`, in the square of the unit of the means.
+    """
+
+    # A root of the eigenvalues of C^1/2 D C^1/2 would turn their rounding errors of 1e-16 into 1e-8.
+    def root(matrix: Tensor) -> Tensor:
+        values, vectors = torch.linalg.eigh(matrix)
+        return vectors * values.clamp(min=0).sqrt()[..., None, :] @ vectors.mT
+
+    traces = sum(matrix.diagonal(dim1=-2, dim2=-1).sum(-1) for matrix in (covariance, other_covariance))
+    shared = torch.linalg.svdvals(root(covariance) @ root(other_covariance)).sum(-1)
+    distance = (mean - other_mean).square().sum(-1) + traces - 2 * shared
+    rounding = 4 * mean.shape[-1] * torch.finfo(mean.dtype).eps * traces
+    return torch.where(distance > rounding, distance, 0.0)
 
 
 def _displacement(samples: Tensor, truth: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ model selection reads `Terms.bound`.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from torch import Tensor
 
@@ -41,6 +41,10 @@ class Evidence:
         free_bits: nats per frame, averaged over the batch, below which a latent's KL costs nothing more; a
             number for every latent, or one for each latent by name (others have none).
         energy_weights: weight of each energy by name (others weigh 1).
+        draws: of a latent, by name, for each sequence: energies that compare samples, such as that of the best of
+            many, need several (see `DynamicalVAE.model`). The terms of the bound are means over them.
+        select: what tells the best weights: the unweighted "bound", or the "loss" itself, where energies are what is
+            trained.
 
     Raises:
         ValueError: on the first call, when a name is not among the terms.
@@ -52,6 +56,12 @@ class Evidence:
     kl_weight: float | Schedule | Mapping[str, float | Schedule] = 1.0
     free_bits: float | Mapping[str, float] = 0.0
     energy_weights: Mapping[str, float | Schedule] = field(default_factory=dict)
+    draws: Mapping[str, int] = field(default_factory=dict)
+    select: Literal["bound", "loss"] = "bound"
+
+    def __post_init__(self) -> None:
+        if self.select not in ("bound", "loss"):
+            raise ValueError(f"select is {self.select!r}; it must be 'bound' or 'loss'")
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
         """Return the loss, a scalar."""

@@ -25,7 +25,7 @@ from ..notation import Factor, Factorization
 from ..priors import FlowPrior, MixturePrior, Prior, VampPrior
 
 SHAPES: dict[str, type[Linear | Cosine | Logistic]] = {"linear": Linear, "cosine": Cosine, "logistic": Logistic}
-EMISSIONS = ("normal", "fixed", "student")
+EMISSIONS = ("normal", "fixed", "student", "unit")
 PRIORS = ("standard", "mixture", "vamp", "flow")
 
 
@@ -35,10 +35,10 @@ class Method:
 
     Args:
         latent: size of z.
-        emission: distribution of x: "fixed" (normal, one learned scale per coordinate), "normal" (scale read from the
-            parents) or "student" (Student t).
-        residual: the mean of x_t is an offset from x_{t-1}, which the factor must read. Sharper one step ahead, but a
-            free run can drift without bound.
+        emission: distribution of x: "fixed" (normal, one learned scale per coordinate), "unit" (normal, variance 1),
+            "normal" (scale read from the parents) or "student" (Student t).
+        residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1, an offset, one step
+            ahead is sharp, but a free run can drift without bound; somewhat less forgets where it was.
         prior: distribution of the static latents without parents: "standard" (normal, nothing learned), "mixture" (of
             normals), "vamp" (of the guide's posteriors of learned pseudo-sequences) or "flow".
         prior_components: of "mixture" and "vamp".
@@ -60,10 +60,11 @@ class Method:
     unused: ClassVar[frozenset[str]] = frozenset()  # options that do not apply; the command line does not show them
     likelihood: ClassVar[bool] = True  # without it, the best weights are by the objective in place of a bound
     forecasts: ClassVar[bool] = True  # whether its models forecast motion, which evaluation and comparison ask for
+    use: ClassVar[str] = "score it with: dvae evaluate {run}"  # what to do with a fitted run
 
     latent: int = 16
-    emission: Literal["fixed", "normal", "student"] = "fixed"
-    residual: bool = False
+    emission: Literal["fixed", "unit", "normal", "student"] = "fixed"
+    residual: float = 0.0
     prior: Literal["standard", "mixture", "vamp", "flow"] = "standard"
     prior_components: int = 16
     prior_steps: int = 16
@@ -81,8 +82,15 @@ class Method:
                 raise ValueError(f"unknown {name} {getattr(self, name)!r}; known: {', '.join(known)}")
         if not 0 <= self.free_bits < math.inf:
             raise ValueError(f"free_bits is {self.free_bits}; it must be finite and at least 0")
+        if not 0 <= self.residual <= 1:
+            raise ValueError(f"residual is {self.residual}; it must be a share, between 0 and 1")
         if not 0 <= self.self_feeding <= 1:
             raise ValueError(f"self_feeding is {self.self_feeding}; it must be a probability, between 0 and 1")
+
+    @property
+    def selects(self) -> Literal["bound", "loss"]:
+        """What tells the best weights (see `Evidence`)."""
+        return "bound" if self.likelihood else "loss"
 
     def equations(self) -> tuple[Factorization, Factorization]:
         """The generative model and the guide."""
@@ -101,6 +109,7 @@ class Method:
         kinds: dict[str, HeadSpec] = {
             "normal": Normal(residual=self.residual),
             "fixed": FixedNormal(scale=0.1, learned=True, residual=self.residual),
+            "unit": FixedNormal(residual=self.residual),
             "student": StudentT(residual=self.residual),
         }
         return {"p(x)": kinds[self.emission]}
@@ -140,7 +149,7 @@ class Method:
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
         """The model for data of these sizes, such as {"x": 60}."""
         sizes = {**self.sizes(), **data}
-        return DynamicalVAE(self.generative, self.inference, sizes, self.networks(), self.heads(), self.priors(sizes))
+        return DynamicalVAE(*self.equations(), sizes, self.networks(), self.heads(), self.priors(sizes))
 
     def suited(self, windows: Windows) -> Method:
         """The method with what its options leave open chosen for these windows; itself, where nothing is open."""
@@ -172,6 +181,10 @@ class Method:
         """Where training draws its batches from: the windows, and what the objective needs beside them."""
         return windows
 
+    def validation(self, windows: Windows) -> Windows:
+        """What the weights are judged by: the windows, with what the model needs beside them."""
+        return windows
+
     def objective(self) -> Objective:
         """What training minimises."""
         weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0
@@ -197,7 +210,21 @@ class Method:
 @cache
 def methods() -> dict[str, type[Method]]:
     """Every known method by name: those of this package and of installed packages (entry points "dvae.methods")."""
-    from . import dkf, dsae, equations, gsps, hit_dvae, kvae, pose_prior, rvae, srnn, storn, vae, vrnn
+    from . import (
+        action_classifier,
+        dkf,
+        dsae,
+        equations,
+        gsps,
+        hit_dvae,
+        kvae,
+        pose_prior,
+        rvae,
+        srnn,
+        storn,
+        vae,
+        vrnn,
+    )
 
     own: list[type[Method]] = [
         vae.VAE,
@@ -212,6 +239,7 @@ def methods() -> dict[str, type[Method]]:
         hit_dvae.HiTDVAE,
         gsps.GSPS,
         pose_prior.PosePrior,
+        action_classifier.ActionClassifier,
         equations.Equations,
     ]
     table = {method.name: method for method in own}

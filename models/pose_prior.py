@@ -59,6 +59,7 @@ class PosePrior(Method):
     inference: ClassVar[str] = ""
     unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method))
     forecasts: ClassVar[bool] = False
+    use: ClassVar[str] = "score the poses of forecasts with: dvae evaluate RUN --pose-prior {run}"
 
     layers: int = 3
     noise: float = 0.002

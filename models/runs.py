@@ -160,7 +160,7 @@ def fit(
     return fit_model(
         model,
         method.batches(train),
-        validation,
+        method.validation(validation),
         stages=method.stages(training.steps),
         out=out,
         config={"method": method.config(), **data.config()},
@@ -200,7 +200,7 @@ def resume(
     return fit_model(
         run.model,
         run.method.batches(run.data.windows("train")),
-        run.data.windows("validation"),
+        run.method.validation(run.data.windows("validation")),
         stages=run.method.stages(steps),
         out=path,
         resume=True,

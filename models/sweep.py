@@ -74,7 +74,7 @@ class Result:
             return f"{self.path.name} failed: {self.error}"
         how = f"in {_clock(self.seconds)}" if self.seconds else "by an earlier sweep"
         bound = "" if self.best_bound is None else f", best bound {self.best_bound:.3f} nats a frame"
-        if self.best_bound is not None and not self.method.likelihood:
+        if self.best_bound is not None and self.method.selects == "loss":
             bound = f", lowest validation loss {-self.best_bound:.4f}"
         return f"{self.path.name} {self.status} at step {self.step} {how}{bound}"
 

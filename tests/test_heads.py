@@ -1,11 +1,12 @@
 """Heads: what they draw is what they say, scales stay positive, and a description is plain data."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 import torch
 
+import dvae
 from dvae import heads
 from dvae.conditional import Conditional
 from dvae.networks import Dense, Recurrent
@@ -83,12 +84,21 @@ def test_parameters_of_one_step_are_those_of_all_steps(name):
 
 
 @pytest.mark.parametrize("name", [name for name in HEADS if "residual" in name or name == "fixed, learned"])
-def test_a_residual_location_is_an_offset(name):
-    head = build(name)
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_a_residual_location_keeps_its_share_of_the_previous_value(name, share):
+    head = replace(HEADS[name], residual=share).build(D, D).double()
     features, before = torch.randn(B, T, D, dtype=torch.float64), previous(head, B, T)
     there, here = head(features, before), head(features, torch.zeros_like(before))
-    torch.testing.assert_close(there[0] - here[0], before)
+    torch.testing.assert_close(there[0] - here[0], share * before)
     torch.testing.assert_close(there[1:], here[1:])
+
+
+def test_a_share_of_the_previous_value_is_one():
+    for share in (-0.1, 1.1):
+        with pytest.raises(ValueError, match="it is a share of the previous value, from 0 to 1"):
+            heads.Normal(residual=share).build(D, D)
+    with pytest.raises(ValueError, match="residual is 2; it must be a share, between 0 and 1"):
+        dvae.method("srnn", residual=2)
 
 
 @pytest.mark.parametrize("spec", [heads.Normal(min_scale=0.2), heads.StudentT(min_scale=0.2)])

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy.linalg
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,6 +15,8 @@ from dvae.inference.metrics import (
     average_pairwise_distance,
     energy_score,
     final_displacement_error,
+    frechet_distance,
+    gaussian_frechet_distance,
     median_average_displacement_error,
     median_final_displacement_error,
     median_multimodal_average_displacement_error,
@@ -153,9 +156,51 @@ def test_variogram_score_sees_lost_dependence_and_not_a_common_offset():
     torch.testing.assert_close(variogram_score(common + 7, truth), variogram_score(common, truth))
 
 
+# Fréchet distance of features
+
+
+@pytest.mark.parametrize("rows", [3, 8, 200])  # with covariances of full rank and of less
+def test_frechet_distance_of_a_set_from_itself_is_exactly_zero_in_any_order(rows):
+    features = draw(rows, 6) @ draw(6, 6, seed=1) + 5
+    assert frechet_distance(features, features) == 0
+    assert frechet_distance(features, features.flip(0)) == 0
+    assert frechet_distance(features, features + 1e-3).item() == pytest.approx(6e-6, rel=1e-6)
+
+
+@given(st.integers(2, 40), st.integers(2, 40), st.integers(1, 6), st.integers(0, 999))
+def test_frechet_distance_is_that_of_normal_fits_by_another_formula(first, second, size, seed):
+    a, b = draw(first, size, seed=seed), draw(second, size, seed=seed + 1) @ draw(size, size, seed=seed + 2) + 1
+    if min(first, second) <= size:  # sqrtm wants full rank
+        a, b = torch.cat([a, draw(size + 1, size, seed=seed + 3)]), torch.cat([b, draw(size + 1, size, seed=seed + 4)])
+    means, covariances = zip(*((x.mean(0).numpy(), np.cov(x.T.numpy()).reshape(size, size)) for x in (a, b)))
+    root = scipy.linalg.sqrtm(covariances[0] @ covariances[1]).real
+    expected = ((means[0] - means[1]) ** 2).sum() + np.trace(covariances[0] + covariances[1] - 2 * root)
+    assert frechet_distance(a, b).item() == pytest.approx(expected, rel=1e-6)
+    assert frechet_distance(b.numpy(), a.numpy()).item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_frechet_distance_of_normals_in_closed_form():
+    mean, other, scales = draw(3), draw(3, seed=1), draw(2, 3, seed=2).abs()
+    turn = torch.linalg.qr(draw(3, 3, seed=3)).Q
+    first, second = ((turn * scale.square()) @ turn.T for scale in scales)
+    expected = (mean - other).square().sum() + (scales[0] - scales[1]).square().sum()  # of covariances that commute
+    torch.testing.assert_close(gaussian_frechet_distance(mean, first, other, second), expected)
+    batch = gaussian_frechet_distance(
+        torch.stack([mean, other]), torch.stack([first, second]), torch.stack([other, other]), torch.stack([second] * 2)
+    )
+    torch.testing.assert_close(batch, torch.stack([expected, torch.zeros_like(expected)]))
+    point = torch.zeros(3, 3, dtype=torch.float64)
+    torch.testing.assert_close(
+        gaussian_frechet_distance(mean, point, mean, first), scales[0].square().sum()
+    )  # a collapsed set lies as far off as the other one is wide
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (lambda: frechet_distance(draw(1, 3), draw(4, 3)), r"N and M at least 2, not \(1, 3\) and \(4, 3\)"),
+        (lambda: frechet_distance(draw(5, 2), draw(4, 3)), r"not \(5, 2\) and \(4, 3\)"),
+        (lambda: frechet_distance(draw(5), draw(4)), r"needs features \(N, F\)"),
         (lambda: average_pairwise_distance(draw(4, 3)), "axis for K = 1"),
         (lambda: average_pairwise_distance(draw(0, 4, 3)), "nothing to score"),
         (lambda: average_displacement_error(draw(5, 4, 3), draw(3, 3)), r"of shape \(4, 3\), not \(3, 3\)"),
@@ -171,5 +216,5 @@ def test_what_does_not_fit_is_refused(call, message):
 
 
 def test_all_scores_are_public():
-    public = {metrics.average_pairwise_distance, *PAIRED, *MULTIMODAL}
+    public = {average_pairwise_distance, frechet_distance, gaussian_frechet_distance, *PAIRED, *MULTIMODAL}
     assert {getattr(metrics, name) for name in metrics.__all__} == public

@@ -11,6 +11,7 @@ from pyro import poutine
 from pyro.infer import Predictive, Trace_ELBO
 
 from dvae import DynamicalVAE, heads, priors
+from dvae.inference.bounds import SequenceELBO
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.rollout import SelfFeeding
 from dvae.testing.strategies import factorizations
@@ -382,6 +383,22 @@ def test_feeding_on_ones_own_means(pair, network, residual):
     some = logs(0.5)
     close(logs(SelfFeeding(0.5, passes=T)), some)
     assert not torch.allclose(some["x"], exact["x"])
+
+
+def test_gradients_flow_back_in_time_through_fed_means_where_they_are_asked_for():
+    """The exact loop and T parallel passes have one gradient; without, that of the fed history as data."""
+    model = build("srnn").double()
+    x = torch.randn(2, T, model.sizes["x"], dtype=torch.float64)
+
+    def gradients(feeding):
+        torch.manual_seed(0)
+        loss = SequenceELBO().differentiable_loss(model, model.guide, x, self_feeding=feeding)
+        return torch.autograd.grad(loss, list(model.generator.parameters()), allow_unused=True)
+
+    loop, passes = (gradients(SelfFeeding(1.0, passes, gradient=True)) for passes in (None, T))
+    detached = gradients(SelfFeeding(1.0))
+    torch.testing.assert_close(loop, passes, rtol=1e-9, atol=1e-9)
+    assert any(not torch.allclose(a, b) for a, b in zip(loop, detached, strict=True) if a is not None)
 
 
 @pytest.mark.parametrize("feeding", [SelfFeeding(0.5), SelfFeeding(0.5, passes=2), SelfFeeding(1.0)])

@@ -28,6 +28,7 @@ NETWORKS = {
     "attention": Attention(8, heads=2),
     "attention, two layers": Attention(8, heads=4, layers=2, feedforward=6),
     "attention, extracted": Attention(8, heads=2, nearest=False, extract={"z": PoseGraph(2), "x": (3,), "w": (4,)}),
+    "attention, with a skip": Attention(8, heads=2, skip=True, extract={"z": (3,)}),
     "lstm, poses": Recurrent(4, extract={"z": PoseGraph(2), "x": PoseGraph(2)}, hidden=(5,)),
     "dense": Dense((5, 4)),
 }
@@ -157,6 +158,25 @@ def test_an_encoder_obeys_its_masks_step_by_step_and_in_ragged_batches(pair, lay
     for i, n in enumerate(lengths.tolist()):
         single = network({k: v[i : i + 1, :n] if v.dim() == 3 else v[i : i + 1] for k, v in parents.items()}, n)
         torch.testing.assert_close(together[i : i + 1, :n], single, rtol=0, atol=1e-10)
+
+
+def test_attention_can_be_looked_at():
+    """Shares sum to one, nothing hidden has one, and the values they mix are what the layers go on with."""
+    inputs = [Input("z", 2, Relation.parse("<t")), Input("x", 3, Relation.parse("1:T")), Input("w", 2)]
+    network = Attention(8, heads=2, layers=2, extract={"x": PoseGraph(2)}).build(inputs, True, 2).double()
+    parents = draw(inputs, 3)
+    mixed = []
+    for layer in network.layers:
+        layer.out.register_forward_pre_hook(lambda _, given: mixed.append(given[0]))
+    network(parents, T)
+    found = network.attention(parents, T)
+    values = network.extractors.of(parents, None)
+    tokens, _ = network.tokens(network.ranged, values, 3, T, None)
+    hidden = ~torch.cat([torch.ones(T, 1, dtype=torch.bool), torch.tril(torch.ones(T, T), -1).bool()], 1)
+    for layer, shares, seen in zip(network.layers, found, mixed, strict=False):
+        torch.testing.assert_close(shares.sum(-1), torch.ones(3, 2, T, dtype=torch.float64))
+        assert (shares[..., : T + 1].masked_select(hidden) == 0).all()
+        torch.testing.assert_close((shares @ layer.project(tokens)[1]).transpose(1, 2).flatten(2), seen)
 
 
 def test_an_encoder_tells_past_from_future():

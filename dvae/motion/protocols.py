@@ -19,6 +19,8 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import astuple, dataclass
 from math import pi
 from typing import Any, Literal
@@ -211,6 +213,7 @@ class Windows:
         self._frames = torch.cat([torch.from_numpy(clip.positions) for clip in self.clips])
         frames = torch.tensor([clip.frames for clip in self.clips])
         self._first = frames.cumsum(0) - frames
+        self._classes: dict[str, Tensor] = {}  # by variable, the class of every clip
         self._starts = frames - length + 1
         self._weights = self._draw_weights().cumsum(0)
 
@@ -264,7 +267,7 @@ class Windows:
             joints = x.unflatten(-1, (-1, 3))
             angle = (2 * pi * turn).float()[:, None, None]
             x = rotate_about_up(joints, angle, self.skeleton.up).flatten(-2)
-        return {"x": x}
+        return {"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}}
 
     def all(self, stride: int | None = None) -> dict[str, Tensor]:
         """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32."""
@@ -272,7 +275,7 @@ class Windows:
         x = torch.empty(len(clips), self.length, self.size)
         for block in torch.arange(len(clips)).split(512):  # so that memory holds the windows little more than once
             x[block] = self._cut(clips[block], starts[block])
-        return {"x": x}
+        return {"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}}
 
     def poses(self) -> Tensor:
         """Every frame of the clips, once, as a window that starts there has it: (N, D) float32."""
@@ -294,6 +297,29 @@ class Windows:
             known = sorted({label for clip in self.clips for label in clip.labels})
             raise KeyError(f"no label {name!r}; there are {', '.join(known) or 'none'}")
         return [self.clips[c].labels.get(name, "") for c in self._list(self.stride)[0].tolist()]
+
+    def classified(self, variable: str, label: str, classes: Sequence[str]) -> Windows:
+        """These windows, whose batches hold the class of each one too: {variable: (B,)} int64, indices of `classes`.
+
+        Args:
+            variable: its name in batches.
+            label: the label of the clips that is the class.
+            classes: what the label may be.
+
+        Raises:
+            ValueError: a clip lacks the label, or has one that is none of the classes.
+        """
+        for clip in self.clips:
+            if (found := clip.labels.get(label)) not in classes:
+                has = "has no label" if found is None else f"has {found!r} for"
+                raise ValueError(
+                    f"clip {'/'.join(clip.key)} ({self.split}) {has} {label!r}, expected one of {', '.join(classes)}: "
+                    "is labels.csv beside the file, with every clip in it and no class among held-out clips alone?"
+                )
+        windows = copy(self)
+        found_in = [classes.index(clip.labels[label]) for clip in self.clips]
+        windows._classes = {**self._classes, variable: torch.tensor(found_in)}
+        return windows
 
     def positions(self, x: Tensor) -> Tensor:
         """Joint positions (..., T, J, 3) of frames (..., T, D), for drawing and bone lengths.
@@ -317,6 +343,8 @@ class Windows:
         digest = hashlib.sha256(repr((astuple(self.protocol), self.split, self.length)).encode())
         digest.update(repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up, self.keys)).encode())
         digest.update(self._frames.numpy().astype("<f4", copy=False).tobytes())
+        for variable, classes in self._classes.items():
+            digest.update(repr((variable, classes.tolist())).encode())
         return digest.hexdigest()
 
     def _list(self, stride: int) -> tuple[Tensor, Tensor]:

@@ -38,6 +38,8 @@ class Attention:
         activation: of the perceptrons.
         nearest: the nearest visible frame of each range joins the query, which then knows where in a motion it is
             before it attends to more.
+        skip: what the query is made of joins the features too, so that the head reads it directly. What a variable
+            shares with its nearest frames is then learned several times faster.
         extract: what comes before all else, by parent: widths of a perceptron, or the description of another module,
             such as `PoseGraph()`.
     """
@@ -48,6 +50,7 @@ class Attention:
     feedforward: int = 0
     activation: str = "gelu"
     nearest: bool = True
+    skip: bool = False
     extract: Extract = field(default_factory=dict)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> AttentionNetwork:
@@ -98,10 +101,18 @@ class Layer(nn.Module):
         keys, values = self.keys_values(tokens).unflatten(-1, (2 * self.heads, -1)).transpose(1, 2).chunk(2, dim=1)
         return keys, values
 
+    def queries(self, stream: Tensor) -> Tensor:
+        """(B, heads, T, W / heads) from the stream (B, T, W)."""
+        return self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+
+    def weights(self, stream: Tensor, keys: Tensor, bias: Tensor) -> Tensor:
+        """The shares (B, heads, T, S) in which a query mixes the values."""
+        query = self.queries(stream)
+        return (query @ keys.transpose(-1, -2) / math.sqrt(query.shape[-1]) + bias).softmax(-1)
+
     def forward(self, stream: Tensor, keys: Tensor, values: Tensor, bias: Tensor) -> Tensor:
         """The stream (B, T, W) after attending under the additive bias, broadcastable to (B, heads, T, S)."""
-        query = self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        seen = functional.scaled_dot_product_attention(query, keys, values, attn_mask=bias)
+        seen = functional.scaled_dot_product_attention(self.queries(stream), keys, values, attn_mask=bias)
         stream = stream + self.out(seen.transpose(1, 2).flatten(2))
         return stream + self.perceptron(stream)
 
@@ -137,6 +148,8 @@ class AttentionNetwork(Network):
         self.embed = nn.ModuleDict({p.name: nn.Linear(p.size, spec.width) for p in self.ranged})
         sizes = [parent.size for parent, _ in self.points]
         self.point = Join(sizes, (spec.width, spec.width), spec.activation) if sizes else None
+        self.skip = Join(sizes, (), spec.activation) if sizes and spec.skip else None
+        self.features += self.skip.features if self.skip is not None else 0
         self.origin = nn.Parameter(torch.randn(spec.width) / math.sqrt(spec.width))
         self.layers = nn.ModuleList(Layer(spec) for _ in range(spec.layers if self.ranged else 0))
         self.norm = nn.LayerNorm(spec.width)
@@ -162,15 +175,41 @@ class AttentionNetwork(Network):
             for layer in self.layers:
                 stream = layer(stream, *layer.project(tokens), bias)
         stream = self.norm(stream)
+        if self.skip is not None:
+            stream = torch.cat(aligned([stream, self.skip(self.parts(parents))]), dim=-1)
         return stream if self.local else stream[:, 0]
+
+    @torch.no_grad()
+    def attention(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> list[Tensor]:
+        """What every layer attends to, to look at: shares (B, heads, T, 1 + T parents) that sum to one.
+
+        The start token comes first, then the steps of each ranged parent, in the order of `ranged`.
+
+        Args:
+            parents, length, lengths: see `Network.forward`.
+        """
+        batch = next(iter(parents.values())).shape[0]
+        parents = self.extractors.of(parents, lengths)
+        stream, found = self.queries(parents, batch, length), []
+        if self.ranged:
+            tokens, bias = self.tokens(self.ranged, parents, batch, length, lengths)
+            for layer in self.layers:
+                keys, values = layer.project(tokens)
+                found.append(layer.weights(stream, keys, bias))
+                stream = layer(stream, keys, values, bias)
+        return found
 
     def queries(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
         """(B, T, W), or (B, 1, W) for a static child."""
         stream = self.origin.expand(batch, length if self.local else 1, -1)
         if self.point is None:
             return stream
-        joined = self.point([part(parents[parent.name], lag) for parent, lag in self.points])
+        joined = self.point(self.parts(parents))
         return stream + (joined if joined.dim() == 3 else joined[:, None])
+
+    def parts(self, parents: Mapping[str, Tensor]) -> list[Tensor]:
+        """What the query is made of: (B, T, D), or (B, D) of static parents."""
+        return [part(parents[parent.name], lag) for parent, lag in self.points]
 
     def tokens(
         self,
@@ -200,6 +239,7 @@ class AttentionNetwork(Network):
         given = self.extractors.of(given, lengths)
         known = {i: part(given[p.name], lag) for i, (p, lag) in enumerate(self.points) if p.name in given}
         queries = self.point.hoist(known, batch, length) if self.point is not None else None
+        skipped = self.skip.hoist(known, batch, length) if self.skip is not None else None
         fixed = [p for p in self.ranged if p.name in given]
         live = [p for p in self.ranged if p.name not in given]
         tokens = bias = self.origin.new_zeros(1, 1, 1)
@@ -215,6 +255,7 @@ class AttentionNetwork(Network):
             bias = torch.cat([bias.expand(*shape, -1), ahead.expand(*shape, -1)], dim=-1)
         return Attending(
             queries=queries,
+            skipped=skipped,
             points=[entry for i, entry in enumerate(self.points) if i not in known],
             bias=bias,
             given=given_tokens,
@@ -231,8 +272,8 @@ class AttentionNetwork(Network):
         """See `Network.step`."""
         drawn = self.extractors.drawn(state.extracted, drawn, state.lengths)
         stream = self.origin.expand(state.batch, -1)
+        parts = [at(drawn[p.name], t + lag, stream, p.size) for p, lag in state.points if lag is not None]
         if state.queries is not None and self.point is not None:
-            parts = [at(drawn[p.name], t + lag, stream, p.size) for p, lag in state.points if lag is not None]
             stream = stream + self.point.add(state.queries, t, parts)
         stream = stream[:, None]
         if self.layers:
@@ -249,7 +290,10 @@ class AttentionNetwork(Network):
             bias = state.row(t)
             for layer, cache in zip(self.layers, state.caches, strict=True):
                 stream = layer(stream, cache.keys, cache.values, bias)
-        return self.norm(stream[:, 0]), state
+        features = self.norm(stream[:, 0])
+        if state.skipped is not None and self.skip is not None:
+            features = torch.cat([features, self.skip.add(state.skipped, t, parts)], dim=-1)
+        return features, state
 
 
 class SelfAttentionNetwork(Network):
@@ -279,6 +323,7 @@ class SelfAttentionNetwork(Network):
         then = replace(spec, extract={n: e for n, e in spec.extract.items() if n in [p.name for p in rest]})
         token = Input(ENCODED, spec.width, Relation.parse("t"))
         self.after = AttentionNetwork(then, [token, *rest], local) if rest else None
+        self.features = spec.width if self.after is None else self.after.features
 
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """See `Network.forward`."""
@@ -385,6 +430,7 @@ class Attending:
     """What an `AttentionNetwork` keeps between steps."""
 
     queries: Hoisted | None
+    skipped: Hoisted | None
     points: list[tuple[Input, int | None]]
     bias: Tensor
     """Of every step to the given tokens and then to all live ones: (B or 1, heads, T, given + parents * T)."""
@@ -394,7 +440,7 @@ class Attending:
     length: int
     masks: dict[str, list[list[bool]]]
     caches: list[Cache]
-    extracted: dict[str, Rows]
+    extracted: dict[str, tuple[Any, Rows]]
     lengths: Tensor | None
     seen: dict[int, None] = field(default_factory=dict)
     """Live tokens in the order of the cache: the step, plus T times the parent's place."""
@@ -407,6 +453,7 @@ class Attending:
         return replace(
             self,
             queries=select(self.queries, rows),
+            skipped=select(self.skipped, rows),
             batch=len(rows),
             caches=select(self.caches, rows),
             extracted=select(self.extracted, rows),

@@ -63,20 +63,33 @@ class Extractors(nn.ModuleDict):
         }
         return {**parents, **own}
 
-    def start(self, length: int) -> dict[str, Rows]:
-        """Where `drawn` keeps what it finds in a loop."""
-        return {name: Rows([None] * length) for name in self}
+    def start(self, length: int) -> dict[str, tuple[Any, Rows]]:
+        """What `drawn` evaluates in a loop, with what can be done before it done, and where it keeps what it finds."""
+        return {n: (getattr(m, "hoisted", lambda m=m: m)(), Rows([None] * length)) for n, m in self.items()}
 
     def drawn(
-        self, kept: Mapping[str, Rows], drawn: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
+        self,
+        kept: Mapping[str, tuple[Any, Rows]],
+        drawn: Mapping[str, Sequence[Tensor]],
+        lengths: Tensor | None,
     ) -> dict[str, Sequence[Tensor]]:
         """The draws of a loop so far as the network reads them; each passes through its extractor once."""
         found = dict(drawn)
         for name in self.keys() & drawn:
-            seen = kept[name]
+            extractor, seen = kept[name]
             for s, value in enumerate(drawn[name]):
                 if seen.missing(s) and value is not None:
-                    features = self[name](value)
+                    features = extractor(value)
                     seen[s] = features if lengths is None else features * (s < lengths)[:, None]
             found[name] = seen
         return found
+
+
+def share(name: str, *networks: Any) -> None:
+    """Gives networks one extractor of a parent, that of the first which has one.
+
+    What it finds is evaluated once for all of them (see `once`).
+    """
+    held = [network.extractors for network in networks if name in network.extractors]
+    for extractors in held[1:]:
+        extractors[name] = held[0][name]

@@ -356,7 +356,7 @@ class RecurrentState:
     hoisted: Hoisted
     memories: list[tuple[Memory, MemoryState]]
     live: list[tuple[Input, int]]
-    extracted: dict[str, Rows]
+    extracted: dict[str, tuple[Any, Rows]]
     given: dict[str, Tensor]
     lengths: Tensor | None
 

@@ -1,0 +1,185 @@
+"""The action classifier: which action a motion shows, and the features by which sets of motions are compared.
+
+    p(c | x_{1:T})
+
+A GRU reads the predicted part of a window, its last state gives the *features*, and these the logits:
+
+    features = tanh(W GRU(x_{O+1:T})_T + b)        p(c | x_{1:T}) = Categorical(logits = V features + a)
+
+It is fitted to real training motion and then judges forecasts (`dvae.evaluate(..., classifiers=...)`): ACC is the share
+of futures that it gives the true class, FID a distance between the features of real and of generated futures.
+
+Bie, Guo, Leglaive, Girin, Moreno-Noguer and Alameda-Pineda, 2022, arXiv 2204.01565, say "GRU of 2 layers, 128 units"
+and no more; the features are those of public code of this family (BeLFusion). That code starts the GRU from normal
+noise at every call, so that its scores are random; here the first state is zero and nothing is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar
+
+import pyro
+import torch
+from pyro import distributions
+from torch import Tensor, nn
+
+from ..inference.batches import Batch
+from ..inference.objectives import Evidence, Objective
+from ..model import DynamicalVAE
+from ..motion import Skeleton, Windows
+from ..notation import Factorization
+from .method import Method
+
+CLASS = "c"
+
+
+@dataclass(frozen=True)
+class ActionClassifier(Method):
+    """See the file. Options of every method that say something of latents, emissions or motion have no effect.
+
+    Args:
+        label: the label of the clips that is the class.
+        hidden: units of the GRU.
+        layers: of the GRU.
+        features: size of the features.
+        classes: names of the classes in the order of the logits; by default all of the training clips, sorted.
+    """
+
+    name: ClassVar[str] = "action-classifier"
+    source: ClassVar[str] = "Bie et al., 2022, arXiv 2204.01565"
+    generative: ClassVar[str] = "p(c | x_{1:T})"
+    inference: ClassVar[str] = ""
+    unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method))
+    forecasts: ClassVar[bool] = False
+    use: ClassVar[str] = "score forecasts with: dvae evaluate RUN --classifier {run}"
+
+    label: str = "content"
+    hidden: int = 128
+    layers: int = 2
+    features: int = 30
+    classes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("hidden", "layers", "features"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+
+    def equations(self) -> tuple[Factorization, Factorization]:
+        """See `Method.equations`; the guide has no factor."""
+        return Factorization.parse(self.generative), Factorization("q", ())
+
+    def check(self) -> None:
+        """See `Method.check`; all its options were checked when they were given."""
+
+    def suited(self, windows: Windows) -> ActionClassifier:
+        """See `Method.suited`: the classes, those of the clips that have a window.
+
+        Raises:
+            ValueError: fewer than two classes.
+        """
+        if self.classes:
+            return self
+        classes = sorted({clip.labels[self.label] for clip in windows.clips if self.label in clip.labels})
+        if len(classes) < 2:
+            known = sorted({label for clip in windows.clips for label in clip.labels})
+            raise ValueError(
+                f"there is nothing to tell apart: training clips have {' and '.join(classes) or 'nothing'} for the "
+                f"label {self.label!r}; their labels are {', '.join(known) or 'none (is labels.csv beside the file?)'}"
+            )
+        return replace(self, classes=tuple(classes))
+
+    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
+        """A classifier cannot be built from sizes alone.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError("an action classifier needs to know the classes; use build_for(windows)")
+
+    def build_for(self, windows: Windows) -> ActionClassifierModel:
+        """The model for such windows."""
+        return ActionClassifierModel(self.suited(windows), windows.skeleton, windows.size, windows.protocol.observed)
+
+    def batches(self, windows: Windows) -> Windows:
+        """See `Method.batches`: windows with their class.
+
+        Raises:
+            ValueError: a clip without the label, or of none of the classes.
+        """
+        return windows.classified(CLASS, self.label, self.suited(windows).classes)
+
+    validation = batches
+
+    def objective(self) -> Objective:
+        """Minus the log-likelihood, in nats per window."""
+        return Evidence()
+
+    def feeding(self, steps: int) -> float:
+        """0: nothing is fed to a model that draws no motion."""
+        return 0.0
+
+
+class ActionClassifierModel(nn.Module):
+    """The classifier.
+
+    Args:
+        method: with its classes.
+        skeleton: of the windows.
+        size: D, numbers of a frame.
+        observed: O, frames of a window before those that are judged.
+    """
+
+    per = "window"  # what there is one log-likelihood of
+
+    def __init__(self, method: ActionClassifier, skeleton: Skeleton, size: int, observed: int):
+        super().__init__()
+        self.label, self.classes = method.label, method.classes
+        self.skeleton, self.size, self.observed = skeleton, size, observed
+        self.gru = nn.GRU(size, method.hidden, method.layers, batch_first=True)
+        self.project = nn.Linear(method.hidden, method.features)
+        self.logits = nn.Linear(method.features, len(method.classes))
+
+    def model(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
+        """The Pyro program: one site c, batch (B,), observed at the windows' classes.
+
+        Args:
+            batch: holds x (B, T, D), and c (B,) int64, indices of the classes.
+
+        Raises:
+            ValueError: no classes, frames of another size, or padded sequences or missing entries, of which there are
+                none in windows of motion.
+        """
+        if extra := {"lengths", "mask"} & set(batch):
+            raise ValueError(f"a classifier reads whole windows; leave {' and '.join(sorted(extra))} out")
+        if CLASS not in batch:
+            raise ValueError(f"the batch lacks {CLASS!r}, the class of each window; Windows.classified gives it")
+        x = batch["x"]
+        if x.shape[1] <= self.observed:
+            raise ValueError(f"windows of {x.shape[1]} frames have none after the {self.observed} observed ones")
+        logits = self.logits(self.features(x[:, self.observed :]))
+        with pyro.plate("windows", len(x)):
+            return {CLASS: pyro.sample(CLASS, distributions.Categorical(logits=logits), obs=batch[CLASS])}
+
+    def guide(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
+        """Nothing is latent."""
+        return {}
+
+    def forward(self, batch: Batch, **options: Any) -> dict[str, Tensor]:
+        """The program, which bounds take."""
+        return self.model(batch, **options)
+
+    def features(self, futures: Tensor) -> Tensor:
+        """Features (..., F), each between -1 and 1, of predicted frames (..., H, D); `logits` takes them.
+
+        Raises:
+            ValueError: frames of another size.
+        """
+        if futures.shape[-1] != self.size:
+            raise ValueError(
+                f"frames have {futures.shape[-1]} numbers; this classifier was fitted to frames of {self.size}"
+            )
+        outputs, _ = self.gru(futures.reshape(-1, *futures.shape[-2:]))
+        return torch.tanh(self.project(outputs[:, -1])).unflatten(0, futures.shape[:-2])
