@@ -24,7 +24,7 @@ from speed import seconds, training_step
 import dvae
 from dvae import motion
 from dvae.distributions.flow import QRFlow
-from dvae.models.gsps import PUBLISHED, GSPSModel
+from dvae.models.gsps import PRESETS, GSPSModel
 
 TARGETS = {"step": ("at most", 28.0), "prior": ("at least", 3.0), "memory": ("at most", 6.7)}
 
@@ -50,7 +50,7 @@ def main() -> None:
 
     protocol = replace(motion.PROTOCOLS["simulated"], observed=25, predicted=100)
     windows = motion.windows(motion.simulate(), protocol, "train")
-    method = dvae.method("gsps", **PUBLISHED["human36m"], pose_prior=0.01)
+    method = dvae.method("gsps", **PRESETS["human36m"], pose_prior=0.01)
     model = method.build_for(windows).train()
     assert isinstance(model, GSPSModel)
     method.prepare(model, windows)

@@ -20,7 +20,7 @@ generator may see every window turned so that the last observed pose faces one w
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from itertools import accumulate
 from math import prod
 from operator import mul
@@ -28,25 +28,22 @@ from string import ascii_lowercase
 from typing import Any, ClassVar
 
 import numpy as np
-import pyro
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from .. import energies
 from ..heads import Delta
-from ..inference.batches import Source
 from ..inference.objectives import Evidence, Objective
 from ..model import WHOLE, Batch, DynamicalVAE
-from ..motion import Skeleton, Windows, face_forward, rotate_about_up
-from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
+from ..motion import Skeleton, Windows
 from ..motion.body import body_parts
-from ..motion.truths import PseudoTruths, WithPseudoTruths
 from ..networks import GraphConv
 from ..notation import Factorization
+from ..rollout import Rollout
+from .energies import EnergyMethod, EnergyModel
 from .method import Method
-from .pose_prior import PosePrior, PosePriorModel, fit_pose_prior
 
-PUBLISHED: dict[str, dict[str, Any]] = {
+PRESETS: dict[str, dict[str, Any]] = {
     "human36m": {
         "coefficients": 10,
         "width": 256,
@@ -67,24 +64,22 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "pool_stride": 15,
         "heading": False,
     },
+    "": {
+        "coefficients": 8,
+        "width": 128,
+        "draws": (4, 4),
+        "diversity": (2.0, 4.0),
+        "diversity_scale": (15.0, 50.0),
+        "pseudo_minimum": 0.02,
+        "pool_stride": 10,
+        "heading": True,
+    },
 }
-"""Skeleton to the paper's options."""
-
-SCALED: dict[str, Any] = {
-    "coefficients": 8,
-    "width": 128,
-    "draws": (4, 4),
-    "diversity": (2.0, 4.0),
-    "diversity_scale": (15.0, 50.0),
-    "pseudo_minimum": 0.02,
-    "pool_stride": 10,
-    "heading": True,
-}
-"""Options for other skeletons, at 30 frames a second and 15 observed and 60 predicted frames."""
+"""Skeleton to options: the paper's; and for others, at 30 frames a second, 15 observed and 60 predicted frames."""
 
 
 @dataclass(frozen=True)
-class GSPS(Method):
+class GSPS(EnergyMethod):
     """See the file. Without a likelihood, emission, residual, prior, warm-up, free bits and self-feeding do not apply.
 
     Options that are None are chosen by the skeleton: the paper's for Human3.6M and HumanEva-I, smaller ones for others.
@@ -99,21 +94,7 @@ class GSPS(Method):
         width: features of a joint in the networks.
         blocks: residual blocks in each.
         draws: of each part's latent, in training, for each draw of the parts before.
-        reconstruction: weight of the squared error of the best future.
-        multimodal: weight of that to the pseudo ground truths.
-        diversity: weight of the likeness of a part's futures, for each part.
-        diversity_scale: metres, L1, over which futures of a part are alike, for each part.
         history: weight of the squared error in the observed frames.
-        limb: weight of the squared error of the limbs' lengths.
-        angles: weight of the violation of the angles' limits.
-        pose_prior: weight of the poses' energy under a pose prior.
-        pose_prior_run: run directory of a fitted pose-prior; "" to fit one first.
-        angle_quantile: share of the training poses that an angle's limit leaves out at each end.
-        pseudo_threshold: metres between last observed poses, within which futures are exchanged.
-        pseudo_minimum: metres, mean over joints, that such a future keeps from the true one.
-        pseudo_most: largest number of them for a window.
-        pool_stride: frames between the windows that they are taken from.
-        heading: turn every window so that its last observed pose faces one way, and the futures back.
     """
 
     name: ClassVar[str] = "gsps"
@@ -122,6 +103,9 @@ class GSPS(Method):
     inference: ClassVar[str] = "q(a) q(b)"
     unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method)) - {"latent"}
     likelihood: ClassVar[bool] = False
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    positive: ClassVar[tuple[str, ...]] = (*EnergyMethod.positive, "coefficients", "width", "blocks", "draws")
+    weights: ClassVar[tuple[str, ...]] = (*EnergyMethod.weights, "history")
 
     latent: int = 64
     parts: tuple[str, ...] = ("lower", "upper")
@@ -131,19 +115,10 @@ class GSPS(Method):
     draws: tuple[int, ...] | None = None
     reconstruction: float = 2.0
     multimodal: float = 1.0
-    diversity: tuple[float, ...] | None = None
-    diversity_scale: tuple[float, ...] | None = None
     history: float = 100.0
     limb: float = 500.0
     angles: float = 100.0
     pose_prior: float = 0.01
-    pose_prior_run: str = ""
-    angle_quantile: float = 0.0
-    pseudo_threshold: float = 0.5
-    pseudo_minimum: float | None = None
-    pseudo_most: int = 10
-    pool_stride: int | None = None
-    heading: bool | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,17 +136,6 @@ class GSPS(Method):
                 raise ValueError(
                     f"{name} is {values}; expected one number, or one for each of the parts {', '.join(self.parts)}"
                 )
-        positive = ("coefficients", "width", "blocks", "draws", "diversity_scale", "pseudo_most", "pool_stride")
-        weights = ("reconstruction", "multimodal", "diversity", "history", "limb", "angles", "pose_prior")
-        for name in (*positive, *weights):
-            value = getattr(self, name)
-            for number in value if isinstance(value, tuple) else () if value is None else (value,):
-                if not number > 0 if name in positive else not 0 <= number < float("inf"):
-                    raise ValueError(
-                        f"{name} is {value}; it must be {'positive' if name in positive else 'at least 0'}"
-                    )
-        if not 0 <= self.angle_quantile < 0.5:
-            raise ValueError(f"angle_quantile is {self.angle_quantile}; it must be at least 0 and below 0.5")
 
     def equations(self) -> tuple[Factorization, Factorization]:
         """The generative model and the guide; here half of the steps count as observed."""
@@ -186,10 +150,9 @@ class GSPS(Method):
     def check(self) -> None:
         """See `Method.check`; the rest needs the skeleton."""
 
-    def suited(self, windows: Windows) -> GSPS:
-        """See `Method.suited`: the options that are None, chosen by the skeleton."""
-        chosen = PUBLISHED.get(windows.skeleton.name, SCALED)
-        return replace(self, **{n: self._spread(n, v) for n, v in chosen.items() if getattr(self, n) is None})
+    def preset(self, windows: Windows) -> Mapping[str, Any]:
+        """See `EnergyMethod.preset`; for these parts."""
+        return {name: self._spread(name, value) for name, value in super().preset(windows).items()}
 
     def _spread(self, name: str, value: Any) -> Any:
         """A preset for two parts, for the parts that there are: with no more futures, if each has two draws."""
@@ -207,60 +170,8 @@ class GSPS(Method):
             ValueError: windows with a root, or parts that are not those of the skeleton.
         """
         method = self.suited(windows)
-        if windows.protocol.root != "drop":
-            raise ValueError(
-                f"gsps makes poses relative to the pelvis, but the protocol {windows.protocol.name} has the root "
-                f"{windows.protocol.root!r}; use one with root='drop'"
-            )
+        self.refuse_root(windows)
         return GSPSModel(method, windows.skeleton, windows.protocol.observed, windows.length)
-
-    def prepare(self, model: nn.Module, windows: Windows) -> None:
-        """See `Method.prepare`: the limits of the angles, and the pose prior.
-
-        Raises:
-            ValueError: a pose prior of another skeleton.
-        """
-        assert isinstance(model, GSPSModel)
-        method = model.method
-        if model.limits is not None:
-            limits = estimate_angle_limits(windows.poses(), windows.skeleton, method.angle_quantile)
-            model.angle_low.copy_(limits.low)
-            model.angle_high.copy_(limits.high)
-        if model.pose_prior is not None:
-            model.pose_prior.load_state_dict(method._fitted_prior(windows).state_dict())
-
-    def _fitted_prior(self, windows: Windows) -> nn.Module:
-        if not self.pose_prior_run:
-            return fit_pose_prior(windows, heading=bool(self.heading))
-        from .runs import load
-
-        loaded = load(self.pose_prior_run)
-        method = loaded.method
-        if not isinstance(method, PosePrior) or loaded.data.motion.skeleton.parents != windows.skeleton.parents:
-            raise ValueError(f"{self.pose_prior_run} holds no pose prior of the skeleton {windows.skeleton.name!r}")
-        if (method.heading, method.layers) != (self.heading, PosePrior.layers):
-            raise ValueError(
-                f"{self.pose_prior_run} was fitted with heading={method.heading} and layers={method.layers}, but this "
-                f"model sees poses with heading={self.heading}, and takes a prior of {PosePrior.layers} layers"
-            )
-        return loaded.model
-
-    def batches(self, windows: Windows) -> Source:
-        """See `Method.batches`: windows and their pseudo ground truths."""
-        method = self.suited(windows)
-        if not method.multimodal:
-            return windows
-        assert method.pseudo_minimum is not None
-        assert method.pool_stride is not None
-        truths = PseudoTruths(
-            windows,
-            threshold=method.pseudo_threshold,
-            minimum=method.pseudo_minimum,
-            most=method.pseudo_most,
-            stride=method.pool_stride,
-            heading=bool(method.heading),
-        )
-        return WithPseudoTruths(windows, truths)
 
     def objective(self) -> Objective:
         """The weighted energies, summed; in `Evidence`'s unit, per frame.
@@ -280,7 +191,7 @@ HISTORY = "h"
 WEIGHTS = ("reconstruction", "multimodal", "history", "limb", "angles", "pose_prior")
 
 
-class GSPSModel(DynamicalVAE):
+class GSPSModel(EnergyModel):
     """The model of GSPS.
 
     On a batch of whole windows its program draws futures jointly and scores them by energies, with "pseudo"
@@ -294,9 +205,6 @@ class GSPSModel(DynamicalVAE):
         length: T, frames that they make.
     """
 
-    angle_low: Tensor
-    angle_high: Tensor
-
     def __init__(self, method: GSPS, skeleton: Skeleton, observed: int, length: int):
         joints = body_parts(skeleton, method.parts)
         count = skeleton.joints - 1
@@ -306,6 +214,9 @@ class GSPSModel(DynamicalVAE):
         assert method.coefficients is not None
         assert method.width is not None
         super().__init__(
+            method,
+            skeleton,
+            observed,
             part_by_part(list(parts), lambda _: observed),
             None,
             {HISTORY: 3 * count, **dict.fromkeys(codes, method.latent), **{name: len(p) for name, p in parts.items()}},
@@ -317,45 +228,32 @@ class GSPSModel(DynamicalVAE):
             parts=parts,
             history=HISTORY,
         )
-        self.method, self.skeleton, self.frames, self.length = method, skeleton, observed, length
+        self.length = length
         self.draws = dict(zip(codes, _each(method.draws, method.parts), strict=True))
-        self.limits: tuple[str, ...] | None = None
-        if method.angles:
-            names = angle_names(skeleton)
-            self.limits = names
-            self.register_buffer("angle_low", torch.full((len(names),), -1.0))
-            self.register_buffer("angle_high", torch.full((len(names),), 1.0))
-        self.pose_prior = PosePriorModel(skeleton).requires_grad_(False) if method.pose_prior else None
 
     def model(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
         """See `DynamicalVAE.model`; of whole windows, with energies. Values are as the networks see them, turned."""
-        if not self._whole(batch, options):
-            return super().model(_without_futures(batch), **options)
-        assert isinstance(batch, Mapping)
-        values = self._with_whole(super().model(_without_futures(batch), **{"draws": self.draws, **options}))
-        truth = self.turned(batch[WHOLE])[0]
-        with pyro.plate("windows", len(truth), dim=-1):
-            for name, energy in self.energies(values, truth, batch).items():
-                pyro.factor(name, -energy)
-        return values
+        return super().model(batch, **self._drawing(batch, options))
 
     def guide(self, batch: Batch, **options: Any) -> dict[str, Tensor]:
         """See `DynamicalVAE.guide`."""
-        draws = {"draws": self.draws} if self._whole(batch, options) else {}
-        return super().guide(_without_futures(batch), **{**draws, **options})
+        return super().guide(batch, **self._drawing(batch, options))
+
+    def _drawing(self, batch: Batch | None, options: Mapping[str, Any]) -> dict[str, Any]:
+        """The options, with several draws where there is a truth to score futures by."""
+        return {**({"draws": self.draws} if self._whole(batch, options) else {}), **options}
 
     def _whole(self, batch: Batch | None, options: Mapping[str, Any]) -> bool:
-        """Whether there is a truth to score futures by: the program is asked for no more than what the batch holds."""
+        """Whether the program is asked for no more than what the batch holds."""
         given = batch[WHOLE] if isinstance(batch, Mapping) and WHOLE in batch else None
         return given is not None and given.shape[1] == self.length and options.get("length") is None
 
-    def _mapping(self, batch: Batch | None) -> dict[str, Any]:
-        """The history turned, wherever a batch comes from."""
-        values = super()._mapping(batch)
-        given = batch if not isinstance(batch, Mapping) else batch.get(WHOLE)
-        if given is not None:
-            values[HISTORY] = self.turned(values[HISTORY])[0]
-        return values
+    def penalties(self, rollout: Rollout, batch: Batch | None, draws: Mapping[str, int]) -> dict[str, Tensor]:
+        """See `DynamicalVAE.penalties`: those of whole windows."""
+        if not draws:
+            return {}
+        assert isinstance(batch, Mapping)
+        return self.energies(self._with_whole(rollout.values), self.turned(batch[WHOLE])[0], batch)
 
     def energies(self, values: Mapping[str, Tensor], truth: Tensor, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The energies of futures that were drawn together, (B,) each; those of weight 0 are left out.
@@ -367,25 +265,10 @@ class GSPSModel(DynamicalVAE):
         """
         method, past, size = self.method, self.frames, len(truth)
         samples = values[WHOLE].unflatten(0, (-1, size))  # (S, B, T, D)
-        future = samples[:, :, past:]
-        found: dict[str, Tensor] = {}
-        if method.reconstruction:
-            found["reconstruction"] = energies.best_of_many(future, truth[:, past:])
-        if method.multimodal:
-            found["multimodal"] = truth.new_zeros(size)
-            if "pseudo" in batch:
-                others = self.turned(batch["pseudo"])[0][:, :, past:]
-                found["multimodal"] = energies.multimodal_best_of_many(future, others, batch["valid"])
+        found = self.best(samples, truth, batch, slice(past, None))
         if method.history:
             found["history"] = energies.history_error(samples[:, :, :past], truth[:, :past])
-        if method.limb:
-            found["limb"] = energies.limb_length(samples, truth[:, 0], self.skeleton)
-        if self.limits is not None:
-            limits = AngleLimits(self.limits, self.angle_low, self.angle_high)
-            found["angles"] = energies.joint_angles(future, limits, self.skeleton)
-        if self.pose_prior is not None:
-            offset = int(torch.randint(min(3, future.shape[2]), ()))  # every third frame, another third at every step
-            found["pose_prior"] = energies.pose_prior_energy(future[:, :, offset::3], self.pose_prior, self.skeleton)
+        found |= self.realism(samples, truth[:, 0], slice(past, None))
         draws = list(self.draws.values())
         names = list(self.parts)
         weights, scales = (_each(given, method.parts) for given in (method.diversity, method.diversity_scale))
@@ -412,7 +295,7 @@ class GSPSModel(DynamicalVAE):
         Raises:
             ValueError: other observed frames than the networks see, or a horizon beyond what they make.
         """
-        x = super()._mapping(batch)[HISTORY]
+        x = DynamicalVAE._mapping(self, batch)[HISTORY]
         most = self.length - self.frames
         if x.shape[1] != self.frames or not 1 <= horizon <= most:
             raise ValueError(
@@ -441,34 +324,6 @@ class GSPSModel(DynamicalVAE):
         if batch is None:
             raise ValueError("this model goes on from a history; give it as batch")
         return self._back(super().sample(n, self.length if length is None else length, batch), self._heading(batch))
-
-    @torch.no_grad()
-    def reconstruct(self, batch: Batch, samples: int = 1) -> dict[str, Tensor]:
-        """See `DynamicalVAE.reconstruct`."""
-        return self._back(super().reconstruct(batch, samples), self._heading(batch))
-
-    def _heading(self, batch: Batch) -> Tensor | None:
-        return self.turned(super()._mapping(batch)[HISTORY])[1]
-
-    def _back(self, values: dict[str, Tensor], heading: Tensor | None) -> dict[str, Tensor]:
-        """Motion as the networks make it, turned back."""
-        return {n: self._rotated(v, heading) if n in (WHOLE, *self.parts) else v for n, v in values.items()}
-
-    def turned(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Windows (..., T, D) as the networks see them, and the headings (...) that they had; None if they stay."""
-        return face_forward(x, self.skeleton, self.frames - 1) if self.method.heading else (x, None)
-
-    def _rotated(self, x: Tensor, angle: Tensor | None) -> Tensor:
-        """(..., B, T, D) turned about the up axis by (B,)."""
-        if angle is None:
-            return x
-        joints = rotate_about_up(x.unflatten(-1, (-1, 3)), angle[:, None, None], self.skeleton.up)
-        return joints.flatten(-2)
-
-
-def _without_futures(batch: Any) -> Any:
-    """The batch without the pseudo ground truths, which are no variables of the model."""
-    return {n: v for n, v in batch.items() if n not in ("pseudo", "valid")} if isinstance(batch, Mapping) else batch
 
 
 def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factorization:

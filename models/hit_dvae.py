@@ -2,53 +2,353 @@
 
     p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)        q(w | x_{1:T}) q(z_t | x_{1:T}, w)
 
-Bie et al., 2022, arXiv 2204.01565. There is no public code. This is the paper's pair of factorizations with the generic
-attention network, one layer a factor, and the plain evidence bound. The guide does not read z_{<t}, on which the exact
-posterior depends. Ours where the paper is silent: the decoder predicts poses, not offsets; the scale of x is one
-learned number per coordinate; and scheduled sampling is scaled to the length of training.
+Poses become features by graph convolutions over the joints, one set for the guide and one for the model. w sums up a
+short window by graph convolutions over its frames, z comes from a transformer's encoder, and the two generative factors
+attend to the past: z from x_{t-1} to z_{<t}, x from z_t to x_{<t}. The guide does not read z_{<t}, on which the exact
+posterior depends (`guide_past` adds it).
+
+The paper does not maximise the evidence. It draws K motions of the guide's latents for each window and takes the best:
+
+    L = lr min_k |x_k - x|^2 + lmm (the same to pseudo ground truths) + lz KL_z + lw KL_w + energies
+
+with means over time, KL_w whole, and the energies of GSPS (diversity, limbs, angles, pose prior) over all frames; in
+training the model soon reads its own output alone. Both are here: loss="best-of-many" and loss="evidence".
+
+Bie et al., 2022, arXiv 2204.01565. There is no public code. Ours where the paper is silent or cannot be followed:
+
+* One layer a factor; linear biases for positions (`networks.Attention`), so that motions may be longer than in
+  training; a learned start token in place of the first step's past, so that x_1 and z_1 are part of the model.
+* Poses are predicted, not offsets (`residual` for these). No normalisation over the batch.
+* With best-of-many, the density of x has one scale per coordinate, fitted to the errors and no more: its gradient does
+  not reach the poses. The paper's unit variance is emission="unit".
+* The observed frames are never replaced in training, as they will not be in a forecast, unless `feed_observed`. Means
+  that are fed back carry no gradient, unless `feeding_gradient`; `feeding_passes` feeds them in parallel.
+* A model may see windows turned so that the last observed pose faces one way, which it does on small sets.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
 
-from ..networks import Attention, NetworkSpec
-from .method import Method
+import torch
+from torch import Tensor
+
+from .. import energies
+from ..inference.batches import Source
+from ..inference.objectives import Evidence, Objective
+from ..inference.schedules import Linear, Schedule
+from ..model import WHOLE, Batch, DynamicalVAE
+from ..motion import Skeleton, Windows
+from ..motion.body import body_parts
+from ..networks import Attention, FrameGraph, NetworkSpec, PoseGraph, Recurrent, SelfAttention
+from ..networks.extract import share
+from ..notation import Factorization
+from ..rollout import Rollout, SelfFeeding
+from .energies import EnergyMethod, EnergyModel
+from .method import SHAPES
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "human36m": {
+        "reconstruction": 20.0,
+        "multimodal": 10.0,
+        "diversity": (0.1, 0.2),
+        "diversity_scale": (100.0, 300.0),
+        "limb": 100.0,
+        "angles": 1.0,
+        "pose_prior": 0.01,
+        "kl_static": 12.5,
+        "samples": 10,
+        "decoder": 256,
+        "pseudo_minimum": 0.1,
+        "pool_stride": 20,
+        "heading": False,
+    },
+    "humaneva": {
+        "reconstruction": 10.0,
+        "multimodal": 5.0,
+        "diversity": (0.1, 0.2),
+        "diversity_scale": (15.0, 50.0),
+        "limb": 100.0,
+        "angles": 1.0,
+        "pose_prior": 0.001,
+        "kl_static": 7.5,
+        "samples": 10,
+        "decoder": 256,
+        "pseudo_minimum": 0.01,
+        "pool_stride": 15,
+        "heading": False,
+    },
+    "": {
+        "reconstruction": 10.0,
+        "multimodal": 5.0,
+        "diversity": (0.1, 0.2),
+        "diversity_scale": (15.0, 50.0),
+        "limb": 100.0,
+        "angles": 1.0,
+        "pose_prior": 0.001,
+        "kl_static": 1.0,
+        "samples": 6,
+        "decoder": 128,
+        "pseudo_minimum": 0.02,
+        "pool_stride": 10,
+        "heading": True,
+    },
+}
+"""Skeleton to options: the paper's; and for others, at 30 frames a second, 15 observed and 60 predicted frames."""
+
+PARTS = ("lower", "upper")
+FRAMES = 15
+"""Observed frames, where there are no windows to tell."""
 
 
 @dataclass(frozen=True)
-class HiTDVAE(Method):
-    """See the file.
+class HiTDVAE(EnergyMethod):
+    """See the file. With loss="evidence" the energies do not apply.
 
     Args:
-        static: size of w.
+        emission: as everywhere, but with loss="best-of-many" the "normal" and "student" do not apply.
+        loss: "best-of-many" (the paper's) or "evidence" (the plain bound).
+        samples: K, motions that are drawn for a window in training; with loss="evidence" there is one.
+        kl_local: weight of the KL of z.
+        kl_static: weight of the KL of w, in the bound's unit; the paper's .1 beside means over T frames is .1 T.
+        static: size of w; 0 for a model without w.
+        attention: False for LSTMs in place of the transformers.
         width: of the attention of guide and prior.
         heads_count: number of attention heads.
         decoder: width of the attention of x.
         layers: of each factor.
+        nearest: the last frame that a generative factor may read joins its query; in the paper it is one key of many.
+        skip: the head of x reads the query's parts, x_{t-1} among them with `nearest`, beside what attention makes of
+            them; not in the paper, and several times faster to learn.
+        pose_width: features of a joint; 0 for poses as they are.
+        summary: of x for w: "graph" (a graph of `frames` frames) or "attention" (over any length).
+        frames: O, of the graph's window; None for as many as the protocol observes.
+        guide_past: the guide of z reads z_{<t} too.
+        feed_observed: whether the observed frames may be replaced too, so that motions come of their latents alone. In
+            the paper that is open.
+        feeding_passes: the means that are fed back, computed in so many parallel passes; 0 for exactly, step by step.
+        feeding_gradient: whether gradients flow through these means.
+        warm_up: steps over which the KL weights rise from 0; the paper's 20 epochs.
+        self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over 16 %
+            of training, after the first 4 %: the paper's 80 and 20 of 500 epochs.
     """
 
     name: ClassVar[str] = "hit-dvae"
     source: ClassVar[str] = "Bie et al., 2022, arXiv 2204.01565"
     generative: ClassVar[str] = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
     inference: ClassVar[str] = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    positive: ClassVar[tuple[str, ...]] = (
+        *EnergyMethod.positive,
+        "width",
+        "heads_count",
+        "decoder",
+        "layers",
+        "frames",
+    )
+    weights: ClassVar[tuple[str, ...]] = (
+        *EnergyMethod.weights,
+        *("kl_local", "kl_static", "static", "pose_width", "feeding_passes"),
+    )
 
     self_feeding: float = 1.0
+    warm_up: int = 625
+    loss: Literal["best-of-many", "evidence"] = "best-of-many"
+    samples: int | None = None
+    kl_local: float = 0.5
+    kl_static: float | None = None
     static: int = 32
+    attention: bool = True
     width: int = 64
     heads_count: int = 4
-    decoder: int = 128
+    decoder: int | None = None
     layers: int = 1
+    nearest: bool = True
+    skip: bool = True
+    pose_width: int = 8
+    summary: Literal["graph", "attention"] = "graph"
+    frames: int | None = None
+    guide_past: bool = False
+    feed_observed: bool = False
+    feeding_passes: int = 0
+    feeding_gradient: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, known in (("loss", ("best-of-many", "evidence")), ("summary", ("graph", "attention"))):
+            if getattr(self, name) not in known:
+                raise ValueError(f"unknown {name} {getattr(self, name)!r}; known: {', '.join(known)}")
+        if self.loss == "best-of-many" and self.emission not in ("fixed", "unit"):
+            raise ValueError(
+                f"emission={self.emission!r} needs loss='evidence'; with best-of-many it is 'fixed' or 'unit'"
+            )
+        if self.samples is not None and self.samples < 2:
+            raise ValueError(f"samples is {self.samples}; the best of many is of at least 2")
+        for name in ("diversity", "diversity_scale"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(PARTS):
+                raise ValueError(f"{name} is {values}; expected one number for each of {', '.join(PARTS)}")
+
+    @property
+    def selects(self) -> Literal["bound", "loss"]:
+        """See `Method.selects`."""
+        return "bound" if self.loss == "evidence" else "loss"
+
+    def equations(self) -> tuple[Factorization, Factorization]:
+        """The generative model and the guide."""
+        p, q = self.generative, self.inference
+        if self.guide_past:
+            q = q.replace("q(z_t | ", "q(z_t | z_{<t}, ")
+        if not self.static:
+            p, q = (text.replace(", w)", ")") for text in (p.replace("p(w) ", ""), q.replace("q(w | x_{1:T}) ", "")))
+        return Factorization.parse(p), Factorization.parse(q)
 
     def sizes(self) -> dict[str, int]:
         """Sizes of w and z."""
-        return {"w": self.static, "z": self.latent}
+        return {**({"w": self.static} if self.static else {}), "z": self.latent}
 
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """Attention for every factor, wider for x."""
-        return {
-            "default": Attention(self.width, self.heads_count, self.layers),
-            "p(x)": Attention(self.decoder, self.heads_count, self.layers),
-        }
+        """The paper's networks, or LSTMs; `build` shares the features of poses."""
+        poses = {"x": PoseGraph(self.pose_width)} if self.pose_width else {}
+        decoder = self.decoder or PRESETS[""]["decoder"]
+        shape: dict[str, Any] = {"heads": self.heads_count, "layers": self.layers, "extract": poses}
+        found: dict[str, NetworkSpec] = {}
+        if self.attention:
+            found["p(z)"] = Attention(self.width, nearest=self.nearest, **shape)
+            found["p(x)"] = Attention(decoder, nearest=self.nearest, skip=self.skip, **shape)
+            found["q(z)"] = SelfAttention(self.width, nearest=self.nearest, **shape)
+        else:
+            found["p(z)"] = found["q(z)"] = Recurrent(self.width, layers=self.layers, extract=poses)
+            found["p(x)"] = Recurrent(decoder, layers=self.layers, hidden=(decoder,), extract=poses)
+        if self.static:
+            pooled = Attention(self.width, **shape)
+            graph = FrameGraph(self.frames or FRAMES, extract=poses)
+            found["q(w)"] = graph if self.summary == "graph" else pooled
+        return found
+
+    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
+        """See `Method.build`; without a skeleton there are no energies."""
+        return self._finished(super().build(data))
+
+    def _finished(self, model: Any) -> Any:
+        """The model, whose factors share their features of poses, and which feeds itself as the options say."""
+        if self.pose_width:
+            for side in (model.generator, model.encoder):
+                share("x", *(conditional.network for conditional in side.values() if conditional.network is not None))
+        start = 0 if self.feed_observed else self.frames or FRAMES
+        model.feeding = SelfFeeding(0.0, self.feeding_passes or None, self.feeding_gradient, start)
+        return model
+
+    def suited(self, windows: Windows) -> HiTDVAE:
+        """See `Method.suited`."""
+        method = replace(super().suited(windows), frames=self.frames or windows.protocol.observed)
+        if self.loss == "evidence":
+            kept = bool(self.heading) if windows.protocol.root != "drop" else method.heading
+            method = replace(method, angles=0.0, pose_prior=0.0, heading=kept)
+        return method
+
+    def build_for(self, windows: Windows) -> DynamicalVAE:
+        """See `Method.build_for`.
+
+        Raises:
+            ValueError: windows with a root, of which there are energies or headings.
+        """
+        method = self.suited(windows)
+        if method.loss == "evidence" and not method.heading:
+            return method.build({WHOLE: windows.size})
+        self.refuse_root(windows)
+        p, q = method.equations()
+        sizes = {**method.sizes(), WHOLE: windows.size}
+        heads: dict[str, Any] = dict(method.heads())
+        if method.selects == "loss":
+            heads["p(x)"] = replace(heads["p(x)"], fitted="scale")
+        model = HiTModel(
+            method,
+            windows.skeleton,
+            windows.protocol.observed,
+            p,
+            q,
+            sizes,
+            method.networks(),
+            heads,
+            method.priors(sizes),
+        )
+        return method._finished(model)
+
+    def batches(self, windows: Windows) -> Source:
+        """See `Method.batches`."""
+        return windows if self.loss == "evidence" else super().batches(windows)
+
+    def objective(self) -> Objective:
+        """See `Method.objective`.
+
+        Raises:
+            ValueError: weights that are still open, which the skeleton decides.
+        """
+        if self.loss == "evidence":
+            return super().objective()
+        if self.diversity is None or self.kl_static is None or self.samples is None:
+            raise ValueError("the weights depend on the skeleton; take those of method.suited(windows)")
+        weights = {"z": self.kl_local, **({"w": self.kl_static} if self.static else {})}
+        ramp = SHAPES[self.warm_up_shape]
+        likeness = {f"diversity_{part}": weight for part, weight in zip(PARTS, self.diversity, strict=True)}
+        energy_weights = {name: getattr(self, name) for name in EnergyMethod.weights if name != "diversity"} | likeness
+        return Evidence(
+            kl_weight={n: ramp(0.0, w, steps=self.warm_up) if self.warm_up else w for n, w in weights.items()},
+            free_bits=self.free_bits,
+            energy_weights={name: weight for name, weight in energy_weights.items() if weight},
+            draws={"w" if self.static else "z": self.samples},
+            select="loss",
+        )
+
+    def feeding(self, steps: int) -> Schedule | float:
+        """See `Method.feeding`: over the paper's shares of the run."""
+        if not self.self_feeding:
+            return 0.0
+        return Linear(0.0, self.self_feeding, steps=max(round(0.16 * steps), 1), delay=round(0.04 * steps))
+
+
+class HiTModel(EnergyModel):
+    """The model of HiT-DVAE for the poses of a skeleton.
+
+    Asked for several draws of a latent, its program scores the motions that come of them, which are the means of x.
+    Energies are of whole sequences, T times the paper's means, so that `Evidence` weighs them as the paper does.
+    """
+
+    def __init__(self, method: HiTDVAE, skeleton: Skeleton, observed: int, *arguments: Any, **options: Any):
+        super().__init__(method, skeleton, observed, *arguments, **options)
+        joints = body_parts(skeleton, PARTS)
+        self.coordinates = {part: [3 * j + axis for j in held for axis in range(3)] for part, held in joints.items()}
+
+    def penalties(self, rollout: Rollout, batch: Batch | None, draws: Mapping[str, int]) -> dict[str, Tensor]:
+        """See `DynamicalVAE.penalties`."""
+        if not draws or WHOLE not in rollout.values or batch is None:
+            return {}
+        size = rollout.batch // rollout.draws
+        x = rollout.values[WHOLE]
+        truth, everything = x[:size], slice(None)
+        motions = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size))  # (K, B, T, D)
+        means = self.realism(motions, truth[:, 0], everything)
+        method = self.method
+        for part, weight, scale in zip(PARTS, method.diversity, method.diversity_scale, strict=True):
+            if weight:
+                held = motions[..., self.coordinates[part]]
+                means[f"diversity_{part}"] = energies.pairwise_diversity(held, scale)
+        futures = batch if isinstance(batch, Mapping) else {}
+        return self.best(motions, truth, futures, everything) | {n: rollout.length * e for n, e in means.items()}
+
+    @torch.no_grad()
+    def forecast(
+        self,
+        batch: Batch,
+        horizon: int,
+        samples: int = 1,
+        *,
+        draw_emission: bool = False,
+        fix: Mapping[str, Tensor] | None = None,
+    ) -> dict[str, Tensor]:
+        """See `DynamicalVAE.forecast`."""
+        out = super().forecast(batch, horizon, samples, draw_emission=draw_emission, fix=fix)
+        return self._back(out, self._heading(batch))

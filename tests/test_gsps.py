@@ -11,7 +11,7 @@ from dvae import energies, motion
 from dvae.inference.fit import fit
 from dvae.inference.metrics import average_pairwise_distance
 from dvae.models import from_config, runs
-from dvae.models.gsps import PUBLISHED, GSPSModel, part_by_part
+from dvae.models.gsps import PRESETS, GSPSModel, part_by_part
 from dvae.models.pose_prior import PosePriorModel
 from dvae.motion.body import LIMBS, body_parts
 from dvae.networks import GraphConv
@@ -115,7 +115,7 @@ def test_parts_that_are_none(parts, message):
     [(motion.HUMAN36M, 25, 125, 1_298_108), (motion.HUMANEVA, 15, 75, None)],
 )
 def test_the_published_numbers_of_parameters(skeleton, observed, length, parameters):
-    method = dvae.method("gsps", **PUBLISHED[skeleton.name])
+    method = dvae.method("gsps", **PRESETS[skeleton.name])
     model = GSPSModel(method, skeleton, observed, length)
     prior = {"human36m": 13_970, "humaneva": 10_710 + 2}[skeleton.name]  # 10,710 is without the two slopes
     assert sum(p.numel() for p in model.pose_prior.parameters()) == prior
@@ -346,7 +346,7 @@ def test_presets_by_skeleton(windows):
     assert from_config(chosen.config()) == chosen
     for skeleton in (motion.HUMAN36M, motion.HUMANEVA):
         published = dvae.method("gsps", width=64).suited(type("Windows", (), {"skeleton": skeleton}))
-        assert published == replace(dvae.method("gsps", **PUBLISHED[skeleton.name]), width=64)
+        assert published == replace(dvae.method("gsps", **PRESETS[skeleton.name]), width=64)
     five = dvae.method("gsps", parts=FIVE).suited(windows)
     assert [len(five.draws), len(five.diversity), len(five.diversity_scale)] == [5, 5, 5]
 

@@ -27,7 +27,7 @@ SMALL = {
     "rvae-noncausal": {"width": 4},
     "dsae": {"width": 4, "decoder": (4, 5)},
     "kvae": {"width": 4, "hidden": (5, 4)},
-    "hit-dvae": {"width": 8, "heads_count": 2, "decoder": 8},
+    "hit-dvae": {"width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "frames": 5, "loss": "evidence"},
     "equations": {"width": 4},
 }
 
@@ -97,6 +97,24 @@ class TestKVAEWithMoreLatentThanAuxiliary(Contract):
 
 class TestHiTDVAE(Contract):
     name = "hit-dvae"
+    missing: ClassVar = {"z": ("z_{<t}",)}
+
+
+class TestHiTDVAEThatReadsItsPast(Contract):
+    name = "hit-dvae"
+    options: ClassVar = {"guide_past": True, "nearest": False}
+    missing: ClassVar = {}
+
+
+class TestHiTDVAEWithoutAttention(Contract):
+    name = "hit-dvae"
+    options: ClassVar = {"attention": False, "summary": "attention"}
+    missing: ClassVar = {"z": ("z_{<t}",)}
+
+
+class TestHiTDVAEWithoutAttentionAndW(Contract):
+    name = "hit-dvae"
+    options: ClassVar = {"attention": False, "static": 0}
     missing: ClassVar = {"z": ("z_{<t}",)}
 
 
@@ -226,7 +244,7 @@ def test_every_method_takes_every_option_or_says_why_not(name, option):
 
 def test_options_of_the_loss_reach_it():
     schedules = dvae.inference.schedules
-    method = dvae.method("hit-dvae", warm_up=7, warm_up_shape="cosine", free_bits=0.3)
+    method = dvae.method("hit-dvae", loss="evidence", warm_up=7, warm_up_shape="cosine", free_bits=0.3)
     assert method.objective() == dvae.Evidence(kl_weight=schedules.Cosine(0.0, 1.0, steps=7), free_bits=0.3)
     assert dvae.method("vae", warm_up=0).objective() == dvae.Evidence()
 

@@ -1,0 +1,104 @@
+"""Speed of HiT-DVAE at its preset for 15 + 60 frames: `python benchmarks/hit_dvae.py`, or `make bench`.
+
+    cache      50 futures of 60 frames for one window with caches, against attending to the whole prefix anew at every
+               frame; how many times faster
+    growth     the cost of a frame among 300 against that of a frame among 60: at most in proportion to the frames
+    seconds    to make 50 futures of 60 frames for each of 100 windows
+    step       a training step (16 windows, K motions each; forward, backward, Adam) in which the model reads its own
+               output, against one in which it reads the truth: exactly, step by step; the same with gradients back in
+               time; and in two parallel passes
+
+Motion is simulated. Times are the least of several, in turns with what they compare to.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import replace
+
+import torch
+from speed import seconds, training_step
+from torch import Tensor
+
+import dvae
+from dvae import motion
+from dvae.rollout import SelfFeeding
+
+TARGETS = {"cache": ("at least", 10.0), "growth": ("at most", 5.0), "seconds": ("at most", 30.0)}
+
+
+@torch.no_grad()
+def without_caches(model: dvae.DynamicalVAE, past: Tensor, horizon: int, samples: int) -> Tensor:
+    """Futures as in `forecast`, every conditional evaluated over the whole prefix for the sake of its last step."""
+    x = past.repeat(samples, 1, 1)
+    latents = model.guide(x)
+    z, w = latents["z"], latents["w"]
+    for _ in range(horizon):
+        x, z = (torch.cat([v, v.new_zeros(len(v), 1, v.shape[2])], 1) for v in (x, z))
+        known = {"x": x, "z": z, "w": w}
+        loc, scale = (p[:, -1] for p in model.generator["z"](known, len(x), x.shape[1]))
+        z[:, -1] = torch.addcmul(loc, scale, torch.randn_like(loc))
+        x[:, -1] = model.generator["x"](known, len(x), x.shape[1])[0][:, -1]
+    return x
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    torch.manual_seed(0)
+    windows = motion.windows(motion.simulate(), motion.PROTOCOLS["simulated"], "train")
+    method = dvae.method("hit-dvae", pose_prior=0.0).suited(windows)
+    model = method.build_for(windows)
+    method.prepare(model, windows)
+    past = model.turned(windows.all()["x"][:100, : windows.protocol.observed])[0]
+    found: dict[str, float] = {}
+
+    model.eval()
+    one = past[:1]
+    cached, anew, long = seconds(
+        lambda: model.forecast(one, 60, 50),
+        lambda: without_caches(model, one, 60, 50),
+        lambda: model.forecast(one, 300, 50),
+        repeat=3,
+    )
+    found["cache"] = anew / cached
+    found["growth"] = (long - cached) / (300 - 60) / (cached / 60)
+    start = time.perf_counter()
+    for part in past.split(20):
+        model.forecast(part, 60, 50)
+    found["seconds"] = time.perf_counter() - start
+
+    model.train()
+    source, objective, elbo = method.batches(windows), method.objective(), dvae.SequenceELBO()
+    generator = torch.Generator().manual_seed(0)
+
+    def step(feeding: SelfFeeding | None):
+        fed = None if feeding is None else replace(feeding, start=windows.protocol.observed)
+        program = {"draws": objective.draws, "self_feeding": fed}
+        return training_step(model, lambda: objective(elbo.terms(model, source.sample(16, generator), **program), 0))
+
+    kinds = {
+        "exact": SelfFeeding(1.0),
+        "gradient": SelfFeeding(1.0, gradient=True),
+        "two passes": SelfFeeding(1.0, passes=2),
+    }
+    forced, *fed = seconds(step(None), *(step(feeding) for feeding in kinds.values()), repeat=3)
+    found |= {f"step, {kind}": each / forced for kind, each in zip(kinds, fed, strict=True)}
+    found["step, seconds"] = forced
+
+    missed = False
+    for name, value in found.items():
+        side, bound = TARGETS.get(name, ("", float("nan")))
+        met = not side or (value <= bound if side == "at most" else value >= bound)
+        missed |= not met
+        print(f"{name:16s} {value:6.2f}   " + (f"{side:8s} {bound:5.2f}   {'ok' if met else 'MISSED'}" if side else ""))
+    if missed:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,261 @@
+"""What methods share that learn from energies of whole motions: their options, and the model that scores its samples.
+
+Several samples of a window are drawn together. The energies say that the best of them is near the truth and that the
+best is near each pseudo ground truth, that the samples of a body part differ, that they keep the limbs' lengths, stay
+within the joints' angles, and look like poses to a prior. Source: GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422).
+
+Ours: a model may see every window turned so that the last observed pose faces one way, which helps on small sets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import inf
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from .. import energies
+from ..inference.batches import Source
+from ..model import WHOLE, Batch, DynamicalVAE
+from ..motion import Skeleton, Windows, face_forward, rotate_about_up
+from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
+from ..motion.truths import PseudoTruths, WithPseudoTruths
+from ..priors import VampPrior
+from .method import Method
+from .pose_prior import PosePrior, PosePriorModel, fit_pose_prior
+
+
+@dataclass(frozen=True)
+class EnergyMethod(Method):
+    """A method that learns from energies. Options that are None are chosen by the skeleton.
+
+    Args:
+        reconstruction: weight of the squared error of the best sample.
+        multimodal: weight of that to the pseudo ground truths.
+        diversity: weight of the likeness of a part's samples, for each part.
+        diversity_scale: metres, L1, over which samples of a part are alike, for each part.
+        limb: weight of the squared error of the limbs' lengths.
+        angles: weight of the violation of the angles' limits.
+        pose_prior: weight of the poses' energy under a pose prior.
+        pose_prior_run: run directory of a fitted pose-prior; "" to fit one first.
+        angle_quantile: share of the training poses that an angle's limit leaves out at each end.
+        pseudo_threshold: metres between last observed poses, within which futures are exchanged.
+        pseudo_minimum: metres, mean over joints, that such a future keeps from the true one.
+        pseudo_most: largest number of them for a window.
+        pool_stride: frames between the windows that they are taken from.
+        heading: turn every window so that its last observed pose faces one way, and the futures back.
+    """
+
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]]
+    """Name of a skeleton to options; those of other skeletons at ""."""
+    positive: ClassVar[tuple[str, ...]] = ("diversity_scale", "pseudo_most", "pool_stride")
+    weights: ClassVar[tuple[str, ...]] = ("reconstruction", "multimodal", "diversity", "limb", "angles", "pose_prior")
+
+    reconstruction: float | None = None
+    multimodal: float | None = None
+    diversity: tuple[float, ...] | None = None
+    diversity_scale: tuple[float, ...] | None = None
+    limb: float | None = None
+    angles: float | None = None
+    pose_prior: float | None = None
+    pose_prior_run: str = ""
+    angle_quantile: float = 0.0
+    pseudo_threshold: float = 0.5
+    pseudo_minimum: float | None = None
+    pseudo_most: int = 10
+    pool_stride: int | None = None
+    heading: bool | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in (*self.positive, *self.weights):
+            value = getattr(self, name)
+            for number in value if isinstance(value, tuple) else () if value is None else (value,):
+                if not number > 0 if name in self.positive else not 0 <= number < inf:
+                    raise ValueError(
+                        f"{name} is {value}; it must be {'positive' if name in self.positive else 'at least 0'}"
+                    )
+        if not 0 <= self.angle_quantile < 0.5:
+            raise ValueError(f"angle_quantile is {self.angle_quantile}; it must be at least 0 and below 0.5")
+
+    def preset(self, windows: Windows) -> Mapping[str, Any]:
+        """The options for a skeleton."""
+        return self.presets.get(windows.skeleton.name, self.presets[""])
+
+    def suited(self, windows: Windows) -> Any:
+        """See `Method.suited`: the options that are None, chosen by the skeleton."""
+        return replace(self, **{n: v for n, v in self.preset(windows).items() if getattr(self, n) is None})
+
+    def refuse_root(self, windows: Windows) -> None:
+        """Refuses windows with a root.
+
+        Raises:
+            ValueError: saying so.
+        """
+        if windows.protocol.root != "drop":
+            raise ValueError(
+                f"{self.name} makes poses relative to the pelvis, but the protocol {windows.protocol.name} has the "
+                f"root {windows.protocol.root!r}; use one with root='drop'"
+            )
+
+    def prepare(self, model: nn.Module, windows: Windows) -> None:
+        """See `Method.prepare`: the limits of the angles, and the pose prior.
+
+        Raises:
+            ValueError: a pose prior of another skeleton.
+        """
+        if not isinstance(model, EnergyModel):
+            super().prepare(model, windows)
+            return
+        for prior in model.priors.values():
+            if isinstance(prior, VampPrior):
+                prior.start_at({WHOLE: model.turned(windows.sample(prior.components, torch.default_generator)["x"])[0]})
+        if model.limits is not None:
+            limits = estimate_angle_limits(windows.poses(), windows.skeleton, self.angle_quantile)
+            model.angle_low.copy_(limits.low)
+            model.angle_high.copy_(limits.high)
+        if model.pose_prior is not None:
+            model.pose_prior.load_state_dict(model.method._fitted_prior(windows).state_dict())
+
+    def _fitted_prior(self, windows: Windows) -> nn.Module:
+        if not self.pose_prior_run:
+            return fit_pose_prior(windows, heading=bool(self.heading))
+        from .runs import load
+
+        loaded = load(self.pose_prior_run)
+        method = loaded.method
+        if not isinstance(method, PosePrior) or loaded.data.motion.skeleton.parents != windows.skeleton.parents:
+            raise ValueError(f"{self.pose_prior_run} holds no pose prior of the skeleton {windows.skeleton.name!r}")
+        if (method.heading, method.layers) != (self.heading, PosePrior.layers):
+            raise ValueError(
+                f"{self.pose_prior_run} was fitted with heading={method.heading} and layers={method.layers}, but this "
+                f"model sees poses with heading={self.heading}, and takes a prior of {PosePrior.layers} layers"
+            )
+        return loaded.model
+
+    def batches(self, windows: Windows) -> Source:
+        """See `Method.batches`: windows and their pseudo ground truths."""
+        method = self.suited(windows)
+        if not method.multimodal:
+            return windows
+        truths = PseudoTruths(
+            windows,
+            threshold=method.pseudo_threshold,
+            minimum=method.pseudo_minimum,
+            most=method.pseudo_most,
+            stride=method.pool_stride,
+            heading=bool(method.heading),
+        )
+        return WithPseudoTruths(windows, truths)
+
+
+class EnergyModel(DynamicalVAE):
+    """A model of windows whose samples are scored by energies.
+
+    Batches may hold "pseudo" (B, M, T, D) and "valid" (B, M): further futures of the windows.
+
+    Args:
+        method: with no option left open.
+        skeleton: of poses whose root was dropped, D = 3 (J - 1).
+        observed: O, frames before the present.
+        *arguments, **options: of `DynamicalVAE`.
+    """
+
+    angle_low: Tensor
+    angle_high: Tensor
+
+    def __init__(self, method: Any, skeleton: Skeleton, observed: int, *arguments: Any, **options: Any):
+        super().__init__(*arguments, **options)
+        self.method, self.skeleton, self.frames = method, skeleton, observed
+        self.limits: tuple[str, ...] | None = None
+        if method.angles:
+            self.limits = angle_names(skeleton)
+            self.register_buffer("angle_low", torch.full((len(self.limits),), -1.0))
+            self.register_buffer("angle_high", torch.full((len(self.limits),), 1.0))
+        self.pose_prior = PosePriorModel(skeleton).requires_grad_(False) if method.pose_prior else None
+
+    def best(self, samples: Tensor, truth: Tensor, batch: Mapping[str, Tensor], frames: slice) -> dict[str, Tensor]:
+        """The energies of the best sample, (B,) each; those of weight 0 are left out.
+
+        Args:
+            samples: (S, B, T, D), as the networks see motion.
+            truth: (B, T, D), likewise.
+            batch: with "pseudo" and "valid", where there are further futures.
+            frames: those that count.
+        """
+        found: dict[str, Tensor] = {}
+        if self.method.reconstruction:
+            found["reconstruction"] = energies.best_of_many(samples[:, :, frames], truth[:, frames])
+        if self.method.multimodal:
+            found["multimodal"] = truth.new_zeros(len(truth))
+            if "pseudo" in batch:
+                others = self.turned(batch["pseudo"])[0][:, :, frames]
+                found["multimodal"] = energies.multimodal_best_of_many(samples[:, :, frames], others, batch["valid"])
+        return found
+
+    def realism(self, samples: Tensor, reference: Tensor, frames: slice) -> dict[str, Tensor]:
+        """The energies of the limbs' lengths, the angles and the pose prior, (B,) each; as in `best`.
+
+        Args:
+            samples: (S, B, T, D), whose limbs count in all frames.
+            reference: (B, D), a pose with the right lengths.
+            frames: whose poses count.
+        """
+        found: dict[str, Tensor] = {}
+        if self.method.limb:
+            found["limb"] = energies.limb_length(samples, reference, self.skeleton)
+        judged = samples[:, :, frames]
+        if self.limits is not None:
+            limits = AngleLimits(self.limits, self.angle_low, self.angle_high)
+            found["angles"] = energies.joint_angles(judged, limits, self.skeleton)
+        if self.pose_prior is not None:
+            offset = int(torch.randint(min(3, judged.shape[2]), ()))  # every third frame, another third at every step
+            found["pose_prior"] = energies.pose_prior_energy(judged[:, :, offset::3], self.pose_prior, self.skeleton)
+        return found
+
+    def _mapping(self, batch: Batch | None) -> dict[str, Any]:
+        """The data as the networks see them, wherever a batch comes from."""
+        values = super()._mapping(_without_futures(batch))
+        name = self.history or WHOLE
+        if self.method.heading and batch is not None and (not isinstance(batch, Mapping) or WHOLE in batch):
+            if "mask" in values and self.history is None:
+                raise ValueError(
+                    "this model turns every window to one heading, which missing entries do not tell; fit with "
+                    "heading=False"
+                )
+            values[name] = self.turned(values[name])[0]
+        return values
+
+    def _heading(self, batch: Batch) -> Tensor | None:
+        """The headings (B,) that the windows had; None if they stay."""
+        return self.turned(super()._mapping(_without_futures(batch))[self.history or WHOLE])[1]
+
+    def turned(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Windows (..., T, D) as the networks see them, and the headings (...) that they had; None if they stay."""
+        if not self.method.heading:
+            return x, None
+        return face_forward(x, self.skeleton, min(self.frames, x.shape[-2]) - 1)
+
+    def _back(self, values: dict[str, Tensor], heading: Tensor | None) -> dict[str, Tensor]:
+        """Motion as the networks make it, turned back."""
+        return {n: self._rotated(v, heading) if n in (WHOLE, *self.parts) else v for n, v in values.items()}
+
+    def _rotated(self, x: Tensor, angle: Tensor | None) -> Tensor:
+        """(..., B, T, D) turned about the up axis by (B,)."""
+        if angle is None:
+            return x
+        joints = rotate_about_up(x.unflatten(-1, (-1, 3)), angle[:, None, None], self.skeleton.up)
+        return joints.flatten(-2)
+
+    @torch.no_grad()
+    def reconstruct(self, batch: Batch, samples: int = 1) -> dict[str, Tensor]:
+        """See `DynamicalVAE.reconstruct`."""
+        return self._back(super().reconstruct(batch, samples), self._heading(batch))
+
+
+def _without_futures(batch: Any) -> Any:
+    """The batch without the pseudo ground truths, which are no variables of the model."""
+    return {n: v for n, v in batch.items() if n not in ("pseudo", "valid")} if isinstance(batch, Mapping) else batch

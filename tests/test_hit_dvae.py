@@ -1,0 +1,304 @@
+"""HiT-DVAE whole: what depends on what in the built model, the paper's objective, forecasts, ablations."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from pyro import poutine
+
+import dvae
+from dvae import energies, motion
+from dvae.models import from_config, runs
+from dvae.models.hit_dvae import PRESETS, HiTModel
+from dvae.motion.body import body_parts
+
+SMALL = {"latent": 3, "static": 2, "width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "samples": 3}
+QUICK = {**SMALL, "pose_prior": 0.0, "angles": 0.0, "multimodal": 0.0, "heading": False}
+ABLATIONS = {
+    "whole": {},
+    "without scheduled sampling": {"self_feeding": 0.0},
+    "without attention": {"attention": False},
+    "without w": {"static": 0},
+    "without attention and w": {"attention": False, "static": 0},
+    "with its past": {"guide_past": True},
+    "queries as in the paper": {"nearest": False},
+    "attention-pooled": {"summary": "attention"},
+    "poses as they are": {"pose_width": 0},
+    "evidence": {"loss": "evidence"},
+    "evidence, turned": {"loss": "evidence", "heading": True},
+}
+
+
+@pytest.fixture(scope="module")
+def people():
+    return runs.Data.open()
+
+
+@pytest.fixture(scope="module")
+def windows(people):
+    return people.windows("train")
+
+
+def build(windows, **options):
+    torch.manual_seed(0)
+    return dvae.method("hit-dvae", **{**QUICK, **options}).suited(windows).build_for(windows).double()
+
+
+def drawn(windows, size=3, **options):
+    method = dvae.method("hit-dvae", **{**QUICK, **options})
+    batch = method.batches(windows).sample(size, torch.Generator().manual_seed(0))
+    return {name: v.double() if v.is_floating_point() else v for name, v in batch.items()}
+
+
+def terms(model, batch, **program):
+    objective = model.method.objective()
+    return dvae.SequenceELBO().terms(model, batch, draws=objective.draws, **program), objective
+
+
+# ------------------------------------------------------------------------------------------ what depends on what
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_the_built_model_leaks_nothing_from_the_present_or_the_future(windows, ablation):
+    """By the program itself: x_t moves no p(x_s | .) and no p(z_s | .) with s <= t, z_t no p(z_s | .) with s <= t."""
+    model, steps = build(windows, **ABLATIONS[ablation]).eval(), 6
+    x = drawn(windows)["x"][:1, :steps]
+    latents = model.guide(x)
+
+    def means(x, z):
+        sites = poutine.trace(poutine.condition(model.model, data={**latents, "z": z})).get_trace(x).nodes
+        return [sites[name]["fn"].elementwise(sites[name]["value"]) for name in ("x", "z")]
+
+    def moved(change):
+        z = latents["z"]
+        before, after = means(x, z), means(*change(x, z))
+        apart = [
+            (a.loc - b.loc).abs().amax((0, 2)) + (a.scale - b.scale).abs().amax((0, 2))
+            for a, b in zip(before, after, strict=True)
+        ]
+        return [values.gt(0).tolist() for values in apart]
+
+    for t in range(steps):
+        nudge = torch.zeros(1, steps, 1, dtype=torch.float64)
+        nudge[:, t] = 0.1
+        of_x, of_z = moved(lambda x, z, nudge=nudge: (x + nudge, z))
+        assert of_x == [s > t for s in range(steps)]
+        assert of_z == [s == t + 1 for s in range(steps)]
+        of_x, of_z = moved(lambda x, z, nudge=nudge: (x, z + nudge))
+        assert of_x == [s == t for s in range(steps)]
+        assert of_z == [s > t for s in range(steps)]
+
+
+def test_the_equations_are_the_papers_and_those_of_its_ablations():
+    def texts(**options):
+        return tuple(equation.text for equation in dvae.method("hit-dvae", **options).equations())
+
+    p, q = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
+    assert texts() == (p, q)
+    assert texts(guide_past=True) == (p, "q(w | x_{1:T}) q(z_t | z_{<t}, x_{1:T}, w)")
+    assert texts(static=0) == ("p(z_t | z_{<t}, x_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | x_{1:T})")
+
+
+def test_factors_share_the_features_of_poses_on_each_side(windows):
+    model = build(windows)
+    ours, theirs = (
+        {id(c.network.extractors["x"]) for c in side.values() if c.network is not None}
+        for side in (model.generator, model.encoder)
+    )
+    assert len(ours) == len(theirs) == 1
+    assert ours != theirs
+
+
+# -------------------------------------------------------------------------------------------------- the objective
+
+
+def test_the_loss_is_the_papers(windows):
+    """L of the card from its terms, with means over time and sums over coordinates, for one window after the other."""
+    options = {"angles": 2.0, "multimodal": 3.0, "heading": True, "warm_up": 0, "pseudo_minimum": 0.0}
+    model, batch = build(windows, **options).eval(), drawn(windows, **options)
+    assert batch["valid"].any()
+    found, objective = terms(model, batch)
+    latents = poutine.trace(model.guide).get_trace
+    torch.manual_seed(1)
+    sites = latents(batch, draws=objective.draws).nodes
+    torch.manual_seed(1)
+    found, _ = terms(model, batch)
+    K, B, T = 3, 3, 75
+    z, w = (sites[name]["value"] for name in ("z", "w"))
+    x, pseudo = (model.turned(batch[name])[0] for name in ("x", "pseudo"))
+    again = {"x": batch["x"].repeat(K, 1, 1)}
+    program = poutine.trace(poutine.condition(model.model, data={"z": z, "w": w})).get_trace(again).nodes
+    motions = program["x"]["fn"].elementwise(x.repeat(K, 1, 1)).loc.unflatten(0, (K, B))
+
+    def kl(name):
+        p, q = (nodes[name]["fn"] for nodes in (program, sites))
+        if name == "z":
+            p, q = p.elementwise(z), q.elementwise(z)
+        return torch.distributions.kl_divergence(getattr(q, "base_dist", q), getattr(p, "base_dist", p)).unflatten(
+            0, (K, B)
+        )
+
+    method = model.method
+    L = (
+        method.reconstruction
+        * torch.stack([min(((motions[k, b] - x[b]) ** 2).sum(-1).mean() for k in range(K)) for b in range(B)]).mean()
+    )
+    pairs = batch["valid"].nonzero().tolist()
+    best = [min(((motions[k, b] - pseudo[b, m]) ** 2).sum(-1).mean() for k in range(K)) for b, m in pairs]
+    L += method.multimodal * torch.stack(best).mean()
+    L += method.kl_local * kl("z").sum(-1).mean(-1).mean() + method.kl_static / T * kl("w").sum(-1).mean()
+    lengths, own = (windows.skeleton.bone_lengths(windows.positions(v)) for v in (motions, x[:, :1]))
+    L += method.limb * ((lengths - own) ** 2).sum(-1).mean()
+    for (part, joints), weight, scale in zip(
+        body_parts(windows.skeleton, ("lower", "upper")).items(), method.diversity, method.diversity_scale, strict=True
+    ):
+        held = motions.unflatten(-1, (-1, 3))[..., list(joints), :]
+        likeness = [torch.exp(-(held[i] - held[j]).abs().sum((1, 2, 3)) / scale) for i in range(K) for j in range(i)]
+        assert part in ("lower", "upper")
+        L += weight * torch.stack(likeness).mean()
+    limits = motion.angles.AngleLimits(model.limits, model.angle_low, model.angle_high)
+    L += method.angles * energies.joint_angles(motions, limits, windows.skeleton).mean()
+    L -= program["x"]["fn"].log_prob(x.repeat(K, 1, 1)).mean() / T  # which fits the scale alone
+    torch.testing.assert_close(objective(found, 0), L, rtol=1e-9, atol=1e-9)
+
+
+def test_the_density_fits_the_scale_and_energies_the_poses(windows):
+    model, batch = build(windows), drawn(windows)
+    found, objective = terms(model, batch, self_feeding=1.0)
+    x = model.generator["x"]
+    likelihood = torch.autograd.grad(
+        found.log_likelihood["x"].sum(), list(x.parameters()), retain_graph=True, allow_unused=True
+    )
+    reached = {
+        name
+        for (name, _), g in zip(x.named_parameters(), likelihood, strict=True)
+        if g is not None and g.abs().sum() > 0
+    }
+    assert reached == {"head.log_scale"}
+    objective(found, 10**6).backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.parameters() if p.requires_grad)
+
+
+def test_the_bound_is_that_of_one_draw_unless_several_are_asked_for(windows):
+    model, batch = build(windows).eval(), drawn(windows)
+    alone = dvae.SequenceELBO().terms(model, batch)
+    assert not alone.energies
+    assert torch.isfinite(dvae.importance_bound(model, batch["x"], particles=3).bound).all()
+    assert set(terms(model, batch)[0].energies) == {"reconstruction", "limb", "diversity_lower", "diversity_upper"}
+
+
+@pytest.mark.parametrize("skeleton", ["human36m", "humaneva"])
+def test_the_presets_are_the_papers_weights(skeleton):
+    """(lr, lmm, l_lower, l_upper, l_limb, l_angle, l_nf, lz, lw) of the card, lw beside means over T frames."""
+    objective = dvae.method("hit-dvae", warm_up=0, **PRESETS[skeleton]).objective()
+    frames = {"human36m": 125, "humaneva": 75}[skeleton]
+    names = ("reconstruction", "multimodal", "diversity_lower", "diversity_upper", "limb", "angles", "pose_prior")
+    card = {
+        "human36m": (20, 10, 0.1, 0.2, 100, 1, 0.01, 0.5, 0.1),
+        "humaneva": (10, 5, 0.1, 0.2, 100, 1, 0.001, 0.5, 0.1),
+    }
+    weights = [objective.energy_weights[name] for name in names] + [
+        objective.kl_weight["z"],
+        objective.kl_weight["w"] / frames,
+    ]
+    assert weights == pytest.approx(card[skeleton])
+
+
+def test_schedules_have_the_papers_shares_of_500_epochs():
+    feeding = dvae.method("hit-dvae").feeding(500)
+    assert [feeding(epoch) for epoch in (0, 20, 60, 100, 499)] == [0, 0, 0.5, 1, 1]
+
+
+# ------------------------------------------------------------------------------------------------------ forecasts
+
+
+@pytest.mark.parametrize("heading", [False, True])
+@pytest.mark.parametrize(("observed", "horizon"), [(15, 60), (4, 3), (30, 100)])
+def test_any_past_is_continued_over_any_horizon(windows, observed, horizon, heading):
+    model = build(windows, heading=heading)
+    past = drawn(windows)["x"][:, :observed]
+    futures = model.forecast(past, horizon, 2)
+    assert futures["x"].shape == (2, 3, horizon, windows.size)
+    assert futures["z"].shape == (2, 3, observed + horizon, 3)
+    assert torch.isfinite(futures["x"]).all()
+
+
+def test_turning_people_turns_their_futures_and_changes_no_score(windows):
+    model, batch = build(windows, heading=True).eval(), drawn(windows)
+
+    def turn(x):
+        joints = motion.rotate_about_up(x.unflatten(-1, (-1, 3)), torch.tensor(1.3, dtype=x.dtype), windows.skeleton.up)
+        return joints.flatten(-2)
+
+    found = []
+    for x in (batch["x"], turn(batch["x"])):
+        torch.manual_seed(0)
+        future, rebuilt = model.forecast(x[:, :15], 5, 2)["x"], model.reconstruct(x)["x"]
+        torch.manual_seed(0)
+        found.append((future, rebuilt, terms(model, {"x": x})[0]))
+    (future, rebuilt, score), (other, another, same) = found
+    torch.testing.assert_close(other, turn(future), rtol=0, atol=1e-9)
+    torch.testing.assert_close(another, turn(rebuilt), rtol=0, atol=1e-9)
+    torch.testing.assert_close(same.bound, score.bound, rtol=1e-9, atol=0)
+    for name, energy in score.energies.items():
+        torch.testing.assert_close(same.energies[name], energy, rtol=1e-8, atol=1e-8)
+
+
+def test_missing_entries_are_refused_where_windows_are_turned(windows):
+    model, x = build(windows, heading=True), drawn(windows)["x"]
+    with pytest.raises(ValueError, match="fit with heading=False"):
+        dvae.SequenceELBO().terms(model, {"x": x, "mask": torch.ones_like(x, dtype=torch.bool)})
+
+
+# -------------------------------------------------------------------------------------------------- runs, ablations
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_every_ablation_is_fitted_loaded_and_forecasts(people, tmp_path, ablation):
+    """And the best weights are by what is trained."""
+    method = dvae.method("hit-dvae", **{**QUICK, "warm_up": 1, **ABLATIONS[ablation]})
+    training = dvae.Training(steps=4, validate_every=2, batch_size=2, progress=False, accelerator="cpu")
+    result = runs.fit(method, people, tmp_path / "run", training)
+    rows = [row for row in result.history if any(name.startswith("validation/") for name in row)]
+    assert all(("validation/loss" in row) == (method.selects == "loss") for row in rows)
+    assert ("validation loss" in result.best) == (method.selects == "loss")
+    loaded = runs.load(tmp_path / "run")
+    assert loaded.method == replace(method.suited(people.windows("train")))
+    assert from_config(loaded.method.config()) == loaded.method
+    assert loaded.model.feeding.probability == 0
+    past = people.windows("test").all()["x"][:2, :15]
+    assert torch.isfinite(loaded.model.forecast(past, 3, 2)["x"]).all()
+    assert ("w" in loaded.model.latents) == bool(method.static)
+
+
+def test_without_a_skeleton_there_are_the_equations_and_their_networks():
+    model = dvae.method("hit-dvae").build({"x": 12})
+    assert not isinstance(model, HiTModel)
+    assert math.isfinite(dvae.SequenceELBO().loss(model, model.guide, torch.randn(2, 4, 12)))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"loss": "elbo"}, "unknown loss 'elbo'; known: best-of-many, evidence"),
+        ({"summary": "mean"}, "unknown summary 'mean'; known: graph, attention"),
+        ({"samples": 1}, "samples is 1; the best of many is of at least 2"),
+        ({"emission": "student"}, "emission='student' needs loss='evidence'"),
+        ({"diversity": (1.0,)}, "diversity is .*; expected one number for each of lower, upper"),
+        ({"kl_static": -1.0}, "kl_static is -1.0; it must be at least 0"),
+        ({"frames": 0}, "frames is 0; it must be positive"),
+    ],
+)
+def test_options_that_cannot_be(options, message):
+    with pytest.raises(ValueError, match=message):
+        dvae.method("hit-dvae", **options)
+
+
+def test_weights_are_asked_for_where_they_are_known(windows):
+    with pytest.raises(ValueError, match=r"take those of method.suited\(windows\)"):
+        dvae.method("hit-dvae").objective()
+    rooted = motion.windows(motion.simulate(clips=4), replace(windows.protocol, root="relative"), "train")
+    with pytest.raises(ValueError, match="use one with root='drop'"):
+        dvae.method("hit-dvae").build_for(rooted)
+    assert dvae.method("hit-dvae", loss="evidence").build_for(rooted).sizes["x"] == 51
