@@ -6,30 +6,17 @@ around them is written by hand.
 """
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import torch
-from family import BEGIN, END, table
+from evaluations import differences, joined, scores, write
+from family import table
 
 import dvae
 from dvae.inference.metrics import average_pairwise_distance
 
 PAGE = Path(__file__).parent / "results" / "gsps.md"
 METRICS = ("APD", "ADE", "FDE", "MMADE", "MMFDE", "energy score", "pose NLL", "bone-length error")
-
-
-def scores(evaluation: dvae.Evaluation) -> str:
-    """Methods down, metrics across."""
-    rows = [[name, *(str(evaluation[name].get(metric, "–")) for metric in METRICS)] for name in evaluation.rows]
-    return table(["", *METRICS], rows)
-
-
-def differences(evaluation: dvae.Evaluation, full: str) -> str:
-    """What each other run has more than the full method, paired."""
-    others = [name for name, row in evaluation.rows.items() if name != full and row.samples > 1]
-    rows = [[name, *(str(evaluation.difference(name, full, metric)) for metric in METRICS[:-1])] for name in others]
-    return table([f"minus {full}", *METRICS[:-1]], rows)
 
 
 @torch.no_grad()
@@ -53,20 +40,8 @@ def control(path: str, samples: int = 50) -> str:
     return table(["", "APD lower", "APD upper"], rows)
 
 
-def _same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
-    return evaluation.data, evaluation.samples, evaluation.seed, evaluation.pose_prior
-
-
 if __name__ == "__main__":
     run, *files = sys.argv[1:]
-    found = {Path(file).stem: dvae.Evaluation.load(file) for file in files}
-    first = next(iter(found.values()))
-    if any(_same(each) != _same(first) for each in found.values()):
-        sys.exit("these evaluations differ in windows, samples, seed or pose prior")
-    references = {name: row for name, row in first.rows.items() if name != "gsps"}
-    rows = references | {name.replace("-", " "): each.rows["gsps"] for name, each in found.items()}
-    evaluation = replace(first, rows=rows)
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    after = rest.split(END)[1]
-    written = "\n".join([scores(evaluation), differences(evaluation, Path(files[0]).stem), control(run)])
-    PAGE.write_text(before + BEGIN + "\n" + written + "\n" + END + after, encoding="utf-8")
+    evaluation = joined(files)
+    first = next(name for name, row in evaluation.rows.items() if row.config)
+    write(PAGE, scores(evaluation, METRICS), differences(evaluation, first, METRICS[:-1]), control(run))

@@ -1,6 +1,6 @@
 """Draws docs/img/overview.png, the picture of the README, from a run:
 
-    dvae fit hit-dvae --latent 8 --steps 350 --warm-up 110 --learning-rate 2e-3 --batch-size 32 \\
+    dvae fit hit-dvae --loss evidence --latent 8 --steps 350 --warm-up 110 --learning-rate 2e-3 --batch-size 32 \\
         --out runs/overview
     python docs/overview.py runs/overview
 """

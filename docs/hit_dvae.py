@@ -1,0 +1,71 @@
+"""Writes the tables of docs/results/hit_dvae.md: `python docs/hit_dvae.py runs/full full.json no-w.json ...`.
+
+The page says how the runs were fitted and scored, each by `dvae evaluate RUN --out NAME.json` on the same windows; the
+first run is that of the full method, whose long forecasts are measured here. The text around the tables is written by
+hand.
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+from evaluations import differences, joined, scores, write
+from family import table
+
+import dvae
+
+PAGE = Path(__file__).parent / "results" / "hit_dvae.md"
+QUALITY = ("ACC content", "FID content", "FID style", "APD", "energy score", "pose NLL", "bone-length error", "ELBO")
+BEST = ("ADE", "FDE", "MMADE", "MMFDE")
+ERRORS = (*BEST, *(f"{name}m" for name in BEST))
+
+
+@torch.no_grad()
+def long_run(path: str, count: int = 200, seconds: float = 10.0) -> str:
+    """Bones and speed of forecasts that run on far past the horizon of training, second by second."""
+    run = dvae.load(path)
+    test = run.data.windows("test")
+    x = test.all()["x"]
+    x = x[torch.linspace(0, len(x) - 1, count).long()]
+    fps, observed = round(test.protocol.fps), test.protocol.observed
+    torch.manual_seed(0)
+    frames = round(seconds * fps)
+    futures = torch.cat([run.model.forecast(part[:, :observed], frames, 5)["x"] for part in x.split(40)], 1)
+    ours, real = test.positions(futures), test.positions(x)
+    lengths, true = test.skeleton.bone_lengths(ours), test.skeleton.bone_lengths(real).mean(1)
+    error = (lengths / true[:, None] - 1).abs()  # (S, B, T, bones)
+    moving = real.diff(dim=1).norm(dim=-1).mean() * fps
+    rows = []
+    for end in range(fps, frames + 1, fps):
+        now = slice(end - fps, end)
+        speed = ours[:, :, now].diff(dim=2).norm(dim=-1).mean() * fps
+        bones = error[:, :, now].mean((0, 1, 2))
+        worst = test.skeleton.names[test.skeleton.edges[int(bones.argmax())][1]]
+        beyond = (error[:, :, now] > 0.1).float().mean()
+        rows.append(
+            [
+                f"{end // fps}",
+                f"{100 * bones.mean():.1f} %",
+                f"{100 * bones.max():.1f} % ({worst})",
+                f"{100 * beyond:.1f} %",
+                f"{speed:.3f}",
+                f"{speed / moving:.2f}",
+            ]
+        )
+    header = [
+        "second",
+        "bone-length error",
+        "worst bone",
+        "lengths off by > 10 %",
+        "joint speed, m/s",
+        "of real motion's",
+    ]
+    return table(header, rows)
+
+
+if __name__ == "__main__":
+    run, *files = sys.argv[1:]
+    evaluation = joined(files)
+    first = next(name for name, row in evaluation.rows.items() if row.config)
+    compared = differences(evaluation, first, (*QUALITY[:4], *ERRORS))
+    write(PAGE, scores(evaluation, QUALITY), scores(evaluation, ERRORS), compared, long_run(run))
