@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,10 +12,21 @@ from torch import Tensor, nn
 from .distributions.chain import DERIVATIVES, gaussian_chain
 from .heads import Head, HeadSpec, NormalHead, Parameters, StandardNormal
 from .networks.base import Input, Network, NetworkSpec, at, shift
+from .networks.rows import Rows
 from .notation import Factor
+from .units import Units
 
 CONSTANT = "1"
 """What the network of a guide's factor without parents reads."""
+
+
+@dataclass
+class Standardised:
+    """The state of a network's loop, and the draws so far without unit."""
+
+    network: Any
+    kept: dict[str, Rows]
+    lengths: Tensor | None
 
 
 class Conditional(nn.Module):
@@ -41,6 +53,7 @@ class Conditional(nn.Module):
         else:
             self.head = StandardNormal(self.size)
         self.parents = [parent.name for parent in factor.parents]
+        self.units: dict[str, Units] = {}  # not registered here: they are the model's
         if self.head.residual and not self._reads_previous():
             raise ValueError(
                 f"{factor} has a residual head, which adds {factor.child}_{{t-1}}, but it does not read that; "
@@ -57,36 +70,53 @@ class Conditional(nn.Module):
         """The head's parameters at all steps, (B, T, D), or (B, D) for a static child."""
         if self.network is None:
             shape = (batch, length, 1) if self.factor.local else (batch, 1)
-            return self.head(next(self.head.buffers()).new_ones(shape))
-        features = self.network(self._read(parents, batch), length, lengths)
-        previous = shift(parents[self.factor.child], -1) if self.head.residual else None
-        return self.head(features, previous)
+            return self._in_units(self.head(next(self.head.buffers()).new_ones(shape)))
+        read = self._read(parents, batch, lengths)
+        features = self.network(read, length, lengths)
+        previous = shift(read[self.factor.child], -1) if self.head.residual else None
+        return self._in_units(self.head(features, previous))
 
-    def _read(self, values: Mapping[str, Tensor], batch: int) -> dict[str, Tensor]:
-        """The parents among `values`, or a constant in place of none."""
+    def _read(self, values: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> dict[str, Tensor]:
+        """The parents among `values`, without unit, or a constant in place of none."""
         if not self.parents:
             return {CONSTANT: next(self.parameters()).new_ones(batch, 1)}
-        return {name: values[name] for name in self.parents if name in values}
+        found = {name: values[name] for name in self.parents if name in values}
+        return found | {n: self.units[n].of(v, lengths) for n, v in found.items() if n in self.units}
+
+    def _in_units(self, parameters: Parameters) -> Parameters:
+        units = self.units.get(self.factor.child)
+        return parameters if units is None else self.head.in_units(parameters, units.mean, units.scale)
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """The state before a loop that draws those of the parents that are not `given`."""
         if self.network is None:
             return tuple(p.unbind(1) for p in self(given, batch, length))
-        return self.network.start(self._read(given, batch), batch, length, lengths)
+        state = self.network.start(self._read(given, batch, lengths), batch, length, lengths)
+        live = [name for name in self.units if name in self.parents and name not in given]
+        if not live:
+            return state
+        return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)
 
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Parameters, Any]:
         """The head's parameters (B, D) at step t, and the next state."""
         if self.network is None:
             return tuple(p[t] for p in state), state
-        features, state = self.network.step(state, t, drawn)
+        if isinstance(state, Standardised):
+            kept, lengths = state.kept, state.lengths
+            drawn = {**drawn, **{n: self.units[n].drawn(rows, drawn[n], lengths) for n, rows in kept.items()}}
+            features, state.network = self.network.step(state.network, t, drawn)
+        else:
+            features, state = self.network.step(state, t, drawn)
         previous = None
         if self.head.residual:
             previous = at(drawn[self.factor.child], t - 1, features, self.size)
-        return self.head(features, previous, t), state
+        return self._in_units(self.head(features, previous, t)), state
 
     def chain(self, state: Any, direction: int, noise: Tensor) -> tuple[Tensor, Parameters] | None:
         """Draws (B, T, D) and their parameters by one fused loop, where the factor is a Gaussian chain; else None."""
         if torch.is_autocast_enabled(noise.device.type):  # the fused loop runs in one precision
+            return None
+        if self.factor.child in self.units:
             return None
         form = None if self.network is None else self.network.chain(state)
         if form is None or form.lag != -direction or form.join.kind not in DERIVATIVES:

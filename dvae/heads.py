@@ -25,7 +25,8 @@ class Head(nn.Module):
 
     Args:
         residual: share of the variable's own previous value that its location keeps, so that features give the rest:
-            1 (True) for an offset. Below 1 a free run forgets where it was, and cannot drift without bound.
+            1 (True) for an offset. Below 1 a free run forgets where it was, and cannot drift without bound. A
+            residual head starts near that share, with weights a hundredth of the usual.
 
     Raises:
         ValueError: a share that is not between 0 and 1.
@@ -39,6 +40,15 @@ class Head(nn.Module):
         if not 0 <= residual <= 1:
             raise ValueError(f"residual is {residual}; it is a share of the previous value, from 0 to 1")
         self.residual = float(residual)
+
+    def projection(self, features: int, out: int, locations: int) -> nn.Linear:
+        """The linear layer to `out` parameters, of which the first so many are locations."""
+        layer = nn.Linear(features, out)
+        if self.residual:
+            with torch.no_grad():
+                layer.weight[:locations] *= 0.01
+                layer.bias[:locations] *= 0.01
+        return layer
 
     def moved(self, loc: Tensor, previous: Tensor | None) -> Tensor:
         """The location from what the features give and the variable's own previous value."""
@@ -58,6 +68,11 @@ class Head(nn.Module):
         """The elementwise distribution over (..., D)."""
         loc, scale = parameters
         return dist.Normal(loc, scale, validate_args=False)
+
+    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+        """The parameters of mean + scale * variable, from those of the variable."""
+        loc, *rest = parameters
+        return torch.addcmul(mean, loc, scale), *(rest[:1] and [rest[0] * scale]), *rest[1:]
 
     def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
         """Noise for all steps at once; `draw` turns it into values."""
@@ -100,7 +115,7 @@ class NormalHead(Head):
     def __init__(self, spec: Normal, features: int, size: int):
         super().__init__(spec.residual)
         self.min_scale = spec.min_scale
-        self.out = nn.Linear(features, 2 * size)
+        self.out = self.projection(features, 2 * size, size)
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         """See `Head.forward`."""
@@ -150,7 +165,7 @@ class FixedNormalHead(Head):
 
     def __init__(self, spec: FixedNormal, features: int, size: int):
         super().__init__(spec.residual)
-        self.out: nn.Module = nn.Linear(features, size) if spec.project else nn.Identity()
+        self.out: nn.Module = self.projection(features, size, size) if spec.project else nn.Identity()
         shape = (spec.steps, size) if spec.steps else (size,)
         log_scale = torch.full(shape, math.log(spec.scale))
         if spec.learned:
@@ -158,7 +173,12 @@ class FixedNormalHead(Head):
         else:
             self.register_buffer("log_scale", log_scale)
         self.steps = spec.steps
-        self.fitted = spec.fitted
+        self.fitted, self.learned = spec.fitted, spec.learned
+
+    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+        """See `Head.in_units`; a scale that is given is in the variable's own unit."""
+        loc, own = super().in_units(parameters, mean, scale)
+        return loc, own if self.learned else parameters[1]
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         """See `Head.distribution`."""
@@ -206,7 +226,7 @@ class StudentTHead(Head):
     def __init__(self, spec: StudentT, features: int, size: int):
         super().__init__(spec.residual)
         self.min_scale = spec.min_scale
-        self.out = nn.Linear(features, 2 * size)
+        self.out = self.projection(features, 2 * size, size)
         self.raw_df = nn.Parameter(torch.full((size,), math.log(math.expm1(spec.df - 2))))
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:

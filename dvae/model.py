@@ -29,6 +29,7 @@ from .networks.base import valid_steps
 from .notation import Factorization, check_pair
 from .priors import Prior
 from .rollout import Rollout, SelfFeeding, like
+from .units import Units
 
 _COUNT = itertools.count()
 WHOLE = "x"
@@ -107,6 +108,7 @@ class DynamicalVAE(nn.Module):
             object.__setattr__(self, "encoder", {name: self.generator[name] for name in self.latents})
         else:
             self.encoder: Any = self._conditionals(self.inference)
+        self.units: Any = nn.ModuleDict()
         self.priors = nn.ModuleDict(dict(priors or {}))
         for name, prior in (priors or {}).items():
             factor = self.generative.factor(name)
@@ -152,6 +154,21 @@ class DynamicalVAE(nn.Module):
                     f"past alone; give {self.history} a mask of your own that hides the frames to be made, such as "
                     f'{self.history}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
                 )
+
+    def standardise(self, name: str) -> Units:
+        """Has networks read and make a variable without unit, by a mean and a scale that `fit` of the result takes.
+
+        Densities and values stay in the variable's own unit; call it before the model is fitted.
+
+        Raises:
+            ValueError: an unknown variable.
+        """
+        if name not in self.sizes:
+            raise ValueError(f"no variable {name!r}; there are {', '.join(self.sizes)}")
+        self.units[name] = Units(self.sizes[name])
+        for conditional in (*self.generator.values(), *self.encoder.values()):
+            conditional.units[name] = self.units[name]
+        return self.units[name]
 
     @property
     def likelihood(self) -> bool:

@@ -32,7 +32,7 @@ class Evidence:
 
     With sums over the sequences of the batch, and F their number of frames,
 
-        loss = - sum log p / F + sum_latents weight * max(KL / F, free bits) + sum_energies weight * energy /
+        loss = - weight * sum log p / F + sum_latents weight * max(KL / F, free bits) + sum_energies weight * energy /
         F.
 
     Args:
@@ -41,6 +41,8 @@ class Evidence:
         free_bits: nats per frame, averaged over the batch, below which a latent's KL costs nothing more; a
             number for every latent, or one for each latent by name (others have none).
         energy_weights: weight of each energy by name (others weigh 1).
+        likelihood_weight: of the log-likelihood. Where energies train the locations, and it fits no more than scales,
+            whose steps an adaptive optimiser takes at any weight, a small one leaves the loss to the energies.
         draws: of a latent, by name, for each sequence: energies that compare samples, such as that of the best of
             many, need several (see `DynamicalVAE.model`). The terms of the bound are means over them.
         select: what tells the best weights: the unweighted "bound", or the "loss" itself, where energies are what is
@@ -56,6 +58,7 @@ class Evidence:
     kl_weight: float | Schedule | Mapping[str, float | Schedule] = 1.0
     free_bits: float | Mapping[str, float] = 0.0
     energy_weights: Mapping[str, float | Schedule] = field(default_factory=dict)
+    likelihood_weight: float = 1.0
     draws: Mapping[str, int] = field(default_factory=dict)
     select: Literal["bound", "loss"] = "bound"
 
@@ -69,7 +72,8 @@ class Evidence:
         free_bits = _by_name("free_bits", self.free_bits, terms.kl, default=0.0)
         energy_weights = _by_name("energy_weights", self.energy_weights, terms.energies, default=1.0)
         frames = terms.frames.sum()
-        loss = -sum((value.sum() for value in terms.log_likelihood.values()), frames.new_zeros(())) / frames
+        likelihood = sum((value.sum() for value in terms.log_likelihood.values()), frames.new_zeros(()))
+        loss = -self.likelihood_weight * likelihood / frames
         for latent, kl in terms.kl.items():
             rate = kl.sum() / frames
             if free_bits[latent] > 0:  # at zero there is no floor: an unbiased estimate of a KL may be negative

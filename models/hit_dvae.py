@@ -18,7 +18,8 @@ Bie et al., 2022, arXiv 2204.01565. There is no public code. Ours where the pape
 
 * One layer a factor; linear biases for positions (`networks.Attention`), so that motions may be longer than in
   training; a learned start token in place of the first step's past, so that x_1 and z_1 are part of the model.
-* Poses are predicted, not offsets (`residual` for these). No normalisation over the batch.
+* Poses are predicted, not offsets (`residual` for these), and standardised: in metres the networks take several times
+  as long to learn what poses have in common. No normalisation over the batch.
 * With best-of-many, the density of x has one scale per coordinate, fitted to the errors and no more: its gradient does
   not reach the poses. The paper's unit variance is emission="unit".
 * The observed frames are never replaced in training, as they will not be in a forecast, unless `feed_observed`. Means
@@ -33,7 +34,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from .. import energies
 from ..inference.batches import Source
@@ -120,8 +121,9 @@ class HiTDVAE(EnergyMethod):
         decoder: width of the attention of x.
         layers: of each factor.
         nearest: the last frame that a generative factor may read joins its query; in the paper it is one key of many.
+        standardise: networks read and make poses without unit, by the mean pose and one spread (`dvae.units`).
         skip: the head of x reads the query's parts, x_{t-1} among them with `nearest`, beside what attention makes of
-            them; not in the paper, and several times faster to learn.
+            them.
         pose_width: features of a joint; 0 for poses as they are.
         summary: of x for w: "graph" (a graph of `frames` frames) or "attention" (over any length).
         frames: O, of the graph's window; None for as many as the protocol observes.
@@ -166,7 +168,8 @@ class HiTDVAE(EnergyMethod):
     decoder: int | None = None
     layers: int = 1
     nearest: bool = True
-    skip: bool = True
+    skip: bool = False
+    standardise: bool = True
     pose_width: int = 8
     summary: Literal["graph", "attention"] = "graph"
     frames: int | None = None
@@ -237,6 +240,8 @@ class HiTDVAE(EnergyMethod):
         if self.pose_width:
             for side in (model.generator, model.encoder):
                 share("x", *(conditional.network for conditional in side.values() if conditional.network is not None))
+        if self.standardise:
+            model.standardise(WHOLE)
         start = 0 if self.feed_observed else self.frames or FRAMES
         model.feeding = SelfFeeding(0.0, self.feeding_passes or None, self.feeding_gradient, start)
         return model
@@ -277,6 +282,14 @@ class HiTDVAE(EnergyMethod):
         )
         return method._finished(model)
 
+    def prepare(self, model: nn.Module, windows: Windows) -> None:
+        """See `Method.prepare`: what `EnergyMethod` takes, and mean and spread of the poses of 1024 windows."""
+        super().prepare(model, windows)
+        if self.standardise:
+            x = windows.sample(1024, torch.default_generator)["x"]
+            units: Any = model.units
+            units[WHOLE].fit(model.turned(x)[0] if isinstance(model, EnergyModel) else x)
+
     def batches(self, windows: Windows) -> Source:
         """See `Method.batches`."""
         return windows if self.loss == "evidence" else super().batches(windows)
@@ -299,6 +312,7 @@ class HiTDVAE(EnergyMethod):
             kl_weight={n: ramp(0.0, w, steps=self.warm_up) if self.warm_up else w for n, w in weights.items()},
             free_bits=self.free_bits,
             energy_weights={name: weight for name, weight in energy_weights.items() if weight},
+            likelihood_weight=1e-3,  # for the scale alone, whose steps are Adam's at any weight
             draws={"w" if self.static else "z": self.samples},
             select="loss",
         )

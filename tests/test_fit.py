@@ -113,6 +113,7 @@ def test_kl_weights_free_bits_and_energies_enter_the_loss_as_documented():
     assert Evidence(free_bits={"w": 0.5})(terms(), 0).item() == pytest.approx((12 + 6) / 6 + 0.5)
     assert Evidence(energy_weights={"feet": 2.0})(energy, 0).item() == pytest.approx((12 + 7.2 + 12) / 6)
     assert Evidence()(energy, 0).item() == pytest.approx((12 + 7.2 + 6) / 6)
+    assert Evidence(likelihood_weight=0.5)(terms(), 0).item() == pytest.approx((6 + 7.2) / 6)
 
 
 def test_free_bits_stop_the_gradient_and_a_negative_kl_estimate_stays_unbiased():
@@ -129,7 +130,15 @@ def test_a_weight_for_an_unknown_term_is_refused(option):
 
 
 def test_an_objective_survives_json():
-    objective = Evidence({"z": Piecewise(((0, 0.0), (9, 1.0)))}, free_bits=0.1, energy_weights={"feet": 2.0})
+    with pytest.raises(ValueError, match="select is 'best'; it must be 'bound' or 'loss'"):
+        Evidence(select="best")
+    objective = Evidence(
+        {"z": Piecewise(((0, 0.0), (9, 1.0)))},
+        free_bits=0.1,
+        energy_weights={"feet": 2.0},
+        draws={"z": 3},
+        select="loss",
+    )
     assert Evidence.from_config(json.loads(json.dumps(objective.to_config()))) == objective
     for wrong in ({"objective": "Other"}, {"objective": "Evidence", "beta": 1.0}):
         with pytest.raises(ValueError, match="expected an objective 'Evidence' with kl_weight"):

@@ -106,6 +106,23 @@ class TestHiTDVAEThatReadsItsPast(Contract):
     missing: ClassVar = {}
 
 
+class TestStandardised(Contract):
+    """Networks without unit, in a loop and out of it; the laws are those of the variable in its own."""
+
+    name = "hit-dvae"
+    options: ClassVar = {"residual": 0.7, "skip": True}
+
+    def build(self, size):
+        model = super().build(size)
+        model.units["x"].fit(3 + 2 * torch.randn(20, size))
+        model.standardise("z").fit(1 + 0.3 * torch.randn(20, model.sizes["z"]))
+        return model
+
+
+class TestStandardisedRecurrent(TestStandardised):
+    options: ClassVar = {"attention": False, "residual": 0.7}
+
+
 class TestHiTDVAEWithoutAttention(Contract):
     name = "hit-dvae"
     options: ClassVar = {"attention": False, "summary": "attention"}

@@ -385,6 +385,16 @@ def test_feeding_on_ones_own_means(pair, network, residual):
     assert not torch.allclose(some["x"], exact["x"])
 
 
+@pytest.mark.parametrize("passes", [None, 2])
+def test_the_first_frames_may_stay_as_they_are(passes):
+    model = build("srnn")
+    x = draw(model)["x"]
+    trace = poutine.trace(model.model).get_trace(x, self_feeding=SelfFeeding(1.0, passes, start=2))
+    history = trace.nodes["x"]["fn"].rollout.history()["x"]
+    assert torch.equal(history[:, :2], x[:, :2])
+    assert (history[:, 2:] != x[:, 2:]).all()
+
+
 def test_gradients_flow_back_in_time_through_fed_means_where_they_are_asked_for():
     """The exact loop and T parallel passes have one gradient; without, that of the fed history as data."""
     model = build("srnn").double()

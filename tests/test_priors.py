@@ -194,7 +194,7 @@ def test_priors_that_do_not_suit(prior, guide, message):
 # ------------------------------------------------------------------------------------------------------- in a run
 
 OPTIONS = {"latent": 2, "static": 2, "width": 4, "heads_count": 1, "decoder": 4, "warm_up": 0, "self_feeding": 0.0}
-VAMP = {**OPTIONS, "prior": "vamp", "prior_components": 3, "prior_steps": 6}
+VAMP = {**OPTIONS, "prior": "vamp", "prior_components": 3, "prior_steps": 6, "heading": False}
 
 
 @pytest.fixture(scope="module")

@@ -77,8 +77,8 @@ class Extractors(nn.ModuleDict):
         found = dict(drawn)
         for name in self.keys() & drawn:
             extractor, seen = kept[name]
-            for s, value in enumerate(drawn[name]):
-                if seen.missing(s) and value is not None:
+            for s in range(len(drawn[name])):
+                if seen.missing(s) and (value := drawn[name][s]) is not None:
                     features = extractor(value)
                     seen[s] = features if lengths is None else features * (s < lengths)[:, None]
             found[name] = seen

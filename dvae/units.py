@@ -1,0 +1,70 @@
+"""Units: the mean and the spread of a variable, in which networks read it and make it.
+
+A network that must find them out first learns much more slowly: in metres, what varies between poses is a tenth of what
+they share. Densities and all that a program returns stay in the variable's own unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from .networks.base import once, valid_steps
+from .networks.rows import Rows
+
+
+class Units(nn.Module):
+    """A mean for every coordinate and one scale for all, which keeps angles; 0 and 1 until `fit`.
+
+    Args:
+        size: D.
+    """
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(()))
+
+    @torch.no_grad()
+    def fit(self, values: Tensor) -> None:
+        """Takes mean and root mean variance of values (..., D).
+
+        Raises:
+            ValueError: values that do not vary, or are of another size.
+        """
+        rows = values.flatten(0, -2)
+        if rows.shape[1:] != self.mean.shape or not rows.var(0).mean() > 0:
+            raise ValueError(
+                f"units come from values (..., {len(self.mean)}) that vary, not from {tuple(values.shape)}"
+                f"{'' if rows.shape[1:] != self.mean.shape else ' without variance'}"
+            )
+        self.mean.copy_(rows.mean(0))
+        self.scale.copy_(rows.var(0).mean().sqrt())
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Values (..., D) without unit."""
+        return (values - self.mean) / self.scale
+
+    def of(self, values: Tensor, lengths: Tensor | None) -> Tensor:
+        """`forward` of (B, T, D) or (B, D), zero at padding; once for all that read the same values."""
+
+        def found() -> Tensor:
+            standard = self(values)
+            if lengths is None or values.dim() == 2:
+                return standard
+            return standard * valid_steps(lengths, values.shape[1])[..., None]
+
+        return once(self, [values, lengths], found)
+
+    def drawn(self, kept: Rows, values: Sequence[Tensor], lengths: Tensor | None) -> Rows:
+        """The draws of a loop so far, each standardised once and kept."""
+        for s in range(len(values)):
+            if kept.missing(s) and values[s] is not None:
+                standard = self(values[s])
+                kept[s] = standard if lengths is None else standard * (s < lengths)[:, None]
+        return kept
