@@ -231,6 +231,13 @@ class HiTDVAE(EnergyMethod):
             found["q(w)"] = graph if self.summary == "graph" else pooled
         return found
 
+    def heads(self) -> dict[str, Any]:
+        """See `Method.heads`; a learned scale starts at the spread of what is standardised."""
+        found: dict[str, Any] = dict(super().heads())
+        if self.standardise and self.emission == "fixed":
+            found["p(x)"] = replace(found["p(x)"], scale=1.0)
+        return found
+
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
         """See `Method.build`; without a skeleton there are no energies."""
         return self._finished(super().build(data))
@@ -266,7 +273,7 @@ class HiTDVAE(EnergyMethod):
         self.refuse_root(windows)
         p, q = method.equations()
         sizes = {**method.sizes(), WHOLE: windows.size}
-        heads: dict[str, Any] = dict(method.heads())
+        heads = method.heads()
         if method.selects == "loss":
             heads["p(x)"] = replace(heads["p(x)"], fitted="scale")
         model = HiTModel(
