@@ -15,11 +15,10 @@ from __future__ import annotations
 
 import argparse
 import resource
-import sys
 from dataclasses import replace
 
 import torch
-from speed import seconds, training_step
+from speed import report, seconds, training_step
 
 import dvae
 from dvae import motion
@@ -80,14 +79,7 @@ def main() -> None:
     )
     found["prior"] = both[0] / both[1]
     found["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    missed = False
-    for name, value in found.items():
-        side, bound = TARGETS.get(name, ("", float("nan")))
-        met = not side or (value <= bound if side == "at most" else value >= bound)
-        missed |= not met
-        print(f"{name:10s} {value:6.2f}   " + (f"{side:8s} {bound:5.2f}   {'ok' if met else 'MISSED'}" if side else ""))
-    if missed:
-        sys.exit(1)
+    report(found, TARGETS)
 
 
 if __name__ == "__main__":

@@ -14,12 +14,11 @@ Motion is simulated. Times are the least of several, in turns with what they com
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import replace
 
 import torch
-from speed import seconds, training_step
+from speed import report, seconds, training_step
 from torch import Tensor
 
 import dvae
@@ -90,14 +89,7 @@ def main() -> None:
     found |= {f"step, {kind}": each / forced for kind, each in zip(kinds, fed, strict=True)}
     found["step, seconds"] = forced
 
-    missed = False
-    for name, value in found.items():
-        side, bound = TARGETS.get(name, ("", float("nan")))
-        met = not side or (value <= bound if side == "at most" else value >= bound)
-        missed |= not met
-        print(f"{name:16s} {value:6.2f}   " + (f"{side:8s} {bound:5.2f}   {'ok' if met else 'MISSED'}" if side else ""))
-    if missed:
-        sys.exit(1)
+    report(found, TARGETS)
 
 
 if __name__ == "__main__":

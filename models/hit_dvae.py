@@ -50,45 +50,35 @@ from ..rollout import Rollout, SelfFeeding
 from .energies import EnergyMethod, EnergyModel
 from .method import SHAPES
 
+HUMANEVA: dict[str, Any] = {
+    "reconstruction": 10.0,
+    "multimodal": 5.0,
+    "diversity": (0.1, 0.2),
+    "diversity_scale": (15.0, 50.0),
+    "limb": 100.0,
+    "angles": 1.0,
+    "pose_prior": 0.001,
+    "kl_static": 7.5,
+    "samples": 10,
+    "decoder": 256,
+    "pseudo_minimum": 0.01,
+    "pool_stride": 15,
+    "heading": False,
+}
 PRESETS: dict[str, dict[str, Any]] = {
-    "human36m": {
+    "humaneva": HUMANEVA,
+    "human36m": HUMANEVA
+    | {
         "reconstruction": 20.0,
         "multimodal": 10.0,
-        "diversity": (0.1, 0.2),
         "diversity_scale": (100.0, 300.0),
-        "limb": 100.0,
-        "angles": 1.0,
         "pose_prior": 0.01,
         "kl_static": 12.5,
-        "samples": 10,
-        "decoder": 256,
         "pseudo_minimum": 0.1,
         "pool_stride": 20,
-        "heading": False,
     },
-    "humaneva": {
-        "reconstruction": 10.0,
-        "multimodal": 5.0,
-        "diversity": (0.1, 0.2),
-        "diversity_scale": (15.0, 50.0),
-        "limb": 100.0,
-        "angles": 1.0,
-        "pose_prior": 0.001,
-        "kl_static": 7.5,
-        "samples": 10,
-        "decoder": 256,
-        "pseudo_minimum": 0.01,
-        "pool_stride": 15,
-        "heading": False,
-    },
-    "": {
-        "reconstruction": 10.0,
-        "multimodal": 5.0,
-        "diversity": (0.1, 0.2),
-        "diversity_scale": (15.0, 50.0),
-        "limb": 100.0,
-        "angles": 1.0,
-        "pose_prior": 0.001,
+    "": HUMANEVA
+    | {
         "kl_static": 1.0,
         "samples": 6,
         "decoder": 128,
