@@ -17,7 +17,7 @@ def joined(files: Sequence[str]) -> dvae.Evaluation:
     found = {Path(file).stem: dvae.Evaluation.load(file) for file in files}
     first = next(iter(found.values()))
     if any(_same(each) != _same(first) for each in found.values()):
-        sys.exit("these evaluations differ in windows, samples, seed, pose prior or classifiers")
+        sys.exit("these evaluations differ in windows, samples, seed, emission, multimodal threshold or judges")
     rows = {name: row for name, row in first.rows.items() if not row.config}
     for name, each in found.items():
         (own,) = (row for row in each.rows.values() if row.config)
@@ -26,7 +26,8 @@ def joined(files: Sequence[str]) -> dvae.Evaluation:
 
 
 def _same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
-    return evaluation.data, evaluation.samples, evaluation.seed, evaluation.pose_prior, evaluation.classifiers
+    drawn = evaluation.samples, evaluation.seed, evaluation.emission, evaluation.bound_particles
+    return evaluation.data, *drawn, evaluation.multimodal, evaluation.pose_prior, evaluation.classifiers
 
 
 def scores(evaluation: dvae.Evaluation, metrics: Sequence[str]) -> str:

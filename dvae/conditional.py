@@ -92,7 +92,8 @@ class Conditional(nn.Module):
         if self.network is None:
             return tuple(p.unbind(1) for p in self(given, batch, length))
         state = self.network.start(self._read(given, batch, lengths), batch, length, lengths)
-        live = [name for name in self.units if name in self.parents and name not in given]
+        own = self.factor.child if self.head.residual else None  # read from the draws, given or not
+        live = [name for name in self.units if name in self.parents and (name not in given or name == own)]
         if not live:
             return state
         return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)

@@ -193,8 +193,8 @@ class DynamicalVAE(nn.Module):
         Args:
             batch: the data (B, T, D), or a mapping from variable names to tensors (context too), with optional
                 "lengths" (B,) of a ragged batch and "mask", True where an entry of the data was observed: (B, T, D),
-                or a mapping of these by name. At a missing entry the model reads its own mean, the guide 0. Arrays
-                are taken as tensors, in the model's precision.
+                or a mapping of these by name. At a missing entry the model reads its own mean, the guide 0, or the
+                mean of a variable with units. Arrays are taken as tensors, in the model's precision.
             length: T. Beyond the length of the data, the data are a prefix from which the program continues.
             size: B, where the batch does not tell.
             prefix: name to the first values (B, O, D) of a latent.
@@ -270,10 +270,14 @@ class DynamicalVAE(nn.Module):
                 )
         values = {}
         for name in self.latents:
-            rollout = rollout.fork((draws or {}).get(name, 1))
+            n = (draws or {}).get(name, 1)
+            one, rollout = rollout, rollout.fork(n)
             with rollout.plate:
                 own = name in self.priors and self.encoder[name] is self.generator[name]
-                law = self._prior(name, rollout.batch) if own else rollout.law(name)
+                if own:
+                    law = self._prior(name, rollout.batch)
+                else:
+                    law = rollout.law(name) if self.inference.local(name) else one.law(name, n)
                 values[name] = pyro.sample(name, law, infer=_note(self.inference, rollout))
                 rollout.know(name, values[name])
         return values
@@ -575,7 +579,8 @@ class DynamicalVAE(nn.Module):
                     f"the mask of {name} is {seen.dtype} {tuple(seen.shape)}; expected bool "
                     f"{tuple(values[name].shape)}, True where an entry was observed"
                 )
-            values[name] = values[name].masked_fill(~seen, 0)
+            fill = self.units[name].mean if name in self.units else values[name].new_zeros(())
+            values[name] = torch.where(seen, values[name], fill)
         if lengths is not None:
             if (
                 lengths.is_floating_point()

@@ -109,13 +109,19 @@ class Rollout:
             prefix=again(self.prefix),
         )
 
-    def law(self, name: str) -> TorchDistribution:
-        """The distribution of a variable, for its Pyro site."""
+    def law(self, name: str, draws: int = 1) -> TorchDistribution:
+        """The distribution of a variable, for its Pyro site.
+
+        Args:
+            draws: of a static variable, which is then over the rows of `fork(draws)`. Its network runs once for all of
+                them: one that is random in training, such as a summary of a window somewhere, is the same for all
+                draws of a sequence, as it is in a forecast.
+        """
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)
         parameters = conditional(self.values, self.batch, self.length, self.lengths)
-        return conditional.head.distribution(parameters).to_event(1)
+        return conditional.head.distribution(tuple(p.repeat(draws, 1) for p in parameters)).to_event(1)
 
     def know(self, name: str, value: Tensor) -> None:
         """Record the value of a site, which later sites read."""

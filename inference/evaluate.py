@@ -649,6 +649,12 @@ def _judge(name: str, classifier: Any, held: _Held, seed: int, batch_size: int) 
             f"the classifier {name} was fitted to the skeleton {classifier.skeleton.name!r} and frames of "
             f"{classifier.size} numbers; these windows have {given} and {held.x.shape[2]}"
         )
+    fitted, asked = ((p.predicted, p.fps) for p in (classifier.protocol, held.windows.protocol))  # type: ignore[attr-defined]
+    if fitted != asked:
+        raise ValueError(
+            f"the classifier {name} was fitted to {fitted[0]} predicted frames at {fitted[1]:g} fps; these windows "
+            f"have {asked[0]} at {asked[1]:g}"
+        )
     try:
         labels = held.windows.labels(classifier.label)  # type: ignore[attr-defined]
     except KeyError as error:

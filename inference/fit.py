@@ -506,7 +506,8 @@ class _Loop:
     def _score(self, data: Sequences, feeding: float) -> dict[str, float]:
         """The unweighted terms on held-out data, per frame, with the same draws each time."""
         sums = dict[str, Tensor]()
-        objective = _stage(self.plan, self.state.step).objective
+        stage = _stage(self.plan, self.state.step)
+        objective, last = stage.objective, self.training.steps  # of its weights, so that losses can be compared
         self.module.eval()
         with _forked_random_state(self.fabric.device), torch.no_grad():
             torch.manual_seed(self.training.seed)
@@ -514,7 +515,7 @@ class _Loop:
                 terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
                 found = _sums(terms)
                 if not terms.likelihood or getattr(objective, "select", "bound") == "loss":
-                    found["loss"] = objective(terms, self.state.step).double() * found["frames"]
+                    found["loss"] = objective(terms, last).double() * found["frames"]
                 for name, value in found.items():
                     sums[name] = sums[name] + value if name in sums else value
         self.module.train()

@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from ..inference.batches import Batch
 from ..inference.objectives import Evidence, Objective
 from ..model import DynamicalVAE
-from ..motion import Skeleton, Windows
+from ..motion import Protocol, Skeleton, Windows
 from ..notation import Factorization
 from .method import Method
 
@@ -101,7 +101,7 @@ class ActionClassifier(Method):
 
     def build_for(self, windows: Windows) -> ActionClassifierModel:
         """The model for such windows."""
-        return ActionClassifierModel(self.suited(windows), windows.skeleton, windows.size, windows.protocol.observed)
+        return ActionClassifierModel(self.suited(windows), windows.skeleton, windows.size, windows.protocol)
 
     def batches(self, windows: Windows) -> Windows:
         """See `Method.batches`: windows with their class.
@@ -129,15 +129,15 @@ class ActionClassifierModel(nn.Module):
         method: with its classes.
         skeleton: of the windows.
         size: D, numbers of a frame.
-        observed: O, frames of a window before those that are judged.
+        protocol: of the windows, whose predicted frames are judged.
     """
 
     per = "window"  # what there is one log-likelihood of
 
-    def __init__(self, method: ActionClassifier, skeleton: Skeleton, size: int, observed: int):
+    def __init__(self, method: ActionClassifier, skeleton: Skeleton, size: int, protocol: Protocol):
         super().__init__()
         self.label, self.classes = method.label, method.classes
-        self.skeleton, self.size, self.observed = skeleton, size, observed
+        self.skeleton, self.size, self.protocol = skeleton, size, protocol
         self.gru = nn.GRU(size, method.hidden, method.layers, batch_first=True)
         self.project = nn.Linear(method.hidden, method.features)
         self.logits = nn.Linear(method.features, len(method.classes))
@@ -157,9 +157,10 @@ class ActionClassifierModel(nn.Module):
         if CLASS not in batch:
             raise ValueError(f"the batch lacks {CLASS!r}, the class of each window; Windows.classified gives it")
         x = batch["x"]
-        if x.shape[1] <= self.observed:
-            raise ValueError(f"windows of {x.shape[1]} frames have none after the {self.observed} observed ones")
-        logits = self.logits(self.features(x[:, self.observed :]))
+        observed = self.protocol.observed
+        if x.shape[1] <= observed:
+            raise ValueError(f"windows of {x.shape[1]} frames have none after the {observed} observed ones")
+        logits = self.logits(self.features(x[:, observed:]))
         with pyro.plate("windows", len(x)):
             return {CLASS: pyro.sample(CLASS, distributions.Categorical(logits=logits), obs=batch[CLASS])}
 

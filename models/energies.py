@@ -46,7 +46,9 @@ class EnergyMethod(Method):
         pseudo_minimum: metres, mean over joints, that such a future keeps from the true one.
         pseudo_most: largest number of them for a window.
         pool_stride: frames between the windows that they are taken from.
-        heading: turn every window so that its last observed pose faces one way, and the futures back.
+        heading: turn every window so that its last observed pose faces one way, and the futures back. Whatever reads
+            the frames before then knows of that one, and bounds are those of turned windows, whose heading nothing
+            scores: they compare with those of models that turn them too, and with no others.
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]]
@@ -225,6 +227,12 @@ class EnergyModel(DynamicalVAE):
                 raise ValueError(
                     "this model turns every window to one heading, which missing entries do not tell; fit with "
                     "heading=False"
+                )
+            needed = min(self.frames, values[name].shape[-2])
+            if "lengths" in values and values["lengths"].min() < needed:
+                raise ValueError(
+                    f"this model turns every window by its frame {needed}, but a sequence has "
+                    f"{values['lengths'].min()}; leave it out, or fit with heading=False"
                 )
             values[name] = self.turned(values[name])[0]
         return values

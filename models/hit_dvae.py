@@ -18,8 +18,9 @@ Bie et al., 2022, arXiv 2204.01565. There is no public code. Ours where the pape
 
 * One layer a factor; linear biases for positions (`networks.Attention`), so that motions may be longer than in
   training; a learned start token in place of the first step's past, so that x_1 and z_1 are part of the model.
-* Poses are predicted, not offsets (`residual` for these), and standardised: in metres the networks take several times
-  as long to learn what poses have in common. No normalisation over the batch.
+* The mean of x_t keeps half of x_{t-1} (`residual`): without that the first predicted frame is off by twice as much,
+  and whole offsets diverge. Poses are standardised: in metres the networks take several times as long to learn what
+  poses have in common. No normalisation over the batch.
 * With best-of-many, the density of x has one scale per coordinate, fitted to the errors and no more: its gradient does
   not reach the poses. The paper's unit variance is emission="unit".
 * The observed frames are never replaced in training, as they will not be in a forecast, unless `feed_observed`. Means
@@ -29,7 +30,7 @@ Bie et al., 2022, arXiv 2204.01565. There is no public code. Ours where the pape
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -38,6 +39,7 @@ from torch import Tensor, nn
 
 from .. import energies
 from ..inference.batches import Source
+from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.schedules import Linear, Schedule
 from ..model import WHOLE, Batch, DynamicalVAE
@@ -58,6 +60,7 @@ HUMANEVA: dict[str, Any] = {
     "limb": 100.0,
     "angles": 1.0,
     "pose_prior": 0.001,
+    "kl_local": 0.5,
     "kl_static": 7.5,
     "samples": 10,
     "decoder": 256,
@@ -79,7 +82,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "": HUMANEVA
     | {
-        "kl_static": 1.0,
         "samples": 6,
         "decoder": 128,
         "pseudo_minimum": 0.02,
@@ -105,24 +107,25 @@ class HiTDVAE(EnergyMethod):
         kl_local: weight of the KL of z.
         kl_static: weight of the KL of w, in the bound's unit; the paper's .1 beside means over T frames is .1 T.
         static: size of w; 0 for a model without w.
-        attention: False for LSTMs in place of the transformers.
+        attention: False for LSTMs in place of the transformers, to which `heads_count` and `nearest` do not apply.
         width: of the attention of guide and prior.
         heads_count: number of attention heads.
         decoder: width of the attention of x.
         layers: of each factor.
         nearest: the last frame that a generative factor may read joins its query; in the paper it is one key of many.
         standardise: networks read and make poses without unit, by the mean pose and one spread (`dvae.units`).
-        skip: the head of x reads the query's parts, x_{t-1} among them with `nearest`, beside what attention makes of
-            them.
         pose_width: features of a joint; 0 for poses as they are.
-        summary: of x for w: "graph" (a graph of `frames` frames) or "attention" (over any length).
-        frames: O, of the graph's window; None for as many as the protocol observes.
+        summary: of x for w: "graph" (a graph of `frames` frames) or "attention" (over any length: all frames, in no
+            order, of a window in training and of its past in a forecast).
+        frames: of the graph's window; None for as many as the protocol observes. The same for all draws of a window in
+            training, and the first ones else.
         guide_past: the guide of z reads z_{<t} too.
         feed_observed: whether the observed frames may be replaced too, so that motions come of their latents alone. In
             the paper that is open.
         feeding_passes: the means that are fed back, computed in so many parallel passes; 0 for exactly, step by step.
         feeding_gradient: whether gradients flow through these means.
-        warm_up: steps over which the KL weights rise from 0; the paper's 20 epochs.
+        warm_up: steps over which the KL weights rise from 0; None for the first 4 % of the run, the paper's 20 epochs
+            of 500. `stages` knows how many these are; `objective` alone has no warm-up then.
         self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over 16 %
             of training, after the first 4 %: the paper's 80 and 20 of 500 epochs.
     """
@@ -145,11 +148,12 @@ class HiTDVAE(EnergyMethod):
         *("kl_local", "kl_static", "static", "pose_width", "feeding_passes"),
     )
 
+    residual: float = 0.5
     self_feeding: float = 1.0
-    warm_up: int = 625
+    warm_up: int | None = None
     loss: Literal["best-of-many", "evidence"] = "best-of-many"
     samples: int | None = None
-    kl_local: float = 0.5
+    kl_local: float | None = None
     kl_static: float | None = None
     static: int = 32
     attention: bool = True
@@ -158,7 +162,6 @@ class HiTDVAE(EnergyMethod):
     decoder: int | None = None
     layers: int = 1
     nearest: bool = True
-    skip: bool = False
     standardise: bool = True
     pose_width: int = 8
     summary: Literal["graph", "attention"] = "graph"
@@ -177,6 +180,9 @@ class HiTDVAE(EnergyMethod):
             raise ValueError(
                 f"emission={self.emission!r} needs loss='evidence'; with best-of-many it is 'fixed' or 'unit'"
             )
+        own = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run")
+        if self.loss == "evidence" and (given := [name for name in own if getattr(self, name)]):
+            raise ValueError(f"loss='evidence' has no {', '.join(given)}; these are of loss='best-of-many'")
         if self.samples is not None and self.samples < 2:
             raise ValueError(f"samples is {self.samples}; the best of many is of at least 2")
         for name in ("diversity", "diversity_scale"):
@@ -210,7 +216,7 @@ class HiTDVAE(EnergyMethod):
         found: dict[str, NetworkSpec] = {}
         if self.attention:
             found["p(z)"] = Attention(self.width, nearest=self.nearest, **shape)
-            found["p(x)"] = Attention(decoder, nearest=self.nearest, skip=self.skip, **shape)
+            found["p(x)"] = Attention(decoder, nearest=self.nearest, **shape)
             found["q(z)"] = SelfAttention(self.width, nearest=self.nearest, **shape)
         else:
             found["p(z)"] = found["q(z)"] = Recurrent(self.width, layers=self.layers, extract=poses)
@@ -230,26 +236,28 @@ class HiTDVAE(EnergyMethod):
 
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
         """See `Method.build`; without a skeleton there are no energies."""
-        return self._finished(super().build(data))
+        return self._finished(super().build(data), self.frames or FRAMES)
 
-    def _finished(self, model: Any) -> Any:
+    def _finished(self, model: Any, observed: int) -> Any:
         """The model, whose factors share their features of poses, and which feeds itself as the options say."""
         if self.pose_width:
             for side in (model.generator, model.encoder):
                 share("x", *(conditional.network for conditional in side.values() if conditional.network is not None))
         if self.standardise:
             model.standardise(WHOLE)
-        start = 0 if self.feed_observed else self.frames or FRAMES
-        model.feeding = SelfFeeding(0.0, self.feeding_passes or None, self.feeding_gradient, start)
+        model.feeding = SelfFeeding(
+            0.0, self.feeding_passes or None, self.feeding_gradient, 0 if self.feed_observed else observed
+        )
         return model
 
     def suited(self, windows: Windows) -> HiTDVAE:
-        """See `Method.suited`."""
-        method = replace(super().suited(windows), frames=self.frames or windows.protocol.observed)
+        """See `Method.suited`; with loss="evidence" windows are turned only if `heading` says so, as bounds of turned
+        windows are of no other model.
+        """
+        suited = replace(self, frames=self.frames or windows.protocol.observed)
         if self.loss == "evidence":
-            kept = bool(self.heading) if windows.protocol.root != "drop" else method.heading
-            method = replace(method, angles=0.0, pose_prior=0.0, heading=kept)
-        return method
+            return replace(suited, heading=bool(self.heading), decoder=self.decoder or self.preset(windows)["decoder"])
+        return super(HiTDVAE, suited).suited(windows)
 
     def build_for(self, windows: Windows) -> DynamicalVAE:
         """See `Method.build_for`.
@@ -258,26 +266,18 @@ class HiTDVAE(EnergyMethod):
             ValueError: windows with a root, of which there are energies or headings.
         """
         method = self.suited(windows)
+        observed = windows.protocol.observed
         if method.loss == "evidence" and not method.heading:
-            return method.build({WHOLE: windows.size})
+            return method._finished(super(HiTDVAE, method).build({WHOLE: windows.size}), observed)
         self.refuse_root(windows)
         p, q = method.equations()
         sizes = {**method.sizes(), WHOLE: windows.size}
         heads = method.heads()
         if method.selects == "loss":
             heads["p(x)"] = replace(heads["p(x)"], fitted="scale")
-        model = HiTModel(
-            method,
-            windows.skeleton,
-            windows.protocol.observed,
-            p,
-            q,
-            sizes,
-            method.networks(),
-            heads,
-            method.priors(sizes),
-        )
-        return method._finished(model)
+        networks, priors = method.networks(), method.priors(sizes)
+        model = HiTModel(method, windows.skeleton, observed, p, q, sizes, networks, heads, priors)
+        return method._finished(model, observed)
 
     def prepare(self, model: nn.Module, windows: Windows) -> None:
         """See `Method.prepare`: what `EnergyMethod` takes, and mean and spread of the poses of 1024 windows."""
@@ -291,6 +291,11 @@ class HiTDVAE(EnergyMethod):
         """See `Method.batches`."""
         return windows if self.loss == "evidence" else super().batches(windows)
 
+    def stages(self, steps: int) -> Sequence[Stage]:
+        """See `Method.stages`, and `warm_up`."""
+        method = replace(self, warm_up=round(0.04 * steps)) if self.warm_up is None else self
+        return super(HiTDVAE, method).stages(steps)
+
     def objective(self) -> Objective:
         """See `Method.objective`.
 
@@ -299,7 +304,7 @@ class HiTDVAE(EnergyMethod):
         """
         if self.loss == "evidence":
             return super().objective()
-        if self.diversity is None or self.kl_static is None or self.samples is None:
+        if self.diversity is None or self.kl_local is None or self.kl_static is None or self.samples is None:
             raise ValueError("the weights depend on the skeleton; take those of method.suited(windows)")
         weights = {"z": self.kl_local, **({"w": self.kl_static} if self.static else {})}
         ramp = SHAPES[self.warm_up_shape]
@@ -330,13 +335,18 @@ class HiTModel(EnergyModel):
 
     def __init__(self, method: HiTDVAE, skeleton: Skeleton, observed: int, *arguments: Any, **options: Any):
         super().__init__(method, skeleton, observed, *arguments, **options)
-        joints = body_parts(skeleton, PARTS)
+        joints = body_parts(skeleton, PARTS) if method.diversity else {}
         self.coordinates = {part: [3 * j + axis for j in held for axis in range(3)] for part, held in joints.items()}
 
     def penalties(self, rollout: Rollout, batch: Batch | None, draws: Mapping[str, int]) -> dict[str, Tensor]:
         """See `DynamicalVAE.penalties`."""
         if not draws or WHOLE not in rollout.values or batch is None:
             return {}
+        if rollout.lengths is not None or rollout.observed:
+            raise ValueError(
+                "the energies are of whole windows; leave 'lengths' and 'mask' out of the batch, or fit with "
+                "loss='evidence'"
+            )
         size = rollout.batch // rollout.draws
         x = rollout.values[WHOLE]
         truth, everything = x[:size], slice(None)

@@ -68,15 +68,15 @@ class Method:
     prior: Literal["standard", "mixture", "vamp", "flow"] = "standard"
     prior_components: int = 16
     prior_steps: int = 16
-    warm_up: int = 500
+    warm_up: int | None = 500
     warm_up_shape: Literal["linear", "cosine", "logistic"] = "linear"
     free_bits: float = 0.0
     self_feeding: float = 0.0
 
     def __post_init__(self) -> None:
         for name, least in (("latent", 1), ("prior_components", 1), ("prior_steps", 1), ("warm_up", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+            if (value := getattr(self, name)) is not None and value < least:
+                raise ValueError(f"{name} is {value}; it must be at least {least}")
         for name, known in (("emission", EMISSIONS), ("prior", PRIORS), ("warm_up_shape", SHAPES)):
             if getattr(self, name) not in known:
                 raise ValueError(f"unknown {name} {getattr(self, name)!r}; known: {', '.join(known)}")

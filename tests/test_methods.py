@@ -110,7 +110,7 @@ class TestStandardised(Contract):
     """Networks without unit, in a loop and out of it; the laws are those of the variable in its own."""
 
     name = "hit-dvae"
-    options: ClassVar = {"residual": 0.7, "skip": True}
+    options: ClassVar = {"residual": 0.7}
 
     def build(self, size):
         model = super().build(size)

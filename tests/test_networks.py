@@ -28,7 +28,6 @@ NETWORKS = {
     "attention": Attention(8, heads=2),
     "attention, two layers": Attention(8, heads=4, layers=2, feedforward=6),
     "attention, extracted": Attention(8, heads=2, nearest=False, extract={"z": PoseGraph(2), "x": (3,), "w": (4,)}),
-    "attention, with a skip": Attention(8, heads=2, skip=True, extract={"z": (3,)}),
     "lstm, poses": Recurrent(4, extract={"z": PoseGraph(2), "x": PoseGraph(2)}, hidden=(5,)),
     "dense": Dense((5, 4)),
 }

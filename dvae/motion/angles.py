@@ -302,7 +302,8 @@ def angle_names(skeleton: Skeleton) -> tuple[str, ...]:
 
 def _angles(skeleton: Skeleton) -> tuple[Angle, ...]:
     if skeleton.name not in ANGLES:
-        raise ValueError(f"no joint angles for skeleton {skeleton.name!r}: there are some for {', '.join(ANGLES)}")
+        known = ", ".join(ANGLES)
+        raise ValueError(f"no joint angles for skeleton {skeleton.name!r}: there are some for {known}; use angles=0")
     return ANGLES[skeleton.name]
 
 

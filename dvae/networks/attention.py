@@ -38,8 +38,6 @@ class Attention:
         activation: of the perceptrons.
         nearest: the nearest visible frame of each range joins the query, which then knows where in a motion it is
             before it attends to more.
-        skip: what the query is made of joins the features too, so that the head reads it directly. What a variable
-            shares with its nearest frames is then learned several times faster.
         extract: what comes before all else, by parent: widths of a perceptron, or the description of another module,
             such as `PoseGraph()`.
     """
@@ -50,7 +48,6 @@ class Attention:
     feedforward: int = 0
     activation: str = "gelu"
     nearest: bool = True
-    skip: bool = False
     extract: Extract = field(default_factory=dict)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> AttentionNetwork:
@@ -148,8 +145,6 @@ class AttentionNetwork(Network):
         self.embed = nn.ModuleDict({p.name: nn.Linear(p.size, spec.width) for p in self.ranged})
         sizes = [parent.size for parent, _ in self.points]
         self.point = Join(sizes, (spec.width, spec.width), spec.activation) if sizes else None
-        self.skip = Join(sizes, (), spec.activation) if sizes and spec.skip else None
-        self.features += self.skip.features if self.skip is not None else 0
         self.origin = nn.Parameter(torch.randn(spec.width) / math.sqrt(spec.width))
         self.layers = nn.ModuleList(Layer(spec) for _ in range(spec.layers if self.ranged else 0))
         self.norm = nn.LayerNorm(spec.width)
@@ -175,8 +170,6 @@ class AttentionNetwork(Network):
             for layer in self.layers:
                 stream = layer(stream, *layer.project(tokens), bias)
         stream = self.norm(stream)
-        if self.skip is not None:
-            stream = torch.cat(aligned([stream, self.skip(self.parts(parents))]), dim=-1)
         return stream if self.local else stream[:, 0]
 
     @torch.no_grad()
@@ -204,12 +197,8 @@ class AttentionNetwork(Network):
         stream = self.origin.expand(batch, length if self.local else 1, -1)
         if self.point is None:
             return stream
-        joined = self.point(self.parts(parents))
+        joined = self.point([part(parents[parent.name], lag) for parent, lag in self.points])
         return stream + (joined if joined.dim() == 3 else joined[:, None])
-
-    def parts(self, parents: Mapping[str, Tensor]) -> list[Tensor]:
-        """What the query is made of: (B, T, D), or (B, D) of static parents."""
-        return [part(parents[parent.name], lag) for parent, lag in self.points]
 
     def tokens(
         self,
@@ -239,7 +228,6 @@ class AttentionNetwork(Network):
         given = self.extractors.of(given, lengths)
         known = {i: part(given[p.name], lag) for i, (p, lag) in enumerate(self.points) if p.name in given}
         queries = self.point.hoist(known, batch, length) if self.point is not None else None
-        skipped = self.skip.hoist(known, batch, length) if self.skip is not None else None
         fixed = [p for p in self.ranged if p.name in given]
         live = [p for p in self.ranged if p.name not in given]
         tokens = bias = self.origin.new_zeros(1, 1, 1)
@@ -255,7 +243,6 @@ class AttentionNetwork(Network):
             bias = torch.cat([bias.expand(*shape, -1), ahead.expand(*shape, -1)], dim=-1)
         return Attending(
             queries=queries,
-            skipped=skipped,
             points=[entry for i, entry in enumerate(self.points) if i not in known],
             bias=bias,
             given=given_tokens,
@@ -290,10 +277,7 @@ class AttentionNetwork(Network):
             bias = state.row(t)
             for layer, cache in zip(self.layers, state.caches, strict=True):
                 stream = layer(stream, cache.keys, cache.values, bias)
-        features = self.norm(stream[:, 0])
-        if state.skipped is not None and self.skip is not None:
-            features = torch.cat([features, self.skip.add(state.skipped, t, parts)], dim=-1)
-        return features, state
+        return self.norm(stream[:, 0]), state
 
 
 class SelfAttentionNetwork(Network):
@@ -304,11 +288,11 @@ class SelfAttentionNetwork(Network):
 
     def __init__(self, spec: SelfAttention, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, spec.width)
-        self.extractors = Extractors(self.inputs, spec.extract, spec.activation)
         frames = [parent for parent in self.inputs if local and _closed(parent)]
         self.encoded = [p for p in frames if _sight(p) == _sight(frames[0])]
         self.statics = [parent for parent in self.inputs if parent.relation is None]
         rest = [parent for parent in self.inputs if parent not in (*self.encoded, *self.statics)]
+        self.extractors = Extractors([*self.encoded, *self.statics], spec.extract, spec.activation)
         if not self.encoded:
             raise ValueError(
                 "SelfAttention encodes parents of a local variable that are read at {1:T}, {<=t} or {>=t}, but the "
@@ -430,7 +414,6 @@ class Attending:
     """What an `AttentionNetwork` keeps between steps."""
 
     queries: Hoisted | None
-    skipped: Hoisted | None
     points: list[tuple[Input, int | None]]
     bias: Tensor
     """Of every step to the given tokens and then to all live ones: (B or 1, heads, T, given + parents * T)."""
@@ -453,7 +436,6 @@ class Attending:
         return replace(
             self,
             queries=select(self.queries, rows),
-            skipped=select(self.skipped, rows),
             batch=len(rows),
             caches=select(self.caches, rows),
             extracted=select(self.extracted, rows),

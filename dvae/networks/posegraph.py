@@ -96,7 +96,7 @@ class FrameGraph:
     anew for every sequence at every evaluation; else it is the first frames. A shorter sequence stays in its last one.
 
     Args:
-        frames: nodes of the graph.
+        frames: nodes of the graph. Outside training, more frames than these are not read.
         width: features of a frame.
         blocks: residual blocks, of two convolutions each.
         extract: what comes before all else, by parent, as in `Attention`.
