@@ -26,7 +26,8 @@ for name, steps in STEPS.items():
     method = dvae.method(name, latent=8, self_feeding=1.0, warm_up=steps // 3, **loss)
     print(f"\n[bold]{name}[/bold]  {method.generative}   {method.inference}", method.source)
     torch.manual_seed(0)
-    models[name] = method.build({"x": train.size})
+    models[name] = method.build_for(train)
+    method.prepare(models[name], train)
     result = dvae.fit(
         models[name],
         train,

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -227,13 +227,6 @@ class HiTDVAE(EnergyMethod):
             found["q(w)"] = graph if self.summary == "graph" else pooled
         return found
 
-    def heads(self) -> dict[str, Any]:
-        """See `Method.heads`; a learned scale starts at the spread of what is standardised."""
-        found: dict[str, Any] = dict(super().heads())
-        if self.standardise and self.emission == "fixed":
-            found["p(x)"] = replace(found["p(x)"], scale=1.0)
-        return found
-
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
         """See `Method.build`; without a skeleton there are no energies."""
         return self._finished(super().build(data), self.frames or FRAMES)
@@ -272,7 +265,7 @@ class HiTDVAE(EnergyMethod):
         self.refuse_root(windows)
         p, q = method.equations()
         sizes = {**method.sizes(), WHOLE: windows.size}
-        heads = method.heads()
+        heads: dict[str, Any] = dict(method.heads())
         if method.selects == "loss":
             heads["p(x)"] = replace(heads["p(x)"], fitted="scale")
         networks, priors = method.networks(), method.priors(sizes)
@@ -280,12 +273,16 @@ class HiTDVAE(EnergyMethod):
         return method._finished(model, observed)
 
     def prepare(self, model: nn.Module, windows: Windows) -> None:
-        """See `Method.prepare`: what `EnergyMethod` takes, and mean and spread of the poses of 1024 windows."""
+        """See `Method.prepare`: what `EnergyMethod` takes, and mean and spread of the poses of 1024 windows, where a
+        learned scale of x starts.
+        """
         super().prepare(model, windows)
         if self.standardise:
             x = windows.sample(1024, torch.default_generator)["x"]
-            units: Any = model.units
+            units, generator = cast(Any, model.units), cast(Any, model.generator)
             units[WHOLE].fit(model.turned(x)[0] if isinstance(model, EnergyModel) else x)
+            if self.emission == "fixed":
+                nn.init.zeros_(generator[WHOLE].head.log_scale)
 
     def batches(self, windows: Windows) -> Source:
         """See `Method.batches`."""

@@ -240,6 +240,15 @@ def test_options_reach_the_model(windows):
     assert build(windows, frames=5).encoder["w"].network.frames == 5
 
 
+def test_a_prepared_model_starts_at_the_spread_of_poses(windows):
+    method = small().suited(windows)
+    model = method.build_for(windows)
+    method.prepare(model, windows)
+    x = windows.all()["x"][:2]
+    scale = poutine.trace(model.model).get_trace(x).nodes["x"]["fn"].elementwise(x).scale
+    assert scale.mean().item() == pytest.approx(windows.poses().var(0).mean().sqrt().item(), rel=0.05)
+
+
 def test_all_draws_of_a_window_sum_up_the_same_frames(windows):
     """In training a window starts anywhere, anew for every sequence, but not for every draw."""
     model = build(windows).train()
