@@ -506,8 +506,8 @@ class _Loop:
     def _score(self, data: Sequences, feeding: float) -> dict[str, float]:
         """The unweighted terms on held-out data, per frame, with the same draws each time."""
         sums = dict[str, Tensor]()
-        stage = _stage(self.plan, self.state.step)
-        objective, last = stage.objective, self.training.steps  # of its weights, so that losses can be compared
+        objective = _stage(self.plan, self.state.step).objective
+        last = self.training.steps  # of the weights, so that losses can be compared
         self.module.eval()
         with _forked_random_state(self.fabric.device), torch.no_grad():
             torch.manual_seed(self.training.seed)

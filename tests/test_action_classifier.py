@@ -338,6 +338,10 @@ def test_the_record_says_which_classifier_and_older_records_are_read(fitted):
         ),
         (lambda: windows("test", protocol=replace(SHORT, root="relative")), "the skeleton 'walker' and 51"),
         (
+            lambda: windows("test", protocol=replace(SHORT, predicted=SHORT.predicted - 1)),
+            f"fitted to {SHORT.predicted} predicted frames at .* have {SHORT.predicted - 1} at",
+        ),
+        (
             lambda: windows("test", motion.simulate(clips=9, frames=40, test=0.4)),
             "tells ways apart, but no label 'way'",
         ),

@@ -162,6 +162,15 @@ def test_a_fit_raises_the_bound_and_reports_terms_that_add_up():
             assert row["loss"] == pytest.approx(weight * row["kl/z"] - row["log_likelihood/x"])
 
 
+def test_validation_losses_have_the_weights_of_the_end():
+    """So that those of a warm-up are not the lowest for costing less."""
+    result = run(validation=HELD_OUT, objective=Evidence(kl_weight=Linear(0.0, 1.0, 60), select="loss"))
+    rows = [row for row in result.history if "validation/loss" in row]
+    assert len(rows) > 1
+    for row in rows:
+        assert row["validation/loss"] == pytest.approx(-row["validation/bound"])
+
+
 def test_validation_scores_held_out_data_in_frames_and_without_weights():
     model = build()
     lengths = torch.tensor([4, 1, 2, 3, 4, 4, 1])
