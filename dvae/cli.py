@@ -38,6 +38,7 @@ from .models.method import Method
 from .models.sweep import ENDED
 from .models.sweep import Interrupted as SweepInterrupted
 from .models.sweep import sweep as sweep_methods
+from .models.trajectories import TrajectoryModel
 from .notation import Factorization
 
 if TYPE_CHECKING:
@@ -339,6 +340,8 @@ def evaluate(
     bound_particles: int = 0,
     pose_prior: Path | None = None,
     classifier: tuple[Path, ...] = (),
+    joints: tuple[str, ...] | None = None,
+    temperature: float | None = None,
     seed: int = 0,
     batch_size: int = 32,
     out: Path | None = None,
@@ -355,6 +358,8 @@ def evaluate(
         bound_particles: particles of the importance-weighted bound; 0 leaves it out.
         pose_prior: run of a pose-prior, by which to score the poses of the forecasts.
         classifier: runs of action-classifiers of different labels, by which to score what the forecasts show.
+        joints: joints whose paths are given to the runs, for methods that take some (trajevae, cvae-rnn).
+        temperature: of the latents' scale, for such methods; 0 for motion at the mean of the prior.
         seed: of the draws.
         batch_size: windows forecast at once.
         out: file to write instead of evaluation.json in each run.
@@ -369,6 +374,14 @@ def evaluate(
     loaded, windows = _on_the_same_windows(run, data)
     _note_unfinished(loaded)
     names = _names(loaded)
+    for each in loaded:
+        if (joints or temperature is not None) and not isinstance(each.model, TrajectoryModel):
+            raise UsageError(
+                f"--joints and --temperature are for methods that take trajectories; {each.path} holds "
+                f"{each.method.name}"
+            )
+    if joints is not None:
+        windows = windows.given(joints)
     result = evaluate_models(
         {name: each.model for name, each in zip(names, loaded, strict=True)},
         windows,
@@ -380,6 +393,7 @@ def evaluate(
         classifiers=_classifiers(classifier, data, windows),
         training_windows=loaded[0].data.windows("train+validation"),
         configs={name: Run(each.path).config for name, each in zip(names, loaded, strict=True)},
+        options={} if temperature is None else {"temperature": temperature},
     )
     OUT.print(result.table())
     for path in [out] if out is not None else [each.path / "evaluation.json" for each in loaded]:
@@ -564,6 +578,78 @@ def forecast(
     ERROR.print(f"wrote {out}: {samples} futures of {frames} frames for each of {len(windows)} windows")
     if figure is not None:
         _save_futures(futures, figure)
+
+
+@app.command(help="Complete motion along paths of some joints, from a clip or from a file.")
+def complete(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    joints: tuple[str, ...] = (),
+    paths: Path | None = None,
+    clip: str | None = None,
+    window: int | None = None,
+    samples: int = 5,
+    exact: bool = False,
+    temperature: float = 1.0,
+    seed: int = 0,
+    data: str | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Complete motion along paths of some joints, from a clip or from a file.
+
+    The motions start at the first pose of a window, and follow its own `--joints`, or the paths of a file. That is an
+    npz of one array (frames, 3) for each joint, or a csv with a header such as LWrist_x,LWrist_y,LWrist_z and one row
+    for each frame: metres, with the pelvis of the first pose at the origin; empty or nan where a path is not known.
+    What is written is what `dvae forecast` writes.
+
+    Args:
+        run: the run directory of a trajevae or cvae-rnn.
+        out: the npz file to write.
+        joints: joints whose way in the window is given.
+        paths: file of other paths.
+        clip: name of a clip, or split/name where the name is not unique; by default any test window.
+        window: which of its windows, from 0; by default the one that moves most.
+        samples: motions.
+        exact: have the motions follow the paths to less than a centimetre, by moving their latents.
+        temperature: of the latents' scale; 0 for the motion of the prior's mean.
+        seed: of the draws.
+        data: where the data lie now, if the path in the run no longer leads there.
+        figure: save a figure of the motions.
+    """
+    _at_least(1, samples=samples)
+    _at_least(0, window=window)
+    _check_file(out, "out")
+    _check_figure(figure, "figure")
+    loaded = _load(run, data)
+    if not isinstance(loaded.model, TrajectoryModel):
+        raise UsageError(f"{run} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
+    windows = _windows_of(loaded, clip)
+    positions = windows.positions(windows.all()["x"]).numpy()
+    chosen = _liveliest(positions, window)
+    pose, truth = positions[chosen, 0], positions[chosen, 1:]
+    given = {joint: truth[:, windows.skeleton.find(joint)] for joint in joints}
+    if paths is not None:
+        given |= motion.read_paths(paths)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        done = loaded.model.complete(
+            pose,
+            given,
+            None if given else len(truth),
+            samples,
+            exact=exact,
+            temperature=temperature,
+            progress=True,
+        )
+    truth = truth[: done.positions.shape[1]]
+    motions = motion.Forecasts(
+        windows.skeleton, [windows.keys[chosen]], done.positions[:, None], pose[None, None], truth[None]
+    )
+    motions.save(out)
+    OUT.print(str(done))
+    ERROR.print(f"wrote {out}: window {chosen}, {_title(motions)}")
+    if figure is not None:
+        _save_futures(motions, figure)
 
 
 @app.command(help="Play forecasts beside what happened, or a clip, as moving skeletons.")

@@ -11,6 +11,11 @@ classifiers of actions there is a third, real motion: the true futures, which no
 All rows score the same windows, and windows of one clip overlap, so standard errors are clustered by clip and
 `Evaluation.difference` is paired.
 
+Where windows move through space (a protocol with root="relative"), these scores are of poses relative to their own
+root, as in TrajeVAE's evaluation; "global ADE" and "global FDE" are of all joints where they are in the world. Where
+windows come with the paths of some joints ("y" in their batches), "path error" is the mean distance of these joints
+from their paths, over all K futures.
+
 A classifier adds two scores under its name (Bie et al. 2022, arXiv:2204.01565). *ACC* is the share of the K futures
 that it gives the window's true class. *FID* is the Fréchet distance between its features of the true futures and of
 all K generated ones of all windows together. It is a number of the whole set, so that its standard error is
@@ -76,6 +81,7 @@ METRICS: dict[str, Metric] = {
         for name in ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm", "energy score")
     },
     "variogram score": Metric("m", "free-running"),
+    **{name: Metric("m", "free-running") for name in ("global ADE", "global FDE", "path error")},
     "bone-length error": Metric("relative", "free-running"),
     "pose NLL": Metric("nats", "free-running"),
     "ACC": Metric("share", "free-running", "higher"),
@@ -142,7 +148,8 @@ class Evaluation(Result):
     Attributes:
         rows: `{method: Row}`.
         clips: `{"split/clip": number of its windows}`, in the order of `Row.clip_means`.
-        data: fingerprint, windows, frames and coordinates of a window, joints where there is a skeleton.
+        data: fingerprint, windows, frames and coordinates of a window, joints where there is a skeleton, and those
+            whose paths were given.
         protocol: the fields of the windows' protocol.
         multimodal: the ground truth of the multimodal errors: threshold of last poses, whether a window's own future
             is among its truths, and how many windows have no other (the public code of GSPS scores none of these).
@@ -153,6 +160,7 @@ class Evaluation(Result):
         pose_prior: SHA-256 of the weights of the pose prior that scored the poses, if one did.
         classifiers: by name, those that scored actions: label, classes, SHA-256 of the weights, and how many windows
             are of no class that it knows; ACC is over the others.
+        options: further arguments of the models' `forecast`.
     """
 
     rows: dict[str, Row]
@@ -166,6 +174,7 @@ class Evaluation(Result):
     seed: int
     pose_prior: str | None = None
     classifiers: dict[str, dict[str, Any]] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
 
     def __getitem__(self, method: str) -> dict[str, Score]:
         return {name: self._score(name, np.array(means)) for name, means in self._row(method).clip_means.items()}
@@ -297,6 +306,9 @@ class Evaluation(Result):
     def _title(self) -> str:
         name = escape(self.protocol.get("name", ""))
         parts = [name, f"{self.data['windows']} windows of {len(self.clips)} clips"]
+        if (given := self.data.get("given")) is not None:
+            parts.append(f"given {escape(', '.join(given)) or 'no paths'}")
+        parts += [f"{name} {value}" for name, value in self.options.items()]
         parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]
         return " · ".join(part for part in parts if part)
 
@@ -486,6 +498,7 @@ def evaluate(
     pose_prior: Any = None,
     classifiers: Mapping[str, Any] | None = None,
     configs: Mapping[str, Mapping[str, Any]] | None = None,
+    options: Mapping[str, Any] | None = None,
     progress: bool = True,
 ) -> Evaluation:
     """Score one model or several, and the reference rows, on the same windows.
@@ -510,6 +523,8 @@ def evaluate(
         classifiers: `{name: fitted action classifier}`, to score futures by what they show: "ACC name" and "FID name",
             and a reference row of real motion. Fitted under the same protocol, they saw no test clip.
         configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
+        options: further arguments of the models' `forecast`, such as {"temperature": 0} for motion at the mean of
+            TrajeVAE's prior.
         progress: whether to show a progress bar.
 
     Returns:
@@ -549,7 +564,7 @@ def evaluate(
             rows[name] = Row(count, _free_running(name, forecaster, count, held, parts(name)))
         for name, each in models.items():
             with evaluating(each, seed):
-                forecaster = _forecaster(each, held, samples, draw_emission)
+                forecaster = _forecaster(each, held, samples, {"draw_emission": draw_emission, **(options or {})})
                 means = _free_running(name, forecaster, samples, held, parts(f"{name}, forecasts"))
             if getattr(each, "likelihood", True):
                 with evaluating(each, seed):
@@ -570,6 +585,7 @@ def evaluate(
         },
         samples=samples,
         emission="drawn" if draw_emission else "mean",
+        options=dict(options or {}),
         bound_particles=bound_particles,
         seed=seed,
         pose_prior=None if pose_prior is None else _hash(pose_prior),
@@ -597,6 +613,14 @@ class _Held:
     def futures(self) -> Tensor:
         return self.x[:, self.observed :]
 
+    def body(self, x: Tensor) -> Tensor:
+        """Frames (..., T, D) relative to their own root, which is left out; as they are, if the protocol did that."""
+        if getattr(self.windows.protocol, "root", "drop") != "relative":
+            return x
+        joints, root = x.unflatten(-1, (-1, 3)), self.windows.skeleton.root  # type: ignore[attr-defined]
+        joints = joints - joints[..., root : root + 1, :]
+        return torch.cat([joints[..., :root, :], joints[..., root + 1 :, :]], -2).flatten(-2)
+
     def past(self, part: slice) -> Batch:
         return {**{name: value[part] for name, value in self.batch.items()}, "x": self.x[part, : self.observed]}
 
@@ -608,6 +632,8 @@ class _Held:
         count, frames, coordinates = self.x.shape
         skeleton = getattr(self.windows, "skeleton", None)
         joints = {"joints": list(skeleton.names)} if skeleton is not None else {}
+        if (given := getattr(self.windows, "given_joints", None)) is not None:
+            joints["given"] = list(given)
         found = {"fingerprint": self.windows.fingerprint, "windows": count, "frames": frames}
         return {**found, "coordinates": coordinates, **joints}
 
@@ -720,11 +746,16 @@ def _free_running(
             raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
         refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
         forecasts = forecasts.movedim(0, 1)
-        scores = {"APD": metrics.average_pairwise_distance(forecasts)}
-        scores |= {metric: score(forecasts, truth) for metric, score in _PAIRED.items()}
+        bodies, body = held.body(forecasts), held.body(truth)
+        scores = {"APD": metrics.average_pairwise_distance(bodies)}
+        scores |= {metric: score(bodies, body) for metric, score in _PAIRED.items()}
         for metric, score in _MULTIMODAL.items():
-            pairs = zip(forecasts, held.truths[part], strict=True)
-            scores[metric] = torch.stack([score(window, held.futures[others]) for window, others in pairs])
+            pairs = zip(bodies, held.truths[part], strict=True)
+            scores[metric] = torch.stack([score(window, held.body(held.futures[others])) for window, others in pairs])
+        if body is not truth:
+            scores |= {f"global {metric}": _PAIRED[metric](forecasts, truth) for metric in ("ADE", "FDE")}
+        if "y" in held.batch:
+            scores |= _path_error(forecasts, held.batch["y"][part, held.observed :])
         if hasattr(held.windows, "skeleton"):
             scores["bone-length error"] = _bone_length_error(held.windows, past, forecasts)
         if held.pose_prior is not None:
@@ -809,6 +840,20 @@ def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple
         )
 
 
+def _path_error(forecasts: Tensor, paths: Tensor) -> dict[str, Tensor]:
+    """Mean distance of given joints from their paths, {"path error": (B,)}; nothing, where no joint is given.
+
+    Args:
+        forecasts: (B, K, T, D).
+        paths: (B, T, D), 0 at joints that are not given.
+    """
+    given = (paths.unflatten(-1, (-1, 3)) != 0).any(-1).any(1)  # (B, J)
+    if not given.any():
+        return {}
+    distances = (forecasts - paths[:, None]).unflatten(-1, (-1, 3)).norm(dim=-1).mean((1, 2))  # (B, J)
+    return {"path error": (distances * given).sum(-1) / given.sum(-1)}
+
+
 def _bone_length_error(windows: Any, observed: Tensor, forecasts: Tensor) -> Tensor:
     """Mean of |length / observed length - 1| over samples, frames and bones: (B,) from (B, K, T, D)."""
     lengths, reference = (windows.skeleton.bone_lengths(windows.positions(poses)) for poses in (forecasts, observed))
@@ -835,11 +880,9 @@ def _pose_nll(prior: Any, observed: Tensor, forecasts: Tensor) -> Tensor:
     return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)
 
 
-def _forecaster(model: Any, held: _Held, samples: int, draw_emission: bool) -> Forecaster:
+def _forecaster(model: Any, held: _Held, samples: int, options: Mapping[str, Any]) -> Forecaster:
     horizon = held.futures.shape[1]
-    return lambda part: model.forecast(
-        on_device_of(model, held.past(part)), horizon, samples, draw_emission=draw_emission
-    )["x"]
+    return lambda part: model.forecast(on_device_of(model, held.past(part)), horizon, samples, **options)["x"]
 
 
 def on_device_of(model: nn.Module, batch: Batch) -> Batch:

@@ -212,6 +212,7 @@ def methods() -> dict[str, type[Method]]:
     """Every known method by name: those of this package and of installed packages (entry points "dvae.methods")."""
     from . import (
         action_classifier,
+        cvae_rnn,
         dkf,
         dsae,
         equations,
@@ -222,6 +223,7 @@ def methods() -> dict[str, type[Method]]:
         rvae,
         srnn,
         storn,
+        trajevae,
         vae,
         vrnn,
     )
@@ -238,6 +240,8 @@ def methods() -> dict[str, type[Method]]:
         kvae.KVAE,
         hit_dvae.HiTDVAE,
         gsps.GSPS,
+        trajevae.TrajeVAE,
+        cvae_rnn.CVAERNN,
         pose_prior.PosePrior,
         action_classifier.ActionClassifier,
         equations.Equations,

@@ -78,7 +78,7 @@ def test_wrong_arguments_exit_with_2(capsys, tmp_path):
     assert "did you mean 'hit-dvae'" in failure(capsys, "show", "hitdvae", code=2)
     assert "both --generative and --inference" in failure(capsys, "show", code=2)
     assert "not both" in failure(capsys, "show", "srnn", "--generative", "p(z_t) p(x_t | z_t)", code=2)
-    assert "hit-dvae, gsps, pose-prior, action-classifier" in failure(capsys, "fit", "hitdvae", *out, code=2)
+    assert "hit-dvae, gsps, trajevae, cvae-rnn, pose-prior" in failure(capsys, "fit", "hitdvae", *out, code=2)
     assert "--steps" in failure(capsys, "fit", "vae", *out, "--step", "3", code=2)
     assert "emission" in failure(capsys, "fit", "vae", *out, "--emission", "loud", code=2)
     assert "batch_size is 0" in failure(capsys, "fit", "vae", *out, "--batch-size", "0", code=2)
@@ -227,6 +227,57 @@ def test_equations_of_ones_own_are_fitted_and_read_back(people, tmp_path):
     loaded = dvae.load(out)
     assert loaded.model.sizes == {"z": 2, "x": 48}
     assert str(loaded.model.inference) == str(dvae.Factorization.parse(EQUATIONS[3]))
+
+
+@pytest.fixture(scope="module")
+def tracker(people, tmp_path_factory):
+    """A run of a method that follows paths."""
+    out = tmp_path_factory.mktemp("runs") / "tracker"
+    small = ["--latent", "4", "--width", "8", "--feedforward", "8", "--layers", "1", "--batch-size", "4"]
+    where = ["--data", str(people), "--protocol", "simulated-trajectories", "--out", str(out)]
+    assert main(["fit", "trajevae", *where, "--steps", "6", "--validate-every", "3", *small]) == 0
+    return out
+
+
+def test_motion_is_completed_along_the_paths_of_a_clip_or_a_file(capsys, tracker, tmp_path):
+    out, figure = tmp_path / "walk.npz", tmp_path / "walk.png"
+    given = ["--clip", "person_0003", "--joints", "left_wrist", "RFoot", "--samples", "2", "--figure", str(figure)]
+    assert main(["complete", str(tracker), "--out", str(out), *given]) == 0
+    assert "LWrist: off its path by" in capsys.readouterr().out
+    assert figure.exists()
+    done = motion.Forecasts.load(out)
+    assert done.forecasts.shape == (2, 1, 60, 17, 3)
+    assert done.observed.shape == (1, 1, 17, 3)
+    assert done.keys[0][1] == "person_0003"
+    rows = ["LWrist_x,LWrist_y,LWrist_z", *(f"{x},{y},{z}" for x, y, z in done.truth[0, :30, 13]), ",,"]
+    (tmp_path / "hand.csv").write_text("\n".join(rows))
+    drawn = ["--clip", "person_0003", "--paths", str(tmp_path / "hand.csv"), "--samples", "1", "--exact"]
+    assert main(["complete", str(tracker), "--out", str(out), *drawn]) == 0
+    assert motion.Forecasts.load(out).forecasts.shape == (1, 1, 31, 17, 3)
+    assert main(["animate", str(out), "--out", str(tmp_path / "walk.html")]) == 0
+
+
+def test_paths_are_given_to_an_evaluation(capsys, tracker, fitted, tmp_path):
+    out = ["--samples", "2", "--out", str(tmp_path / "scores.json")]
+    assert main(["evaluate", str(tracker), "--joints", "RFoot", "LFoot", "--temperature", "0", *out]) == 0
+    found = dvae.Evaluation.load(tmp_path / "scores.json")
+    assert found.data["given"] == ["RFoot", "LFoot"]
+    assert found["trajevae"]["path error"].mean > 0
+    assert found["trajevae"]["APD"].mean == 0
+    assert "no joint 'RPaw'" in failure(capsys, "evaluate", str(tracker), "--joints", "RPaw", *out)
+    error = failure(capsys, "evaluate", str(fitted), "--joints", "RFoot", *out, code=2)
+    assert "are for methods that take trajectories" in error
+
+
+def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
+    out = ["--out", str(tmp_path / "walk.npz")]
+    assert "which takes no paths" in failure(capsys, "complete", str(fitted), *out, code=2)
+    assert "no joint 'tail'" in failure(capsys, "complete", str(tracker), *out, "--joints", "tail")
+    assert "at least 1" in failure(capsys, "complete", str(tracker), *out, "--samples", "0", code=2)
+    assert "No such file" in failure(capsys, "complete", str(tracker), *out, "--paths", str(tmp_path / "none.csv"))
+    error = failure(capsys, "fit", "trajevae", "--data", str(people), "--out", str(tmp_path / "run"), "--steps", "2")
+    assert "observed=1, such as" in error
+    assert "simulated-trajectories" in error
 
 
 def test_a_loaded_run_forecasts_as_the_fitted_model_does(people, tmp_path):

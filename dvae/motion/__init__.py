@@ -3,7 +3,7 @@
 from .angles import AngleLimits, estimate_angle_limits
 from .data import Clip, MotionSet
 from .forecasts import Forecasts, is_forecasts
-from .formats import load, save
+from .formats import load, read_paths, save
 from .protocols import PROTOCOLS, Protocol, Windows, windows
 from .simulate import simulate
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, face_forward, rotate_about_up
@@ -28,6 +28,7 @@ __all__ = [
     "face_forward",
     "is_forecasts",
     "load",
+    "read_paths",
     "rotate_about_up",
     "save",
     "simulate",

@@ -180,6 +180,59 @@ def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
         return {member.name: member.array() for member in _members(path)}
 
 
+def read_paths(path: str | Path) -> dict[str, np.ndarray]:
+    """Paths of joints, each (frames, 3), NaN where it is not known.
+
+    Args:
+        path: an npz file of one array for each joint; or a csv file whose header names three columns for each joint,
+            as in `LWrist_x,LWrist_y,LWrist_z`, with one row for each frame and an empty cell where nothing is known.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, or is not as described.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".npz":
+        found = read_arrays(path)
+        for joint, values in found.items():
+            if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
+                raise ValueError(
+                    f"{path}: the path of {joint} is {values.dtype} {values.shape}, expected numbers (frames, 3)"
+                )
+    else:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            header, *rows = [row for row in csv.reader(file) if row] or [[]]
+        columns: dict[str, list[str]] = {}
+        for place, name in enumerate(header):
+            joint, _, axis = name.strip().rpartition("_")
+            columns.setdefault(joint, ["", "", ""])
+            if axis not in ("x", "y", "z") or not joint or columns[joint]["xyz".index(axis)]:
+                raise ValueError(
+                    f"{path}: column {place + 1} is {name!r}; expected a header of columns such as LWrist_x, LWrist_y "
+                    "and LWrist_z, each once"
+                )
+            columns[joint]["xyz".index(axis)] = name
+        short = [joint for joint, names in columns.items() if not all(names)]
+        if short or not columns or not rows:
+            raise ValueError(
+                f"{path}: "
+                + (f"{short[0]} lacks a column" if short else "expected a header and one row for each frame")
+            )
+        values = np.full((len(rows), len(header)), np.nan)
+        for number, row in enumerate(rows):
+            if len(row) != len(header):
+                raise ValueError(f"{path}: row {number + 2} has {len(row)} cells, the header {len(header)}")
+            for place, cell in enumerate(row):
+                try:
+                    values[number, place] = float(cell) if cell.strip() else np.nan
+                except ValueError:
+                    raise ValueError(f"{path}: row {number + 2}, {header[place]}: {cell!r} is no number") from None
+        found = {joint: values[:, [header.index(name) for name in names]] for joint, names in columns.items()}
+    if not found:
+        raise ValueError(f"{path}: there is no path in it")
+    return found
+
+
 def _read_clips(path: Path) -> list[tuple[str, str, np.ndarray]]:
     with _reading(path):
         members = _members(path)

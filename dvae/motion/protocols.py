@@ -101,6 +101,7 @@ _HUMAN36M: dict[str, Any] = {
     "sampling": "subject",
 }
 _STYLES: dict[str, Any] = {"split_by": "file_group", "train": ("A", "B"), "test": ("C",)}
+_TRAJECTORIES: dict[str, Any] = {"root": "relative", "rotate": True}
 
 PROTOCOLS = {
     protocol.name: protocol
@@ -115,11 +116,14 @@ PROTOCOLS = {
             test=("Validate/S1", "Validate/S2", "Validate/S3"),
             sampling="subject",
         ),
-        Protocol("trajevae", 1, 100, 50, train_stride=25, test_stride=25, root="relative", rotate=True, **_HUMAN36M),
+        Protocol("trajevae", 1, 100, 50, train_stride=25, test_stride=25, **_TRAJECTORIES, **_HUMAN36M),
         Protocol("bandai2-by-style", 15, 60, 30, train_stride=5, test_stride=15, **_STYLES),
+        Protocol("bandai2-trajectories", 1, 60, 30, train_stride=5, test_stride=15, **_TRAJECTORIES, **_STYLES),
         Protocol("bandai2-by-take", 15, 60, 30, train_stride=5, test_stride=15),
         Protocol("cmu8", 15, 60, 30, train_stride=5, test_stride=15),
+        Protocol("cmu8-trajectories", 1, 60, 30, train_stride=5, test_stride=15, **_TRAJECTORIES),
         Protocol("simulated", 15, 60, 30, train_stride=5, test_stride=15),
+        Protocol("simulated-trajectories", 1, 60, 30, train_stride=5, test_stride=15, **_TRAJECTORIES),
     )
 }
 """The presets by name. In `bandai2-by-style` all clips of groups A and B train, all of C test, whatever the
@@ -214,6 +218,7 @@ class Windows:
         frames = torch.tensor([clip.frames for clip in self.clips])
         self._first = frames.cumsum(0) - frames
         self._classes: dict[str, Tensor] = {}  # by variable, the class of every clip
+        self._given: Tensor | float | None = None  # see `given`
         self._starts = frames - length + 1
         self._weights = self._draw_weights().cumsum(0)
 
@@ -267,7 +272,7 @@ class Windows:
             joints = x.unflatten(-1, (-1, 3))
             angle = (2 * pi * turn).float()[:, None, None]
             x = rotate_about_up(joints, angle, self.skeleton.up).flatten(-2)
-        return {"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}}
+        return self._batch(x, clips, generator)
 
     def all(self, stride: int | None = None) -> dict[str, Tensor]:
         """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32."""
@@ -275,7 +280,7 @@ class Windows:
         x = torch.empty(len(clips), self.length, self.size)
         for block in torch.arange(len(clips)).split(512):  # so that memory holds the windows little more than once
             x[block] = self._cut(clips[block], starts[block])
-        return {"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}}
+        return self._batch(x, clips, torch.Generator().manual_seed(0))
 
     def poses(self) -> Tensor:
         """Every frame of the clips, once, as a window that starts there has it: (N, D) float32."""
@@ -337,6 +342,56 @@ class Windows:
         root = self.skeleton.root
         return torch.cat([joints[..., :root, :], torch.zeros_like(joints[..., :1, :]), joints[..., root:, :]], -2)
 
+    def given(self, joints: Sequence[str] | float) -> Windows:
+        """These windows, whose batches hold trajectories too: {"y": (B, T, D)}, x at given joints and 0 at others.
+
+        Args:
+            joints: names of the given ones, see `Skeleton.find`; or the probability with which each one is given over
+                a whole window, one draw for a window and joint. `all` draws the same ones every time.
+
+        Raises:
+            ValueError: an unknown joint, or one that the protocol has dropped.
+        """
+        windows = copy(self)
+        if isinstance(joints, float | int):
+            windows._given = float(joints)
+            return windows
+        found = {self.skeleton.names[self.skeleton.find(joint)] for joint in joints}
+        if dropped := found - set(self._joints):
+            raise ValueError(f"the protocol {self.protocol.name} drops {dropped.pop()}")
+        windows._given = torch.tensor([float(name in found) for name in self._joints])
+        return windows
+
+    @property
+    def _joints(self) -> list[str]:
+        """Names of the joints of a frame."""
+        names, root = self.skeleton.names, self.skeleton.root
+        return [name for j, name in enumerate(names) if self.protocol.root != "drop" or j != root]
+
+    @property
+    def given_joints(self) -> tuple[str, ...] | None:
+        """Names of the joints whose trajectories batches hold, if these are the same ones in every window."""
+        if not isinstance(self._given, Tensor):
+            return None
+        return tuple(name for name, given in zip(self._joints, self._given.tolist(), strict=True) if given)
+
+    def with_protocol(self, protocol: Protocol) -> Windows:
+        """These windows, drawn and cut as another protocol says, which divides clips and frames alike."""
+        windows = copy(self)
+        windows.protocol = protocol
+        return windows
+
+    def _batch(self, x: Tensor, clips: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        """Windows with what is to go with them."""
+        batch = {"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}}
+        if self._given is not None:
+            mask = self._given
+            if not isinstance(mask, Tensor):
+                mask = (torch.rand(len(x), self.size // 3, generator=generator) < mask).float()
+            mask = mask.repeat_interleave(3, dim=-1)
+            batch["y"] = x * (mask if mask.dim() == 1 else mask[:, None])
+        return batch
+
     @property
     def fingerprint(self) -> str:
         """SHA-256 of the protocol, the skeleton, the listed windows and the data they are cut from."""
@@ -345,6 +400,9 @@ class Windows:
         digest.update(self._frames.numpy().astype("<f4", copy=False).tobytes())
         for variable, classes in self._classes.items():
             digest.update(repr((variable, classes.tolist())).encode())
+        if self._given is not None:
+            given = self._given.tolist() if isinstance(self._given, Tensor) else self._given
+            digest.update(repr(("given", given)).encode())
         return digest.hexdigest()
 
     def _list(self, stride: int) -> tuple[Tensor, Tensor]:

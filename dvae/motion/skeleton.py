@@ -7,6 +7,7 @@ motion prediction papers use them (Mao, Liu and Salzmann 2021, GSPS).
 
 from __future__ import annotations
 
+import difflib
 import json
 from dataclasses import dataclass
 from functools import lru_cache
@@ -93,6 +94,28 @@ class Skeleton:
     def root(self) -> int:
         """Index of the root joint, the pelvis."""
         return self.parents.index(-1)
+
+    def find(self, joint: str) -> int:
+        """Index of a joint by its name, in any case, with "left_" and "right_" for L and R.
+
+        Raises:
+            ValueError: an unknown name, with the nearest one.
+        """
+
+        def plain(name: str) -> str:
+            name = name.lower().replace("_", "").replace("-", "")
+            for side in ("left", "right"):
+                name = side[0] + name.removeprefix(side) if name.startswith(side) else name
+            return name
+
+        names = [plain(name) for name in self.names]
+        if joint in self.names:
+            return self.names.index(joint)
+        if names.count(plain(joint)) == 1:
+            return names.index(plain(joint))
+        close = difflib.get_close_matches(plain(joint), names, n=1)
+        hint = f" (did you mean {self.names[names.index(close[0])]!r}?)" if close else ""
+        raise ValueError(f"no joint {joint!r}{hint}; skeleton {self.name!r} has {', '.join(self.names)}")
 
     @property
     def edges(self) -> list[tuple[int, int]]:

@@ -2,6 +2,7 @@
 
 from .attention import Attention, SelfAttention
 from .base import Input, Network, NetworkSpec
+from .cosine import CosineEncoder, MotionDecoder
 from .dense import Dense
 from .graphconv import GraphConv
 from .linear import Linear
@@ -10,11 +11,13 @@ from .recurrent import Recurrent
 
 __all__ = [
     "Attention",
+    "CosineEncoder",
     "Dense",
     "FrameGraph",
     "GraphConv",
     "Input",
     "Linear",
+    "MotionDecoder",
     "Network",
     "NetworkSpec",
     "PoseGraph",

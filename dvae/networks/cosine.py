@@ -1,0 +1,243 @@
+"""CosineEncoder and MotionDecoder: transformers between a motion and the cosine coefficients of a latent sequence.
+
+Step k of the latent is its coefficient k. The encoder reads what is given over time, and what the body was like at
+first, and changes over to coefficients half way:
+
+    h_t = transformer([f(y_t); g(s)] + position)        features_k = transformer(sum_t basis_{kt} h_t)
+
+The decoder goes back in time, and makes a motion by its offsets from the first pose:
+
+    o_t = transformer(f([sum_k basis_{kt} z_k; g(s)]) + position)        x_t = s + o_1 + ... + o_t
+
+Everything is parallel in time. TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with the layers of its
+public implementation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..distributions.dct import cosine_basis
+from .base import Input, Network, once
+
+
+@dataclass(frozen=True)
+class CosineEncoder:
+    """Features of each coefficient, from one parent over all time, such as y_{1:T}, and one static parent.
+
+    Args:
+        width: W, features of each parent; the transformers have 2 W.
+        feedforward: hidden units in their layers.
+        heads: of their attention.
+        layers: of each of the three transformers: one before the change to coefficients, two after it.
+        dropout: share of units left out in training.
+        cosine: False to stay in time, so that step t of the child is time t.
+    """
+
+    width: int = 256
+    feedforward: int = 512
+    heads: int = 4
+    layers: int = 2
+    dropout: float = 0.1
+    cosine: bool = True
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineEncoderNetwork:
+        """The network of a factor with these parents.
+
+        Raises:
+            ValueError: other parents, or a static child.
+        """
+        return CosineEncoderNetwork(self, inputs, local)
+
+
+@dataclass(frozen=True)
+class MotionDecoder:
+    """Poses (B, T, D) from coefficients, a parent over time, and from a static parent of size D, the first pose.
+
+    A further parent over all time joins the coefficients, once they are back in time.
+
+    Args:
+        width: W, features of the static parent.
+        hidden: features in time.
+        components: C, coefficients that are read; 0 for all.
+        feedforward, heads, layers, dropout, cosine: see `CosineEncoder`; there is one transformer.
+        latent: name of the parent that holds coefficients.
+    """
+
+    width: int = 256
+    hidden: int = 512
+    components: int = 0
+    feedforward: int = 512
+    heads: int = 4
+    layers: int = 2
+    dropout: float = 0.1
+    cosine: bool = True
+    latent: str = "z"
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> MotionDecoderNetwork:
+        """The network of a factor with these parents.
+
+        Raises:
+            ValueError: other parents, or a static child.
+        """
+        return MotionDecoderNetwork(self, inputs, local, size)
+
+
+class _AtOnce(Network):
+    """A network that makes all steps at once, for sequences of one length."""
+
+    def apart(self, spec: Any, local: bool) -> tuple[list[Input], Input]:
+        """The parents over time and the static one."""
+        over_time = [parent for parent in self.inputs if parent.relation is not None]
+        static = [parent for parent in self.inputs if parent.relation is None]
+        if not local or not over_time or len(static) != 1:
+            given = ", ".join(f"{p.name} ({'static' if p.relation is None else 'local'})" for p in self.inputs)
+            raise ValueError(
+                f"{type(spec).__name__} reads parents over time and one static parent, for a local variable; it was "
+                f"given {given or 'none'} for a {'local' if local else 'static'} one"
+            )
+        return over_time, static[0]
+
+    def refuse_ragged(self, lengths: Tensor | None) -> None:
+        """Refuses padding, which would enter the coefficients."""
+        if lengths is not None:
+            raise ValueError(
+                "a cosine transform is of sequences of one length, but the batch is ragged; cut or split it"
+            )
+
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """See `Network.start`."""
+        if missing := [parent.name for parent in self.inputs if parent.name not in given]:
+            raise ValueError(
+                f"{type(self).__name__} makes all steps at once; it cannot be in a loop with {', '.join(missing)}"
+            )
+        return self(given, length, lengths).unbind(1)
+
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        """See `Network.step`."""
+        return state[t], state
+
+
+class CosineEncoderNetwork(_AtOnce):
+    """See `CosineEncoder`. Networks may share `over_time`, `static`, `before` and `between`."""
+
+    def __init__(self, spec: CosineEncoder, inputs: Sequence[Input], local: bool):
+        super().__init__(inputs, local, 2 * spec.width)
+        (source, *others), static = self.apart(spec, local)
+        if others or not _reads_everything(source):
+            raise ValueError(f"CosineEncoder reads one parent over all time, as in y_{{1:T}}; not {self.inputs}")
+        self.names, self.cosine = (source.name, static.name), spec.cosine
+        self.over_time: Any = perceptron(source.size, spec.width)
+        self.static: Any = perceptron(static.size, spec.width)
+        self.before: Any = transformer(self.features, spec)
+        self.between: Any = transformer(self.features, spec)
+        self.after: Any = transformer(self.features, spec)
+        self.dropout = nn.Dropout(spec.dropout)
+
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """See `Network.forward`; no sequence is padded."""
+        self.refuse_ragged(lengths)
+        source, static = (parents[name] for name in self.names)
+        body = once(self.static, [static], partial(self.static, static))
+        hidden = torch.cat([self.over_time(source), body[:, None].expand(-1, length, -1)], dim=-1)
+        hidden = self.before(self.dropout(hidden + positions(length, self.features, hidden)))
+        if self.cosine:
+            hidden = _basis(length, length, hidden) @ hidden
+        return self.after(self.between(hidden))
+
+
+class MotionDecoderNetwork(_AtOnce):
+    """See `MotionDecoder`. Networks may share `static`."""
+
+    def __init__(self, spec: MotionDecoder, inputs: Sequence[Input], local: bool, size: int):
+        super().__init__(inputs, local, size)
+        over_time, static = self.apart(spec, local)
+        sizes = {parent.name: parent.size for parent in over_time}
+        if spec.latent not in sizes or static.size != size:
+            raise ValueError(
+                f"MotionDecoder makes poses of size {size} from {spec.latent}_{{1:T}} and a first pose of that size; "
+                f"it was given {', '.join(f'{p.name} of size {p.size}' for p in self.inputs)}"
+            )
+        self.spec, self.first = spec, static.name
+        self.others = [name for name in sizes if name != spec.latent]
+        self.static: Any = perceptron(size, spec.width)
+        into = sum(sizes.values()) + spec.width
+        self.into = nn.Sequential(*_layer(into, spec.hidden), nn.Linear(spec.hidden, spec.hidden))
+        self.transformer: Any = transformer(spec.hidden, spec)
+        self.offsets = nn.Sequential(*_layer(spec.hidden, spec.hidden), nn.Linear(spec.hidden, size))
+        self.dropout = nn.Dropout(spec.dropout)
+
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """See `Network.forward`; no sequence is padded."""
+        self.refuse_ragged(lengths)
+        first, values = parents[self.first], parents[self.spec.latent]
+        components = min(self.spec.components or length, length)
+        values = values[:, :components]
+        if self.spec.cosine:
+            values = _basis(length, components, values).T @ values
+        body = once(self.static, [first], partial(self.static, first))
+        joined = [body[:, None].expand(-1, length, -1), values, *(parents[name] for name in self.others)]
+        hidden = self.into(torch.cat(joined, dim=-1))
+        hidden = self.transformer(self.dropout(hidden + positions(length, hidden.shape[-1], hidden)))
+        return first[:, None] + self.offsets(hidden).cumsum(1)
+
+
+def share(networks: Sequence[Any], *names: str) -> None:
+    """Gives networks the modules of these names of the first of them."""
+    for network in networks[1:]:
+        for name in names:
+            setattr(network, name, getattr(networks[0], name))
+
+
+def perceptron(size: int, width: int) -> nn.Sequential:
+    """Two layers with normalisation, pose by pose."""
+    return nn.Sequential(*_layer(size, width), *_layer(width, width))
+
+
+def _layer(size: int, out: int) -> list[nn.Module]:
+    return [nn.Linear(size, out), nn.LayerNorm(out), nn.LeakyReLU(0.1)]
+
+
+def transformer(size: int, spec: CosineEncoder | MotionDecoder) -> nn.TransformerEncoder:
+    """A transformer's encoder, normalised behind each layer and at its end."""
+    layer = nn.TransformerEncoderLayer(size, spec.heads, spec.feedforward, spec.dropout, batch_first=True)
+    made = nn.TransformerEncoder(layer, spec.layers, nn.LayerNorm(size), enable_nested_tensor=False)
+    for parameter in made.parameters():  # the layers are copies of one, which would start alike
+        if parameter.dim() > 1:
+            nn.init.xavier_uniform_(parameter)
+    return made
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _positions(length: int, size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    waves = torch.exp(torch.arange(0, size, 2, dtype=torch.float64) * (-math.log(10000.0) / size))
+    phase = torch.arange(length, dtype=torch.float64)[:, None] * waves
+    return torch.stack([phase.sin(), phase.cos()], dim=-1).flatten(1)[:, :size].to(device, dtype)
+
+
+def positions(length: int, size: int, like: Tensor) -> Tensor:
+    """Sinusoidal encodings (T, size) of the steps (Vaswani et al., 2017)."""
+    return _positions(length, size, like.dtype, like.device)
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)  # whoever asks first, others will differentiate through it
+def _cached_basis(length: int, coefficients: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return cosine_basis(length, coefficients).to(device, dtype)
+
+
+def _basis(length: int, coefficients: int, like: Tensor) -> Tensor:
+    """(C, T), see `cosine_basis`."""
+    return _cached_basis(length, coefficients, like.dtype, like.device)
+
+
+def _reads_everything(parent: Input) -> bool:
+    return parent.relation is not None and bool(parent.relation.mask(3).all())

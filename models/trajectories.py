@@ -1,0 +1,353 @@
+"""What methods share that make motion from one pose and the paths that some joints are to take.
+
+    s the first pose, y_{1:T} the given trajectories, r_{1:T} the other joints', x_{1:T} the motion
+
+Poses are positions in metres relative to the first pelvis, so that the body moves through space; y and r are x with
+zeros at the joints that are not theirs. In training, every joint of a window is given with probability `keep`, over all
+its frames: so one model takes any number of trajectories.
+
+Source: TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with what its public implementation does.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from math import sqrt
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from ..heads import FixedNormal, HeadSpec
+from ..inference.control import bend
+from ..inference.objectives import Evidence, Objective
+from ..model import WHOLE, Batch, DynamicalVAE, repeat
+from ..motion import PROTOCOLS, Clip, Skeleton, Windows
+from ..motion.data import defect
+from .method import Method
+
+FIRST, GIVEN, REST = "s", "y", "r"
+NEEDED = "relative", 1
+"""Root and number of observed frames of a protocol under which methods complete motion."""
+
+
+@dataclass(frozen=True)
+class TrajectoryMethod(Method):
+    """A method that completes motion. The likelihood is the paper's squared error, whatever else methods offer.
+
+    Args:
+        beta: weight of the KL, beside squared errors in square metres.
+        keep: probability with which a joint is given, in training.
+        complement: the guide sees the joints that are not given, and not the others.
+        rotate: turn every training window about the up axis by a uniform angle.
+    """
+
+    projected: ClassVar[bool] = True
+    """Whether a linear layer makes poses of the features; else these are poses."""
+    unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method)) - {"latent"}
+
+    beta: float = 0.01
+    keep: float = 0.15
+    complement: bool = True
+    rotate: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for option in fields(self):
+            if option.name in self.unused and getattr(self, option.name) != option.default:
+                raise ValueError(f"{self.name} has no {option.name}; leave it at {option.default!r}")
+        if not 0 <= self.keep <= 1:
+            raise ValueError(f"keep is {self.keep}; it must be a probability, between 0 and 1")
+        if not 0 <= self.beta < float("inf"):
+            raise ValueError(f"beta is {self.beta}; it must be finite and at least 0")
+
+    @property
+    def selects(self) -> Literal["bound", "loss"]:
+        """See `Method.selects`: beta is part of the model, which the bound does not know."""
+        return "loss"
+
+    def heads(self) -> Mapping[str, HeadSpec]:
+        """x is normal with variance 1/2, minus whose log-density is the squared error."""
+        return {"p(x)": FixedNormal(scale=sqrt(0.5), project=self.projected)}
+
+    def build_for(self, windows: Windows) -> TrajectoryModel:
+        """See `Method.build_for`.
+
+        Raises:
+            ValueError: windows without a root, or with more than one observed frame.
+        """
+        protocol = windows.protocol
+        if (protocol.root, protocol.observed) != NEEDED:
+            raise ValueError(
+                f"{self.name} moves a body through space from one pose on, but the protocol {protocol.name} has "
+                f"root={protocol.root!r} and {protocol.observed} observed frames; use one with root='relative' and "
+                f"observed=1, such as {', '.join(n for n, p in PROTOCOLS.items() if (p.root, p.observed) == NEEDED)}"
+            )
+        return self.build_on(windows.skeleton)
+
+    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
+        """See `Method.build`; y, r and s are of the size of x."""
+        return self._built(DynamicalVAE, data[WHOLE])
+
+    def build_on(self, skeleton: Skeleton) -> TrajectoryModel:
+        """The model for poses of this skeleton."""
+        return self._built(TrajectoryModel, 3 * skeleton.joints, skeleton, self.complement)
+
+    def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
+        sizes = {**self.sizes(), **dict.fromkeys((WHOLE, FIRST, GIVEN, REST), size)}
+        return kind(*arguments, *self.equations(), sizes, self.networks(), self.heads())
+
+    def batches(self, windows: Windows) -> Windows:
+        """See `Method.batches`: windows with the trajectories that are given, turned anyhow."""
+        return windows.with_protocol(replace(windows.protocol, rotate=self.rotate)).given(self.keep)
+
+    def validation(self, windows: Windows) -> Windows:
+        """See `Method.validation`."""
+        return windows.given(self.keep)
+
+    def objective(self) -> Objective:
+        """Squared errors and the weighted KL."""
+        return Evidence(kl_weight=self.beta, select="loss")
+
+    def feeding(self, steps: int) -> float:
+        """0: x is no parent of x."""
+        return 0.0
+
+
+class TrajectoryModel(DynamicalVAE):
+    """A model of motion given its first pose and some trajectories.
+
+    A batch holds either windows x (B, 1 + T, D), whose first frame is s, with y (B, 1 + T, D) if trajectories are
+    given, or the variables themselves: s (B, D), y (B, T, D) and, to train, x and r.
+
+    Args:
+        skeleton: of the poses.
+        complement: whether r is what y leaves of x, and not all of x.
+        *arguments, **options: of `DynamicalVAE`.
+    """
+
+    def __init__(self, skeleton: Skeleton, complement: bool, *arguments: Any, **options: Any):
+        super().__init__(*arguments, **options)
+        self.skeleton, self.complement = skeleton, complement
+
+    def _mapping(self, batch: Batch | None) -> dict[str, Any]:
+        values = super()._mapping(batch)
+        if FIRST not in values and WHOLE in values:
+            if "lengths" in values:
+                raise ValueError("windows of motion have one length; leave 'lengths' out of the batch")
+            values[FIRST] = values[WHOLE][:, 0]
+            for name in {WHOLE, GIVEN, "mask"} & values.keys():
+                values[name] = values[name][:, 1:]
+            if not values[WHOLE].shape[1]:
+                del values[WHOLE]
+                values.pop("mask", None)
+        if WHOLE in values:
+            x = values[WHOLE]
+            if isinstance(mask := values.get("mask"), Tensor):
+                x = torch.where(mask, x, 0.0)
+            given = values.setdefault(GIVEN, torch.zeros_like(x))
+            values.setdefault(REST, x - given if self.complement else x)
+        return values
+
+    @torch.no_grad()
+    def forecast(
+        self,
+        batch: Batch,
+        horizon: int,
+        samples: int = 1,
+        *,
+        draw_emission: bool = False,
+        fix: Mapping[str, Tensor] | None = None,
+        temperature: float = 1.0,
+    ) -> dict[str, Tensor]:
+        """Goes on from a pose, along the given trajectories if there are any.
+
+        Args:
+            batch: x (B, 1, D), or s (B, D); and y, over the horizon, if trajectories are given.
+            horizon: H.
+            samples: S, motions for each pose.
+            draw_emission: see `DynamicalVAE.forecast`.
+            fix: nothing can be fixed; give trajectories.
+            temperature: of the latent's scale: 0 for the motion of the prior's mean.
+
+        Returns:
+            "x" (S, B, H, D) and the latents.
+
+        Raises:
+            ValueError: more than one observed frame, or trajectories that end before the horizon.
+        """
+        if fix:
+            raise ValueError(f"cannot fix {', '.join(fix)}: what is known of a motion are its trajectories, in y")
+        if horizon < 1 or samples < 1:
+            raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
+        data = self._mapping(batch)
+        if WHOLE in data or FIRST not in data:
+            raise ValueError("a motion goes on from one pose: x (B, 1, D) or s (B, D)")
+        first = data[FIRST]
+        given = data.get(GIVEN, first.new_zeros(len(first), horizon, first.shape[-1]))
+        if given.shape[1] < horizon:
+            raise ValueError(f"the trajectories have {given.shape[1]} frames, but {horizon} are asked for")
+        data = {FIRST: first, GIVEN: given[:, :horizon]}
+        with self._evaluating():
+            latents = {}
+            for name in self.latents:  # the prior is evaluated once for all samples
+                loc, scale = self.generator[name](data, len(first), horizon)
+                noise = torch.randn(samples, *loc.shape, dtype=loc.dtype, device=loc.device)
+                latents[name] = torch.addcmul(loc, scale, noise, value=temperature).flatten(0, 1)
+            many = {name: repeat(value, samples) for name, value in data.items()}
+            out = poutine.condition(self.model, data=latents)(many, length=horizon, mean_emission=not draw_emission)
+        return {name: out[name].unflatten(0, (samples, -1)) for name in (WHOLE, *self.latents)}
+
+    def complete(
+        self,
+        initial_pose: Any,
+        trajectories: Mapping[str, Any] | None = None,
+        frames: int | None = None,
+        samples: int = 1,
+        *,
+        exact: bool = False,
+        temperature: float = 1.0,
+        tolerance: float = 5e-4,
+        steps: int = 200,
+        progress: bool = False,
+    ) -> Completion:
+        """Motions that start at a pose and follow paths of some joints.
+
+        The networks know of a path frame by frame. Where it has gaps they are told of a straight one across them, from
+        the joint's place in the first pose on, and of a resting joint behind the last known frame.
+
+        Args:
+            initial_pose: positions (J, 3) of all joints in metres, anywhere in the world.
+            trajectories: joint to its path (T, 3) in metres in the same world, one frame after the pose first; NaN
+                where it is not known. A joint has its name in the skeleton, or one such as "left_wrist".
+            frames: T; needed without trajectories.
+            samples: S, motions.
+            exact: move each motion as little as it takes, within the prior of its latents, for the given joints to
+                follow their paths, by optimising the latents through the decoder. Bones keep their lengths.
+            temperature: of the latents' scales; 0 for the motion of the prior's mean.
+            tolerance: metres, standard deviation of an exact path's misses.
+            steps: of the optimiser, with `exact`.
+            progress: whether to show a progress bar, with `exact`.
+
+        Raises:
+            ValueError: an unknown joint, a path of another length or without a known frame, or positions that are not
+                in metres.
+        """
+        pose = torch.as_tensor(np.asarray(initial_pose, dtype=np.float64))
+        if complaint := defect(Clip("initial", "pose", pose[None].numpy()), self.skeleton):
+            raise ValueError(complaint.replace("clip initial/pose", "the initial pose, as one frame,"))
+        given = trajectories or {}
+        paths = {self.skeleton.find(joint): self._path(joint, path, pose) for joint, path in given.items()}
+        if len(paths) < len(given):
+            raise ValueError(f"the trajectories name a joint twice: {', '.join(given)}")
+        lengths = {joint: len(path) for joint, path in zip(given, paths.values(), strict=True)}
+        if frames is not None:
+            lengths["frames"] = frames
+        if len(set(lengths.values())) != 1 or min(lengths.values()) < 1:
+            got = ", ".join(f"{name}: {length}" for name, length in lengths.items()) or "neither"
+            raise ValueError(f"expected paths of one length, or frames= without any; got {got}")
+        length = next(iter(lengths.values()))
+        world = pose[self.skeleton.root]
+        told, known = torch.zeros(length, self.skeleton.joints, 3), torch.zeros(length, self.skeleton.joints, 3)
+        for joint, path in paths.items():
+            seen = path.isfinite().all(-1)
+            told[:, joint] = _bridged(path, seen, pose[joint]) - world
+            known[:, joint] = seen[:, None].float()
+        first = (pose - world).flatten()[None]
+        parameter = next(self.parameters())
+        data = {FIRST: first.to(parameter), GIVEN: told.flatten(1)[None].to(parameter)}
+        out = self.forecast(data, length, samples, temperature=temperature)
+        x = out[WHOLE][:, 0]
+        if exact and paths:
+            options = {"tolerance": tolerance, "steps": steps, "progress": progress}
+            x = self._followed(data, out, known.flatten(1).to(parameter), **options)
+        motion = x.cpu().double().unflatten(-1, (-1, 3)) + world
+        names = self.skeleton.names
+        errors = {names[joint]: (motion[:, :, joint] - path).norm(dim=-1).numpy() for joint, path in paths.items()}
+        return Completion(self.skeleton, motion.numpy(), errors)
+
+    def _path(self, joint: str, given: Any, pose: Tensor) -> Tensor:
+        """A path as it was given, if it can be one."""
+        path = torch.as_tensor(np.asarray(given, dtype=np.float64))
+        if path.dim() != 2 or path.shape[-1] != 3:
+            raise ValueError(f"the path of {joint} has shape {tuple(path.shape)}, expected (frames, 3) in metres")
+        seen = path.isfinite().all(-1)
+        if not seen.any():
+            raise ValueError(f"the path of {joint} has no known frame; leave it out")
+        start = (path[seen] - pose[self.skeleton.find(joint)]).norm(dim=-1)
+        if start.median() > FAR:
+            raise ValueError(
+                f"the path of {joint} is {start.median():.4g} m (median) from where the pose has it; paths are in "
+                "metres, in the same world as the pose"
+            )
+        first = int(seen.nonzero()[0])
+        if start[0] > LEAP * (first + 1):
+            warnings.warn(
+                f"the path of {joint} starts {start[0]:.2f} m from where the pose has it, {first + 1} frames before",
+                stacklevel=3,
+            )
+        return path
+
+    def _followed(self, data: Mapping[str, Tensor], out: Mapping[str, Tensor], known: Tensor, **options: Any) -> Tensor:
+        """Motions (S, T, D) whose known coordinates are the given ones (see `inference.control`)."""
+        (name,) = self.latents
+        drawn = out[name][:, 0]
+        many = {variable: repeat(value, len(drawn)) for variable, value in data.items()}
+        bones = self.skeleton.limbs(data[FIRST][0]).norm(dim=-1)
+        with self._evaluating():
+            with torch.no_grad():
+                scale = self.generator[name](data, 1, len(known))[1]
+            latents = bend(
+                lambda z: self._means(many, z), drawn, scale, data[GIVEN], known, self.skeleton, bones, **options
+            )
+            with torch.no_grad():
+                return self._means(many, latents)
+
+    def _means(self, data: Mapping[str, Tensor], latents: Tensor) -> Tensor:
+        """Means of x (S, T, D) given latents."""
+        rollout = self._rollout(self.generative, self.generator, data, data[GIVEN].shape[1], 1)
+        rollout.mean_emission = True
+        rollout.values[self.latents[0]] = latents
+        return rollout.draw(WHOLE)
+
+
+FAR, LEAP = 50.0, 0.5
+"""Metres from a joint's place in the first pose: a path that far is none, and one that leaps so in a frame is odd."""
+
+
+@dataclass(frozen=True, eq=False)
+class Completion:
+    """Motions along given paths.
+
+    Args:
+        skeleton: the tree.
+        positions: (S, T, J, 3), metres, in the world of the pose and the paths.
+        errors: joint to (S, T), metres between it and its path; NaN where that is not known.
+    """
+
+    skeleton: Skeleton
+    positions: np.ndarray
+    errors: Mapping[str, np.ndarray]
+
+    def __str__(self) -> str:
+        samples, frames = self.positions.shape[:2]
+        lines = [f"{samples} motions of {frames} frames"]
+        for joint, errors in self.errors.items():
+            missed = errors[np.isfinite(errors)]
+            share = np.mean(missed < 0.01)
+            lines.append(
+                f"  {joint}: off its path by {missed.mean():.3f} m (mean), within 1 cm in {share:.0%} of frames"
+            )
+        return "\n".join(lines)
+
+
+def _bridged(path: Tensor, seen: Tensor, start: Tensor) -> Tensor:
+    """The path (T, 3) without gaps: straight between known frames, from its start one frame before."""
+    times = np.concatenate([[-1], seen.nonzero()[:, 0].numpy()])
+    places = torch.cat([start[None], path[seen]]).numpy()
+    now = np.arange(len(path))
+    return torch.from_numpy(np.stack([np.interp(now, times, places[:, axis]) for axis in range(3)], axis=-1))

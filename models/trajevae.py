@@ -1,0 +1,117 @@
+"""TrajeVAE: motion from one pose and any number of joint trajectories, all at once, by its cosine coefficients.
+
+    p(z_k | y_{1:T}, s) p(x_t | z_{1:T}, s)        q(z_k | r_{1:T}, s)
+
+k counts coefficients of the cosine transform, t frames; z has as many of the one as x has of the other, so that here
+both are steps. The prior is learned: a transformer of the given trajectories y and the first pose s. The guide reads
+what the trajectories leave out, r. The mean of x is s plus offsets, summed up over time. Minimised is
+
+    sum_t |x_t - mean_t|^2 + .01 KL(q | p)
+
+Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, with the layers of its public implementation: prior and guide
+share the perceptrons of poses and two of three transformers, and the decoder the perceptron of s. Ours: scales of z are
+softplus where that has log-variances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..heads import HeadSpec, Normal
+from ..networks import CosineEncoder, MotionDecoder, NetworkSpec
+from ..networks.cosine import share
+from ..notation import Factorization
+from .trajectories import TrajectoryMethod
+
+
+@dataclass(frozen=True)
+class TrajeVAE(TrajectoryMethod):
+    """See the file.
+
+    Args:
+        latent: size of z, for each coefficient.
+        components: coefficients of z, the slow ones; 0 for as many as there are frames.
+        width: features of a pose; the transformers have twice as many.
+        feedforward: hidden units in their layers.
+        heads_count: of their attention.
+        layers: of each transformer.
+        dropout: share of units left out in training.
+        learned_prior: False for p(z) = N(0, I); the decoder then reads y.
+        cosine: False to leave out the cosine transform, so that z has one value for each frame.
+    """
+
+    name: ClassVar[str] = "trajevae"
+    source: ClassVar[str] = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
+    generative: ClassVar[str] = "p(z_t | y_{1:T}, s) p(x_t | z_{1:T}, s)"
+    inference: ClassVar[str] = "q(z_t | r_{1:T}, s)"
+
+    projected: ClassVar[bool] = False
+
+    latent: int = 512
+    components: int = 0
+    width: int = 256
+    feedforward: int = 512
+    heads_count: int = 4
+    layers: int = 2
+    dropout: float = 0.1
+    learned_prior: bool = True
+    cosine: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, least in (("components", 0), *((n, 1) for n in ("width", "feedforward", "heads_count", "layers"))):
+            if (value := getattr(self, name)) < least:
+                raise ValueError(f"{name} is {value}; it must be at least {least}")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout is {self.dropout}; it must be a share, at least 0 and below 1")
+        if 2 * self.width % self.heads_count:
+            raise ValueError(
+                f"{self.heads_count} heads do not divide the transformers' {2 * self.width} features; take a width "
+                "whose double they divide"
+            )
+        if self.components and not self.cosine:
+            raise ValueError("components are of the cosine transform; leave them at 0 without it")
+
+    def equations(self) -> tuple[Factorization, Factorization]:
+        """The generative model and the guide."""
+        p = self.generative
+        if not self.learned_prior:
+            p = "p(z_t) p(x_t | z_{1:T}, y_{1:T}, s)"
+        masks = {}
+        if self.components:
+            p = p.replace("z_{1:T}", "z_{1:C}")
+            masks = {"1:C": lambda length: np.arange(length)[None] < self.components}
+        return Factorization.parse(p, masks), Factorization.parse(self.inference)
+
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        """The transformers; the model has them share what they share."""
+        shape: dict[str, Any] = {
+            "width": self.width,
+            "feedforward": self.feedforward,
+            "heads": self.heads_count,
+            "layers": self.layers,
+            "dropout": self.dropout,
+            "cosine": self.cosine,
+        }
+        encoder = CosineEncoder(**shape)
+        found: dict[str, NetworkSpec] = {"q(z)": encoder}
+        if self.learned_prior:
+            found["p(z)"] = encoder
+        return {**found, "p(x)": MotionDecoder(hidden=2 * self.width, components=self.components, **shape)}
+
+    def heads(self) -> Mapping[str, HeadSpec]:
+        """Normal latents, of which those beyond `components` are noise that nothing reads."""
+        latent = Normal(steps=self.components)
+        return {**super().heads(), "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
+
+    def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
+        model = super()._built(kind, size, *arguments)
+        guide, decoder = model.encoder["z"].network, model.generator["x"].network
+        share([guide, decoder], "static")
+        if self.learned_prior:
+            share([guide, model.generator["z"].network], "over_time", "static", "before", "between")
+        return model

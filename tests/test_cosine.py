@@ -1,0 +1,132 @@
+"""The transformers of TrajeVAE against their published definition, with scipy's cosine transform."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.fft import dct, idct
+
+from dvae.networks import CosineEncoder, MotionDecoder
+from dvae.networks.base import Input
+from dvae.networks.cosine import positions, share
+from dvae.notation import Relation
+
+ALL, LENGTH = Relation.parse("1:T"), 7
+SMALL = {"width": 6, "feedforward": 10, "heads": 2, "layers": 2}
+
+
+def encoder(**options):
+    spec = CosineEncoder(**{**SMALL, **options})
+    return spec.build([Input("y", 9, ALL), Input("s", 9)], True, 4).double().eval()
+
+
+def decoder(**options):
+    inputs = [Input("z", 4, ALL), *options.pop("others", ()), Input("s", 9)]
+    return MotionDecoder(hidden=12, **{**SMALL, **options}).build(inputs, True, 9).double().eval()
+
+
+def values(**sizes):
+    shapes = {"y": (3, LENGTH, 9), "z": (3, LENGTH, 4), "s": (3, 9), **sizes}
+    return {name: torch.randn(shape, dtype=torch.float64) for name, shape in shapes.items()}
+
+
+def encoded(size):
+    """Sinusoidal positions as Vaswani et al. define them."""
+    found = np.zeros((LENGTH, size))
+    for t in range(LENGTH):
+        for i in range(0, size, 2):
+            found[t, i] = math.sin(t / 10000 ** (i / size))
+            found[t, i + 1] = math.cos(t / 10000 ** (i / size))
+    return torch.from_numpy(found)
+
+
+def test_positions_are_the_published_waves():
+    assert torch.allclose(positions(LENGTH, 6, torch.zeros(1, dtype=torch.float64)), encoded(6), atol=1e-12)
+
+
+@pytest.mark.parametrize("cosine", [True, False])
+def test_the_encoder_is_the_published_one(cosine):
+    net, given = encoder(cosine=cosine), values()
+    body = net.static(given["s"])[:, None].expand(-1, LENGTH, -1)
+    hidden = net.before(torch.cat([net.over_time(given["y"]), body], -1) + encoded(12))
+    if cosine:
+        hidden = torch.from_numpy(dct(hidden.detach().numpy(), axis=1, norm="ortho"))
+    assert torch.allclose(net(given, LENGTH), net.after(net.between(hidden)), atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("components", [0, 3, 20])
+def test_the_decoder_adds_offsets_to_the_first_pose(components):
+    net, given = decoder(components=components), values()
+    z = given["z"].clone()
+    if components:
+        z[:, components:] = 0
+    in_time = torch.from_numpy(idct(z.numpy(), axis=1, norm="ortho"))
+    body = net.static(given["s"])[:, None].expand(-1, LENGTH, -1)
+    offsets = net.offsets(net.transformer(net.into(torch.cat([body, in_time], -1)) + encoded(12)))
+    pose, expected = given["s"], []
+    for t in range(LENGTH):
+        pose = pose + offsets[:, t]
+        expected.append(pose)
+    assert torch.allclose(net(given, LENGTH), torch.stack(expected, 1), atol=1e-10, rtol=0)
+
+
+def test_without_the_cosine_transform_the_decoder_stays_in_time():
+    net, given = decoder(cosine=False), values()
+    body = net.static(given["s"])[:, None].expand(-1, LENGTH, -1)
+    hidden = net.into(torch.cat([body, given["z"]], -1)) + encoded(12)
+    expected = given["s"][:, None] + net.offsets(net.transformer(hidden)).cumsum(1)
+    assert torch.allclose(net(given, LENGTH), expected, atol=1e-10, rtol=0)
+
+
+def test_the_decoder_reads_what_else_is_given_over_time():
+    net, given = decoder(others=[Input("y", 9, ALL)]), values()
+    moved = {**given, "y": given["y"] + 1}
+    assert not torch.allclose(net(given, LENGTH), net(moved, LENGTH))
+
+
+@pytest.mark.parametrize("made", [encoder, decoder])
+def test_the_two_forms_are_one_function(made):
+    net, given = made(), values()
+    state, steps = net.start(given, 3, LENGTH), []
+    for t in range(LENGTH):
+        features, state = net.step(state, t, {})
+        steps.append(features)
+    assert torch.allclose(torch.stack(steps, 1), net(given, LENGTH), atol=1e-10, rtol=0)
+
+
+def test_layers_do_not_start_alike_and_shared_modules_are_one():
+    first, second = encoder(), encoder()
+    one, two = first.before.layers
+    assert not torch.equal(one.linear1.weight, two.linear1.weight)
+    share([first, second], "static", "between")
+    assert second.static is first.static
+    assert second.between is first.between
+    assert second.after is not first.after
+
+
+def test_dropout_is_in_training_alone():
+    net, given = encoder(dropout=0.5), values()
+    assert torch.equal(net(given, LENGTH), net(given, LENGTH))
+    net.train()
+    assert not torch.equal(net(given, LENGTH), net(given, LENGTH))
+
+
+@pytest.mark.parametrize(
+    ("run", "message"),
+    [
+        (lambda: encoder()(values(), LENGTH, torch.tensor([7, 7, 3])), "the batch is ragged"),
+        (lambda: decoder().start({"s": values()["s"]}, 3, LENGTH), "cannot be in a loop with z"),
+        (lambda: CosineEncoder(**SMALL).build([Input("s", 9)], True, 4), r"given s \(static\) for a local"),
+        (lambda: CosineEncoder(**SMALL).build([], False, 4), "given none for a static"),
+        (
+            lambda: CosineEncoder(**SMALL).build([Input("y", 9, Relation.parse("<t")), Input("s", 9)], True, 4),
+            "reads one parent over all time",
+        ),
+        (lambda: MotionDecoder(**SMALL).build([Input("z", 4, ALL), Input("s", 8)], True, 9), "s of size 8"),
+        (lambda: MotionDecoder(**SMALL).build([Input("y", 4, ALL), Input("s", 9)], True, 9), r"from z_\{1:T\}"),
+    ],
+)
+def test_what_they_refuse(run, message):
+    with pytest.raises(ValueError, match=message):
+        run()
