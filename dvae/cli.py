@@ -341,6 +341,7 @@ def evaluate(
     pose_prior: Path | None = None,
     classifier: tuple[Path, ...] = (),
     joints: tuple[str, ...] | None = None,
+    exchange: bool = False,
     temperature: float | None = None,
     seed: int = 0,
     batch_size: int = 32,
@@ -359,6 +360,7 @@ def evaluate(
         pose_prior: run of a pose-prior, by which to score the poses of the forecasts.
         classifier: runs of action-classifiers of different labels, by which to score what the forecasts show.
         joints: joints whose paths are given to the runs, for methods that take some (trajevae, cvae-rnn).
+        exchange: begin each window with the pose of another one whose given joints are there at the same place.
         temperature: of the latents' scale, for such methods; 0 for motion at the mean of the prior.
         seed: of the draws.
         batch_size: windows forecast at once.
@@ -375,16 +377,16 @@ def evaluate(
     _note_unfinished(loaded)
     names = _names(loaded)
     for each in loaded:
-        if (joints or temperature is not None) and not isinstance(each.model, TrajectoryModel):
+        if (joints or exchange or temperature is not None) and not isinstance(each.model, TrajectoryModel):
             raise UsageError(
-                f"--joints and --temperature are for methods that take trajectories; {each.path} holds "
+                f"--joints, --exchange and --temperature are for methods that take trajectories; {each.path} holds "
                 f"{each.method.name}"
             )
     if joints is not None:
         windows = windows.given(joints)
     result = evaluate_models(
         {name: each.model for name, each in zip(names, loaded, strict=True)},
-        windows,
+        motion.Exchanged(windows) if exchange else windows,
         samples=samples,
         seed=seed,
         batch_size=batch_size,

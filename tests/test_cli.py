@@ -267,6 +267,7 @@ def test_paths_are_given_to_an_evaluation(capsys, tracker, fitted, tmp_path):
     assert "no joint 'RPaw'" in failure(capsys, "evaluate", str(tracker), "--joints", "RPaw", *out)
     error = failure(capsys, "evaluate", str(fitted), "--joints", "RFoot", *out, code=2)
     assert "are for methods that take trajectories" in error
+    assert "are given no joints" in failure(capsys, "evaluate", str(tracker), "--exchange", *out)
 
 
 def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):

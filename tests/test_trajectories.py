@@ -523,3 +523,27 @@ def test_temperature_is_an_option_of_an_evaluation(people):
     assert found["model"]["APD"].mean == 0
     assert found.options == {"temperature": 0.0}
     assert dvae.Evaluation.from_json(found.to_json()).options == {"temperature": 0.0}
+
+
+def test_poses_are_exchanged_among_windows_whose_given_joints_agree(people):
+    windows = motion.windows(people, replace(PROTOCOL, test_stride=3), "test").given(["RFoot", "LFoot"])
+    found = motion.Exchanged(windows, threshold=0.4)
+    x, y = found.all()["x"], found.all()["y"]
+    whole, keys = windows.all(), windows.keys
+    feet = [windows.skeleton.find(name) for name in ("RFoot", "LFoot")]
+    assert 0 < len(x) == len(found.keys) < len(keys)
+    for n, key in enumerate(found.keys):
+        own = keys.index(key)
+        assert torch.equal(x[n, 1:], whole["x"][own, 1:])
+        assert torch.equal(y[n], whole["y"][own])
+        (partner,) = [m for m in range(len(keys)) if torch.equal(whole["x"][m, 0], x[n, 0])]
+        assert keys[partner][:2] != key[:2]
+        apart = (whole["x"][partner, 0] - whole["x"][own, 0]).unflatten(-1, (-1, 3))[feet].norm(dim=-1)
+        assert (apart < 0.4).all()
+    assert found.fingerprint != motion.Exchanged(windows, threshold=0.4, seed=5).fingerprint != windows.fingerprint
+    scores = dvae.evaluate(build(windows).float(), found, samples=2, references=False, progress=False)
+    assert math.isfinite(scores["model"]["path error"].mean)
+    with pytest.raises(ValueError, match="no two windows of different clips have RFoot, LFoot within 1e-09 m"):
+        motion.Exchanged(windows, threshold=1e-9)
+    with pytest.raises(ValueError, match="these have 1 observed frames and are given no joints"):
+        motion.Exchanged(windows.given(0.5))

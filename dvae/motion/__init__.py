@@ -2,6 +2,7 @@
 
 from .angles import AngleLimits, estimate_angle_limits
 from .data import Clip, MotionSet
+from .exchange import Exchanged
 from .forecasts import Forecasts, is_forecasts
 from .formats import load, read_paths, save
 from .protocols import PROTOCOLS, Protocol, Windows, windows
@@ -17,6 +18,7 @@ __all__ = [
     "WALKER",
     "AngleLimits",
     "Clip",
+    "Exchanged",
     "Forecasts",
     "MotionSet",
     "Protocol",

@@ -357,14 +357,14 @@ class Windows:
             windows._given = float(joints)
             return windows
         found = {self.skeleton.names[self.skeleton.find(joint)] for joint in joints}
-        if dropped := found - set(self._joints):
+        if dropped := found - set(self.joints):
             raise ValueError(f"the protocol {self.protocol.name} drops {dropped.pop()}")
-        windows._given = torch.tensor([float(name in found) for name in self._joints])
+        windows._given = torch.tensor([float(name in found) for name in self.joints])
         return windows
 
     @property
-    def _joints(self) -> list[str]:
-        """Names of the joints of a frame."""
+    def joints(self) -> list[str]:
+        """Names of the joints of a frame; all but the root, if the protocol drops that."""
         names, root = self.skeleton.names, self.skeleton.root
         return [name for j, name in enumerate(names) if self.protocol.root != "drop" or j != root]
 
@@ -373,7 +373,7 @@ class Windows:
         """Names of the joints whose trajectories batches hold, if these are the same ones in every window."""
         if not isinstance(self._given, Tensor):
             return None
-        return tuple(name for name, given in zip(self._joints, self._given.tolist(), strict=True) if given)
+        return tuple(name for name, given in zip(self.joints, self._given.tolist(), strict=True) if given)
 
     def with_protocol(self, protocol: Protocol) -> Windows:
         """These windows, drawn and cut as another protocol says, which divides clips and frames alike."""

@@ -1,0 +1,89 @@
+"""Exchange: one window's first pose with another's paths, to see whether motion follows what it is told.
+
+TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351) gives a pose the trajectories of another sequence whose
+given joints start at the same place, and compares with the sequence that the trajectories come from. (Its public code
+compares with the one that the pose comes from.) Ours: one partner for each window, of another clip.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .protocols import Windows
+
+
+class Exchanged:
+    """Windows that begin with the pose of another window, as `dvae.evaluate` takes them.
+
+    Window n keeps its frames and paths but for the first frame, which is that of another one whose given joints are
+    there at nearly the same place relative to the pelvis. Windows that have no such partner are left out.
+
+    Args:
+        windows: with the same joints given everywhere, `windows.given(["LWrist"])`, and one observed frame.
+        threshold: metres, within which each given joint is in both first frames.
+        seed: of the choice among partners.
+
+    Raises:
+        ValueError: windows without given joints or with more than one observed frame, or no window with a partner.
+    """
+
+    def __init__(self, windows: Windows, threshold: float = 0.01, seed: int = 0):
+        if not windows.given_joints or windows.protocol.observed != 1:
+            raise ValueError(
+                "what is exchanged is one pose among windows with the same given joints, as in "
+                f"windows.given(['LWrist']); these have {windows.protocol.observed} observed frames and are given "
+                f"{', '.join(windows.given_joints or ()) or 'no joints'}"
+            )
+        self.windows, self.threshold, self.seed = windows, threshold, seed
+        if not len(self._pairs[0]):
+            raise ValueError(
+                f"no two windows of different clips have {', '.join(windows.given_joints)} within {threshold:g} m"
+            )
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.windows, name)
+
+    @cached_property
+    def _pairs(self) -> tuple[Tensor, Tensor]:
+        """Windows that have a partner, and theirs."""
+        first = self.windows.all()["y"][:, 0].unflatten(-1, (-1, 3))
+        first = first[:, [self.windows.joints.index(name) for name in self.windows.given_joints or ()]]
+        clips = [key[:2] for key in self.windows.keys]
+        clip = torch.tensor([clips.index(key) for key in clips])
+        order = torch.rand(len(first), generator=torch.Generator().manual_seed(self.seed))
+        kept, partners = [], []
+        for n, joints in enumerate(first):
+            close = ((first - joints).norm(dim=-1) < self.threshold).all(-1) & (clip != clip[n])
+            if close.any():
+                kept.append(n)
+                partners.append(int(torch.where(close, order, -1.0).argmax()))
+        return torch.tensor(kept), torch.tensor(partners)
+
+    @property
+    def keys(self) -> list[tuple[str, str, int]]:
+        """(split, clip, first frame) of the windows that the paths come from."""
+        keys = self.windows.keys
+        return [keys[n] for n in self._pairs[0].tolist()]
+
+    def all(self) -> dict[str, Tensor]:
+        """The windows, as of `Windows.all`."""
+        kept, partners = self._pairs
+        whole = self.windows.all()
+        batch = {name: values[kept] for name, values in whole.items()}
+        batch["x"] = torch.cat([whole["x"][partners, :1], batch["x"][:, 1:]], 1)
+        return batch
+
+    def labels(self, name: str) -> list[str]:
+        """The label of every window's clip."""
+        labels = self.windows.labels(name)
+        return [labels[n] for n in self._pairs[0].tolist()]
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the windows and the partners."""
+        return hashlib.sha256(f"{self.windows.fingerprint} {[p.tolist() for p in self._pairs]}".encode()).hexdigest()
