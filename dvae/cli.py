@@ -458,8 +458,13 @@ def criticise(
         if figure is not None:
             _save_figure(result.plot(), figure.with_stem(f"{figure.stem}-{figure_part}"))
 
-    calibration = calibrate(loaded.model, windows.length, simulations, draws, steps=steps, seed=seed)
-    keep("calibration", calibration, "calibration")
+    if getattr(loaded.model, "context", ()):
+        ERROR.print(
+            f"no calibration: sequences are simulated from nothing, but {loaded.method.name} starts from a pose"
+        )
+    else:
+        calibration = calibrate(loaded.model, windows.length, simulations, draws, steps=steps, seed=seed)
+        keep("calibration", calibration, "calibration")
     checks = predictive_checks(
         {loaded.method.name: loaded.model},
         windows,

@@ -751,10 +751,15 @@ def predictive_checks(
 def _decode(
     model: DynamicalVAE, batch: Mapping[str, Tensor], latents: Mapping[str, Tensor], mean_emission: bool
 ) -> Tensor:
-    """x (B, T, D) run free from its own past, given context and latents; latents that are not given are drawn."""
-    known = {name: value for name, value in batch.items() if name in model.context}
-    length, size = batch["x"].shape[1], len(batch["x"])
-    return model.model({**known, **latents}, length=length, size=size, mean_emission=mean_emission)["x"]
+    """x (B, T, D) run free from its own past, given context and latents; latents that are not given are drawn.
+
+    First frames that are context, as a pose from which motion starts, stay as they are.
+    """
+    data = model._mapping(batch)
+    known = {name: value for name, value in data.items() if name in model.context}
+    length, size = data.get("x", batch["x"]).shape[1], len(batch["x"])
+    x = model.model({**known, **latents}, length=length, size=size, mean_emission=mean_emission)["x"]
+    return torch.cat([batch["x"][:, : batch["x"].shape[1] - length], x], 1)
 
 
 def _quantiles(values: np.ndarray) -> list[str]:

@@ -60,6 +60,7 @@ class Method:
     unused: ClassVar[frozenset[str]] = frozenset()  # options that do not apply; the command line does not show them
     likelihood: ClassVar[bool] = True  # without it, the best weights are by the objective in place of a bound
     forecasts: ClassVar[bool] = True  # whether its models forecast motion, which evaluation and comparison ask for
+    control: ClassVar[bool] = False  # whether its models make motion from a pose along given paths
     use: ClassVar[str] = "score it with: dvae evaluate {run}"  # what to do with a fitted run
 
     latent: int = 16

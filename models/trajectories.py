@@ -48,6 +48,7 @@ class TrajectoryMethod(Method):
 
     projected: ClassVar[bool] = True
     """Whether a linear layer makes poses of the features; else these are poses."""
+    control: ClassVar[bool] = True
     unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method)) - {"latent"}
 
     beta: float = 0.01

@@ -270,6 +270,13 @@ def test_paths_are_given_to_an_evaluation(capsys, tracker, fitted, tmp_path):
     assert "are given no joints" in failure(capsys, "evaluate", str(tracker), "--exchange", *out)
 
 
+def test_what_starts_from_a_pose_is_criticised_by_its_motion_alone(capsys, tracker, tmp_path):
+    out = tmp_path / "criticism.json"
+    assert main(["criticise", str(tracker), "--samples", "19", "--out", str(out)]) == 0
+    assert "no calibration" in capsys.readouterr().err
+    assert list(json.loads(out.read_text())) == ["predictive"]
+
+
 def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
     out = ["--out", str(tmp_path / "walk.npz")]
     assert "which takes no paths" in failure(capsys, "complete", str(fitted), *out, code=2)

@@ -548,7 +548,8 @@ def test_what_traversals_refuse(options, message):
 
 
 @pytest.mark.parametrize(
-    "name", [n for n, m in dvae.methods().items() if m.likelihood and m.forecasts and n != "equations"]
+    "name",
+    [n for n, m in dvae.methods().items() if m.likelihood and m.forecasts and not m.control and n != "equations"],
 )
 def test_every_method_can_be_criticised(name):
     model = dvae.method(name).build({"x": 9})

@@ -136,7 +136,8 @@ def test_pyros_svi_trains_every_parameter_and_keeps_models_apart():
 
 
 @pytest.mark.parametrize(
-    "name", [n for n, m in dvae.methods().items() if m.likelihood and m.forecasts and n != "equations"]
+    "name",
+    [n for n, m in dvae.methods().items() if m.likelihood and m.forecasts and not m.control and n != "equations"],
 )
 def test_mixed_precision_trains(name):
     model = dvae.method(name).build({"x": 3})

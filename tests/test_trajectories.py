@@ -386,7 +386,7 @@ def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
     torch.manual_seed(0)
     method = small(width=32, feedforward=32, latent=16, dropout=0.0)
     model = method.build_for(windows)
-    options = {"steps": 150, "batch_size": 16, "learning_rate": 2e-3, "progress": False, "accelerator": "cpu"}
+    options = {"steps": 300, "batch_size": 16, "learning_rate": 1e-3, "progress": False, "accelerator": "cpu"}
     dvae.fit(model, method.batches(windows), objective=method.objective(), **options)
     walk = Straight(windows)
     paths = {"LWrist": walk.path("LWrist")}
@@ -401,6 +401,21 @@ def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
     lengths, first = (windows.skeleton.bone_lengths(positions) for positions in (done.positions, walk.pose))
     assert np.abs(lengths / first - 1).mean() < 0.1
     assert not np.allclose(done.positions[0], done.positions[1], atol=1e-2)  # each from its own draw
+
+
+def test_a_recurrent_decoder_is_bent_through_its_loop(windows):
+    torch.manual_seed(0)
+    method = small("cvae-rnn", latent=16, width=16)
+    model, walk = method.build_for(windows), Straight(windows)
+    options = {"steps": 60, "batch_size": 16, "learning_rate": 5e-3, "progress": False, "accelerator": "cpu"}
+    dvae.fit(model, method.batches(windows), objective=method.objective(), self_feeding=method.feeding(60), **options)
+    errors = []
+    for exact in (False, True):
+        torch.manual_seed(0)
+        errors.append(
+            model.complete(walk.pose, {"LWrist": walk.path("LWrist")}, samples=2, exact=exact).errors["LWrist"]
+        )
+    assert errors[1].mean() < 0.5 * errors[0].mean()
 
 
 def test_a_path_that_leaps_is_spoken_of(windows, walk):

@@ -10,7 +10,7 @@ The decoder goes back in time, and makes a motion by its offsets from the first 
     o_t = transformer(f([sum_k basis_{kt} z_k; g(s)]) + position)        x_t = s + o_1 + ... + o_t
 
 Everything is parallel in time. TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with the layers of its
-public implementation.
+public implementation. Ours: a decoder starts near the motion that stands still.
 """
 
 from __future__ import annotations
@@ -171,7 +171,11 @@ class MotionDecoderNetwork(_AtOnce):
         into = sum(sizes.values()) + spec.width
         self.into = nn.Sequential(*_layer(into, spec.hidden), nn.Linear(spec.hidden, spec.hidden))
         self.transformer: Any = transformer(spec.hidden, spec)
-        self.offsets = nn.Sequential(*_layer(spec.hidden, spec.hidden), nn.Linear(spec.hidden, size))
+        last = nn.Linear(spec.hidden, size)
+        with torch.no_grad():  # summed up over time, offsets of the usual size would lead tens of metres away
+            last.weight *= 0.01
+            last.bias *= 0.01
+        self.offsets = nn.Sequential(*_layer(spec.hidden, spec.hidden), last)
         self.dropout = nn.Dropout(spec.dropout)
 
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:

@@ -1,0 +1,55 @@
+"""Speed of TrajeVAE at its size for Human3.6M: `python benchmarks/trajevae.py`, or `make bench`.
+
+    step      a training step (32 windows of 1 + 100 frames; forward, backward, Adam), in units of one
+              2048 x 2048 x 2048 float32 product timed beside it. The public implementation takes 48.
+    sampling  50 motions of one pose and its paths, in the same unit; the public implementation 11
+    bend      20 motions of 60 frames bent to the path of a wrist, in seconds
+
+Motion is simulated, on the same tree of joints. Times are the least of several, in turns with what they compare to.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+
+import torch
+from speed import report, seconds, training_step
+
+import dvae
+from dvae import motion
+
+TARGETS = {"step": ("at most", 48.0), "sampling": ("at most", 5.0)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    torch.manual_seed(0)
+
+    protocol = replace(motion.PROTOCOLS["simulated-trajectories"], predicted=100)
+    windows = motion.windows(motion.simulate(), protocol, "train")
+    method = dvae.method("trajevae")
+    model = method.build_for(windows).train()
+    source, generator = method.batches(windows), torch.Generator().manual_seed(0)
+    elbo, objective, square = dvae.SequenceELBO(), method.objective(), torch.randn(2048, 2048)
+    step = training_step(model, lambda: objective(elbo.terms(model, source.sample(32, generator)), 0))
+    batch = {name: value[:1] for name, value in windows.given(["RFoot", "LFoot"]).all().items()}
+    past = {"x": batch["x"][:, :1], "y": batch["y"]}
+    sampling = lambda: model.forecast(past, 100, 50)  # noqa: E731
+    product, *times = seconds(lambda: square @ square, step, sampling, repeat=3)
+    found = dict(zip(("step", "sampling"), (each / product for each in times), strict=True))
+
+    positions = windows.positions(batch["x"])[0].numpy()
+    path = {"LWrist": positions[1:61, windows.skeleton.find("LWrist")]}
+    start = time.perf_counter()
+    model.complete(positions[0], path, samples=20, exact=True)
+    found["bend"] = time.perf_counter() - start
+    report(found, TARGETS)
+
+
+if __name__ == "__main__":
+    main()
