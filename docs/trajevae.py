@@ -21,8 +21,15 @@ def read(files: list[str]) -> dict[str, dict[int, dvae.Evaluation]]:
     found: dict[str, dict[int, dvae.Evaluation]] = {}
     for file in files:
         evaluation = dvae.Evaluation.load(file)
-        found.setdefault(Path(file).stem.rpartition("-")[0], {})[len(evaluation.data["given"])] = evaluation
+        found.setdefault(Path(file).stem.rpartition("-")[0], {})[len(evaluation.data.get("given", []))] = evaluation
+    every = [each for by_count in found.values() for each in by_count.values()]
+    if any(_same(each) != _same(every[0]) for each in every):
+        sys.exit("these evaluations differ in clips, protocol, samples, seed or options")
     return found
+
+
+def _same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
+    return evaluation.clips, evaluation.protocol, evaluation.samples, evaluation.seed, evaluation.options
 
 
 def scores(found: dict[str, dict[int, dvae.Evaluation]]) -> str:
@@ -51,8 +58,7 @@ def steps(found: dict[str, dict[int, dvae.Evaluation]], metrics: tuple[str, ...]
             joined = dvae.Evaluation(
                 **{**vars(more), "rows": {"more": more.rows[ours[0]], "fewer": fewer.rows[ours[1]]}}
             )
-            joint = more.data["given"]
-            added = ", ".join(j for j in joint if j not in fewer.data["given"])
+            added = ", ".join(set(more.data["given"]) - set(fewer.data.get("given", [])))
             rows.append(
                 [
                     name,

@@ -341,7 +341,7 @@ def evaluate(
     pose_prior: Path | None = None,
     classifier: tuple[Path, ...] = (),
     joints: tuple[str, ...] | None = None,
-    exchange: bool = False,
+    exchange: float | None = None,
     temperature: float | None = None,
     seed: int = 0,
     batch_size: int = 32,
@@ -350,7 +350,8 @@ def evaluate(
 ) -> None:
     """Score runs on the test windows of their protocol, beside zero velocity and nearest neighbours.
 
-    Prints the table, and writes it with all that it rests on to evaluation.json in each run, or to --out.
+    Prints the table, and writes it with all that it rests on to evaluation.json in each run, or to --out. With given
+    joints, the name of the file says which.
 
     Args:
         run: run directories, fitted on the same data under the same protocol.
@@ -360,7 +361,8 @@ def evaluate(
         pose_prior: run of a pose-prior, by which to score the poses of the forecasts.
         classifier: runs of action-classifiers of different labels, by which to score what the forecasts show.
         joints: joints whose paths are given to the runs, for methods that take some (trajevae, cvae-rnn).
-        exchange: begin each window with the pose of another one whose given joints are there at the same place.
+        exchange: begin each window with the pose of another one, whose given joints are so many metres from its own at
+            most (in the paper .01).
         temperature: of the latents' scale, for such methods; 0 for motion at the mean of the prior.
         seed: of the draws.
         batch_size: windows forecast at once.
@@ -376,17 +378,18 @@ def evaluate(
     loaded, windows = _on_the_same_windows(run, data)
     _note_unfinished(loaded)
     names = _names(loaded)
+    given = None if (joints, exchange, temperature) == (None, None, None) else _joints(joints or ())
     for each in loaded:
-        if (joints or exchange or temperature is not None) and not isinstance(each.model, TrajectoryModel):
+        if given is not None and not isinstance(each.model, TrajectoryModel):
             raise UsageError(
                 f"--joints, --exchange and --temperature are for methods that take trajectories; {each.path} holds "
                 f"{each.method.name}"
             )
-    if joints is not None:
-        windows = windows.given(joints)
+    if given is not None:
+        windows = windows.given(given)
     result = evaluate_models(
         {name: each.model for name, each in zip(names, loaded, strict=True)},
-        motion.Exchanged(windows) if exchange else windows,
+        windows if exchange is None else motion.Exchanged(windows, exchange),
         samples=samples,
         seed=seed,
         batch_size=batch_size,
@@ -398,7 +401,9 @@ def evaluate(
         options={} if temperature is None else {"temperature": temperature},
     )
     OUT.print(result.table())
-    for path in [out] if out is not None else [each.path / "evaluation.json" for each in loaded]:
+    kind = "-".join(["evaluation", *(given or ()), *([f"exchanged-{exchange:g}"] if exchange is not None else ())])
+    kind += "" if temperature is None else f"-temperature-{temperature:g}"
+    for path in [out] if out is not None else [each.path / f"{kind}.json" for each in loaded]:
         path.parent.mkdir(parents=True, exist_ok=True)
         result.save(path)
         ERROR.print(f"wrote {path}")
@@ -414,7 +419,7 @@ def criticise(
     draws: int = 99,
     ranked_steps: int = 4,
     samples: int = 20,
-    draw_emission: bool = True,
+    draw_emission: bool | None = None,
     seed: int = 0,
     batch_size: int = 32,
     out: Path | None = None,
@@ -432,7 +437,8 @@ def criticise(
         draws: from the guide for each simulation.
         ranked_steps: time steps, evenly spread, at which local latents are ranked.
         samples: replicates of each test window, at least 19.
-        draw_emission: replicate draws of x, or its means, which lack the emission's noise: motion as it is shown.
+        draw_emission: replicate draws of x, or its means, which lack the emission's noise: motion as it is shown. By
+            default draws, but of trajevae and cvae-rnn means, as their emission is a weight of the loss.
         seed: of the draws.
         batch_size: windows replicated at once.
         out: file to write instead of criticism.json in the run.
@@ -469,7 +475,7 @@ def criticise(
         {loaded.method.name: loaded.model},
         windows,
         samples=samples,
-        draw_emission=draw_emission,
+        draw_emission=not loaded.method.control if draw_emission is None else draw_emission,
         seed=seed,
         batch_size=batch_size,
     )
@@ -634,7 +640,7 @@ def complete(
     positions = windows.positions(windows.all()["x"]).numpy()
     chosen = _liveliest(positions, window)
     pose, truth = positions[chosen, 0], positions[chosen, 1:]
-    given = {joint: truth[:, windows.skeleton.find(joint)] for joint in joints}
+    given = {joint: truth[:, windows.skeleton.find(joint)] for joint in _joints(joints)}
     if paths is not None:
         given |= motion.read_paths(paths)
     with torch.random.fork_rng():
@@ -825,6 +831,11 @@ def _cluster(scheduler: str | None) -> Iterator[None]:
         raise UsageError("--scheduler needs dask: pip install 'pyro-dvae[dask]'") from error
     with Client(scheduler) as client, parallel_config(backend="dask", client=client):
         yield
+
+
+def _joints(given: Sequence[str]) -> list[str]:
+    """Names of joints, with commas or blanks between them."""
+    return [name for text in given for name in text.split(",") if name]
 
 
 def _at_least(smallest: int, **options: int | None) -> None:

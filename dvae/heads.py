@@ -99,17 +99,13 @@ class Normal:
     Args:
         min_scale: the scale stays above it; a likelihood whose scale can vanish has no maximum.
         residual: see `Head`.
-        steps: of a local variable that is read from features; later ones are standard normal. 0 for all.
     """
 
     min_scale: float = 1e-3
     residual: float = False
-    steps: int = 0
 
     def build(self, features: int, size: int, local: bool = True) -> Head:
         """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
-        if self.steps and not local:
-            raise ValueError(f"Normal(steps={self.steps}) is for a local variable; a static one has no steps")
         return NormalHead(self, features, size)
 
 
@@ -118,7 +114,7 @@ class NormalHead(Head):
 
     def __init__(self, spec: Normal, features: int, size: int):
         super().__init__(spec.residual)
-        self.min_scale, self.steps = spec.min_scale, spec.steps
+        self.min_scale = spec.min_scale
         self.out = self.projection(features, 2 * size, size)
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
@@ -126,15 +122,7 @@ class NormalHead(Head):
         loc, raw = self.out(features).chunk(2, dim=-1)
         # contiguous: on a slice, softplus is not vectorised and takes nine times as long
         scale = functional.softplus(raw.contiguous()) + self.min_scale
-        loc = self.moved(loc, previous)
-        if not self.steps:
-            return loc, scale
-        if t is not None:
-            return (loc, scale) if t < self.steps else (torch.zeros_like(loc), torch.ones_like(scale))
-        beyond = max(loc.shape[1] - self.steps, 0)
-        padding = (0, 0, 0, beyond)
-        loc, scale = loc[:, : self.steps], scale[:, : self.steps]
-        return functional.pad(loc, padding), functional.pad(scale, padding, value=1.0)
+        return self.moved(loc, previous), scale
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,12 @@ def bend(
 
     Returns:
         Latents, of the shape of those given.
+
+    Raises:
+        ValueError: a tolerance or a number of steps that is not positive.
     """
+    if not tolerance > 0 or steps < 1:
+        raise ValueError(f"tolerance is a positive distance and steps at least 1, got {tolerance} and {steps}")
     move = torch.zeros_like(latents, requires_grad=True)
     optimiser = torch.optim.LBFGS([move], max_iter=steps, history_size=50, line_search_fn="strong_wolfe")
     with progress_bar(progress) as bar, torch.enable_grad():

@@ -13,8 +13,8 @@ All rows score the same windows, and windows of one clip overlap, so standard er
 
 Where windows move through space (a protocol with root="relative"), these scores are of poses relative to their own
 root, as in TrajeVAE's evaluation; "global ADE" and "global FDE" are of all joints where they are in the world. Where
-windows come with the paths of some joints ("y" in their batches), "path error" is the mean distance of these joints
-from their paths, over all K futures.
+the same joints' paths are given in all windows, "path error" is the mean distance of these joints from their paths,
+over all K futures.
 
 A classifier adds two scores under its name (Bie et al. 2022, arXiv:2204.01565). *ACC* is the share of the K futures
 that it gives the window's true class. *FID* is the Fréchet distance between its features of the true futures and of
@@ -32,6 +32,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -148,8 +149,8 @@ class Evaluation(Result):
     Attributes:
         rows: `{method: Row}`.
         clips: `{"split/clip": number of its windows}`, in the order of `Row.clip_means`.
-        data: fingerprint, windows, frames and coordinates of a window, joints where there is a skeleton, and those
-            whose paths were given.
+        data: fingerprint, windows, frames and coordinates of a window, joints where there is a skeleton, those whose
+            paths were given, and how poses were exchanged.
         protocol: the fields of the windows' protocol.
         multimodal: the ground truth of the multimodal errors: threshold of last poses, whether a window's own future
             is among its truths, and how many windows have no other (the public code of GSPS scores none of these).
@@ -308,6 +309,8 @@ class Evaluation(Result):
         parts = [name, f"{self.data['windows']} windows of {len(self.clips)} clips"]
         if (given := self.data.get("given")) is not None:
             parts.append(f"given {escape(', '.join(given)) or 'no paths'}")
+        if exchanged := self.data.get("exchanged"):
+            parts.append(f"first poses of {exchanged['partners']} other windows")
         parts += [f"{name} {value}" for name, value in self.options.items()]
         parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]
         return " · ".join(part for part in parts if part)
@@ -621,6 +624,17 @@ class _Held:
         joints = joints - joints[..., root : root + 1, :]
         return torch.cat([joints[..., :root, :], joints[..., root + 1 :, :]], -2).flatten(-2)
 
+    @cached_property
+    def bodies(self) -> Tensor:
+        """The true futures as `body` has them."""
+        return self.body(self.futures)
+
+    @property
+    def given(self) -> list[int]:
+        """Places of the joints whose paths are given in all windows."""
+        names = getattr(self.windows, "given_joints", None) or ()
+        return [self.windows.joints.index(name) for name in names]  # type: ignore[attr-defined]
+
     def past(self, part: slice) -> Batch:
         return {**{name: value[part] for name, value in self.batch.items()}, "x": self.x[part, : self.observed]}
 
@@ -634,6 +648,8 @@ class _Held:
         joints = {"joints": list(skeleton.names)} if skeleton is not None else {}
         if (given := getattr(self.windows, "given_joints", None)) is not None:
             joints["given"] = list(given)
+        if exchanged := getattr(self.windows, "exchanged", None):
+            joints["exchanged"] = exchanged
         found = {"fingerprint": self.windows.fingerprint, "windows": count, "frames": frames}
         return {**found, "coordinates": coordinates, **joints}
 
@@ -711,7 +727,9 @@ def hold(windows: HeldOutWindows) -> _Held:
             f"windows of {batch['x'].shape[1]} frames, {observed} of them observed, leave nothing to "
             "observe or nothing to predict"
         )
-    return _Held(windows, batch, observed, list(windows.keys), multimodal_truths(windows))
+    # A pose that was exchanged has no truths: the windows that begin like it go on from other poses.
+    truths = [] if getattr(windows, "exchanged", None) else multimodal_truths(windows)
+    return _Held(windows, batch, observed, list(windows.keys), truths)
 
 
 def _references(
@@ -746,16 +764,17 @@ def _free_running(
             raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
         refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
         forecasts = forecasts.movedim(0, 1)
-        bodies, body = held.body(forecasts), held.body(truth)
+        bodies, body = held.body(forecasts), held.bodies[part]
         scores = {"APD": metrics.average_pairwise_distance(bodies)}
         scores |= {metric: score(bodies, body) for metric, score in _PAIRED.items()}
-        for metric, score in _MULTIMODAL.items():
+        for metric, score in _MULTIMODAL.items() if held.truths else ():
             pairs = zip(bodies, held.truths[part], strict=True)
-            scores[metric] = torch.stack([score(window, held.body(held.futures[others])) for window, others in pairs])
-        if body is not truth:
+            scores[metric] = torch.stack([score(window, held.bodies[others]) for window, others in pairs])
+        if bodies is not forecasts:
             scores |= {f"global {metric}": _PAIRED[metric](forecasts, truth) for metric in ("ADE", "FDE")}
-        if "y" in held.batch:
-            scores |= _path_error(forecasts, held.batch["y"][part, held.observed :])
+        if held.given:
+            distances = (forecasts - held.batch["y"][part, None, held.observed :]).unflatten(-1, (-1, 3)).norm(dim=-1)
+            scores["path error"] = distances[..., held.given].mean((1, 2, 3))
         if hasattr(held.windows, "skeleton"):
             scores["bone-length error"] = _bone_length_error(held.windows, past, forecasts)
         if held.pose_prior is not None:
@@ -838,20 +857,6 @@ def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple
             f"the {what} of {name} is not finite for the window at frame {start} of clip {clip!r} ({split}); "
             "it cannot be left out, since all methods are scored on the same ones"
         )
-
-
-def _path_error(forecasts: Tensor, paths: Tensor) -> dict[str, Tensor]:
-    """Mean distance of given joints from their paths, {"path error": (B,)}; nothing, where no joint is given.
-
-    Args:
-        forecasts: (B, K, T, D).
-        paths: (B, T, D), 0 at joints that are not given.
-    """
-    given = (paths.unflatten(-1, (-1, 3)) != 0).any(-1).any(1)  # (B, J)
-    if not given.any():
-        return {}
-    distances = (forecasts - paths[:, None]).unflatten(-1, (-1, 3)).norm(dim=-1).mean((1, 2))  # (B, J)
-    return {"path error": (distances * given).sum(-1) / given.sum(-1)}
 
 
 def _bone_length_error(windows: Any, observed: Tensor, forecasts: Tensor) -> Tensor:

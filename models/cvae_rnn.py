@@ -3,23 +3,32 @@
     p(w) p(x_t | x_{<t}, y_{1:T}, w, s)        q(w | r_{1:T}, y_{1:T}, s)
 
 The stochastic baseline of TrajeVAE, in the same frame: y are the given trajectories, r what they leave out, s the first
-pose. The decoder reads its own means in place of x from the first step on, in training too, and gradients flow through
-them. Poses are absolute.
+pose. Each is summed up by a recurrent network in both directions, whose states are averaged over time. The decoder
+reads the summary of y, w, y_t and its own mean at t-1 (s at first) in place of x_{t-1}, in training too, and gradients
+flow through these means. Poses are absolute.
 
-Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, after the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386. Ours:
-LSTMs, whose last states enter the guide where that has a mean over time of GRUs, and a backward state of y at every
-frame of the decoder where that has one summary of y beside y_t.
+Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, after the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386. Where
+perceptrons stand is ours, so that sizes and number of parameters (913,883 for Human3.6M) are the paper's: one on the
+summary of y before the decoder reads it, one to the decoder's first state, one behind its states.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
-from ..networks import NetworkSpec, Recurrent
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ..networks import Input, Network, NetworkSpec
+from ..networks.base import once, perceptron
+from ..networks.cosine import share
+from ..networks.recurrent import gru_cell
 from ..rollout import SelfFeeding
-from .trajectories import TrajectoryMethod
+from .trajectories import FIRST, GIVEN, REST, TrajectoryMethod
 
 
 @dataclass(frozen=True)
@@ -28,10 +37,9 @@ class CVAERNN(TrajectoryMethod):
 
     Args:
         latent: size of w.
-        summary: units of the guide's recurrent states, for each direction.
-        width: units of the decoder's.
-        hidden: widths of the guide's perceptron.
-        decoder: widths of the decoder's.
+        summary: units of the recurrent summaries, for each direction.
+        width: units of the decoder's state.
+        hidden: widths of perceptrons; the last is that of a summary in the decoder.
     """
 
     name: ClassVar[str] = "cvae-rnn"
@@ -44,24 +52,148 @@ class CVAERNN(TrajectoryMethod):
     summary: int = 64
     width: int = 128
     hidden: tuple[int, ...] = (300, 200, 128)
-    decoder: tuple[int, ...] = (300, 200)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("summary", "width"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        if not self.hidden:
+            raise ValueError("hidden is empty; a perceptron has at least one layer")
 
     def sizes(self) -> dict[str, int]:
         """Size of w."""
         return {"w": self.latent}
 
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """Recurrent states and perceptrons."""
+        """Summaries, and the decoder; guide and decoder share that of y."""
         return {
-            "q(w)": Recurrent(self.summary, hidden=self.hidden),
-            "p(x)": Recurrent(self.width, hidden=self.decoder),
+            "q(w)": Summaries(self.summary, self.hidden),
+            "p(x)": Decoder(self.summary, self.hidden, self.width),
         }
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         model = super()._built(kind, size, *arguments)
+        share([model.encoder["w"].network.summaries, model.generator["x"].network.summaries], GIVEN)
         model.feeding = SelfFeeding(1.0, gradient=True)
         return model
 
     def feeding(self, steps: int) -> float:
         """1: the model never reads what it has not made."""
         return 1.0
+
+
+@dataclass(frozen=True)
+class Summaries:
+    """Features of a static variable from sequences that start with s.
+
+    Args:
+        width: units for each direction.
+        hidden: widths of the perceptron on all summaries.
+    """
+
+    width: int
+    hidden: tuple[int, ...]
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> SummariesNetwork:
+        """The network of a factor with these parents."""
+        return SummariesNetwork(self, inputs)
+
+
+class SummariesNetwork(Network):
+    """See `Summaries`."""
+
+    def __init__(self, spec: Summaries, inputs: Sequence[Input]):
+        super().__init__(inputs, False, spec.hidden[-1])
+        sizes = {parent.name: parent.size for parent in inputs if parent.name in (GIVEN, REST)}
+        self.summaries = nn.ModuleDict({name: Summary(size, spec.width) for name, size in sizes.items()})
+        self.join = perceptron((2 * spec.width * len(sizes), *spec.hidden), "tanh")
+
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """See `Network.forward`; no sequence is padded."""
+        _refuse_ragged(lengths)
+        return self.join(torch.cat([each(parents[FIRST], parents[n]) for n, each in self.summaries.items()], dim=-1))
+
+
+class Summary(nn.Module):
+    """Mean over time (B, 2 W) of the states of a recurrent network over s and a sequence, in both directions."""
+
+    def __init__(self, size: int, width: int):
+        super().__init__()
+        self.network = nn.GRU(size, width, batch_first=True, bidirectional=True)
+
+    def forward(self, first: Tensor, sequence: Tensor) -> Tensor:
+        """The summary of s (B, D) and a sequence (B, T, D)."""
+        return once(self, [first, sequence], partial(self._mean, first, sequence))
+
+    def _mean(self, first: Tensor, sequence: Tensor) -> Tensor:
+        return self.network(torch.cat([first[:, None], sequence], 1))[0].mean(1)
+
+
+@dataclass(frozen=True)
+class Decoder:
+    """Features of x_t: states of a recurrent network over [summary of y, w, x_{t-1}, y_t], and a perceptron.
+
+    Args:
+        summary: units of the summary, for each direction.
+        hidden: widths of perceptrons; behind the states, without the last.
+        width: units of the state.
+    """
+
+    summary: int
+    hidden: tuple[int, ...]
+    width: int
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> DecoderNetwork:
+        """The network of a factor with these parents."""
+        return DecoderNetwork(self, inputs, size)
+
+
+class DecoderNetwork(Network):
+    """See `Decoder`."""
+
+    def __init__(self, spec: Decoder, inputs: Sequence[Input], size: int):
+        behind = (spec.width, *spec.hidden[:-1])
+        super().__init__(inputs, True, behind[-1])
+        sizes = {parent.name: parent.size for parent in inputs}
+        (self.latent,) = sizes.keys() - {"x", GIVEN, FIRST}
+        self.summaries = nn.ModuleDict({GIVEN: Summary(sizes[GIVEN], spec.summary)})
+        self.before = perceptron((2 * spec.summary, *spec.hidden), "tanh")
+        self.first = perceptron((2 * spec.summary, *spec.hidden[:-1], spec.width), "tanh")
+        self.known = spec.hidden[-1] + sizes[self.latent] + sizes[GIVEN]
+        self.cell: Any = nn.GRU(self.known + size, spec.width, batch_first=True)
+        self.behind = perceptron(behind, "tanh")
+
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """See `Network.forward`; no sequence is padded."""
+        _refuse_ragged(lengths)
+        known, state = self._known(parents)
+        previous = torch.cat([parents[FIRST][:, None], parents["x"][:, : length - 1]], 1)
+        return self.behind(self.cell(torch.cat([known, previous], -1), state[None])[0])
+
+    def _known(self, parents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """What enters the states at every step (B, T, known) but for x, and the state before the first (B, W)."""
+        given = parents[GIVEN]
+        summary = self.summaries[GIVEN](parents[FIRST], given)
+        static = torch.cat([self.before(summary), parents[self.latent]], -1)
+        return torch.cat([static[:, None].expand(-1, given.shape[1], -1), given], -1), self.first(summary)
+
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """See `Network.start`."""
+        _refuse_ragged(lengths)
+        known, state = self._known(given)
+        weight, bias = self.cell.weight_ih_l0[:, : self.known], self.cell.bias_ih_l0
+        return functional.linear(known, weight, bias).unbind(1), given[FIRST], given.get("x"), state
+
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        """See `Network.step`."""
+        shares, first, given, hidden = state
+        previous = first if t == 0 else drawn["x"][t - 1] if given is None else given[:, t - 1]
+        gates = torch.addmm(shares[t], previous, self.cell.weight_ih_l0[:, self.known :].t())
+        hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
+        return self.behind(hidden), (shares, first, given, hidden)
+
+
+def _refuse_ragged(lengths: Tensor | None) -> None:
+    if lengths is not None:
+        raise ValueError("summaries of trajectories are of motions of one length, but the batch is ragged; split it")

@@ -12,7 +12,7 @@ Source: TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with w
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from math import sqrt
 from typing import Any, ClassVar, Literal
@@ -88,15 +88,15 @@ class TrajectoryMethod(Method):
                 f"root={protocol.root!r} and {protocol.observed} observed frames; use one with root='relative' and "
                 f"observed=1, such as {', '.join(n for n, p in PROTOCOLS.items() if (p.root, p.observed) == NEEDED)}"
             )
-        return self.build_on(windows.skeleton)
+        return self.build_on(windows.skeleton, windows.length - 1)
 
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
         """See `Method.build`; y, r and s are of the size of x."""
         return self._built(DynamicalVAE, data[WHOLE])
 
-    def build_on(self, skeleton: Skeleton) -> TrajectoryModel:
-        """The model for poses of this skeleton."""
-        return self._built(TrajectoryModel, 3 * skeleton.joints, skeleton, self.complement)
+    def build_on(self, skeleton: Skeleton, frames: int | None = None) -> TrajectoryModel:
+        """The model for poses of this skeleton, to be fitted to motions of T frames after the first pose."""
+        return self._built(TrajectoryModel, 3 * skeleton.joints, skeleton, self.complement, frames)
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         sizes = {**self.sizes(), **dict.fromkeys((WHOLE, FIRST, GIVEN, REST), size)}
@@ -128,19 +128,42 @@ class TrajectoryModel(DynamicalVAE):
     Args:
         skeleton: of the poses.
         complement: whether r is what y leaves of x, and not all of x.
+        frames: T of the motions that it is fitted to; None if that is not known.
         *arguments, **options: of `DynamicalVAE`.
     """
 
-    def __init__(self, skeleton: Skeleton, complement: bool, *arguments: Any, **options: Any):
+    def __init__(self, skeleton: Skeleton, complement: bool, frames: int | None, *arguments: Any, **options: Any):
         super().__init__(*arguments, **options)
-        self.skeleton, self.complement = skeleton, complement
+        self.skeleton, self.complement, self.frames = skeleton, complement, frames
+
+    def model(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
+        """See `DynamicalVAE.model`; without trajectories in the batch, none are given.
+
+        Raises:
+            ValueError: no pose to start from.
+        """
+        data = self._mapping(batch)
+        if FIRST not in data:
+            raise ValueError("a motion starts from a pose: give a batch with s (B, D), or with windows x (B, 1 + T, D)")
+        first, length = data[FIRST], options.get("length")
+        if GIVEN not in data and length is not None:
+            data[GIVEN] = first.new_zeros(len(first), length, first.shape[-1])
+        return super().model(data, **options)
 
     def _mapping(self, batch: Batch | None) -> dict[str, Any]:
         values = super()._mapping(batch)
         if FIRST not in values and WHOLE in values:
             if "lengths" in values:
                 raise ValueError("windows of motion have one length; leave 'lengths' out of the batch")
+            frames, given = values[WHOLE].shape[1], values.get(GIVEN)
+            if given is not None and not (given.shape[1] == frames if frames > 1 else given.shape[1] > 1):
+                raise ValueError(
+                    f"beside x {tuple(values[WHOLE].shape)}, whose first frame is the pose to start from, y is as long "
+                    f"as the whole window, (B, 1 + T, D); got {tuple(given.shape)}"
+                )
             values[FIRST] = values[WHOLE][:, 0]
+            if isinstance(values.get("mask"), Mapping):
+                values["mask"] = values["mask"][WHOLE]
             for name in {WHOLE, GIVEN, "mask"} & values.keys():
                 values[name] = values[name][:, 1:]
             if not values[WHOLE].shape[1]:
@@ -151,7 +174,7 @@ class TrajectoryModel(DynamicalVAE):
             if isinstance(mask := values.get("mask"), Tensor):
                 x = torch.where(mask, x, 0.0)
             given = values.setdefault(GIVEN, torch.zeros_like(x))
-            values.setdefault(REST, x - given if self.complement else x)
+            values.setdefault(REST, torch.where(given == 0, x, 0.0) if self.complement else x)
         return values
 
     @torch.no_grad()
@@ -168,7 +191,7 @@ class TrajectoryModel(DynamicalVAE):
         """Goes on from a pose, along the given trajectories if there are any.
 
         Args:
-            batch: x (B, 1, D), or s (B, D); and y, over the horizon, if trajectories are given.
+            batch: x (B, 1, D) and, if trajectories are given, y (B, 1 + H, D); or s (B, D) and y (B, H, D).
             horizon: H.
             samples: S, motions for each pose.
             draw_emission: see `DynamicalVAE.forecast`.
@@ -219,7 +242,8 @@ class TrajectoryModel(DynamicalVAE):
         """Motions that start at a pose and follow paths of some joints.
 
         The networks know of a path frame by frame. Where it has gaps they are told of a straight one across them, from
-        the joint's place in the first pose on, and of a resting joint behind the last known frame.
+        the joint's place in the first pose on, and of a resting joint behind the last known frame. Of motions that are
+        shorter than those the model was fitted to, it makes the whole and gives the beginning.
 
         Args:
             initial_pose: positions (J, 3) of all joints in metres, anywhere in the world.
@@ -235,12 +259,17 @@ class TrajectoryModel(DynamicalVAE):
             progress: whether to show a progress bar, with `exact`.
 
         Raises:
-            ValueError: an unknown joint, a path of another length or without a known frame, or positions that are not
-                in metres.
+            ValueError: an unknown joint, a path of another length or without a known frame, positions that are not in
+                metres, or an exact motion without a path.
         """
         pose = torch.as_tensor(np.asarray(initial_pose, dtype=np.float64))
+        if pose.shape != (self.skeleton.joints, 3):
+            raise ValueError(
+                f"the initial pose has shape {tuple(pose.shape)}, expected ({self.skeleton.joints}, 3): "
+                f"{', '.join(self.skeleton.names)}"
+            )
         if complaint := defect(Clip("initial", "pose", pose[None].numpy()), self.skeleton):
-            raise ValueError(complaint.replace("clip initial/pose", "the initial pose, as one frame,"))
+            raise ValueError(complaint.replace("clip initial/pose", "the initial pose"))
         given = trajectories or {}
         paths = {self.skeleton.find(joint): self._path(joint, path, pose) for joint, path in given.items()}
         if len(paths) < len(given):
@@ -251,29 +280,42 @@ class TrajectoryModel(DynamicalVAE):
         if len(set(lengths.values())) != 1 or min(lengths.values()) < 1:
             got = ", ".join(f"{name}: {length}" for name, length in lengths.items()) or "neither"
             raise ValueError(f"expected paths of one length, or frames= without any; got {got}")
+        if exact and not paths:
+            raise ValueError("exact=True has motions follow paths; give some trajectories")
         length = next(iter(lengths.values()))
+        made = max(length, self.frames or length)  # of shorter motions than it was fitted to, the beginning
+        if self.frames is not None and length > self.frames:
+            warnings.warn(
+                f"this model was fitted to motions of {self.frames} frames, and knows little of {length}: cut the "
+                "paths, or fit it under a protocol that predicts so many",
+                stacklevel=2,
+            )
         world = pose[self.skeleton.root]
-        told, known = torch.zeros(length, self.skeleton.joints, 3), torch.zeros(length, self.skeleton.joints, 3)
+        told, known = pose.new_zeros(2, made, self.skeleton.joints, 3)
         for joint, path in paths.items():
+            path = torch.cat([path, path.new_full((made - length, 3), torch.nan)])
             seen = path.isfinite().all(-1)
             told[:, joint] = _bridged(path, seen, pose[joint]) - world
             known[:, joint] = seen[:, None].float()
         first = (pose - world).flatten()[None]
         parameter = next(self.parameters())
         data = {FIRST: first.to(parameter), GIVEN: told.flatten(1)[None].to(parameter)}
-        out = self.forecast(data, length, samples, temperature=temperature)
+        out = self.forecast(data, made, samples, temperature=temperature)
         x = out[WHOLE][:, 0]
         if exact and paths:
             options = {"tolerance": tolerance, "steps": steps, "progress": progress}
             x = self._followed(data, out, known.flatten(1).to(parameter), **options)
-        motion = x.cpu().double().unflatten(-1, (-1, 3)) + world
+        motion = x[:, :length].cpu().double().unflatten(-1, (-1, 3)) + world
         names = self.skeleton.names
+        if exact:
+            _warn_of_misses(motion, paths, names)
         errors = {names[joint]: (motion[:, :, joint] - path).norm(dim=-1).numpy() for joint, path in paths.items()}
         return Completion(self.skeleton, motion.numpy(), errors)
 
     def _path(self, joint: str, given: Any, pose: Tensor) -> Tensor:
         """A path as it was given, if it can be one."""
-        path = torch.as_tensor(np.asarray(given, dtype=np.float64))
+        path = torch.as_tensor(np.asarray(given, dtype=np.float64)).clone()
+        path[~path.isfinite()] = torch.nan
         if path.dim() != 2 or path.shape[-1] != 3:
             raise ValueError(f"the path of {joint} has shape {tuple(path.shape)}, expected (frames, 3) in metres")
         seen = path.isfinite().all(-1)
@@ -352,3 +394,16 @@ def _bridged(path: Tensor, seen: Tensor, start: Tensor) -> Tensor:
     places = torch.cat([start[None], path[seen]]).numpy()
     now = np.arange(len(path))
     return torch.from_numpy(np.stack([np.interp(now, times, places[:, axis]) for axis in range(3)], axis=-1))
+
+
+def _warn_of_misses(motion: Tensor, paths: Mapping[int, Tensor], names: Sequence[str]) -> None:
+    """Warns of joints that are more than a centimetre off their paths in more than one known frame of twenty."""
+    for joint, path in paths.items():
+        missed = (motion[:, :, joint] - path).norm(dim=-1)
+        share = (missed[missed.isfinite()] < 0.01).double().mean().item()
+        if share < 0.95:
+            warnings.warn(
+                f"{names[joint]} is within 1 cm of its path in {share:.0%} of the known frames only; its path may be "
+                "out of reach for this body, or the latents may say too little of the motion",
+                stacklevel=3,
+            )

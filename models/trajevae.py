@@ -10,7 +10,8 @@ what the trajectories leave out, r. The mean of x is s plus offsets, summed up o
 
 Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, with the layers of its public implementation: prior and guide
 share the perceptrons of poses and two of three transformers, and the decoder the perceptron of s. Ours: scales of z are
-softplus where that has log-variances.
+softplus where that has log-variances; and without the learned prior, of which the paper says little, the decoder reads
+the trajectories beside z, in time and as they are.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from ..heads import HeadSpec, Normal
+from ..heads import Head, HeadSpec, Normal, NormalHead, Parameters
 from ..networks import CosineEncoder, MotionDecoder, NetworkSpec
 from ..networks.cosine import share
 from ..notation import Factorization
@@ -105,7 +108,7 @@ class TrajeVAE(TrajectoryMethod):
 
     def heads(self) -> Mapping[str, HeadSpec]:
         """Normal latents, of which those beyond `components` are noise that nothing reads."""
-        latent = Normal(steps=self.components)
+        latent: HeadSpec = SlowNormal(steps=self.components) if self.components else Normal()
         return {**super().heads(), "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
@@ -115,3 +118,34 @@ class TrajeVAE(TrajectoryMethod):
         if self.learned_prior:
             share([guide, model.generator["z"].network], "over_time", "static", "before", "between")
         return model
+
+
+@dataclass(frozen=True)
+class SlowNormal(Normal):
+    """A `Normal` of the first so many steps of a local variable; later ones are N(0, I), whatever the features.
+
+    Args:
+        steps: how many.
+    """
+
+    steps: int = 0
+
+    def build(self, features: int, size: int, local: bool = True) -> Head:
+        """See `Normal.build`."""
+        return SlowNormalHead(self, features, size)
+
+
+class SlowNormalHead(NormalHead):
+    """See `SlowNormal`."""
+
+    def __init__(self, spec: SlowNormal, features: int, size: int):
+        super().__init__(spec, features, size)
+        self.steps = spec.steps
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Head.forward`."""
+        loc, scale = super().forward(features, previous, t)
+        if t is not None:
+            return (loc, scale) if t < self.steps else (torch.zeros_like(loc), torch.ones_like(scale))
+        late = torch.arange(loc.shape[1], device=loc.device)[:, None] >= self.steps
+        return loc.masked_fill(late, 0.0), scale.masked_fill(late, 1.0)

@@ -1,6 +1,7 @@
 """TrajeVAE and CVAE-RNN: equations, what is given and what is not, the objective, completing motion along paths."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import ClassVar
 
@@ -18,7 +19,7 @@ from dvae.testing import FactorizationContract
 
 SMALL = {
     "trajevae": {"latent": 4, "width": 8, "feedforward": 8, "heads_count": 2, "layers": 1},
-    "cvae-rnn": {"latent": 4, "summary": 3, "width": 5, "hidden": (6,), "decoder": (7,)},
+    "cvae-rnn": {"latent": 4, "summary": 3, "width": 5, "hidden": (6, 7)},
 }
 ABLATIONS = {
     "whole": {},
@@ -68,17 +69,17 @@ class Contract(FactorizationContract):
         return small(self.name, **{"latent": size, **self.options}).build({"x": size})
 
 
-class AtOnce(Contract):
-    @pytest.mark.skip(reason="a cosine transform is of sequences of one length, and none is padded")
+class OfOneLength(Contract):
+    @pytest.mark.skip(reason="these networks make sequences of one length, and none is padded")
     def test_padding_changes_nothing(self):
         pass
 
 
-class TestTrajeVAE(AtOnce):
+class TestTrajeVAE(OfOneLength):
     name = "trajevae"
 
 
-class TestTrajeVAEWithFewerComponents(AtOnce):
+class TestTrajeVAEWithFewerComponents(OfOneLength):
     name = "trajevae"
     options: ClassVar = {"components": 2}
 
@@ -87,18 +88,19 @@ class TestTrajeVAEWithFewerComponents(AtOnce):
         pass
 
 
-class TestTrajeVAEWithStandardPrior(AtOnce):
+class TestTrajeVAEWithStandardPrior(OfOneLength):
     name = "trajevae"
     options: ClassVar = {"learned_prior": False}
 
 
-class TestCVAERNN(Contract):
+class TestCVAERNN(OfOneLength):
     name = "cvae-rnn"
 
 
-def test_the_model_of_human36m_has_the_published_size():
-    model = dvae.method("trajevae").build_on(HUMAN36M)
-    assert sum(parameter.numel() for parameter in model.parameters()) == 17_943_091
+def test_models_of_human36m_have_the_published_size():
+    for name, published in (("trajevae", 17_943_091), ("cvae-rnn", 913_883)):
+        model = dvae.method(name).build_on(HUMAN36M)
+        assert sum(parameter.numel() for parameter in model.parameters()) == published
 
 
 @pytest.mark.parametrize("options", ABLATIONS.values(), ids=ABLATIONS)
@@ -231,6 +233,11 @@ def test_hidden_entries_are_unknown_to_the_guide(windows):
     model, x = build(windows), windows.sample(2, torch.Generator().manual_seed(0))["x"].double()
     mask = torch.ones_like(x, dtype=torch.bool)
     mask[:, 5:, 3:9] = False
+    path = torch.zeros_like(x)
+    path[..., 6:12] = x[..., 6:12]  # of a joint that is hidden, and of another one
+    both = model._mapping({"x": x, "y": path, "mask": mask})
+    assert torch.equal(both["r"], torch.where((path == 0) & mask, x, 0.0)[:, 1:])
+    assert torch.equal(model._mapping({"x": x, "mask": {"x": mask}})["mask"], mask[:, 1:])
     found = model._mapping({"x": x, "mask": mask})
     assert (found["r"][:, 4:, 3:9] == 0).all()
     assert torch.equal(found["mask"], mask[:, 1:])
@@ -251,6 +258,10 @@ def test_named_joints_are_given(windows):
     assert torch.equal(again.all()["y"], again.all()["y"])
     prints = {w.fingerprint for w in (windows, windows.given([]), windows.given(["RFoot"]), windows.given(0.5))}
     assert len(prints) == 4
+    with pytest.raises(ValueError, match="given with a probability between 0 and 1"):
+        windows.given(1.5)
+    with pytest.raises(ValueError, match=r"a list of names, \['LWrist'\]"):
+        windows.given("LWrist")
 
 
 def test_joints_are_found_by_their_usual_names(windows):
@@ -320,6 +331,19 @@ def test_forecasts_can_be_shorter_than_the_trajectories(windows):
         model.forecast(past, 5, fix={"x": batch["x"]})
     with pytest.raises(ValueError, match="leave 'lengths' out"):
         model.forecast({**past, "lengths": torch.tensor([1, 1])}, 5)
+    with pytest.raises(ValueError, match=r"y is as long as the whole window, \(B, 1 \+ T, D\); got \(2, 20, 51\)"):
+        dvae.SequenceELBO().terms(model, {"x": batch["x"], "y": batch["y"][:, 1:]})
+
+
+def test_a_program_without_trajectories_is_told_of_none(windows):
+    model, first = build(windows), windows.all()["x"][:2, 0].double()
+    torch.manual_seed(0)
+    free = model.sample(length=6, batch={"s": first})
+    torch.manual_seed(0)
+    told = model.sample(length=6, batch={"s": first, "y": torch.zeros(2, 6, windows.size, dtype=torch.float64)})
+    assert torch.equal(free["x"], told["x"])
+    with pytest.raises(ValueError, match=r"a motion starts from a pose: give a batch with s \(B, D\)"):
+        model.sample(3, length=6)
 
 
 # ---------------------------------------------------------------------------------------------------------- control
@@ -360,7 +384,15 @@ def test_a_motion_is_completed_where_the_pose_is(windows, walk):
     given[..., held] = x[..., held]
     same = model.forecast({"x": x[:, :1], "y": given}, 20, 3)["x"][:, 0]
     assert np.allclose(same.unflatten(-1, (-1, 3)).numpy() + walk.pose[0], done.positions, atol=1e-9)
-    assert model.complete(walk.pose, frames=9).positions.shape == (1, 9, 17, 3)
+    torch.manual_seed(0)
+    short = model.complete(walk.pose, {"left_wrist": walk.path("LWrist")[:9]}, samples=3)
+    assert short.positions.shape == (3, 9, 17, 3)
+    rest = np.concatenate([walk.path("LWrist")[:9], np.full((11, 3), np.nan)])
+    torch.manual_seed(0)
+    whole = model.complete(walk.pose, {"left_wrist": rest}, samples=3)
+    assert np.allclose(short.positions, whole.positions[:, :9])  # the beginning of a whole motion
+    with pytest.warns(UserWarning, match="fitted to motions of 20 frames, and knows little of 25"):
+        assert model.complete(walk.pose, frames=25).positions.shape == (1, 25, 17, 3)
     assert "within 1 cm" in str(done)
 
 
@@ -386,7 +418,7 @@ def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
     torch.manual_seed(0)
     method = small(width=32, feedforward=32, latent=16, dropout=0.0)
     model = method.build_for(windows)
-    options = {"steps": 300, "batch_size": 16, "learning_rate": 1e-3, "progress": False, "accelerator": "cpu"}
+    options = {"steps": 400, "batch_size": 16, "learning_rate": 1e-3, "progress": False, "accelerator": "cpu"}
     dvae.fit(model, method.batches(windows), objective=method.objective(), **options)
     walk = Straight(windows)
     paths = {"LWrist": walk.path("LWrist")}
@@ -399,7 +431,7 @@ def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
     assert free.errors["LWrist"][:, known].mean() > 0.05
     assert (done.errors["LWrist"][:, known] < 0.01).mean() > 0.95
     lengths, first = (windows.skeleton.bone_lengths(positions) for positions in (done.positions, walk.pose))
-    assert np.abs(lengths / first - 1).mean() < 0.1
+    assert (np.abs(lengths / first - 1) < 0.1).mean() > 0.95
     assert not np.allclose(done.positions[0], done.positions[1], atol=1e-2)  # each from its own draw
 
 
@@ -412,9 +444,9 @@ def test_a_recurrent_decoder_is_bent_through_its_loop(windows):
     errors = []
     for exact in (False, True):
         torch.manual_seed(0)
-        errors.append(
-            model.complete(walk.pose, {"LWrist": walk.path("LWrist")}, samples=2, exact=exact).errors["LWrist"]
-        )
+        with pytest.warns(UserWarning, match="within 1 cm of its path") if exact else nullcontext():
+            done = model.complete(walk.pose, {"LWrist": walk.path("LWrist")}, samples=2, exact=exact)
+        errors.append(done.errors["LWrist"])
     assert errors[1].mean() < 0.5 * errors[0].mean()
 
 
@@ -438,7 +470,13 @@ def test_a_path_that_leaps_is_spoken_of(windows, walk):
         ({"trajectories": {"LWrist": np.zeros((4, 3))}, "frames": 6}, "got LWrist: 4, frames: 6"),
         ({"trajectories": {}}, "got neither"),
         ({"frames": 0}, "got frames: 0"),
-        ({"initial_pose": np.zeros((16, 3)), "frames": 4}, "has 16 joints, skeleton 'walker' has 17"),
+        ({"initial_pose": np.zeros((16, 3)), "frames": 4}, r"has shape \(16, 3\), expected \(17, 3\): Pelvis, RHip"),
+        ({"frames": 4, "exact": True}, "exact=True has motions follow paths; give some trajectories"),
+        (
+            {"trajectories": {"LWrist": np.zeros((4, 3))}, "exact": True, "steps": 0},
+            "steps at least 1, got 0.0005 and 0",
+        ),
+        ({"trajectories": {"LWrist": np.zeros((4, 3))}, "exact": True, "tolerance": 0.0}, "tolerance is a positive"),
         ({"initial_pose": "millimetres", "frames": 4}, "it looks like millimetres"),
         ({"initial_pose": "broken", "frames": 4}, "NaN or infinite positions"),
     ],
@@ -459,9 +497,10 @@ def test_paths_are_read_from_files(tmp_path):
     path = np.arange(12.0).reshape(4, 3)
     path[2] = np.nan
     np.savez(tmp_path / "paths.npz", LWrist=path)
-    rows = ["LWrist_z,LWrist_x,LWrist_y", *(f"{z},{x},{y}" for x, y, z in path[:2]), ",,", "11,9,10"]
-    (tmp_path / "paths.csv").write_text("\n".join(rows) + "\n")
-    for name in ("paths.npz", "paths.csv"):
+    for name, unknown in (("paths.csv", ",,"), ("blank.csv", "")):
+        rows = ["LWrist_z,LWrist_x,LWrist_y", *(f"{z},{x},{y}" for x, y, z in path[:2]), unknown, "11,9,10"]
+        (tmp_path / name).write_text("\n".join(rows) + "\n\n")
+    for name in ("paths.npz", "paths.csv", "blank.csv"):
         assert np.array_equal(motion.read_paths(tmp_path / name)["LWrist"], path, equal_nan=True)
 
 
@@ -484,6 +523,12 @@ def test_paths_that_cannot_be_read(tmp_path, text, message):
 
 
 def test_arrays_that_are_no_paths(tmp_path):
+    np.save(tmp_path / "paths.npy", np.zeros((4, 3)))
+    (tmp_path / "paths.npy").rename(tmp_path / "paths.csv")
+    with pytest.raises(ValueError, match=r"paths\.csv: is no text"):
+        motion.read_paths(tmp_path / "paths.csv")
+    with pytest.raises(ValueError, match=r"paths\.txt: paths of joints are in an npz or a csv file"):
+        motion.read_paths(tmp_path / "paths.txt")
     np.savez(tmp_path / "paths.npz", LWrist=np.zeros((4, 2)))
     with pytest.raises(ValueError, match=r"the path of LWrist is float64 \(4, 2\), expected numbers"):
         motion.read_paths(tmp_path / "paths.npz")
@@ -547,18 +592,23 @@ def test_poses_are_exchanged_among_windows_whose_given_joints_agree(people):
     whole, keys = windows.all(), windows.keys
     feet = [windows.skeleton.find(name) for name in ("RFoot", "LFoot")]
     assert 0 < len(x) == len(found.keys) < len(keys)
+    partners = set()
     for n, key in enumerate(found.keys):
         own = keys.index(key)
         assert torch.equal(x[n, 1:], whole["x"][own, 1:])
         assert torch.equal(y[n], whole["y"][own])
         (partner,) = [m for m in range(len(keys)) if torch.equal(whole["x"][m, 0], x[n, 0])]
+        partners.add(partner)
         assert keys[partner][:2] != key[:2]
         apart = (whole["x"][partner, 0] - whole["x"][own, 0]).unflatten(-1, (-1, 3))[feet].norm(dim=-1)
         assert (apart < 0.4).all()
     assert found.fingerprint != motion.Exchanged(windows, threshold=0.4, seed=5).fingerprint != windows.fingerprint
     scores = dvae.evaluate(build(windows).float(), found, samples=2, references=False, progress=False)
     assert math.isfinite(scores["model"]["path error"].mean)
-    with pytest.raises(ValueError, match="no two windows of different clips have RFoot, LFoot within 1e-09 m"):
+    assert "MMADE" not in scores["model"]  # the windows that begin with that pose have other paths
+    assert scores.data["exchanged"] == {"threshold": 0.4, "seed": 0, "partners": len(partners)}
+    assert len(partners) > 0.3 * len(x)
+    with pytest.raises(ValueError, match=r"have RFoot, LFoot within 1e-09 m; the nearest two are 0\.\d+ m"):
         motion.Exchanged(windows, threshold=1e-9)
     with pytest.raises(ValueError, match="these have 1 observed frames and are given no joints"):
         motion.Exchanged(windows.given(0.5))

@@ -8,7 +8,7 @@ compares with the one that the pose comes from.) Ours: one partner for each wind
 from __future__ import annotations
 
 import hashlib
-from functools import cached_property
+from math import inf
 from typing import Any
 
 import torch
@@ -21,7 +21,8 @@ class Exchanged:
     """Windows that begin with the pose of another window, as `dvae.evaluate` takes them.
 
     Window n keeps its frames and paths but for the first frame, which is that of another one whose given joints are
-    there at nearly the same place relative to the pelvis. Windows that have no such partner are left out.
+    there at nearly the same place relative to the pelvis. Windows that have no such partner are left out. Multimodal
+    errors there are none: the windows that begin with that pose have paths of their own.
 
     Args:
         windows: with the same joints given everywhere, `windows.given(["LWrist"])`, and one observed frame.
@@ -40,50 +41,61 @@ class Exchanged:
                 f"{', '.join(windows.given_joints or ()) or 'no joints'}"
             )
         self.windows, self.threshold, self.seed = windows, threshold, seed
-        if not len(self._pairs[0]):
-            raise ValueError(
-                f"no two windows of different clips have {', '.join(windows.given_joints)} within {threshold:g} m"
-            )
+        self.protocol, self.skeleton, self.joints = windows.protocol, windows.skeleton, windows.joints
+        self.given_joints, self.positions = windows.given_joints, windows.positions
+        self._kept, self._partners = self._pairs()
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.windows, name)
-
-    @cached_property
     def _pairs(self) -> tuple[Tensor, Tensor]:
         """Windows that have a partner, and theirs."""
         first = self.windows.all()["y"][:, 0].unflatten(-1, (-1, 3))
-        first = first[:, [self.windows.joints.index(name) for name in self.windows.given_joints or ()]]
+        first = first[:, [self.joints.index(name) for name in self.given_joints or ()]]
         clips = [key[:2] for key in self.windows.keys]
         clip = torch.tensor([clips.index(key) for key in clips])
-        order = torch.rand(len(first), generator=torch.Generator().manual_seed(self.seed))
-        kept, partners = [], []
+        generator = torch.Generator().manual_seed(self.seed)
+        kept, partners, nearest = [], [], inf
         for n, joints in enumerate(first):
-            close = ((first - joints).norm(dim=-1) < self.threshold).all(-1) & (clip != clip[n])
-            if close.any():
+            apart = (first - joints).norm(dim=-1).amax(-1).masked_fill(clip == clip[n], inf)
+            close = (apart < self.threshold).nonzero()[:, 0]
+            nearest = min(nearest, apart.min().item())
+            if len(close):
                 kept.append(n)
-                partners.append(int(torch.where(close, order, -1.0).argmax()))
+                partners.append(int(close[torch.randint(len(close), (), generator=generator)]))
+        if not kept:
+            raise ValueError(
+                f"no two windows of different clips have {', '.join(self.given_joints or ())} within "
+                f"{self.threshold:g} m; the nearest two are {nearest:.3g} m apart"
+            )
         return torch.tensor(kept), torch.tensor(partners)
+
+    @property
+    def exchanged(self) -> dict[str, Any]:
+        """How, for the record of an evaluation."""
+        partners = len(self._partners.unique())
+        return {"threshold": self.threshold, "seed": self.seed, "partners": partners}
+
+    def __len__(self) -> int:
+        return len(self._kept)
 
     @property
     def keys(self) -> list[tuple[str, str, int]]:
         """(split, clip, first frame) of the windows that the paths come from."""
         keys = self.windows.keys
-        return [keys[n] for n in self._pairs[0].tolist()]
+        return [keys[n] for n in self._kept.tolist()]
 
     def all(self) -> dict[str, Tensor]:
         """The windows, as of `Windows.all`."""
-        kept, partners = self._pairs
         whole = self.windows.all()
-        batch = {name: values[kept] for name, values in whole.items()}
-        batch["x"] = torch.cat([whole["x"][partners, :1], batch["x"][:, 1:]], 1)
+        batch = {name: values[self._kept] for name, values in whole.items()}
+        batch["x"] = torch.cat([whole["x"][self._partners, :1], batch["x"][:, 1:]], 1)
         return batch
 
     def labels(self, name: str) -> list[str]:
         """The label of every window's clip."""
         labels = self.windows.labels(name)
-        return [labels[n] for n in self._pairs[0].tolist()]
+        return [labels[n] for n in self._kept.tolist()]
 
     @property
     def fingerprint(self) -> str:
         """SHA-256 of the windows and the partners."""
-        return hashlib.sha256(f"{self.windows.fingerprint} {[p.tolist() for p in self._pairs]}".encode()).hexdigest()
+        pairs = self._kept.tolist(), self._partners.tolist()
+        return hashlib.sha256(f"{self.windows.fingerprint} {pairs}".encode()).hexdigest()

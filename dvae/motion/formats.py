@@ -200,8 +200,15 @@ def read_paths(path: str | Path) -> dict[str, np.ndarray]:
                     f"{path}: the path of {joint} is {values.dtype} {values.shape}, expected numbers (frames, 3)"
                 )
     else:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            header, *rows = [row for row in csv.reader(file) if row] or [[]]
+        if path.suffix.lower() != ".csv":
+            raise ValueError(f"{path}: paths of joints are in an npz or a csv file")
+        try:
+            lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path}: is no text ({error})") from error
+        while lines and not lines[-1]:
+            lines.pop()
+        header, *rows = lines or [[]]
         columns: dict[str, list[str]] = {}
         for place, name in enumerate(header):
             joint, _, axis = name.strip().rpartition("_")
@@ -220,7 +227,7 @@ def read_paths(path: str | Path) -> dict[str, np.ndarray]:
             )
         values = np.full((len(rows), len(header)), np.nan)
         for number, row in enumerate(rows):
-            if len(row) != len(header):
+            if row and len(row) != len(header):
                 raise ValueError(f"{path}: row {number + 2} has {len(row)} cells, the header {len(header)}")
             for place, cell in enumerate(row):
                 try:

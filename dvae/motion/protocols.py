@@ -350,12 +350,16 @@ class Windows:
                 a whole window, one draw for a window and joint. `all` draws the same ones every time.
 
         Raises:
-            ValueError: an unknown joint, or one that the protocol has dropped.
+            ValueError: an unknown joint, one that the protocol has dropped, or no probability.
         """
         windows = copy(self)
         if isinstance(joints, float | int):
+            if not 0 <= joints <= 1:
+                raise ValueError(f"joints are given with a probability between 0 and 1, not {joints}")
             windows._given = float(joints)
             return windows
+        if isinstance(joints, str):
+            raise ValueError(f"joints are a list of names, [{joints!r}]")
         found = {self.skeleton.names[self.skeleton.find(joint)] for joint in joints}
         if dropped := found - set(self.joints):
             raise ValueError(f"the protocol {self.protocol.name} drops {dropped.pop()}")

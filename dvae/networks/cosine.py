@@ -173,8 +173,8 @@ class MotionDecoderNetwork(_AtOnce):
         self.transformer: Any = transformer(spec.hidden, spec)
         last = nn.Linear(spec.hidden, size)
         with torch.no_grad():  # summed up over time, offsets of the usual size would lead tens of metres away
-            last.weight *= 0.01
-            last.bias *= 0.01
+            for parameter in last.parameters():
+                parameter.mul_(0.01)
         self.offsets = nn.Sequential(*_layer(spec.hidden, spec.hidden), last)
         self.dropout = nn.Dropout(spec.dropout)
 
