@@ -23,6 +23,8 @@ Bie et al., 2022, arXiv 2204.01565. There is no public code. Ours where the pape
   poses have in common. No normalisation over the batch.
 * With best-of-many, the density of x has one scale per coordinate, fitted to the errors and no more: its gradient does
   not reach the poses. The paper's unit variance is emission="unit".
+* Off the paper's data z costs .03 a nat and not .5, under which it falls silent in short runs: motions then lose their
+  rhythm (docs/decisions.md).
 * The observed frames are never replaced in training, as they will not be in a forecast, unless `feed_observed`. Means
   that are fed back carry no gradient, unless `feeding_gradient`; `feeding_passes` feeds them in parallel.
 * A model may see windows turned so that the last observed pose faces one way, which it does on small sets.
@@ -82,6 +84,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "": HUMANEVA
     | {
+        "kl_local": 0.03,
         "samples": 6,
         "decoder": 128,
         "pseudo_minimum": 0.02,
