@@ -111,7 +111,7 @@ class SummariesNetwork(Network):
 
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """See `Network.forward`; no sequence is padded."""
-        _refuse_ragged(lengths)
+        self.refuse_ragged(lengths)
         return self.join(torch.cat([each(parents[FIRST], parents[n]) for n, each in self.summaries.items()], dim=-1))
 
 
@@ -166,7 +166,7 @@ class DecoderNetwork(Network):
 
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """See `Network.forward`; no sequence is padded."""
-        _refuse_ragged(lengths)
+        self.refuse_ragged(lengths)
         known, state = self._known(parents)
         previous = torch.cat([parents[FIRST][:, None], parents["x"][:, : length - 1]], 1)
         return self.behind(self.cell(torch.cat([known, previous], -1), state[None])[0])
@@ -180,7 +180,7 @@ class DecoderNetwork(Network):
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """See `Network.start`."""
-        _refuse_ragged(lengths)
+        self.refuse_ragged(lengths)
         known, state = self._known(given)
         weight, bias = self.cell.weight_ih_l0[:, : self.known], self.cell.bias_ih_l0
         return functional.linear(known, weight, bias).unbind(1), given[FIRST], given.get("x"), state
@@ -192,8 +192,3 @@ class DecoderNetwork(Network):
         gates = torch.addmm(shares[t], previous, self.cell.weight_ih_l0[:, self.known :].t())
         hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
         return self.behind(hidden), (shares, first, given, hidden)
-
-
-def _refuse_ragged(lengths: Tensor | None) -> None:
-    if lengths is not None:
-        raise ValueError("summaries of trajectories are of motions of one length, but the batch is ragged; split it")

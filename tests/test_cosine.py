@@ -115,7 +115,7 @@ def test_dropout_is_in_training_alone():
 @pytest.mark.parametrize(
     ("run", "message"),
     [
-        (lambda: encoder()(values(), LENGTH, torch.tensor([7, 7, 3])), "the batch is ragged"),
+        (lambda: encoder()(values(), LENGTH, torch.tensor([7, 7, 3])), "this is a ragged batch"),
         (lambda: decoder().start({"s": values()["s"]}, 3, LENGTH), "cannot be in a loop with z"),
         (lambda: CosineEncoder(**SMALL).build([Input("s", 9)], True, 4), r"given s \(static\) for a local"),
         (lambda: CosineEncoder(**SMALL).build([], False, 4), "given none for a static"),

@@ -117,7 +117,7 @@ def test_step_by_step_is_all_at_once():
     ("change", "message"),
     [
         (lambda: network()(parents(), LENGTH - 1), "was given 8 steps; it makes sequences of its length"),
-        (lambda: network()(parents(), LENGTH, torch.tensor([9, 9, 3])), "of a ragged batch"),
+        (lambda: network()(parents(), LENGTH, torch.tensor([9, 9, 3])), "this is a ragged batch"),
         (lambda: network(coefficients=10), "9 steps has 1 to 9 coefficients"),
         (lambda: network().start({"h": parents()["h"]}, 3, LENGTH), "cannot be in a loop with lower, b"),
         (lambda: GraphConv(EVERYTHING, "lower", 9, 3).build([Input("h", 15, ALL)], True, 5), "not of size 5"),

@@ -133,6 +133,12 @@ class Network(nn.Module):
         """
         raise NotImplementedError
 
+    def refuse_ragged(self, lengths: Tensor | None) -> None:
+        """Refuses padding, for a network in which every step sees all of a sequence."""
+        if lengths is not None:
+            name = type(self).__name__.removesuffix("Network")
+            raise ValueError(f"{name} makes sequences of one length, but this is a ragged batch; split it by length")
+
     def select(self, state: Any, rows: Tensor) -> Any:
         """The state with these rows (N,) of its batch, each as often as it is named (see `rows.select`)."""
         return select(state, rows)
@@ -140,6 +146,21 @@ class Network(nn.Module):
     def chain(self, state: Any) -> Chain | None:
         """The loop after `start` in the form that one fused function runs, where it has that form."""
         return None
+
+
+class AtOnce(Network):
+    """A network that makes all steps together, of sequences of one length."""
+
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """See `Network.start`."""
+        if missing := [parent.name for parent in self.inputs if parent.name not in given]:
+            name = type(self).__name__.removesuffix("Network")
+            raise ValueError(f"{name} makes all steps at once; it cannot be in a loop with {', '.join(missing)}")
+        return self(given, length, lengths).unbind(1)
+
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        """See `Network.step`."""
+        return state[t], state
 
 
 class NetworkSpec(Protocol):

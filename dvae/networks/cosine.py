@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from ..distributions.dct import cosine_basis
-from .base import Input, Network, once
+from .base import AtOnce, Input, Network, once
 
 
 @dataclass(frozen=True)
@@ -90,47 +90,25 @@ class MotionDecoder:
         return MotionDecoderNetwork(self, inputs, local, size)
 
 
-class _AtOnce(Network):
-    """A network that makes all steps at once, for sequences of one length."""
-
-    def apart(self, spec: Any, local: bool) -> tuple[list[Input], Input]:
-        """The parents over time and the static one."""
-        over_time = [parent for parent in self.inputs if parent.relation is not None]
-        static = [parent for parent in self.inputs if parent.relation is None]
-        if not local or not over_time or len(static) != 1:
-            given = ", ".join(f"{p.name} ({'static' if p.relation is None else 'local'})" for p in self.inputs)
-            raise ValueError(
-                f"{type(spec).__name__} reads parents over time and one static parent, for a local variable; it was "
-                f"given {given or 'none'} for a {'local' if local else 'static'} one"
-            )
-        return over_time, static[0]
-
-    def refuse_ragged(self, lengths: Tensor | None) -> None:
-        """Refuses padding, which would enter the coefficients."""
-        if lengths is not None:
-            raise ValueError(
-                "a cosine transform is of sequences of one length, but the batch is ragged; cut or split it"
-            )
-
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
-        if missing := [parent.name for parent in self.inputs if parent.name not in given]:
-            raise ValueError(
-                f"{type(self).__name__} makes all steps at once; it cannot be in a loop with {', '.join(missing)}"
-            )
-        return self(given, length, lengths).unbind(1)
-
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
-        return state[t], state
+def _apart(network: Network, spec: Any) -> tuple[list[Input], Input]:
+    """The parents over time and the static one."""
+    over_time = [parent for parent in network.inputs if parent.relation is not None]
+    static = [parent for parent in network.inputs if parent.relation is None]
+    if not network.local or not over_time or len(static) != 1:
+        given = ", ".join(f"{p.name} ({'static' if p.relation is None else 'local'})" for p in network.inputs)
+        raise ValueError(
+            f"{type(spec).__name__} reads parents over time and one static parent, for a local variable; it was given "
+            f"{given or 'none'} for a {'local' if network.local else 'static'} one"
+        )
+    return over_time, static[0]
 
 
-class CosineEncoderNetwork(_AtOnce):
+class CosineEncoderNetwork(AtOnce):
     """See `CosineEncoder`. Networks may share `over_time`, `static`, `before` and `between`."""
 
     def __init__(self, spec: CosineEncoder, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, 2 * spec.width)
-        (source, *others), static = self.apart(spec, local)
+        (source, *others), static = _apart(self, spec)
         if others or not _reads_everything(source):
             raise ValueError(f"CosineEncoder reads one parent over all time, as in y_{{1:T}}; not {self.inputs}")
         self.names, self.cosine = (source.name, static.name), spec.cosine
@@ -153,12 +131,12 @@ class CosineEncoderNetwork(_AtOnce):
         return self.after(self.between(hidden))
 
 
-class MotionDecoderNetwork(_AtOnce):
+class MotionDecoderNetwork(AtOnce):
     """See `MotionDecoder`. Networks may share `static`."""
 
     def __init__(self, spec: MotionDecoder, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)
-        over_time, static = self.apart(spec, local)
+        over_time, static = _apart(self, spec)
         sizes = {parent.name: parent.size for parent in over_time}
         if spec.latent not in sizes or static.size != size:
             raise ValueError(

@@ -23,7 +23,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from ..distributions.dct import cosine_basis
-from .base import Input, Network
+from .base import AtOnce, Input
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class GraphConv:
         return GraphConvNetwork(self, inputs, local, size)
 
 
-class GraphConvNetwork(Network):
+class GraphConvNetwork(AtOnce):
     """See `GraphConv`; the features (B, T, D) are the child's coordinates themselves."""
 
     def __init__(self, spec: GraphConv, inputs: Sequence[Input], local: bool, size: int):
@@ -96,11 +96,10 @@ class GraphConvNetwork(Network):
 
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """See `Network.forward`; T is that of the description, and no sequence is padded."""
-        if length != self.spec.length or lengths is not None:
-            ragged = " of a ragged batch" if lengths is not None else ""
+        self.refuse_ragged(lengths)
+        if length != self.spec.length:
             raise ValueError(
-                f"GraphConv(length={self.spec.length}) was given {length} steps{ragged}; it makes sequences of its "
-                "length"
+                f"GraphConv(length={self.spec.length}) was given {length} steps; it makes sequences of its length"
             )
         if self.training and len(parents[self.trajectories[0][0]]) == 1:
             raise ValueError(
@@ -135,16 +134,6 @@ class GraphConvNetwork(Network):
 
     def _transform(self, seen: int, like: Tensor) -> Tensor:
         return _transform(seen, self.spec.length, self.spec.coefficients, like.dtype, like.device)
-
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
-        if missing := [parent.name for parent in self.inputs if parent.name not in given]:
-            raise ValueError(f"GraphConv makes all steps at once; it cannot be in a loop with {', '.join(missing)}")
-        return self(given, length, lengths).unbind(1)
-
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
-        return state[t], state
 
 
 class _Convolution(nn.Module):
