@@ -13,12 +13,11 @@ Motion is simulated, on the same tree of joints. Times are the least of several,
 
 from __future__ import annotations
 
-import argparse
 import resource
 from dataclasses import replace
 
 import torch
-from speed import report, seconds, training_step
+from speed import report, seconds, start, training_step
 
 import dvae
 from dvae import motion
@@ -41,11 +40,7 @@ def sequential(flow: QRFlow, x: torch.Tensor) -> torch.Tensor:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--threads", type=int, default=2)
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    torch.manual_seed(0)
+    start(__doc__)
 
     protocol = replace(motion.PROTOCOLS["simulated"], observed=25, predicted=100)
     windows = motion.windows(motion.simulate(), protocol, "train")

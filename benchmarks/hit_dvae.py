@@ -13,12 +13,11 @@ Motion is simulated. Times are the least of several, in turns with what they com
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 
 import torch
-from speed import report, seconds, training_step
+from speed import report, seconds, start, training_step
 from torch import Tensor
 
 import dvae
@@ -44,11 +43,7 @@ def without_caches(model: dvae.DynamicalVAE, past: Tensor, horizon: int, samples
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--threads", type=int, default=2)
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    torch.manual_seed(0)
+    start(__doc__)
     windows = motion.windows(motion.simulate(), motion.PROTOCOLS["simulated"], "train")
     method = dvae.method("hit-dvae", pose_prior=0.0).suited(windows)
     model = method.build_for(windows)
@@ -66,10 +61,10 @@ def main() -> None:
     )
     found["cache"] = anew / cached
     found["growth"] = (long - cached) / (300 - 60) / (cached / 60)
-    start = time.perf_counter()
+    begun = time.perf_counter()
     for part in past.split(20):
         model.forecast(part, 60, 50)
-    found["seconds"] = time.perf_counter() - start
+    found["seconds"] = time.perf_counter() - begun
 
     model.train()
     source, objective, elbo = method.batches(windows), method.objective(), dvae.SequenceELBO()

@@ -8,7 +8,8 @@
               implementation, in units of one 2048 x 2048 x 2048 float32 product timed beside it
 
 Times are the least of several repetitions, the two sides of a ratio alternating, so that what else the machine does
-counts least. Each row says whether its target was met; one that was missed makes the exit status 1.
+counts least. Each row says whether its target was met; one that was missed makes the exit status 1. `--out FILE` keeps
+the ratios as JSON.
 """
 
 from __future__ import annotations
@@ -185,13 +186,20 @@ def member(name: str, x: Tensor) -> float:
     return a / b
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def start(description: str | None, *options: str) -> argparse.Namespace:
+    """Reads the options of a benchmark, the number of threads and paths by these names, and sets threads and seed."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--out", type=Path, help="write the ratios as JSON")
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
+    for option in options:
+        parser.add_argument(option, type=Path)
+    found = parser.parse_args()
+    torch.set_num_threads(found.threads)
     torch.manual_seed(0)
+    return found
+
+
+def main() -> None:
+    options = start(__doc__, "--out")
     x = torch.randn(BATCH, STEPS, SIZE)
     ratios = {"program": program(x), "chain": chain(x), "cache": cache(), "linear": linear()}
     ratios |= {name: member(name, x) for name in FAMILY}

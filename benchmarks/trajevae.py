@@ -10,12 +10,11 @@ Motion is simulated, on the same tree of joints. Times are the least of several,
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 
 import torch
-from speed import report, seconds, training_step
+from speed import report, seconds, start, training_step
 
 import dvae
 from dvae import motion
@@ -24,11 +23,7 @@ TARGETS = {"step": ("at most", 48.0), "sampling": ("at most", 5.0)}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--threads", type=int, default=2)
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    torch.manual_seed(0)
+    start(__doc__)
 
     protocol = replace(motion.PROTOCOLS["simulated-trajectories"], predicted=100)
     windows = motion.windows(motion.simulate(), protocol, "train")
@@ -45,9 +40,9 @@ def main() -> None:
 
     positions = windows.positions(batch["x"])[0].numpy()
     path = {"LWrist": positions[1:61, windows.skeleton.find("LWrist")]}
-    start = time.perf_counter()
+    begun = time.perf_counter()
     model.complete(positions[0], path, samples=20, exact=True)
-    found["bend"] = time.perf_counter() - start
+    found["bend"] = time.perf_counter() - begun
     report(found, TARGETS)
 
 
