@@ -419,7 +419,7 @@ def criticise(
     draws: int = 99,
     ranked_steps: int = 4,
     samples: int = 20,
-    draw_emission: bool | None = None,
+    draw_emission: bool = True,
     seed: int = 0,
     batch_size: int = 32,
     out: Path | None = None,
@@ -437,8 +437,8 @@ def criticise(
         draws: from the guide for each simulation.
         ranked_steps: time steps, evenly spread, at which local latents are ranked.
         samples: replicates of each test window, at least 19.
-        draw_emission: replicate draws of x, or its means, which lack the emission's noise: motion as it is shown. By
-            default draws, but of trajevae and cvae-rnn means, as their emission is a weight of the loss.
+        draw_emission: replicate draws of x, or its means, which lack the emission's noise: motion as it is shown. Of
+            trajevae and cvae-rnn always means, as their emission is a weight of the loss.
         seed: of the draws.
         batch_size: windows replicated at once.
         out: file to write instead of criticism.json in the run.
@@ -475,7 +475,7 @@ def criticise(
         {loaded.method.name: loaded.model},
         windows,
         samples=samples,
-        draw_emission=not loaded.method.control if draw_emission is None else draw_emission,
+        draw_emission=draw_emission and not loaded.method.control,
         seed=seed,
         batch_size=batch_size,
     )

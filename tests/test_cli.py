@@ -279,7 +279,9 @@ def test_what_starts_from_a_pose_is_criticised_by_its_motion_alone(capsys, track
     out = tmp_path / "criticism.json"
     assert main(["criticise", str(tracker), "--samples", "19", "--out", str(out)]) == 0
     assert "no calibration" in capsys.readouterr().err
-    assert list(json.loads(out.read_text())) == ["predictive"]
+    document = json.loads(out.read_text())
+    assert list(document) == ["predictive"]
+    assert document["predictive"]["emission"] == "mean"
 
 
 def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
