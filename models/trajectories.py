@@ -49,6 +49,9 @@ class TrajectoryMethod(Method):
     projected: ClassVar[bool] = True
     """Whether a linear layer makes poses of the features; else these are poses."""
     control: ClassVar[bool] = True
+    use: ClassVar[str] = (
+        "score it with: dvae evaluate {run} --joints JOINT …, move it with: dvae complete {run} --joints JOINT …"
+    )
     unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method)) - {"latent"}
 
     beta: float = 0.01
