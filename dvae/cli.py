@@ -636,6 +636,8 @@ def complete(
     loaded = _load(run, data)
     if not isinstance(loaded.model, TrajectoryModel):
         raise UsageError(f"{run} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
+    if exact and not (joints or paths):
+        raise UsageError("--exact has motions follow paths; say which, by --joints or --paths")
     windows = _windows_of(loaded, clip)
     positions = windows.positions(windows.all()["x"]).numpy()
     chosen = _liveliest(positions, window)

@@ -24,8 +24,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ..networks import Input, Network, NetworkSpec
-from ..networks.base import once, perceptron
-from ..networks.cosine import share
+from ..networks.base import once, perceptron, share_modules
 from ..networks.recurrent import gru_cell
 from ..rollout import SelfFeeding
 from .trajectories import FIRST, GIVEN, REST, TrajectoryMethod
@@ -74,7 +73,7 @@ class CVAERNN(TrajectoryMethod):
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         model = super()._built(kind, size, *arguments)
-        share([model.encoder["w"].network.summaries, model.generator["x"].network.summaries], GIVEN)
+        share_modules([model.encoder["w"].network.summaries, model.generator["x"].network.summaries], GIVEN)
         model.feeding = SelfFeeding(1.0, gradient=True)
         return model
 

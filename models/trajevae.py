@@ -26,7 +26,7 @@ from torch import Tensor
 
 from ..heads import Head, HeadSpec, Normal, NormalHead, Parameters
 from ..networks import CosineEncoder, MotionDecoder, NetworkSpec
-from ..networks.cosine import share
+from ..networks.base import share_modules
 from ..notation import Factorization
 from .trajectories import TrajectoryMethod
 
@@ -114,9 +114,9 @@ class TrajeVAE(TrajectoryMethod):
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         model = super()._built(kind, size, *arguments)
         guide, decoder = model.encoder["z"].network, model.generator["x"].network
-        share([guide, decoder], "static")
+        share_modules([guide, decoder], "static")
         if self.learned_prior:
-            share([guide, model.generator["z"].network], "over_time", "static", "before", "between")
+            share_modules([guide, model.generator["z"].network], "over_time", "static", "before", "between")
         return model
 
 

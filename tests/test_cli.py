@@ -287,6 +287,7 @@ def test_what_starts_from_a_pose_is_criticised_by_its_motion_alone(capsys, track
 def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
     out = ["--out", str(tmp_path / "walk.npz")]
     assert "which takes no paths" in failure(capsys, "complete", str(fitted), *out, code=2)
+    assert "by --joints or --paths" in failure(capsys, "complete", str(tracker), *out, "--exact", code=2)
     assert "no joint 'tail'" in failure(capsys, "complete", str(tracker), *out, "--joints", "tail")
     assert "at least 1" in failure(capsys, "complete", str(tracker), *out, "--samples", "0", code=2)
     assert "none.csv" in failure(capsys, "complete", str(tracker), *out, "--paths", str(tmp_path / "none.csv"))

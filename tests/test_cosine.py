@@ -8,8 +8,8 @@ import torch
 from scipy.fft import dct, idct
 
 from dvae.networks import CosineEncoder, MotionDecoder
-from dvae.networks.base import Input
-from dvae.networks.cosine import positions, share
+from dvae.networks.base import Input, share_modules
+from dvae.networks.cosine import positions
 from dvae.notation import Relation
 
 ALL, LENGTH = Relation.parse("1:T"), 7
@@ -99,7 +99,7 @@ def test_layers_do_not_start_alike_and_shared_modules_are_one():
     first, second = encoder(), encoder()
     one, two = first.before.layers
     assert not torch.equal(one.linear1.weight, two.linear1.weight)
-    share([first, second], "static", "between")
+    share_modules([first, second], "static", "between")
     assert second.static is first.static
     assert second.between is first.between
     assert second.after is not first.after

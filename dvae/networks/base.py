@@ -163,6 +163,13 @@ class AtOnce(Network):
         return state[t], state
 
 
+def share_modules(networks: Sequence[Any], *names: str) -> None:
+    """Gives networks the modules of these names of the first of them."""
+    for network in networks[1:]:
+        for name in names:
+            setattr(network, name, getattr(networks[0], name))
+
+
 class NetworkSpec(Protocol):
     """A description of a network: a frozen dataclass that `build`s one for a factor."""
 

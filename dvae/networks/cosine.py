@@ -171,13 +171,6 @@ class MotionDecoderNetwork(AtOnce):
         return first[:, None] + self.offsets(hidden).cumsum(1)
 
 
-def share(networks: Sequence[Any], *names: str) -> None:
-    """Gives networks the modules of these names of the first of them."""
-    for network in networks[1:]:
-        for name in names:
-            setattr(network, name, getattr(networks[0], name))
-
-
 def perceptron(size: int, width: int) -> nn.Sequential:
     """Two layers with normalisation, pose by pose."""
     return nn.Sequential(*_layer(size, width), *_layer(width, width))
