@@ -11,7 +11,7 @@ import sys
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, make_dataclass, replace
 from pathlib import Path
@@ -627,7 +627,7 @@ def complete(
         temperature: of the latents' scale; 0 for the motion of the prior's mean.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there.
-        figure: save a figure of the motions.
+        figure: save a figure of the motions; crosses are the given paths.
     """
     _at_least(1, samples=samples)
     _at_least(0, window=window)
@@ -664,7 +664,7 @@ def complete(
     OUT.print(str(done))
     ERROR.print(f"wrote {out}: window {chosen}, {_title(motions)}")
     if figure is not None:
-        _save_futures(motions, figure)
+        _save_futures(motions, figure, given)
 
 
 @app.command(help="Play forecasts beside what happened, or a clip, as moving skeletons.")
@@ -1083,14 +1083,15 @@ def _title(futures: motion.Forecasts) -> str:
     return f"{split}/{clip} from frame {start}: {len(futures.forecasts)} futures"
 
 
-def _save_futures(futures: motion.Forecasts, path: Path) -> None:
-    """A figure of the first window's futures."""
+def _save_futures(futures: motion.Forecasts, path: Path, paths: Mapping[str, Any] | None = None) -> None:
+    """A figure of the first window's futures, and of the paths that joints were given."""
     from matplotlib.figure import Figure
 
     from .motion.plot import futures as draw
 
     drawing = Figure(figsize=(9, 2.6), layout="constrained")
-    axes = draw(futures.skeleton, futures.observed[0], futures.forecasts[:, 0], futures.truth[0], ax=drawing.subplots())
+    window = futures.observed[0], futures.forecasts[:, 0], futures.truth[0]
+    axes = draw(futures.skeleton, *window, ax=drawing.subplots(), paths=paths)
     axes.set_title(_title(futures), fontsize=9)
     _save_figure(drawing, path)
 

@@ -10,7 +10,7 @@ Ours: a model may see every window turned so that the last observed pose faces o
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar
 
@@ -51,8 +51,6 @@ class EnergyMethod(Method):
             scores: they compare with those of models that turn them too, and with no others.
     """
 
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]]
-    """Name of a skeleton to options; those of other skeletons at ""."""
     positive: ClassVar[tuple[str, ...]] = ("diversity_scale", "pseudo_most", "pool_stride")
     weights: ClassVar[tuple[str, ...]] = ("reconstruction", "multimodal", "diversity", "limb", "angles", "pose_prior")
 
@@ -82,14 +80,6 @@ class EnergyMethod(Method):
                     )
         if not 0 <= self.angle_quantile < 0.5:
             raise ValueError(f"angle_quantile is {self.angle_quantile}; it must be at least 0 and below 0.5")
-
-    def preset(self, windows: Windows) -> Mapping[str, Any]:
-        """The options for a skeleton."""
-        return self.presets.get(windows.skeleton.name, self.presets[""])
-
-    def suited(self, windows: Windows) -> Any:
-        """See `Method.suited`: the options that are None, chosen by the skeleton."""
-        return replace(self, **{n: v for n, v in self.preset(windows).items() if getattr(self, n) is None})
 
     def refuse_root(self, windows: Windows) -> None:
         """Refuses windows with a root.
@@ -140,7 +130,7 @@ class EnergyMethod(Method):
 
     def batches(self, windows: Windows) -> Source:
         """See `Method.batches`: windows and their pseudo ground truths."""
-        method = self.suited(windows)
+        method: Any = self.suited(windows)
         if not method.multimodal:
             return windows
         truths = PseudoTruths(

@@ -150,9 +150,9 @@ class GSPS(EnergyMethod):
     def check(self) -> None:
         """See `Method.check`; the rest needs the skeleton."""
 
-    def preset(self, windows: Windows) -> Mapping[str, Any]:
-        """See `EnergyMethod.preset`; for these parts."""
-        return {name: self._spread(name, value) for name, value in super().preset(windows).items()}
+    def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
+        """See `Method.preset`; for these parts."""
+        return {name: self._spread(name, value) for name, value in super().preset(skeleton).items()}
 
     def _spread(self, name: str, value: Any) -> Any:
         """A preset for two parts, for the parts that there are: with no more futures, if each has two draws."""

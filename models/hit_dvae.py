@@ -252,7 +252,9 @@ class HiTDVAE(EnergyMethod):
         """
         suited = replace(self, frames=self.frames or windows.protocol.observed)
         if self.loss == "evidence":
-            return replace(suited, heading=bool(self.heading), decoder=self.decoder or self.preset(windows)["decoder"])
+            return replace(
+                suited, heading=bool(self.heading), decoder=self.decoder or self.preset(windows.skeleton)["decoder"]
+            )
         return super(HiTDVAE, suited).suited(windows)
 
     def build_for(self, windows: Windows) -> DynamicalVAE:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import nn
@@ -19,7 +19,7 @@ from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.schedules import Cosine, Linear, Logistic, Schedule
 from ..model import DynamicalVAE
-from ..motion import Windows
+from ..motion import Skeleton, Windows
 from ..networks import NetworkSpec
 from ..notation import Factor, Factorization
 from ..priors import FlowPrior, MixturePrior, Prior, VampPrior
@@ -61,6 +61,7 @@ class Method:
     likelihood: ClassVar[bool] = True  # without it, the best weights are by the objective in place of a bound
     forecasts: ClassVar[bool] = True  # whether its models forecast motion, which evaluation and comparison ask for
     control: ClassVar[bool] = False  # whether its models make motion from a pose along given paths
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"": {}}  # by the skeleton's name, and "" for any other
     use: ClassVar[str] = "score it with: dvae evaluate {run}"  # what to do with a fitted run
 
     latent: int = 16
@@ -152,9 +153,18 @@ class Method:
         sizes = {**self.sizes(), **data}
         return DynamicalVAE(*self.equations(), sizes, self.networks(), self.heads(), self.priors(sizes))
 
-    def suited(self, windows: Windows) -> Method:
+    def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
+        """What options that are None stand for, with poses of this skeleton; see `presets`."""
+        presets = self.presets
+        return presets.get("" if skeleton is None else skeleton.name, presets[""])
+
+    def filled(self, preset: Mapping[str, Any]) -> Self:
+        """The method with options that are None taken from a preset."""
+        return replace(self, **{name: value for name, value in preset.items() if getattr(self, name) is None})
+
+    def suited(self, windows: Windows) -> Self:
         """The method with what its options leave open chosen for these windows; itself, where nothing is open."""
-        return self
+        return self.filled(self.preset(windows.skeleton))
 
     def check(self) -> None:
         """Refuses options that do not fit together, before any data are read.

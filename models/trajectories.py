@@ -26,7 +26,7 @@ from ..heads import FixedNormal, HeadSpec
 from ..inference.control import bend
 from ..inference.objectives import Evidence, Objective
 from ..model import WHOLE, Batch, DynamicalVAE, repeat
-from ..motion import PROTOCOLS, Clip, Skeleton, Windows
+from ..motion import HUMAN36M, PROTOCOLS, Clip, Skeleton, Windows, rotate_about_up
 from ..motion.data import defect
 from .method import Method
 
@@ -40,10 +40,13 @@ class TrajectoryMethod(Method):
     """A method that completes motion. The likelihood is the paper's squared error, whatever else methods offer.
 
     Args:
-        beta: weight of the KL, beside squared errors in square metres.
+        beta: weight of the KL, beside squared errors in square metres. None for what suits the skeleton.
         keep: probability with which a joint is given, in training.
         complement: the guide sees the joints that are not given, and not the others.
         rotate: turn every training window about the up axis by a uniform angle.
+        heading: turn every window so that its first pose faces one way, and the motion back. Turned windows then have
+            turned motions, exactly, and `rotate` changes nothing. None for not with Human3.6M's poses, as in the
+            paper, where that is left to learn, and for so with others.
     """
 
     projected: ClassVar[bool] = True
@@ -54,10 +57,11 @@ class TrajectoryMethod(Method):
     )
     unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method)) - {"latent"}
 
-    beta: float = 0.01
+    beta: float | None = None
     keep: float = 0.15
     complement: bool = True
     rotate: bool = True
+    heading: bool | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -66,7 +70,7 @@ class TrajectoryMethod(Method):
                 raise ValueError(f"{self.name} has no {option.name}; leave it at {option.default!r}")
         if not 0 <= self.keep <= 1:
             raise ValueError(f"keep is {self.keep}; it must be a probability, between 0 and 1")
-        if not 0 <= self.beta < float("inf"):
+        if self.beta is not None and not 0 <= self.beta < float("inf"):
             raise ValueError(f"beta is {self.beta}; it must be finite and at least 0")
 
     @property
@@ -94,12 +98,13 @@ class TrajectoryMethod(Method):
         return self.build_on(windows.skeleton, windows.length - 1)
 
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
-        """See `Method.build`; y, r and s are of the size of x."""
-        return self._built(DynamicalVAE, data[WHOLE])
+        """See `Method.build`; y, r and s are of the size of x, and options left open are the paper's."""
+        return self.filled(self.presets[HUMAN36M.name])._built(DynamicalVAE, data[WHOLE])
 
     def build_on(self, skeleton: Skeleton, frames: int | None = None) -> TrajectoryModel:
         """The model for poses of this skeleton, to be fitted to motions of T frames after the first pose."""
-        return self._built(TrajectoryModel, 3 * skeleton.joints, skeleton, self.complement, frames)
+        method = self.filled(self.preset(skeleton))
+        return method._built(TrajectoryModel, 3 * skeleton.joints, method, skeleton, frames)
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         sizes = {**self.sizes(), **dict.fromkeys((WHOLE, FIRST, GIVEN, REST), size)}
@@ -114,7 +119,13 @@ class TrajectoryMethod(Method):
         return windows.given(self.keep)
 
     def objective(self) -> Objective:
-        """Squared errors and the weighted KL."""
+        """Squared errors and the weighted KL.
+
+        Raises:
+            ValueError: a weight that is still open, which the skeleton decides.
+        """
+        if self.beta is None:
+            raise ValueError("beta depends on the skeleton; take the objective of method.suited(windows)")
         return Evidence(kl_weight=self.beta, select="loss")
 
     def feeding(self, steps: int) -> float:
@@ -128,16 +139,20 @@ class TrajectoryModel(DynamicalVAE):
     A batch holds either windows x (B, 1 + T, D), whose first frame is s, with y (B, 1 + T, D) if trajectories are
     given, or the variables themselves: s (B, D), y (B, T, D) and, to train, x and r.
 
+    Its programs see windows turned if the method says so (`heading`); what else it returns is as the batch was.
+
     Args:
+        method: with no option left open.
         skeleton: of the poses.
-        complement: whether r is what y leaves of x, and not all of x.
         frames: T of the motions that it is fitted to; None if that is not known.
         *arguments, **options: of `DynamicalVAE`.
     """
 
-    def __init__(self, skeleton: Skeleton, complement: bool, frames: int | None, *arguments: Any, **options: Any):
+    def __init__(
+        self, method: TrajectoryMethod, skeleton: Skeleton, frames: int | None, *arguments: Any, **options: Any
+    ):
         super().__init__(*arguments, **options)
-        self.skeleton, self.complement, self.frames = skeleton, complement, frames
+        self.method, self.skeleton, self.frames = method, skeleton, frames
 
     def model(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
         """See `DynamicalVAE.model`; without trajectories in the batch, none are given.
@@ -154,6 +169,35 @@ class TrajectoryModel(DynamicalVAE):
         return super().model(data, **options)
 
     def _mapping(self, batch: Batch | None) -> dict[str, Any]:
+        """The variables as the networks see them."""
+        values = self._apart(batch)
+        if self.method.heading and FIRST in values:
+            if "mask" in values:
+                raise ValueError(
+                    "this model turns every window by its first pose, and missing entries cannot be turned; fit with "
+                    "heading=False"
+                )
+            back = -self._heading(values)
+            values |= {n: self._turned(values[n], back) for n in (FIRST, GIVEN, REST, WHOLE) if n in values}
+        return values
+
+    def _heading(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Where first poses face, (B,) radians."""
+        return self.skeleton.heading(values[FIRST].unflatten(-1, (-1, 3)))
+
+    def _turned(self, values: Tensor, angle: Tensor) -> Tensor:
+        """Motion (..., B, T, D), or poses (B, D), turned about the up axis by angles (B,)."""
+        angle = angle[:, None] if values.dim() == 2 else angle[:, None, None]
+        return rotate_about_up(values.unflatten(-1, (-1, 3)), angle, self.skeleton.up).flatten(-2)
+
+    def _back(self, out: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+        """What the networks made, as the batch was turned."""
+        if self.method.heading:
+            out[WHOLE] = self._turned(out[WHOLE], self._heading(self._apart(batch)))
+        return out
+
+    def _apart(self, batch: Batch | None) -> dict[str, Any]:
+        """The variables that a batch of windows is made of."""
         values = super()._mapping(batch)
         if FIRST not in values and WHOLE in values:
             if "lengths" in values:
@@ -177,7 +221,7 @@ class TrajectoryModel(DynamicalVAE):
             if isinstance(mask := values.get("mask"), Tensor):
                 x = torch.where(mask, x, 0.0)
             given = values.setdefault(GIVEN, torch.zeros_like(x))
-            values.setdefault(REST, torch.where(given == 0, x, 0.0) if self.complement else x)
+            values.setdefault(REST, torch.where(given == 0, x, 0.0) if self.method.complement else x)
         return values
 
     @torch.no_grad()
@@ -227,7 +271,18 @@ class TrajectoryModel(DynamicalVAE):
                 latents[name] = torch.addcmul(loc, scale, noise, value=temperature).flatten(0, 1)
             many = {name: repeat(value, samples) for name, value in data.items()}
             out = poutine.condition(self.model, data=latents)(many, length=horizon, mean_emission=not draw_emission)
-        return {name: out[name].unflatten(0, (samples, -1)) for name in (WHOLE, *self.latents)}
+        return self._back({name: out[name].unflatten(0, (samples, -1)) for name in (WHOLE, *self.latents)}, batch)
+
+    @torch.no_grad()
+    def sample(self, n: int = 1, length: int | None = None, batch: Batch | None = None) -> dict[str, Tensor]:
+        """See `DynamicalVAE.sample`."""
+        out = super().sample(n, length, batch)
+        return out if batch is None else self._back(out, batch)
+
+    @torch.no_grad()
+    def reconstruct(self, batch: Batch, samples: int = 1) -> dict[str, Tensor]:
+        """See `DynamicalVAE.reconstruct`."""
+        return self._back(super().reconstruct(batch, samples), batch)
 
     def complete(
         self,
@@ -307,7 +362,7 @@ class TrajectoryModel(DynamicalVAE):
         x = out[WHOLE][:, 0]
         if exact and paths:
             options = {"tolerance": tolerance, "steps": steps, "progress": progress}
-            x = self._followed(data, out, known.flatten(1).to(parameter), **options)
+            x = self._back({WHOLE: self._followed(data, out, known.flatten(1).to(parameter), **options)}, data)[WHOLE]
         motion = x[:, :length].cpu().double().unflatten(-1, (-1, 3)) + world
         names = self.skeleton.names
         if exact:
@@ -341,7 +396,7 @@ class TrajectoryModel(DynamicalVAE):
     def _followed(self, data: Mapping[str, Tensor], out: Mapping[str, Tensor], known: Tensor, **options: Any) -> Tensor:
         """Motions (S, T, D) whose known coordinates are the given ones (see `inference.control`)."""
         (name,) = self.latents
-        drawn = out[name][:, 0]
+        drawn, data = out[name][:, 0], self._mapping(data)
         many = {variable: repeat(value, len(drawn)) for variable, value in data.items()}
         bones = self.skeleton.limbs(data[FIRST][0]).norm(dim=-1)
         with self._evaluating():

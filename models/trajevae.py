@@ -11,7 +11,8 @@ what the trajectories leave out, r. The mean of x is s plus offsets, summed up o
 Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, with the layers of its public implementation: prior and guide
 share the perceptrons of poses and two of three transformers, and the decoder the perceptron of s. Ours: scales of z are
 softplus where that has log-variances; and without the learned prior, of which the paper says little, the decoder reads
-the trajectories beside z, in time and as they are.
+the trajectories beside z, in time and as they are. Off the paper's data, options left open stand for small networks,
+few coefficients, a cheaper z and windows turned to one heading (docs/decisions.md).
 """
 
 from __future__ import annotations
@@ -25,15 +26,40 @@ import torch
 from torch import Tensor
 
 from ..heads import Head, HeadSpec, Normal, NormalHead, Parameters
+from ..motion import Skeleton
 from ..networks import CosineEncoder, MotionDecoder, NetworkSpec
 from ..networks.base import share_modules
 from ..notation import Factorization
 from .trajectories import TrajectoryMethod
 
+PRESETS: dict[str, dict[str, Any]] = {
+    "human36m": {
+        "latent": 512,
+        "beta": 0.01,
+        "components": 0,
+        "width": 256,
+        "feedforward": 512,
+        "layers": 2,
+        "dropout": 0.1,
+        "heading": False,
+    },
+    "": {
+        "latent": 32,
+        "beta": 0.001,
+        "components": 15,
+        "width": 32,
+        "feedforward": 128,
+        "layers": 1,
+        "dropout": 0.0,
+        "heading": True,
+    },
+}
+"""Skeleton to options: the paper's; and for others what learns in minutes on a processor."""
+
 
 @dataclass(frozen=True)
 class TrajeVAE(TrajectoryMethod):
-    """See the file.
+    """See the file. Options that are None are chosen by the skeleton.
 
     Args:
         latent: size of z, for each coefficient.
@@ -52,32 +78,37 @@ class TrajeVAE(TrajectoryMethod):
     generative: ClassVar[str] = "p(z_t | y_{1:T}, s) p(x_t | z_{1:T}, s)"
     inference: ClassVar[str] = "q(z_t | r_{1:T}, s)"
 
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
     projected: ClassVar[bool] = False
 
-    latent: int = 512
-    components: int = 0
-    width: int = 256
-    feedforward: int = 512
+    latent: int | None = None  # type: ignore[assignment]  # chosen by the skeleton, as the next ones
+    components: int | None = None
+    width: int | None = None
+    feedforward: int | None = None
     heads_count: int = 4
-    layers: int = 2
-    dropout: float = 0.1
+    layers: int | None = None
+    dropout: float | None = None
     learned_prior: bool = True
     cosine: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, least in (("components", 0), *((n, 1) for n in ("width", "feedforward", "heads_count", "layers"))):
-            if (value := getattr(self, name)) < least:
+            if (value := getattr(self, name)) is not None and value < least:
                 raise ValueError(f"{name} is {value}; it must be at least {least}")
-        if not 0 <= self.dropout < 1:
+        if self.dropout is not None and not 0 <= self.dropout < 1:
             raise ValueError(f"dropout is {self.dropout}; it must be a share, at least 0 and below 1")
-        if 2 * self.width % self.heads_count:
+        if self.width is not None and 2 * self.width % self.heads_count:
             raise ValueError(
                 f"{self.heads_count} heads do not divide the transformers' {2 * self.width} features; take a width "
                 "whose double they divide"
             )
         if self.components and not self.cosine:
             raise ValueError("components are of the cosine transform; leave them at 0 without it")
+
+    def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
+        """See `Method.preset`; without the cosine transform there are no coefficients."""
+        return {**super().preset(skeleton), **({} if self.cosine else {"components": 0})}
 
     def equations(self) -> tuple[Factorization, Factorization]:
         """The generative model and the guide."""
@@ -87,7 +118,8 @@ class TrajeVAE(TrajectoryMethod):
         masks = {}
         if self.components:
             p = p.replace("z_{1:T}", "z_{1:C}")
-            masks = {"1:C": lambda length: np.arange(length)[None] < self.components}
+            components = self.components
+            masks = {"1:C": lambda length: np.arange(length)[None] < components}
         return Factorization.parse(p, masks), Factorization.parse(self.inference)
 
     def networks(self) -> Mapping[str, NetworkSpec]:
@@ -99,12 +131,13 @@ class TrajeVAE(TrajectoryMethod):
             "layers": self.layers,
             "dropout": self.dropout,
             "cosine": self.cosine,
+            "components": self.components,
         }
         encoder = CosineEncoder(**shape)
         found: dict[str, NetworkSpec] = {"q(z)": encoder}
         if self.learned_prior:
             found["p(z)"] = encoder
-        return {**found, "p(x)": MotionDecoder(hidden=2 * self.width, components=self.components, **shape)}
+        return {**found, "p(x)": MotionDecoder(hidden=2 * shape["width"], **shape)}
 
     def heads(self) -> Mapping[str, HeadSpec]:
         """Normal latents, of which those beyond `components` are noise that nothing reads."""

@@ -1,6 +1,7 @@
 """TrajeVAE and CVAE-RNN: equations, what is given and what is not, the objective, completing motion along paths."""
 
 import math
+import warnings
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import ClassVar
@@ -17,9 +18,10 @@ from dvae.motion import PROTOCOLS
 from dvae.motion.skeleton import HUMAN36M
 from dvae.testing import FactorizationContract
 
+SIZES = {"latent": 4, "width": 8, "feedforward": 8, "heads_count": 2, "layers": 1, "components": 0}
 SMALL = {
-    "trajevae": {"latent": 4, "width": 8, "feedforward": 8, "heads_count": 2, "layers": 1},
-    "cvae-rnn": {"latent": 4, "summary": 3, "width": 5, "hidden": (6, 7)},
+    "trajevae": {**SIZES, "beta": 0.01, "dropout": 0.1, "heading": False},
+    "cvae-rnn": {"latent": 4, "summary": 3, "width": 5, "hidden": (6, 7), "beta": 0.1, "heading": False},
 }
 ABLATIONS = {
     "whole": {},
@@ -288,6 +290,65 @@ def test_training_windows_are_turned_and_validation_windows_are_not(windows):
 
 
 # -------------------------------------------------------------------------------------------------------- forecasts
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_with_a_heading_turned_windows_have_turned_motions(windows, walk, name):
+    model, angle = build(windows, name, heading=True), torch.tensor(2.0, dtype=torch.float64)
+    batch = double(windows.given(["LWrist"]).all())
+    batch = {variable: value[:3] for variable, value in batch.items()}
+
+    def turn(values):
+        joints = torch.as_tensor(values, dtype=torch.float64).unflatten(-1, (-1, 3))
+        return motion.rotate_about_up(joints, angle, windows.skeleton.up).flatten(-2)
+
+    def of(batch):
+        first = {"s": batch["x"][:, 0], "y": batch["y"][:, 1:]}
+        runs = {
+            "forecast": lambda: model.forecast({"x": batch["x"][:, :1], "y": batch["y"]}, 20, 2)["x"],
+            "sample": lambda: model.sample(length=20, batch=first)["x"],
+            "reconstruct": lambda: model.reconstruct(batch, 2)["x"],
+        }
+        found = {}
+        for run, made in runs.items():
+            torch.manual_seed(1)
+            found[run] = made()
+        return found
+
+    ours, turned = of(batch), of({variable: turn(value) for variable, value in batch.items()})
+    for run in ours:
+        torch.testing.assert_close(turned[run], turn(ours[run]), msg=run)
+    assert (
+        build(windows, name, heading=False).forecast(batch["x"][:, :1], 20, 2)["x"] - ours["forecast"]
+    ).norm() > 1e-3
+
+    def completed(change):
+        torch.manual_seed(1)
+        pose, path = change(walk.pose.reshape(1, -1)).reshape(-1, 3), change(walk.path("LWrist"))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an untrained model misses its path
+            return model.complete(pose, {"LWrist": path}, samples=2, exact=True, steps=3).positions
+
+    there = completed(lambda place: turn(place).numpy())
+    torch.testing.assert_close(
+        torch.from_numpy(there), turn(completed(np.asarray).reshape(2, 20, -1)).reshape(2, 20, -1, 3), atol=1e-6, rtol=0
+    )
+
+
+def test_with_a_heading_missing_entries_are_refused(windows):
+    x = windows.all()["x"][:2].double()
+    with pytest.raises(ValueError, match="missing entries cannot be turned; fit with heading=False"):
+        build(windows, heading=True).guide({"x": x, "mask": torch.ones_like(x, dtype=torch.bool)})
+
+
+def test_options_that_are_open_are_chosen_by_the_skeleton(windows):
+    method = dvae.method("trajevae", latent=7)
+    ours, published = method.suited(windows), method.filled(method.preset(HUMAN36M))
+    assert (ours.latent, ours.heading, published.latent, published.heading) == (7, True, 7, False)
+    assert (published.width, published.components, published.beta) == (256, 0, 0.01)
+    assert ours.width < 256
+    with pytest.raises(ValueError, match=r"objective of method.suited\(windows\)"):
+        method.objective()
 
 
 def test_forecasts_are_draws_of_the_program(windows):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from math import ceil, pi
 from os import PathLike
 from typing import Any
@@ -17,7 +17,7 @@ from matplotlib.colors import to_hex
 
 from .skeleton import Skeleton, rotate_about_up
 
-PAST, TRUTH, FIXED = "black", "#1a7f37", "#4a4f57"
+PAST, TRUTH, FIXED, GIVEN = "black", "#1a7f37", "#4a4f57", "#cf222e"
 
 SPACING = 1.15
 """Metres between the skeletons of a figure."""
@@ -84,12 +84,14 @@ def futures(
     frames: int = 6,
     ax: Axes | None = None,
     view: float = pi / 5,
+    paths: Mapping[str, Any] | None = None,
 ) -> Axes:
     """Observed motion and sampled futures, as skeletons from left to right over time.
 
     The past is black, the truth green, each sample has a colour of its own through time. Every pose is drawn
     relative to its pelvis, all from the same side: the last observed pose is seen from the front, turned by
-    `view`.
+    `view`. Where joints were given paths, these are crosses, and all of a frame is drawn relative to one place, the
+    mean of the samples' pelvises.
 
     Args:
         skeleton: the tree.
@@ -99,6 +101,7 @@ def futures(
         frames: how many future frames are drawn, the last always among them.
         ax: where to draw; a new figure without it.
         view: radians between the last observed heading and the viewer.
+        paths: joint to the path (H, 3) that it was given, metres; NaN where that is not known.
 
     Returns:
         The axes; `ax.figure.savefig(...)` saves them.
@@ -107,6 +110,7 @@ def futures(
         ValueError: the shapes do not fit each other or the skeleton, or there is nothing to draw.
     """
     past, future, real = _checked(skeleton, observed, samples, truth)
+    crosses = _given(paths or {}, skeleton, future.shape[1])
     azimuth = view - _heading(skeleton, past[-1])
     now, horizon = len(past) - 1, future.shape[1]
     ahead = np.unique(np.linspace(0, horizon, frames + 1)[1:].round().clip(1)).astype(int)
@@ -114,9 +118,12 @@ def futures(
     if ax is None:
         ax = plt.subplots(figsize=(1.15 * len(shown), 2.3), layout="constrained")[1]
 
+    middle = future[:, :, skeleton.root].mean(0)
+
     def draw(poses: np.ndarray, column: int, **line: Any) -> None:
-        pelvic = poses - poses[..., skeleton.root : skeleton.root + 1, :]
-        pose(ax, pelvic, skeleton, at=(column * SPACING, 0.0), azimuth=azimuth, **line)
+        shared = len(crosses) and shown[column] > now
+        origin = middle[shown[column] - now - 1] if shared else poses[..., skeleton.root : skeleton.root + 1, :]
+        pose(ax, poses - origin, skeleton, at=(column * SPACING, 0.0), azimuth=azimuth, **line)
 
     colours = _colours(len(future)).repeat(len(skeleton.edges), axis=0)
     opacity = float(np.clip(6 / len(future), 0.15, 0.9))
@@ -127,6 +134,10 @@ def futures(
         draw(future[:, frame - now - 1], column, colors=colours, linewidths=1.2, alpha=opacity)
         if real is not None and frame - now <= len(real):
             draw(real[frame - now - 1], column, colors=TRUTH, linewidths=1.8)
+        if len(crosses):
+            places = torch.from_numpy(crosses[:, frame - now - 1] - middle[frame - now - 1])
+            seen = rotate_about_up(places, torch.tensor(azimuth, dtype=torch.float64), skeleton.up).numpy()
+            ax.plot(column * SPACING + seen[:, 0], seen[:, skeleton.vertical], "x", color=GIVEN, zorder=3)
 
     ax.autoscale_view()
     ax.set_aspect("equal")
@@ -332,6 +343,16 @@ def _polylines(skeleton: Skeleton, joints: Collection[int]) -> list[int]:
         if joint in joints:
             path += [joint] if path and path[-1] == parent else [skeleton.joints, parent, joint]
     return path[1:]
+
+
+def _given(paths: Mapping[str, Any], skeleton: Skeleton, horizon: int) -> np.ndarray:
+    """The paths of some joints (paths, H, 3)."""
+    found = {joint: np.asarray(path, np.float64) for joint, path in paths.items()}
+    for joint, path in found.items():
+        skeleton.find(joint)  # which refuses an unknown one
+        if path.shape != (horizon, 3):
+            raise ValueError(f"expected a path ({horizon}, 3) of {joint}, as long as the samples; got {path.shape}")
+    return np.array([*found.values()]).reshape(-1, horizon, 3)
 
 
 def _checked(

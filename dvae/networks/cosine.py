@@ -23,6 +23,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from ..distributions.dct import cosine_basis
 from .base import AtOnce, Input, Network, once
@@ -39,6 +40,7 @@ class CosineEncoder:
         layers: of each of the three transformers: one before the change to coefficients, two after it.
         dropout: share of units left out in training.
         cosine: False to stay in time, so that step t of the child is time t.
+        components: C, coefficients that are made, the slow ones; features of the others are 0. 0 for all.
     """
 
     width: int = 256
@@ -47,6 +49,7 @@ class CosineEncoder:
     layers: int = 2
     dropout: float = 0.1
     cosine: bool = True
+    components: int = 0
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineEncoderNetwork:
         """The network of a factor with these parents.
@@ -111,7 +114,7 @@ class CosineEncoderNetwork(AtOnce):
         (source, *others), static = _apart(self, spec)
         if others or not _reads_everything(source):
             raise ValueError(f"CosineEncoder reads one parent over all time, as in y_{{1:T}}; not {self.inputs}")
-        self.names, self.cosine = (source.name, static.name), spec.cosine
+        self.spec, self.names = spec, (source.name, static.name)
         self.over_time: Any = perceptron(source.size, spec.width)
         self.static: Any = perceptron(static.size, spec.width)
         self.before: Any = transformer(self.features, spec)
@@ -126,9 +129,10 @@ class CosineEncoderNetwork(AtOnce):
         body = once(self.static, [static], partial(self.static, static))
         hidden = torch.cat([self.over_time(source), body[:, None].expand(-1, length, -1)], dim=-1)
         hidden = self.before(self.dropout(hidden + positions(length, self.features, hidden)))
-        if self.cosine:
-            hidden = _basis(length, length, hidden) @ hidden
-        return self.after(self.between(hidden))
+        if self.spec.cosine:
+            components = min(self.spec.components or length, length)
+            hidden = _basis(length, components, hidden) @ hidden
+        return functional.pad(self.after(self.between(hidden)), (0, 0, 0, length - hidden.shape[1]))
 
 
 class MotionDecoderNetwork(AtOnce):
