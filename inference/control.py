@@ -1,12 +1,15 @@
-"""Control: motions bent to given paths, by the least move of their latents that does it.
+"""Control: motions bent to given paths, by the least move of their latents that does it, and of their poses.
 
-Minimised over moves m of latents that start at z_k, in units of their prior's scale s,
+Minimised over moves m of latents that start at z_k, in units of their prior's scale s, and over corrections e of the
+poses that the decoder f makes of them
 
-    |(f(z_k + s m) - path) / tolerance|^2 over known coordinates + |bone lengths / first - 1|^2 / stretch^2 + |m|^2
+    |(x - path) / tolerance|^2 over known coordinates + |bone lengths / first - 1|^2 / stretch^2 + |m|^2 + |e / c|^2
+    x = f(z_k + s m) + e
 
-with f the decoder: the mode of a posterior whose prior is centred at each draw, so that draws stay different. TrajeVAE
-(Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351) names it as a limitation that given joints miss their paths;
-bending is ours.
+which is the mode of a posterior whose prior is centred at each draw, so that draws stay different. What a decoder has
+not learned to make, no latent has it make; e is the few centimetres between, and shared out among joints by the bones.
+TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351) names it as a limitation that given joints miss their
+paths; bending is ours.
 """
 
 from __future__ import annotations
@@ -33,10 +36,11 @@ def bend(
     bones: Tensor,
     *,
     tolerance: float = 5e-4,
+    correction: float = 0.01,
     steps: int = 200,
     progress: bool = False,
-) -> Tensor:
-    """Latents near given ones whose motions follow the paths, by L-BFGS.
+) -> tuple[Tensor, Tensor]:
+    """Motions that follow the paths, by L-BFGS.
 
     Args:
         decode: motions (S, T, D) in metres of latents (S, ...).
@@ -47,30 +51,44 @@ def bend(
         skeleton: of the poses.
         bones: (J - 1,) lengths to keep, in metres.
         tolerance: metres, standard deviation of the misses.
+        correction: c, metres, standard deviation of the corrections; 0 for none.
         steps: at most so many, of all motions together.
         progress: whether to show a progress bar.
 
     Returns:
-        Latents, of the shape of those given.
+        The motions (S, T, D), and their corrections (S, T, D) in metres.
 
     Raises:
-        ValueError: a tolerance or a number of steps that is not positive.
+        ValueError: a tolerance or a number of steps that is not positive, or a negative correction.
     """
-    if not tolerance > 0 or steps < 1:
-        raise ValueError(f"tolerance is a positive distance and steps at least 1, got {tolerance} and {steps}")
-    move = torch.zeros_like(latents, requires_grad=True)
-    optimiser = torch.optim.LBFGS([move], max_iter=steps, history_size=50, line_search_fn="strong_wolfe")
+    if not tolerance > 0 or steps < 1 or not correction >= 0:
+        raise ValueError(
+            f"tolerance is a positive distance, correction none or a positive one, and steps at least 1, got "
+            f"{tolerance}, {correction} and {steps}"
+        )
+    with torch.no_grad():
+        moves = [torch.zeros_like(latents), torch.zeros_like(decode(latents))]
+    for each in moves[: 2 if correction else 1]:
+        each.requires_grad_()
+    free = [each for each in moves if each.requires_grad]
+
+    def motion() -> Tensor:
+        return decode(latents + scale * moves[0]) + correction * moves[1]
+
+    optimiser = torch.optim.LBFGS(free, max_iter=steps, history_size=50, line_search_fn="strong_wolfe")
     with progress_bar(progress) as bar, torch.enable_grad():
         task = bar.add_task("following the paths", total=None)
 
         def loss() -> Tensor:
-            x = decode(latents + scale * move)
+            x = motion()
             missed = ((x - paths) * known / tolerance).square().sum()
             stretched = ((skeleton.limbs(x).norm(dim=-1) / bones - 1) / STRETCH).square().sum()
-            total = missed + stretched + move.square().sum()
-            (move.grad,) = torch.autograd.grad(total, [move])
+            total = missed + stretched + sum(each.square().sum() for each in free)
+            for each, gradient in zip(free, torch.autograd.grad(total, free), strict=True):
+                each.grad = gradient
             bar.advance(task)
             return total.detach()
 
         optimiser.step(loss)  # type: ignore[no-untyped-call]
-    return (latents + scale * move).detach()
+    with torch.no_grad():
+        return motion(), correction * moves[1]

@@ -310,7 +310,8 @@ class TrajectoryModel(DynamicalVAE):
             frames: T; needed without trajectories.
             samples: S, motions.
             exact: move each motion as little as it takes, within the prior of its latents, for the given joints to
-                follow their paths, by optimising the latents through the decoder. Bones keep their lengths.
+                follow their paths, by optimising the latents through the decoder; and correct its poses by what the
+                decoder does not reach, some centimetres. Bones keep their lengths (see `inference.control`).
             temperature: of the latents' scales; 0 for the motion of the prior's mean.
             tolerance: metres, standard deviation of an exact path's misses.
             steps: of the optimiser, with `exact`.
@@ -359,16 +360,18 @@ class TrajectoryModel(DynamicalVAE):
         parameter = next(self.parameters())
         data = {FIRST: first.to(parameter), GIVEN: told.flatten(1)[None].to(parameter)}
         out = self.forecast(data, made, samples, temperature=temperature)
-        x = out[WHOLE][:, 0]
-        if exact and paths:
+        x, corrections = out[WHOLE][:, 0], None
+        if exact:
             options = {"tolerance": tolerance, "steps": steps, "progress": progress}
-            x = self._back({WHOLE: self._followed(data, out, known.flatten(1).to(parameter), **options)}, data)[WHOLE]
+            x, moved = self._followed(data, out, known.flatten(1).to(parameter), **options)
+            x = self._back({WHOLE: x}, data)[WHOLE]
+            corrections = moved[:, :length].cpu().double().unflatten(-1, (-1, 3)).norm(dim=-1).numpy()
         motion = x[:, :length].cpu().double().unflatten(-1, (-1, 3)) + world
         names = self.skeleton.names
         if exact:
             _warn_of_misses(motion, paths, names)
         errors = {names[joint]: (motion[:, :, joint] - path).norm(dim=-1).numpy() for joint, path in paths.items()}
-        return Completion(self.skeleton, motion.numpy(), errors)
+        return Completion(self.skeleton, motion.numpy(), errors, corrections)
 
     def _path(self, joint: str, given: Any, pose: Tensor) -> Tensor:
         """A path as it was given, if it can be one."""
@@ -393,8 +396,10 @@ class TrajectoryModel(DynamicalVAE):
             )
         return path
 
-    def _followed(self, data: Mapping[str, Tensor], out: Mapping[str, Tensor], known: Tensor, **options: Any) -> Tensor:
-        """Motions (S, T, D) whose known coordinates are the given ones (see `inference.control`)."""
+    def _followed(
+        self, data: Mapping[str, Tensor], out: Mapping[str, Tensor], known: Tensor, **options: Any
+    ) -> tuple[Tensor, Tensor]:
+        """Motions (S, T, D) whose known coordinates are the given ones, and their corrections."""
         (name,) = self.latents
         drawn, data = out[name][:, 0], self._mapping(data)
         many = {variable: repeat(value, len(drawn)) for variable, value in data.items()}
@@ -402,11 +407,9 @@ class TrajectoryModel(DynamicalVAE):
         with self._evaluating():
             with torch.no_grad():
                 scale = self.generator[name](data, 1, len(known))[1]
-            latents = bend(
+            return bend(
                 lambda z: self._means(many, z), drawn, scale, data[GIVEN], known, self.skeleton, bones, **options
             )
-            with torch.no_grad():
-                return self._means(many, latents)
 
     def _means(self, data: Mapping[str, Tensor], latents: Tensor) -> Tensor:
         """Means of x (S, T, D) given latents."""
@@ -428,11 +431,13 @@ class Completion:
         skeleton: the tree.
         positions: (S, T, J, 3), metres, in the world of the pose and the paths.
         errors: joint to (S, T), metres between it and its path; NaN where that is not known.
+        corrections: (S, T, J), metres by which exact motions are moved beyond what the decoder makes; else None.
     """
 
     skeleton: Skeleton
     positions: np.ndarray
     errors: Mapping[str, np.ndarray]
+    corrections: np.ndarray | None = None
 
     def __str__(self) -> str:
         samples, frames = self.positions.shape[:2]
@@ -443,6 +448,8 @@ class Completion:
             lines.append(
                 f"  {joint}: off its path by {missed.mean():.3f} m (mean), within 1 cm in {share:.0%} of frames"
             )
+        if self.corrections is not None:
+            lines.append(f"  poses corrected by {self.corrections.mean():.3f} m (mean over joints)")
         return "\n".join(lines)
 
 

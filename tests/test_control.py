@@ -9,7 +9,7 @@ POINT = Skeleton(("root", "tip"), (-1, 0))
 
 
 def test_a_linear_decoder_has_a_closed_form():
-    """Without bones that matter, the mode of a linear Gaussian posterior around each draw."""
+    """Without bones that matter, the mode of a linear Gaussian posterior around each draw; corrections or not."""
     steps, size, latent = 3, 6, 4
     weight = torch.randn(steps * size, latent, dtype=torch.float64)
     drawn = torch.randn(2, latent, dtype=torch.float64)
@@ -20,23 +20,22 @@ def test_a_linear_decoder_has_a_closed_form():
     tolerance = 0.1
     bones = torch.full((1,), 1e9, dtype=torch.float64)  # any length is as good
 
-    found = bend(
-        lambda z: (z @ weight.T).unflatten(-1, (steps, size)),
-        drawn,
-        scale,
-        paths,
-        known,
-        POINT,
-        bones,
-        tolerance=tolerance,
-    )
+    def decode(z):
+        return (z @ weight.T).unflatten(-1, (steps, size))
+
     rows = known.flatten().bool()
-    seen = weight[rows] * scale
-    precision = seen.T @ seen / tolerance**2 + torch.eye(latent, dtype=torch.float64)
-    for z, moved in zip(drawn, found, strict=True):
-        missing = paths.flatten()[rows] - weight[rows] @ z
-        move = torch.linalg.solve(precision, seen.T @ missing / tolerance**2)
-        assert torch.allclose(moved, z + scale * move, atol=1e-5)
+    for correction in (0.0, 0.3):
+        options = {"tolerance": tolerance, "correction": correction}
+        found, corrections = bend(decode, drawn, scale, paths, known, POINT, bones, **options)
+        spread = [weight * scale, correction * torch.eye(steps * size, dtype=torch.float64)]
+        whole = torch.cat(spread, dim=1)
+        seen = whole[rows]
+        precision = seen.T @ seen / tolerance**2 + torch.eye(whole.shape[1], dtype=torch.float64)
+        for z, motion, corrected in zip(drawn, found, corrections, strict=True):
+            missing = paths.flatten()[rows] - weight[rows] @ z
+            move = torch.linalg.solve(precision, seen.T @ missing / tolerance**2)
+            torch.testing.assert_close(motion.flatten(), weight @ z + whole @ move, atol=1e-4, rtol=0)
+            torch.testing.assert_close(corrected.flatten(), spread[1] @ move[latent:], atol=1e-4, rtol=0)
 
 
 def test_bones_are_kept_where_the_path_leaves_the_choice():
@@ -46,9 +45,10 @@ def test_bones_are_kept_where_the_path_leaves_the_choice():
     paths = torch.tensor([[0.0, 0.6, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
     one = torch.ones(6, dtype=torch.float64)
     bones = torch.ones(1, dtype=torch.float64)
-    found = bend(lambda z: z[:, None], drawn, one, paths, known, POINT, bones, tolerance=1e-3)[0]
+    found = bend(lambda z: z[:, None], drawn, one, paths, known, POINT, bones, tolerance=1e-3, correction=0.0)[0][0, 0]
     assert torch.allclose(found[:3], paths[0, :3], atol=2e-3)
     assert abs((found[3:] - found[:3]).norm() - 1) < 0.01
     assert torch.allclose(found[3::2], torch.zeros(2, dtype=torch.float64), atol=1e-3)
-    unmoved = bend(lambda z: z[:, None], drawn, one, paths, 0 * known, POINT, bones)
-    assert torch.allclose(unmoved, drawn)
+    unmoved, corrections = bend(lambda z: z[:, None], drawn, one, paths, 0 * known, POINT, bones)
+    assert torch.allclose(unmoved[:, 0], drawn)
+    assert torch.allclose(corrections, torch.zeros(()).double())
