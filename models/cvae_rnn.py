@@ -46,12 +46,8 @@ class CVAERNN(TrajectoryMethod):
     generative: ClassVar[str] = "p(w) p(x_t | x_{<t}, y_{1:T}, w, s)"
     inference: ClassVar[str] = "q(w | r_{1:T}, y_{1:T}, s)"
 
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "human36m": {"beta": 0.1, "heading": False},
-        "": {"beta": 0.1, "heading": True},
-    }
-
     latent: int = 256
+    beta: float | None = 0.1
     summary: int = 64
     width: int = 128
     hidden: tuple[int, ...] = (300, 200, 128)

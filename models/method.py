@@ -155,8 +155,7 @@ class Method:
 
     def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
         """What options that are None stand for, with poses of this skeleton; see `presets`."""
-        presets = self.presets
-        return presets.get("" if skeleton is None else skeleton.name, presets[""])
+        return self.presets.get("" if skeleton is None else skeleton.name, self.presets[""])
 
     def filled(self, preset: Mapping[str, Any]) -> Self:
         """The method with options that are None taken from a preset."""

@@ -40,7 +40,7 @@ class TrajectoryMethod(Method):
     """A method that completes motion. The likelihood is the paper's squared error, whatever else methods offer.
 
     Args:
-        beta: weight of the KL, beside squared errors in square metres. None for what suits the skeleton.
+        beta: weight of the KL, beside squared errors in square metres.
         keep: probability with which a joint is given, in training.
         complement: the guide sees the joints that are not given, and not the others.
         rotate: turn every training window about the up axis by a uniform angle.
@@ -55,6 +55,7 @@ class TrajectoryMethod(Method):
     use: ClassVar[str] = (
         "score it with: dvae evaluate {run} --joints JOINT …, move it with: dvae complete {run} --joints JOINT …"
     )
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
     unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method)) - {"latent"}
 
     beta: float | None = None
