@@ -1,4 +1,4 @@
-"""Speed of HiT-DVAE at its preset for 15 + 60 frames: `python benchmarks/hit_dvae.py`, or `make bench`.
+"""Speed of HiT-DVAE at the paper's widths and 15 + 60 frames: `python benchmarks/hit_dvae.py`, or `make bench`.
 
     cache      50 futures of 60 frames for one window with caches, against attending to the whole prefix anew at every
                frame; how many times faster
@@ -45,7 +45,7 @@ def without_caches(model: dvae.DynamicalVAE, past: Tensor, horizon: int, samples
 def main() -> None:
     start(__doc__)
     windows = motion.windows(motion.simulate(), motion.PROTOCOLS["simulated"], "train")
-    method = dvae.method("hit-dvae", pose_prior=0.0).suited(windows)
+    method = dvae.method("hit-dvae", pose_prior=0.0, decoder=256).suited(windows)  # the paper's width
     model = method.build_for(windows)
     method.prepare(model, windows)
     past = model.turned(windows.all()["x"][:100, : windows.protocol.observed])[0]

@@ -109,7 +109,10 @@ class Layer(nn.Module):
 
     def forward(self, stream: Tensor, keys: Tensor, values: Tensor, bias: Tensor) -> Tensor:
         """The stream (B, T, W) after attending under the additive bias, broadcastable to (B, heads, T, S)."""
-        seen = functional.scaled_dot_product_attention(self.queries(stream), keys, values, attn_mask=bias)
+        if stream.shape[1] == 1:  # a step of a loop, for which the fused kernel takes several times as long
+            seen = self.weights(stream, keys, bias) @ values
+        else:
+            seen = functional.scaled_dot_product_attention(self.queries(stream), keys, values, attn_mask=bias)
         stream = stream + self.out(seen.transpose(1, 2).flatten(2))
         return stream + self.perceptron(stream)
 
@@ -249,7 +252,9 @@ class AttentionNetwork(Network):
             batch=batch,
             live=live,
             length=length,
-            masks={p.name: p.relation.mask(length).tolist() for p in live if p.relation is not None},
+            masks=np.concatenate(
+                [np.zeros((length, 0), bool), *(p.relation.mask(length) for p in live if p.relation)], 1
+            ),
             caches=[Cache(layer.project(tokens), room=length * len(live)) for layer in self.layers],
             extracted=self.extractors.start(length),
             lengths=lengths,
@@ -265,11 +270,10 @@ class AttentionNetwork(Network):
         stream = stream[:, None]
         if self.layers:
             fresh = []
-            for i, parent in enumerate(state.live):
-                for s, visible in enumerate(state.masks[parent.name][t]):
-                    if visible and (token := i * state.length + s) not in state.seen:
-                        state.see(token)
-                        fresh.append(self.embed[parent.name](drawn[parent.name][s]))
+            for token in state.fresh(t):
+                i, s = divmod(token, state.length)
+                name = state.live[i].name
+                fresh.append(self.embed[name](drawn[name][s]))
             if fresh:
                 tokens = torch.stack(fresh, dim=1)
                 for layer, cache in zip(self.layers, state.caches, strict=True):
@@ -421,11 +425,12 @@ class Attending:
     batch: int
     live: list[Input]
     length: int
-    masks: dict[str, list[list[bool]]]
+    masks: np.ndarray
+    """(T, parents * T): the live tokens that a step sees."""
     caches: list[Cache]
     extracted: dict[str, tuple[Any, Rows]]
     lengths: Tensor | None
-    seen: dict[int, None] = field(default_factory=dict)
+    seen: list[int] = field(default_factory=list)
     """Live tokens in the order of the cache: the step, plus T times the parent's place."""
     in_order: bool = True
     rows: Tensor | None = None
@@ -440,14 +445,19 @@ class Attending:
             caches=select(self.caches, rows),
             extracted=select(self.extracted, rows),
             lengths=None if self.lengths is None else self.lengths[rows],
-            seen=dict(self.seen),
+            masks=self.masks.copy(),
+            seen=list(self.seen),
             rows=rows if self.rows is None else self.rows.index_select(0, rows),
         )
 
-    def see(self, token: int) -> None:
-        """Note a live token that enters the cache."""
-        self.in_order &= token == len(self.seen)
-        self.seen[token] = None
+    def fresh(self, t: int) -> list[int]:
+        """The live tokens that step t is the first to see, which enter the cache now."""
+        found = np.flatnonzero(self.masks[t]).tolist()
+        if found:
+            self.masks[:, found] = False
+            self.in_order &= found == [*range(len(self.seen), len(self.seen) + len(found))]
+            self.seen += found
+        return found
 
     def row(self, t: int) -> Tensor:
         """The bias of step t to every token in the cache, broadcastable to (B, heads, 1, S)."""
