@@ -61,11 +61,10 @@ def bend(
     Raises:
         ValueError: a tolerance or a number of steps that is not positive, or a negative correction.
     """
-    if not tolerance > 0 or steps < 1 or not correction >= 0:
-        raise ValueError(
-            f"tolerance is a positive distance, correction none or a positive one, and steps at least 1, got "
-            f"{tolerance}, {correction} and {steps}"
-        )
+    if not tolerance > 0 or steps < 1:
+        raise ValueError(f"tolerance is a positive distance and steps at least 1, got {tolerance} and {steps}")
+    if not correction >= 0:
+        raise ValueError(f"correction is a distance or 0, got {correction}")
     with torch.no_grad():
         moves = [torch.zeros_like(latents), torch.zeros_like(decode(latents))]
     for each in moves[: 2 if correction else 1]:
