@@ -385,6 +385,7 @@ def evaluate(
                 f"--joints, --exchange and --temperature are for methods that take trajectories; {each.path} holds "
                 f"{each.method.name}"
             )
+    classifiers = _classifiers(classifier, data, windows)
     if given is not None:
         windows = windows.given(given)
     result = evaluate_models(
@@ -395,7 +396,7 @@ def evaluate(
         batch_size=batch_size,
         bound_particles=bound_particles,
         pose_prior=None if pose_prior is None else _pose_prior(pose_prior, data, windows.skeleton),
-        classifiers=_classifiers(classifier, data, windows),
+        classifiers=classifiers,
         training_windows=loaded[0].data.windows("train+validation"),
         configs={name: Run(each.path).config for name, each in zip(names, loaded, strict=True)},
         options={} if temperature is None else {"temperature": temperature},
@@ -623,7 +624,8 @@ def complete(
         clip: name of a clip, or split/name where the name is not unique; by default any test window.
         window: which of its windows, from 0; by default the one that moves most.
         samples: motions.
-        exact: have the motions follow the paths to less than a centimetre, by moving their latents.
+        exact: have the given joints on their paths, with bones at their lengths, by moving the motions' latents and, by
+            what that leaves, their poses.
         temperature: of the latents' scale; 0 for the motion of the prior's mean.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there.
@@ -644,7 +646,15 @@ def complete(
     pose, truth = positions[chosen, 0], positions[chosen, 1:]
     given = {joint: truth[:, windows.skeleton.find(joint)] for joint in _joints(joints)}
     if paths is not None:
-        given |= motion.read_paths(paths)
+        drawn = motion.read_paths(paths)
+        if twice := {windows.skeleton.find(joint) for joint in given} & {
+            windows.skeleton.find(joint) for joint in drawn
+        }:
+            names = ", ".join(windows.skeleton.names[joint] for joint in twice)
+            raise UsageError(
+                f"{names} is named by --joints, and {paths} has a path of it; say which by leaving one out"
+            )
+        given |= drawn
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         done = loaded.model.complete(
@@ -837,7 +847,7 @@ def _cluster(scheduler: str | None) -> Iterator[None]:
 
 def _joints(given: Sequence[str]) -> list[str]:
     """Names of joints, with commas or blanks between them."""
-    return [name for text in given for name in text.split(",") if name]
+    return [name for text in given for name in text.replace(",", " ").split()]
 
 
 def _at_least(smallest: int, **options: int | None) -> None:

@@ -12,9 +12,9 @@ Source: TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with w
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from math import sqrt
+from math import inf, sqrt
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -46,7 +46,7 @@ class TrajectoryMethod(Method):
         rotate: turn every training window about the up axis by a uniform angle.
         heading: turn every window so that its first pose faces one way, and the motion back. Turned windows then have
             turned motions, exactly, and `rotate` changes nothing. None for not with Human3.6M's poses, as in the
-            paper, where that is left to learn, and for so with others.
+            paper, where that is left to learn, and for so with others whose left and right are known.
     """
 
     projected: ClassVar[bool] = True
@@ -73,6 +73,11 @@ class TrajectoryMethod(Method):
             raise ValueError(f"keep is {self.keep}; it must be a probability, between 0 and 1")
         if self.beta is not None and not 0 <= self.beta < float("inf"):
             raise ValueError(f"beta is {self.beta}; it must be finite and at least 0")
+
+    def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
+        """See `Method.preset`; where left and right are unknown, so are headings."""
+        found = super().preset(skeleton)
+        return found if skeleton is None or (skeleton.left and skeleton.right) else {**found, "heading": False}
 
     @property
     def selects(self) -> Literal["bound", "loss"]:
@@ -105,6 +110,8 @@ class TrajectoryMethod(Method):
     def build_on(self, skeleton: Skeleton, frames: int | None = None) -> TrajectoryModel:
         """The model for poses of this skeleton, to be fitted to motions of T frames after the first pose."""
         method = self.filled(self.preset(skeleton))
+        if method.heading:
+            skeleton.heading(torch.zeros(skeleton.joints, 3))  # refuses one without left and right
         return method._built(TrajectoryModel, 3 * skeleton.joints, method, skeleton, frames)
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
@@ -238,8 +245,11 @@ class TrajectoryModel(DynamicalVAE):
     ) -> dict[str, Tensor]:
         """Goes on from a pose, along the given trajectories if there are any.
 
+        Of motions that are shorter than those the model was fitted to, it makes the whole, with joints at rest where
+        their trajectories end, and gives the beginning: z has the length of the whole.
+
         Args:
-            batch: x (B, 1, D) and, if trajectories are given, y (B, 1 + H, D); or s (B, D) and y (B, H, D).
+            batch: x (B, 1, D) and, if trajectories are given, y (B, 1 + H, D) or longer; or s (B, D) and y (B, H, D).
             horizon: H.
             samples: S, motions for each pose.
             draw_emission: see `DynamicalVAE.forecast`.
@@ -250,29 +260,59 @@ class TrajectoryModel(DynamicalVAE):
             "x" (S, B, H, D) and the latents.
 
         Raises:
-            ValueError: more than one observed frame, or trajectories that end before the horizon.
+            ValueError: more than one observed frame, trajectories that end before the horizon or are not of the poses'
+                size, or a temperature that is negative or not finite.
         """
         if fix:
             raise ValueError(f"cannot fix {', '.join(fix)}: what is known of a motion are its trajectories, in y")
         if horizon < 1 or samples < 1:
             raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
+        if not 0 <= temperature < inf:
+            raise ValueError(f"temperature is {temperature}; it must be finite and at least 0")
         data = self._mapping(batch)
         if WHOLE in data or FIRST not in data:
             raise ValueError("a motion goes on from one pose: x (B, 1, D) or s (B, D)")
-        first = data[FIRST]
-        given = data.get(GIVEN, first.new_zeros(len(first), horizon, first.shape[-1]))
-        if given.shape[1] < horizon:
-            raise ValueError(f"the trajectories have {given.shape[1]} frames, but {horizon} are asked for")
-        data = {FIRST: first, GIVEN: given[:, :horizon]}
+        data = self._whole(data, horizon)
+        if self.frames is not None and horizon > self.frames:
+            warnings.warn(
+                f"this model was fitted to motions of {self.frames} frames, and knows little of {horizon}: ask for "
+                "fewer, or fit it under a protocol that predicts so many",
+                stacklevel=3,  # torch.no_grad is between
+            )
+        first, length = data[FIRST], data[GIVEN].shape[1]
         with self._evaluating():
             latents = {}
             for name in self.latents:  # the prior is evaluated once for all samples
-                loc, scale = self.generator[name](data, len(first), horizon)
+                loc, scale = self.generator[name](data, len(first), length)
                 noise = torch.randn(samples, *loc.shape, dtype=loc.dtype, device=loc.device)
                 latents[name] = torch.addcmul(loc, scale, noise, value=temperature).flatten(0, 1)
             many = {name: repeat(value, samples) for name, value in data.items()}
-            out = poutine.condition(self.model, data=latents)(many, length=horizon, mean_emission=not draw_emission)
-        return self._back({name: out[name].unflatten(0, (samples, -1)) for name in (WHOLE, *self.latents)}, batch)
+            out = poutine.condition(self.model, data=latents)(many, length=length, mean_emission=not draw_emission)
+        found = {name: out[name].unflatten(0, (samples, -1)) for name in (WHOLE, *self.latents)}
+        found[WHOLE] = found[WHOLE][:, :, :horizon]
+        return self._back(found, batch)
+
+    def _whole(self, data: Mapping[str, Tensor], horizon: int) -> dict[str, Tensor]:
+        """The first pose, and trajectories over all frames that the networks are to make for a horizon.
+
+        Raises:
+            ValueError: trajectories that end before the horizon or are not of the poses' size.
+        """
+        first = data[FIRST]
+        given = data.get(GIVEN, first.new_zeros(len(first), horizon, first.shape[-1]))
+        if given.dim() != 3 or (len(given), given.shape[-1]) != first.shape:
+            raise ValueError(
+                f"beside poses {tuple(first.shape)} trajectories are of shape (B, frames, D); got {tuple(given.shape)}"
+            )
+        if given.shape[1] < horizon:
+            raise ValueError(f"the trajectories have {given.shape[1]} frames, but {horizon} are asked for")
+        if not given.isfinite().all():
+            raise ValueError(
+                "trajectories are finite, 0 at joints that are not given; `complete` takes paths with gaps"
+            )
+        made = max(horizon, self.frames or horizon)
+        rest = given[:, -1:].expand(-1, max(made - given.shape[1], 0), -1)
+        return {FIRST: first, GIVEN: torch.cat([given[:, :made], rest], 1)}
 
     @torch.no_grad()
     def sample(self, n: int = 1, length: int | None = None, batch: Batch | None = None) -> dict[str, Tensor]:
@@ -294,27 +334,24 @@ class TrajectoryModel(DynamicalVAE):
         *,
         exact: bool = False,
         temperature: float = 1.0,
-        tolerance: float = 5e-4,
-        steps: int = 200,
+        steps: int = 400,
         progress: bool = False,
     ) -> Completion:
         """Motions that start at a pose and follow paths of some joints.
 
         The networks know of a path frame by frame. Where it has gaps they are told of a straight one across them, from
-        the joint's place in the first pose on, and of a resting joint behind the last known frame. Of motions that are
-        shorter than those the model was fitted to, it makes the whole and gives the beginning.
+        the joint's place in the first pose on, and of a resting joint behind the last known frame. See `forecast` for
+        motions of other lengths than those that the model was fitted to.
 
         Args:
             initial_pose: positions (J, 3) of all joints in metres, anywhere in the world.
-            trajectories: joint to its path (T, 3) in metres in the same world, one frame after the pose first; NaN
-                where it is not known. A joint has its name in the skeleton, or one such as "left_wrist".
+            trajectories: joint to its path (T, 3) in metres in the same world, one frame after the pose first; a
+                frame with a NaN is not known. A joint has its name in the skeleton, or one such as "left_wrist".
             frames: T; needed without trajectories.
             samples: S, motions.
-            exact: move each motion as little as it takes, within the prior of its latents, for the given joints to
-                follow their paths, by optimising the latents through the decoder; and correct its poses by what the
-                decoder does not reach, some centimetres. Bones keep their lengths (see `inference.control`).
+            exact: have the given joints on their paths, by the most likely move of the latents and correction of the
+                poses, with bones at their lengths; see `inference.control`. The completion has the corrections.
             temperature: of the latents' scales; 0 for the motion of the prior's mean.
-            tolerance: metres, standard deviation of an exact path's misses.
             steps: of the optimiser, with `exact`.
             progress: whether to show a progress bar, with `exact`.
 
@@ -322,7 +359,7 @@ class TrajectoryModel(DynamicalVAE):
             ValueError: an unknown joint, a path of another length or without a known frame, positions that are not in
                 metres, or an exact motion without a path.
         """
-        pose = torch.as_tensor(np.asarray(initial_pose, dtype=np.float64))
+        pose = _numbers(initial_pose, "the initial pose")
         if pose.shape != (self.skeleton.joints, 3):
             raise ValueError(
                 f"the initial pose has shape {tuple(pose.shape)}, expected ({self.skeleton.joints}, 3): "
@@ -343,74 +380,71 @@ class TrajectoryModel(DynamicalVAE):
         if exact and not paths:
             raise ValueError("exact=True has motions follow paths; give some trajectories")
         length = next(iter(lengths.values()))
-        made = max(length, self.frames or length)  # of shorter motions than it was fitted to, the beginning
-        if self.frames is not None and length > self.frames:
-            warnings.warn(
-                f"this model was fitted to motions of {self.frames} frames, and knows little of {length}: cut the "
-                "paths, or fit it under a protocol that predicts so many",
-                stacklevel=2,
-            )
         world = pose[self.skeleton.root]
-        told, known = pose.new_zeros(2, made, self.skeleton.joints, 3)
+        told, known = pose.new_zeros(2, length, self.skeleton.joints, 3)
         for joint, path in paths.items():
-            path = torch.cat([path, path.new_full((made - length, 3), torch.nan)])
             seen = path.isfinite().all(-1)
             told[:, joint] = _bridged(path, seen, pose[joint]) - world
-            known[:, joint] = seen[:, None].float()
+            known[:, joint] = seen[:, None].double()
+            if not told[:, joint].any():
+                warnings.warn(
+                    f"{self.skeleton.names[joint]} rests where the first pose has the root, which is how networks are "
+                    "told of no path at all; exact=True holds it there",
+                    stacklevel=2,
+                )
         first = (pose - world).flatten()[None]
         parameter = next(self.parameters())
         data = {FIRST: first.to(parameter), GIVEN: told.flatten(1)[None].to(parameter)}
-        out = self.forecast(data, made, samples, temperature=temperature)
+        out = self.forecast(data, length, samples, temperature=temperature)
         x, corrections = out[WHOLE][:, 0], None
         if exact:
-            options = {"tolerance": tolerance, "steps": steps, "progress": progress}
-            x, moved = self._followed(data, out, known.flatten(1).to(parameter), **options)
-            x = self._back({WHOLE: x}, data)[WHOLE]
+            latents, known = out[self.latents[0]][:, 0], known.flatten(1).to(parameter)
+            x, moved = self._followed(data, latents, known, steps=steps, progress=progress)
             corrections = moved[:, :length].cpu().double().unflatten(-1, (-1, 3)).norm(dim=-1).numpy()
         motion = x[:, :length].cpu().double().unflatten(-1, (-1, 3)) + world
         names = self.skeleton.names
         if exact:
-            _warn_of_misses(motion, paths, names)
+            self._warn_of_stretching(motion, pose)
         errors = {names[joint]: (motion[:, :, joint] - path).norm(dim=-1).numpy() for joint, path in paths.items()}
         return Completion(self.skeleton, motion.numpy(), errors, corrections)
 
     def _path(self, joint: str, given: Any, pose: Tensor) -> Tensor:
         """A path as it was given, if it can be one."""
-        path = torch.as_tensor(np.asarray(given, dtype=np.float64)).clone()
+        path = _numbers(given, f"the path of {joint}")
         path[~path.isfinite()] = torch.nan
         if path.dim() != 2 or path.shape[-1] != 3:
             raise ValueError(f"the path of {joint} has shape {tuple(path.shape)}, expected (frames, 3) in metres")
         seen = path.isfinite().all(-1)
         if not seen.any():
             raise ValueError(f"the path of {joint} has no known frame; leave it out")
-        start = (path[seen] - pose[self.skeleton.find(joint)]).norm(dim=-1)
-        if start.median() > FAR:
-            raise ValueError(
-                f"the path of {joint} is {start.median():.4g} m (median) from where the pose has it; paths are in "
-                "metres, in the same world as the pose"
+        frames = torch.cat([torch.tensor([-1]), seen.nonzero()[:, 0]])
+        places = torch.cat([pose[None, self.skeleton.find(joint)], path[seen]])
+        leaps = places.diff(dim=0).norm(dim=-1) / frames.diff()
+        worst = int(leaps.argmax())
+        if leaps[worst] > LEAP:
+            what = (
+                f"the path of {joint} moves by {leaps[worst]:.4g} m a frame before its frame {frames[worst + 1]} "
+                f"(from {'the pose' if worst == 0 else f'frame {frames[worst]}'} on)"
             )
-        first = int(seen.nonzero()[0])
-        if start[0] > LEAP * (first + 1):
-            warnings.warn(
-                f"the path of {joint} starts {start[0]:.2f} m from where the pose has it, {first + 1} frames before",
-                stacklevel=3,
-            )
+            if leaps[worst] > FAR:
+                raise ValueError(f"{what}; paths are in metres, in the same world as the pose")
+            warnings.warn(what, stacklevel=3)
         return path
 
     def _followed(
-        self, data: Mapping[str, Tensor], out: Mapping[str, Tensor], known: Tensor, **options: Any
+        self, batch: Mapping[str, Tensor], latents: Tensor, known: Tensor, **options: Any
     ) -> tuple[Tensor, Tensor]:
-        """Motions (S, T, D) whose known coordinates are the given ones, and their corrections."""
-        (name,) = self.latents
-        drawn, data = out[name][:, 0], self._mapping(data)
-        many = {variable: repeat(value, len(drawn)) for variable, value in data.items()}
+        """Motions (S, T, D) on the given paths where these are known, and their corrections."""
+        data = self._whole(self._mapping(batch), len(known))
+        known = torch.cat([known, known.new_zeros(data[GIVEN].shape[1] - len(known), known.shape[1])])
         bones = self.skeleton.limbs(data[FIRST][0]).norm(dim=-1)
         with self._evaluating():
             with torch.no_grad():
-                scale = self.generator[name](data, 1, len(known))[1]
-            return bend(
-                lambda z: self._means(many, z), drawn, scale, data[GIVEN], known, self.skeleton, bones, **options
+                scale = self.generator[self.latents[0]](data, 1, len(known))[1]
+            x, corrections = bend(
+                lambda z: self._means(data, z), latents, scale, data[GIVEN][0], known, self.skeleton, bones, **options
             )
+        return self._back({WHOLE: x}, batch)[WHOLE], corrections
 
     def _means(self, data: Mapping[str, Tensor], latents: Tensor) -> Tensor:
         """Means of x (S, T, D) given latents."""
@@ -419,9 +453,20 @@ class TrajectoryModel(DynamicalVAE):
         rollout.values[self.latents[0]] = latents
         return rollout.draw(WHOLE)
 
+    def _warn_of_stretching(self, motion: Tensor, pose: Tensor) -> None:
+        """Warns where more than one bone of twenty is more than a tenth too long or too short."""
+        lengths, true = (self.skeleton.bone_lengths(positions.numpy()) for positions in (motion, pose))
+        share = np.mean(np.abs(lengths - true) < 0.1 * true)
+        if share < 0.95:
+            warnings.warn(
+                f"only {share:.0%} of the bones are within 10 % of their length; the paths may be out of reach for "
+                "this body, or the model too little fitted",
+                stacklevel=3,
+            )
 
-FAR, LEAP = 50.0, 0.5
-"""Metres from a joint's place in the first pose: a path that far is none, and one that leaps so in a frame is odd."""
+
+FAR, LEAP = 5.0, 0.5
+"""Metres a frame: no joint moves so far, and one that moves so is odd."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -450,8 +495,19 @@ class Completion:
                 f"  {joint}: off its path by {missed.mean():.3f} m (mean), within 1 cm in {share:.0%} of frames"
             )
         if self.corrections is not None:
-            lines.append(f"  poses corrected by {self.corrections.mean():.3f} m (mean over joints)")
+            mean, most = self.corrections.mean(), self.corrections.max()
+            lines.append(
+                f"  beyond what the model makes: joints corrected by {mean:.3f} m (mean), {most:.3f} m at most"
+            )
         return "\n".join(lines)
+
+
+def _numbers(given: Any, what: str) -> Tensor:
+    """A copy of an array, in double precision."""
+    try:
+        return torch.tensor(np.array(given.detach().cpu() if isinstance(given, Tensor) else given, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what} is no array of numbers: {error}") from error
 
 
 def _bridged(path: Tensor, seen: Tensor, start: Tensor) -> Tensor:
@@ -460,16 +516,3 @@ def _bridged(path: Tensor, seen: Tensor, start: Tensor) -> Tensor:
     places = torch.cat([start[None], path[seen]]).numpy()
     now = np.arange(len(path))
     return torch.from_numpy(np.stack([np.interp(now, times, places[:, axis]) for axis in range(3)], axis=-1))
-
-
-def _warn_of_misses(motion: Tensor, paths: Mapping[int, Tensor], names: Sequence[str]) -> None:
-    """Warns of joints that are more than a centimetre off their paths in more than one known frame of twenty."""
-    for joint, path in paths.items():
-        missed = (motion[:, :, joint] - path).norm(dim=-1)
-        share = (missed[missed.isfinite()] < 0.01).double().mean().item()
-        if share < 0.95:
-            warnings.warn(
-                f"{names[joint]} is within 1 cm of its path in {share:.0%} of the known frames only; its path may be "
-                "out of reach for this body, or the latents may say too little of the motion",
-                stacklevel=3,
-            )

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -118,8 +119,7 @@ class TrajeVAE(TrajectoryMethod):
         masks = {}
         if self.components:
             p = p.replace("z_{1:T}", "z_{1:C}")
-            components = self.components
-            masks = {"1:C": lambda length: np.arange(length)[None] < components}
+            masks = {"1:C": partial(_slow, components=self.components)}
         return Factorization.parse(p, masks), Factorization.parse(self.inference)
 
     def networks(self) -> Mapping[str, NetworkSpec]:
@@ -151,6 +151,11 @@ class TrajeVAE(TrajectoryMethod):
         if self.learned_prior:
             share_modules([guide, model.generator["z"].network], "over_time", "static", "before", "between")
         return model
+
+
+def _slow(length: int, components: int) -> np.ndarray:
+    """Which coefficients each frame reads: the first ones."""
+    return np.arange(length)[None] < components
 
 
 @dataclass(frozen=True)

@@ -375,3 +375,16 @@ def test_the_command_line_scores_runs_by_classifiers(run, file, tmp_path, capsys
         capsys.readouterr()
         assert main([*arguments, "--classifier", *map(str, runs_)]) == 2
         assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_motion_along_paths_is_judged_too(file, tmp_path):
+    data = ["--data", str(file), "--protocol", "simulated-trajectories", "--batch-size", "4", "--steps", "2"]
+    small = ["--latent", "2", "--width", "8", "--feedforward", "8"]
+    assert main(["fit", "trajevae", *data, *small, "--out", str(tmp_path / "paths")]) == 0
+    assert (
+        main(["fit", "action-classifier", *data, "--label", "way", "--hidden", "4", "--out", str(tmp_path / "way")])
+        == 0
+    )
+    scored = ["evaluate", str(tmp_path / "paths"), "--samples", "2", "--out", str(tmp_path / "scores.json")]
+    assert main([*scored, "--joints", "LWrist", "--classifier", str(tmp_path / "way")]) == 0
+    assert {"ACC way", "path error"} <= Evaluation.load(tmp_path / "scores.json")["trajevae"].keys()

@@ -30,7 +30,8 @@ class Exchanged:
         seed: of the choice among partners.
 
     Raises:
-        ValueError: windows without given joints or with more than one observed frame, or no window with a partner.
+        ValueError: windows without given joints or with more than one observed frame, a threshold that is no distance,
+            or no window with a partner.
     """
 
     def __init__(self, windows: Windows, threshold: float = 0.01, seed: int = 0):
@@ -40,6 +41,8 @@ class Exchanged:
                 f"windows.given(['LWrist']); these have {windows.protocol.observed} observed frames and are given "
                 f"{', '.join(windows.given_joints or ()) or 'no joints'}"
             )
+        if not threshold > 0:
+            raise ValueError(f"the threshold is {threshold}; it must be a positive distance in metres")
         self.windows, self.threshold, self.seed = windows, threshold, seed
         self.protocol, self.skeleton, self.joints = windows.protocol, windows.skeleton, windows.joints
         self.given_joints, self.positions = windows.given_joints, windows.positions

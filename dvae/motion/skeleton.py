@@ -109,6 +109,7 @@ class Skeleton:
             return name
 
         names = [plain(name) for name in self.names]
+        joint = str(joint)
         if joint in self.names:
             return self.names.index(joint)
         if names.count(plain(joint)) == 1:
