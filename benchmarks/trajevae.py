@@ -5,7 +5,7 @@
     sampling  50 motions of one pose and its paths, in the same unit; the public implementation 11
     bend      20 motions of 100 frames bent to the path of a wrist, in seconds, once
 
-Motion is simulated, on the same tree of joints. Others are the least of several times, in turns with what they compare to.
+Motion is simulated, on the same tree of joints. The first two are the least of several times, in turns with products.
 """
 
 from __future__ import annotations

@@ -1,10 +1,13 @@
-"""Writes the tables of docs/results/trajevae.md: `python docs/trajevae.py full-0.json full-1.json cvae-rnn-0.json ...`.
+"""Writes the tables of docs/results/trajevae.md: `python docs/trajevae.py 0.json 1.json ... mean-0.json ...`.
 
-The page says how the runs were fitted and scored, each by `dvae evaluate RUN --joints … --out NAME-K.json` for K given
-joints, on the same windows. The tables stand between two marks; the text around them is written by hand.
+The page says how the runs were fitted, and scored together: `dvae evaluate RUN ... --joints ... --out FILE` for each
+number of given joints, for motion at the prior's mean as well, and from other windows' poses. A file is known by what
+it holds, whatever its name. The tables stand between two marks; the text around them is written by hand.
 """
 
 import sys
+from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 from evaluations import write
@@ -14,61 +17,87 @@ import dvae
 
 PAGE = Path(__file__).parent / "results" / "trajevae.md"
 METRICS = ("APD", "ADE", "FDE", "MMADE", "MMFDE", "path error", "global ADE", "bone-length error")
+SINGLE = ("ADE", "FDE", "path error", "global ADE")
+STEPS = (
+    ("+ learned prior", "in-time", "standard-prior"),
+    ("+ cosine transform", "whole-poses", "in-time"),
+    ("+ masked poses", "full", "whole-poses"),
+    ("over CVAE-RNN", "full", "cvae-rnn"),
+)
+"""What is compared: a change, and the runs with it and without it."""
+
+Counts = dict[int, dvae.Evaluation]
 
 
-def read(files: list[str]) -> dict[str, dict[int, dvae.Evaluation]]:
-    """Name to the number of given joints to the evaluation."""
-    found: dict[str, dict[int, dvae.Evaluation]] = {}
+def read(files: Sequence[str]) -> tuple[Counts, Counts, Counts]:
+    """Number of given joints to the evaluation: of draws, of means and from other windows' poses."""
+    groups: dict[str, Counts] = defaultdict(dict)
     for file in files:
-        evaluation = dvae.Evaluation.load(file)
-        found.setdefault(Path(file).stem.rpartition("-")[0], {})[len(evaluation.data.get("given", []))] = evaluation
-    every = [each for by_count in found.values() for each in by_count.values()]
-    if any(_same(each) != _same(every[0]) for each in every):
-        sys.exit("these evaluations differ in clips, protocol, samples, seed or options")
-    return found
+        found = dvae.Evaluation.load(file)
+        kind = "exchanged" if found.data.get("exchanged") else "means" if found.options else "draws"
+        groups[kind][len(found.data.get("given", []))] = found
+    for kind, each in groups.items():
+        same = {
+            (kind == "exchanged" or str(e.clips), str((e.protocol, e.samples, e.seed, e.options)))
+            for e in each.values()
+        }
+        if len(same) > 1:
+            sys.exit(f"evaluations of {kind} differ in clips, protocol, samples, seed or options")
+    draws, means, exchanged = (dict(sorted(groups[kind].items())) for kind in ("draws", "means", "exchanged"))
+    return draws, means, exchanged
 
 
-def _same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
-    return evaluation.clips, evaluation.protocol, evaluation.samples, evaluation.seed, evaluation.options
+def fitted(evaluation: dvae.Evaluation) -> list[str]:
+    """Names of the rows that are runs."""
+    return [name for name, row in evaluation.rows.items() if row.config]
 
 
-def scores(found: dict[str, dict[int, dvae.Evaluation]]) -> str:
-    """Runs and numbers of given joints down, metrics across; references once."""
+def scores(found: Counts, metrics: Sequence[str], references: bool = True) -> str:
+    """Runs and numbers of given joints down, metrics across; references, which know no paths, once."""
     rows = []
-    first = next(iter(next(iter(found.values())).values()))
-    for name, row in first.rows.items():
-        if not row.config:
-            rows.append([name, "", *(str(first[name].get(metric, "–")) for metric in METRICS)])
-    for name, by_count in found.items():
-        for count, evaluation in sorted(by_count.items()):
-            (own,) = (method for method, row in evaluation.rows.items() if row.config)
-            rows.append([name, str(count), *(str(evaluation[own].get(metric, "–")) for metric in METRICS)])
-    return table(["", "given", *METRICS], rows)
-
-
-def steps(found: dict[str, dict[int, dvae.Evaluation]], metrics: tuple[str, ...] = ("APD", "ADE")) -> str:
-    """What each further given joint changes, paired."""
-    rows = []
-    for name, by_count in found.items():
-        for count in sorted(by_count)[1:]:
-            if count - 1 not in by_count:
-                continue
-            more, fewer = by_count[count], by_count[count - 1]
-            ours = [next(method for method, row in each.rows.items() if row.config) for each in (more, fewer)]
-            joined = dvae.Evaluation(
-                **{**vars(more), "rows": {"more": more.rows[ours[0]], "fewer": fewer.rows[ours[1]]}}
-            )
-            added = ", ".join(set(more.data["given"]) - set(fewer.data.get("given", [])))
-            rows.append(
-                [
-                    name,
-                    f"{count - 1} to {count} ({added})",
-                    *(str(joined.difference("more", "fewer", m)) for m in metrics),
-                ]
-            )
+    for name in {name: None for each in found.values() for name in each.rows}:
+        run = name in {n for each in found.values() for n in fitted(each)}
+        have = {count: each for count, each in found.items() if name in each.rows}
+        if run or references:
+            for count, each in list(have.items())[: None if run else 1]:
+                values = (str(each[name].get(metric, "–")) for metric in metrics)
+                rows.append([name, str(count) if run else "", *values])
     return table(["", "given", *metrics], rows)
 
 
+def more_joints(found: Counts, metrics: Sequence[str] = ("ADE", "APD")) -> str:
+    """What each further given joint changes, paired."""
+    counts = [(before, count) for before, count in zip(found, list(found)[1:], strict=False) if count == before + 1]
+    rows = []
+    for name in fitted(next(iter(found.values()))):
+        for metric in metrics:
+            cells = []
+            for before, count in counts:
+                more, fewer = found[count], found[before]
+                rows_of = {"more": more.rows[name], "fewer": fewer.rows[name]}
+                cells.append(str(dvae.Evaluation(**{**vars(more), "rows": rows_of}).difference(*rows_of, metric)))
+            rows.append([name, metric, *cells])
+    joints = [(set(found[c].data["given"]) - set(found[b].data["given"])).pop() for b, c in counts]
+    return table(["", "", *(f"{b} to {c}: {joint}" for (b, c), joint in zip(counts, joints, strict=True))], rows)
+
+
+def changes(found: Counts, metrics: Sequence[str] = ("ADE", "APD")) -> str:
+    """What each change does, paired, by the number of given joints."""
+    rows = [
+        [change, metric, *(str(each.difference(having, lacking, metric)) for each in found.values())]
+        for change, having, lacking in STEPS
+        for metric in metrics
+    ]
+    return table(["", "", *(f"{count} given" for count in found)], rows)
+
+
 if __name__ == "__main__":
-    evaluations = read(sys.argv[1:])
-    write(PAGE, scores(evaluations), steps(evaluations))
+    draws, means, exchanged = read(sys.argv[1:])
+    write(
+        PAGE,
+        scores(draws, METRICS),
+        more_joints(draws),
+        changes(draws),
+        scores(means, SINGLE, references=False),
+        scores(exchanged, METRICS, references=False),
+    )
