@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.fft import dct, idct
+from scipy.stats import binomtest
 
 from dvae.networks import CosineEncoder, MotionDecoder
 from dvae.networks.base import Input, share_modules
-from dvae.networks.cosine import positions
+from dvae.networks.cosine import Dropout, TransformerLayer, positions
 from dvae.notation import Relation
 
 ALL, LENGTH = Relation.parse("1:T"), 7
@@ -103,6 +104,37 @@ def test_layers_do_not_start_alike_and_shared_modules_are_one():
     assert second.static is first.static
     assert second.between is first.between
     assert second.after is not first.after
+
+
+def test_a_layer_in_training_is_torchs():
+    layer = TransformerLayer(8, 2, 6, 0.0, batch_first=True).double()
+    x = torch.randn(3, 5, 8, dtype=torch.float64, requires_grad=True)
+    found = []
+    for forward in (layer.train(), lambda x: torch.nn.TransformerEncoderLayer.forward(layer, x), layer.eval()):
+        out = forward(x)
+        found.append((out, *torch.autograd.grad(out.sin().sum(), [x, *layer.parameters()])))
+        assert len(found[-1]) == 14
+    for other in found[1:]:
+        torch.testing.assert_close(other, found[0])
+
+
+def test_dropout_leaves_out_the_share_that_it_says():
+    """Each unit apart, whatever their number, scaled to keep the mean; the same ones in the gradient."""
+    torch.manual_seed(0)
+    for share, count in ((0.1, 200_000), (0.1, 200_003), (0.73, 200_002)):
+        x = torch.rand(count) + 1
+        x.requires_grad_()
+        out = Dropout(share)(x)
+        gone = out == 0
+        assert binomtest(int(gone.sum()), count, share).pvalue > 0.001
+        together = (gone[:-1] & gone[1:]).sum() + (gone[:-3] & gone[3:]).sum()
+        assert int(together) == pytest.approx(2 * count * share**2, abs=6 * (2 * count * share**2) ** 0.5)
+        torch.testing.assert_close(out[~gone], x[~gone] / (1 - share), rtol=1e-4, atol=0)
+        (gradient,) = torch.autograd.grad(out.sum(), x)
+        assert torch.equal(gradient == 0, gone)
+    for share, kept in ((0.0, 1), (1.0, 0)):
+        assert torch.equal(Dropout(share)(x), kept * x)
+    assert torch.equal(Dropout(0.5).eval()(x), x)
 
 
 def test_dropout_is_in_training_alone():
