@@ -194,7 +194,7 @@ def test_priors_that_do_not_suit(prior, guide, message):
 # ------------------------------------------------------------------------------------------------------- in a run
 
 OPTIONS = {"latent": 2, "static": 2, "width": 4, "heads_count": 1, "decoder": 4, "warm_up": 0, "self_feeding": 0.0}
-VAMP = {**OPTIONS, "prior": "vamp", "prior_components": 3, "prior_steps": 6, "heading": False}
+VAMP = {**OPTIONS, "prior": "vamp", "prior_components": 3, "prior_steps": 6, "heading": False, "pose_prior": 0.0}
 
 
 @pytest.fixture(scope="module")
@@ -240,6 +240,7 @@ def test_priors_on_the_command_line(prior, people, tmp_path):
     out = tmp_path / "run"
     small = [f"--{name.replace('_', '-')}={value}" for name, value in OPTIONS.items()]
     fit = ["fit", "hit-dvae", "--prior", prior, *small, "--free-bits", "0.1", "--warm-up-shape", "cosine"]
+    fit += ["--pose-prior", "0"]  # which would be fitted first
     assert main([*fit, "--data", str(people), "--out", str(out), "--steps", "4", "--batch-size", "2"]) == 0
     assert main(["resume", str(out), "--steps", "6"]) == 0
     loaded = dvae.load(out)
