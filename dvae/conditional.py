@@ -13,7 +13,7 @@ from .distributions.chain import DERIVATIVES, gaussian_chain
 from .heads import Head, HeadSpec, NormalHead, Parameters, StandardNormal
 from .networks.base import Input, Network, NetworkSpec, at, shift
 from .networks.rows import Rows
-from .notation import Factor
+from .notation import PROBED, Factor
 from .units import Units
 
 CONSTANT = "1"
@@ -54,15 +54,22 @@ class Conditional(nn.Module):
             self.head = StandardNormal(self.size)
         self.parents = [parent.name for parent in factor.parents]
         self.units: dict[str, Units] = {}  # not registered here: they are the model's
-        if self.head.residual and not self._reads_previous():
-            raise ValueError(
-                f"{factor} has a residual head, which adds {factor.child}_{{t-1}}, but it does not read that; "
-                f"add {factor.child}_{{t-1}} or {factor.child}_{{<t}} to its parents, or use residual=0"
-            )
+        for length in PROBED:
+            self.check(length)
 
-    def _reads_previous(self) -> bool:
-        own = [parent for parent in self.factor.parents if parent.name == self.factor.child]
-        return bool(own) and own[0].relation is not None and bool(own[0].relation.mask(2)[1, 0])
+    def check(self, length: int) -> None:
+        """Refuses a residual head that reads what the factor does not, at sequences of this length.
+
+        Raises:
+            ValueError: the factor does not read the child's own value a step before.
+        """
+        own = self.factor.parent(self.factor.child)
+        if self.head.residual and not (own and own.relation and own.relation.reads(-1, length)):
+            raise ValueError(
+                f"{self.factor} has a residual head, which adds {self.factor.child}_{{t-1}}, but it does not read that "
+                f"at {length} steps; add {self.factor.child}_{{t-1}} or {self.factor.child}_{{<t}} to its parents, or "
+                "use residual=0"
+            )
 
     def forward(
         self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None

@@ -65,25 +65,46 @@ def markov_boundary(dag: nx.DiGraph, node: Node, given: AbstractSet[Node]) -> se
     return boundary
 
 
-def analytic_kl(generative: Factorization, inference: Factorization) -> dict[str, bool]:
+def analytic_kl(
+    generative: Factorization, inference: Factorization, hidden: Iterable[str] = (), steps: int = 12
+) -> dict[str, bool]:
     """For which latents the bound may use the analytic KL(q(z_t | ...) || p(z_t | ...)).
 
     That form holds the parents of z_t in the model fixed while it averages over z_t, so it is right exactly
     where no such parent is a descendant of z_t in the guide. A backward guide q(z_t | z_{>t}, ...) for
     p(z_t | z_{t-1}) draws z_{t-1} from z_t: the analytic form would be biased, and the log-ratio has to be
-    averaged instead.
+    averaged instead. In place of hidden data the model reads its own mean, a function of that mean's parents: these
+    are then parents of z_t too.
+
+    Args:
+        generative, inference: p and q.
+        hidden: names of the data of which some entries are the model's own means (missing, or fed).
+        steps: T of the run, which matters where a mask is the user's own.
 
     Returns:
         {latent: True where the analytic form is unbiased}, in the order in which the guide draws them.
     """
-    relations = _relations(generative, inference)
-    T = 3 + sum(relation.lag for relation in relations)
+    relations, hidden = _relations(generative, inference), frozenset(hidden)
+    if any(relation.intervals is None for relation in relations):
+        T = steps
+    else:
+        reach = sum(relation.lag for relation in relations)
+        T = 3 + (reach**2 if hidden else reach)  # lags that add up again and again meet within their product
     model, guide = generative.dag(T), inference.dag(T)
     latents = [name for block in inference.blocks for name in block.names]
+
+    def reads(node: Node) -> set[Node]:
+        found: set[Node] = set()
+        frontier = list(model.predecessors(node))
+        while frontier:
+            parent = frontier.pop()
+            if parent not in found:
+                found.add(parent)
+                frontier.extend(model.predecessors(parent) if parent[0] in hidden else ())
+        return found
+
     return {
-        latent: all(
-            nx.descendants(guide, node).isdisjoint(model.predecessors(node)) for node in guide if node[0] == latent
-        )
+        latent: all(nx.descendants(guide, node).isdisjoint(reads(node)) for node in guide if node[0] == latent)
         for latent in latents
     }
 
@@ -108,6 +129,8 @@ class Audit:
             The bound cannot be tight.
         redundant_parents: for each latent, what the guide factor reads though the latent is independent of it
             given the rest of what that factor reads. Harmless: nothing is lost by dropping it.
+        steps: the one length T that it holds for, where a mask is the user's own and may be another at every length;
+            None where it holds for all.
     """
 
     generative: Factorization
@@ -115,6 +138,7 @@ class Audit:
     observed: tuple[str, ...]
     missing_parents: dict[str, tuple[Parent, ...]] = field(repr=False)
     redundant_parents: dict[str, tuple[Parent, ...]] = field(repr=False)
+    steps: int | None = None
 
     @property
     def missing(self) -> dict[str, tuple[str, ...]]:
@@ -147,9 +171,10 @@ class Audit:
     @property
     def verdict(self) -> str:
         """One sentence."""
+        where = "" if self.steps is None else f" at T = {self.steps} (masks of your own may differ at other lengths)"
         if self.exact:
-            return "exact: the guide reads everything the posterior depends on"
-        return "not exact: the guide misses what the posterior depends on, so the bound stays below the evidence"
+            return f"exact{where}: the guide reads everything the posterior depends on"
+        return f"not exact{where}: the guide misses what the posterior depends on, so the bound stays below the evidence"
 
     def table(self) -> Table:
         """A rich table with one row per guide factor."""
@@ -199,7 +224,7 @@ def _terms(parents: dict[str, tuple[Parent, ...]]) -> dict[str, tuple[str, ...]]
 def audit(
     generative: Factorization | str,
     inference: Factorization | str,
-    steps: int = 5,
+    steps: int | None = None,
     observed: Iterable[str] = ("x",),
 ) -> Audit:
     """Compares what each factor of a guide reads with what the exact posterior factor depends on.
@@ -210,10 +235,14 @@ def audit(
     to depend on; steps is widened where a relation reaches further. A pattern that is periodic in time (a lag
     of 2 without one of 1) is listed as far as seen.
 
+    A mask of the user's own is known at one length at a time, and may single out some steps: the graphs are then
+    compared at all of exactly ``steps`` steps, and the audit says so.
+
     Args:
         generative: p, a factorization or its text.
         inference: q.
-        steps: number of inner steps compared.
+        steps: number of inner steps compared, 5 if None; with masks of the user's own T, the length that they will
+            be used at, 16 if None.
         observed: names of the observed variables.
 
     Raises:
@@ -225,8 +254,13 @@ def audit(
     generative = Factorization.parse(generative) if isinstance(generative, str) else generative
     inference = Factorization.parse(inference) if isinstance(inference, str) else inference
     latents, data, context = check_pair(generative, inference, observed)
-    lag = max((relation.lag for relation in _relations(generative, inference)), default=0)
-    width, margin = max(steps, 2 * lag + 3), 2 * lag + 2
+    relations = _relations(generative, inference)
+    custom = any(relation.intervals is None for relation in relations)
+    if custom:
+        width, margin = steps or 16, 0
+    else:
+        lag = max((relation.lag for relation in relations), default=0)
+        width, margin = max(steps or 5, 2 * lag + 3), 2 * lag + 2
     T = width + 2 * margin
     local = {name: (inference if name in inference.context else generative).local(name) for name in context}
     local |= {name: generative.local(name) for name in (*data, *latents)}
@@ -264,7 +298,7 @@ def audit(
                 if offsets.any():
                     relation = (_relation(offsets) if in_time else ALL) if local[name] else None
                     found[child] = (*found.get(child, ()), Parent(name, local[name], relation))
-    return Audit(generative, inference, data, missing, redundant)
+    return Audit(generative, inference, data, missing, redundant, T if custom else None)
 
 
 def _by_offset(arrows: np.ndarray, in_time: bool) -> np.ndarray:

@@ -43,6 +43,8 @@ RESERVED = {
     "mask": "the batch's entry for which entries are observed",
     "sequences": "the name of the plate over the batch",
 }
+PROBED = (*range(2, 9), 16, 32, 64)
+"""Lengths at which the direction of a custom mask is looked up; every run checks it at its own."""
 FONT = r"\\(?:math(?:bf|rm|it|sf)|boldsymbol|bm)(?![a-z])\s*"
 
 
@@ -133,21 +135,29 @@ class Relation:
 
     @property
     def lag(self) -> int:
-        """The largest finite distance in its definition: 1 for {<t} and {t+1}, 3 for {t-3:t}, 0 for {1:T}."""
-        if self.intervals is not None:
-            return max((int(abs(end)) for i in self.intervals for end in i if math.isfinite(end)), default=0)
-        t, s = np.nonzero(self._square(8))
-        distance = np.abs(s - t).max(initial=0)
-        return int(distance) if distance < 7 else 1
+        """The largest finite distance in its definition: 1 for {<t} and {t+1}, 3 for {t-3:t}, 0 for {1:T}.
+
+        Raises:
+            ValueError: a custom mask, whose reach may depend on T.
+        """
+        if self.intervals is None:
+            raise ValueError(f"the custom mask {self} has no lag: what it reads is known at a given length only")
+        return max((int(abs(end)) for i in self.intervals for end in i if math.isfinite(end)), default=0)
 
     @property
     def directions(self) -> frozenset[int]:
-        """Where it reads: -1 the past, 0 the same step, +1 the future; for custom masks, at T = 2, ..., 8."""
+        """Where it reads: -1 the past, 0 the same step, +1 the future; for custom masks, at the lengths `PROBED`."""
         if self.intervals is not None:
             reads = {-1: (-math.inf, -1), 0: (0, 0), 1: (1, math.inf)}
             return frozenset(k for k, side in reads.items() if (self & Relation.of([side])).intervals)
-        offsets = [np.subtract(*np.nonzero(self._square(T).T)) for T in range(2, 9)]
+        offsets = [np.subtract(*np.nonzero(self.mask(T).T)) for T in PROBED]
         return frozenset(int(sign) for sign in np.sign(np.concatenate(offsets)))
+
+    def reads(self, offset: int, T: int) -> bool:
+        """Whether the child reads the parent so many steps away wherever there is such a step of T."""
+        if self.intervals is not None:
+            return any(low <= offset <= high for low, high in self.intervals)
+        return bool(self.mask(T).diagonal(offset).all())
 
     def mask(self, T: int) -> np.ndarray:
         """Bool array (T, T): M[t, s] is True where the child at t may read the parent at s (counted from 0).
@@ -155,6 +165,10 @@ class Relation:
         Raises:
             ValueError: a custom function returns anything but a bool array (T, T) or (1, T).
         """
+        return np.broadcast_to(self.rows(T), (T, T)).copy()
+
+    def rows(self, T: int) -> np.ndarray:
+        """`mask`, or its one row (1, T) where a custom function gives the same for every t."""
         if self.intervals is not None:
             offset = np.arange(T)[None, :] - np.arange(T)[:, None]
             return np.any([(low <= offset) & (offset <= high) for low, high in self.intervals or [(1, 0)]], axis=0)
@@ -166,9 +180,6 @@ class Relation:
                 f"({T}, {T}) with rows t and columns s (or (1, {T}): the same row for every t)"
             )
         return mask
-
-    def _square(self, T: int) -> np.ndarray:
-        return np.broadcast_to(self.mask(T), (T, T))
 
     def __or__(self, other: Relation) -> Relation:
         if self.intervals is not None and other.intervals is not None:
@@ -201,7 +212,7 @@ class _Composed:
     operands: tuple[Relation, ...]
 
     def __call__(self, T: int) -> np.ndarray:
-        return self.operation(*(operand.mask(T) for operand in self.operands))
+        return self.operation(*(operand.rows(T) for operand in self.operands))
 
 
 def _interval_name(low: float, high: float) -> str:
@@ -269,13 +280,13 @@ class Factor:
         rows, columns = T if self.local else 1, T if reads.local else 1
         if reads.relation is None or (reads.relation == ALL and not self.local):
             return np.ones((rows, columns), dtype=bool)
-        mask = reads.relation.mask(T)
-        if not self.local and len(mask) != 1:
+        mask = reads.relation.mask(T) if self.local else reads.relation.rows(T)
+        if len(mask) != rows:
             raise ValueError(
                 f"the mask {reads.relation} of {self} is {mask.shape} at T={T}, but {self.child} is static: "
                 f"expected a bool array (1, {T})"
             )
-        return np.broadcast_to(mask, (rows, columns)).copy()
+        return mask
 
     def edges(self, T: int) -> list[tuple[Node, Node]]:
         """The arrows (parent, child) of the graph unrolled over T steps; see :meth:`Factorization.dag`."""
@@ -499,8 +510,8 @@ class Factorization:
 
     def _cycle(self, child: str, parent: str) -> list[Node]:
         """The shortest cycle through child reading parent in the unrolled graph, from step 2; or []."""
-        lags = [p.relation.lag for f in self.factors for p in f.parents if p.relation is not None]
-        dag = self.dag(3 + max(lags, default=0))
+        relations = [p.relation for f in self.factors for p in f.parents if p.relation is not None]
+        dag = self.dag(max((11 if r.intervals is None else 3 + r.lag for r in relations), default=3))
         found: list[list[Node]] = []
         for source, target in dag.edges:
             if source[0] == parent and target[0] == child and nx.has_path(dag, target, source):
@@ -594,7 +605,7 @@ class _Reader:
     def custom(name: str, mask: Relation | MaskFunction) -> Relation:
         if not isinstance(mask, Relation):
             return Relation.custom(name, mask)
-        return mask if mask.intervals else Relation.custom(name, mask.mask)
+        return mask if mask.intervals else Relation.custom(name, mask.rows)
 
     def fail(self, message: str, at: int | None = None) -> NoReturn:
         at = self.at if at is None else at

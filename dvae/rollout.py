@@ -80,6 +80,8 @@ class Rollout:
 
     def __post_init__(self) -> None:
         _check_custom_masks(self.factorization, self.length)
+        for conditional in self.conditionals.values():
+            conditional.check(self.length)
         self._block = {name: block for block in self.factorization.blocks for name in block.names}
         self._drawn: dict[str, Tensor] = {}
         self._evaluated: dict[str, tuple[Tensor, Parameters]] = {}

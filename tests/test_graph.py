@@ -148,11 +148,67 @@ def test_where_the_analytic_kl_is_unbiased(generative, inference, analytic):
     assert analytic_kl(Factorization.parse(generative), Factorization.parse(inference)) == analytic
 
 
+@pytest.mark.parametrize(
+    ("generative", "inference", "hidden", "analytic"),
+    [
+        # x_{t-1} is the model's own mean where it is missing, a function of z_{t-1}, which was drawn from z_t
+        ("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | z_{t+1}, x_{1:T})", {}, True),
+        ("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | z_{t+1}, x_{1:T})", {"x"}, False),
+        ("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | z_{<t}, x_{1:T})", {"x"}, True),
+        # through several means in a row: 8 k = 7 m + 1 first at k = 1, and at 8 k + 1 = 7 m only at k = 6
+        ("p(z_t | x_{t-1}) p(x_t | z_t, x_{t-8})", "q(z_t | z_{t+7}, x_{1:T})", {"x"}, False),
+        ("p(z_t | x_{t-1}) p(y_t | y_{t-1}, u) p(x_t | y_t) p(u)", "q(z_t | x_t) q(u | z_{1:T})", {"x", "y"}, False),
+    ],
+)
+def test_parents_of_a_hidden_mean_count_as_parents(generative, inference, hidden, analytic):
+    found = analytic_kl(Factorization.parse(generative), Factorization.parse(inference), hidden)
+    assert found["z"] == analytic
+
+
+def test_masks_of_the_users_own_are_looked_up_at_the_length_of_the_run():
+    masks = {"far": far}
+    pair = (
+        Factorization.parse("p(z_t | z_{far}) p(x_t | z_t)", masks=masks),
+        Factorization.parse("q(z_t | z_{>t}, x_{1:T})"),
+    )
+    assert analytic_kl(*pair, steps=9) == {"z": True}
+    assert analytic_kl(*pair, steps=10) == {"z": False}
+
+
 def test_masks_of_the_users_own_are_audited():
     masks = {"recent": lambda T: Relation.parse("t-2:t-1").mask(T)}
     guide = Factorization.parse("q(z_t | z_{recent}, x_{1:T})", masks=masks)
     result = audit(HIT_DVAE.replace("p(w) ", "").replace(", w", ""), guide)
     assert result.missing == {"z": ("z_{<=t-3}",)}
+
+
+def first(length):
+    return np.arange(length)[None] < 1
+
+
+def far(length):
+    return np.eye(length, k=-9, dtype=bool)
+
+
+@pytest.mark.parametrize(
+    ("generative", "inference", "missing"),
+    [
+        # absolute steps: x_1 alone is read by all, so that every z is bound to z_1 through it
+        ("p(z_t) p(x_t | z_{first})", "q(z_t | x_t)", True),
+        ("p(z_t) p(x_t | z_{first})", "q(z_t | x_{1:T})", False),
+        # a reach that is seen at long sequences only
+        ("p(z_t | z_{far}) p(x_t | z_t)", "q(z_t | x_{1:T})", True),
+        ("p(z_t | z_{far}) p(x_t | z_t)", "q(z_t | z_{<t}, x_{1:T})", False),
+        ("p(z_t) p(x_t | z_t, z_{far})", "q(z_t | x_t)", True),
+    ],
+)
+def test_masks_of_the_users_own_are_audited_over_all_steps_of_one_length(generative, inference, missing):
+    model = Factorization.parse(generative, masks={"first": first, "far": far})
+    result = audit(model, inference, steps=12)
+    assert bool(result.missing) == missing
+    assert "at T = 12" in result.verdict
+    assert result.steps == 12
+    assert audit("p(z_t) p(x_t | z_t)", "q(z_t | x_t)").steps is None
 
 
 def test_long_lags_are_seen_whole():

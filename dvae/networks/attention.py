@@ -293,7 +293,7 @@ class SelfAttentionNetwork(Network):
     def __init__(self, spec: SelfAttention, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, spec.width)
         frames = [parent for parent in self.inputs if local and _closed(parent)]
-        self.encoded = [p for p in frames if _sight(p) == _sight(frames[0])]
+        self.encoded = [p for p in frames if p.relation == frames[0].relation]
         self.statics = [parent for parent in self.inputs if parent.relation is None]
         rest = [parent for parent in self.inputs if parent not in (*self.encoded, *self.statics)]
         self.extractors = Extractors([*self.encoded, *self.statics], spec.extract, spec.activation)
@@ -333,7 +333,9 @@ class SelfAttentionNetwork(Network):
 
     def bias(self, length: int) -> Tensor:
         """(1, heads, T, T): minus slope times distance where visible, else -inf."""
-        mask = torch.as_tensor(_mask(self.encoded[0], length), device=self.slopes.device)
+        relation = self.encoded[0].relation
+        assert relation is not None
+        mask = torch.as_tensor(relation.mask(length), device=self.slopes.device)
         steps = torch.arange(length, device=self.slopes.device, dtype=self.slopes.dtype)
         ahead = steps[None, :] - steps[:, None]
         looks_ahead = torch.arange(len(self.slopes), device=self.slopes.device)[:, None, None] % 2 == 1
@@ -363,20 +365,11 @@ def _slopes(heads: int) -> Tensor:
     return torch.tensor([2.0 ** (-8 * (h + 1) / heads) for h in range(heads)])
 
 
-def _mask(parent: Input, length: int) -> np.ndarray:
-    assert parent.relation is not None
-    return parent.relation.mask(length) & np.ones((length, 1), dtype=bool)
-
-
-def _sight(parent: Input) -> bytes:
-    return _mask(parent, 6).tobytes()
-
-
 def _closed(parent: Input) -> bool:
     """Whether frames that exchange what they see see no more for it, themselves included."""
     if parent.relation is None or parent.relation.intervals is None or parent.relation.pointwise:
         return False
-    mask = _mask(parent, 6)
+    mask = parent.relation.mask(2 * parent.relation.lag + 6)  # two looks, as far as they go
     return bool(mask.diagonal().all() and not ((mask.astype(int) @ mask > 0) & ~mask).any())
 
 

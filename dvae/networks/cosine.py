@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ..distributions.dct import cosine_basis
+from ..notation import ALL
 from .base import AtOnce, Input, Network, once
 
 
@@ -112,7 +113,7 @@ class CosineEncoderNetwork(AtOnce):
     def __init__(self, spec: CosineEncoder, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, 2 * spec.width)
         (source, *others), static = _apart(self, spec)
-        if others or not _reads_everything(source):
+        if others or source.relation != ALL:
             raise ValueError(f"CosineEncoder reads one parent over all time, as in y_{{1:T}}; not {self.inputs}")
         self.spec, self.names = spec, (source.name, static.name)
         self.over_time: Any = perceptron(source.size, spec.width)
@@ -258,6 +259,3 @@ def _basis(length: int, coefficients: int, like: Tensor) -> Tensor:
     """(C, T), see `cosine_basis`."""
     return _cached_basis(length, coefficients, like.dtype, like.device)
 
-
-def _reads_everything(parent: Input) -> bool:
-    return parent.relation is not None and bool(parent.relation.mask(3).all())

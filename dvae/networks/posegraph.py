@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ..notation import ALL
 from .base import Input, Network
 from .extract import Extract, Extractors
 
@@ -113,7 +114,7 @@ class FrameGraph:
         Raises:
             ValueError: a local child, or parents that are not read over {1:T}.
         """
-        if local or any(p.relation is None or not p.relation.mask(6)[:1].all() for p in inputs):
+        if local or any(p.relation != ALL for p in inputs):
             raise ValueError(
                 "FrameGraph sums up parents read over {1:T} for a static variable; use networks.SelfAttention or "
                 "networks.Attention for this factor"
