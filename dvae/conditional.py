@@ -54,8 +54,35 @@ class Conditional(nn.Module):
             self.head = StandardNormal(self.size)
         self.parents = [parent.name for parent in factor.parents]
         self.units: dict[str, Units] = {}  # not registered here: they are the model's
+        self.discrete, self.reparameterised = self._try_head()
         for length in PROBED:
             self.check(length)
+
+    @torch.inference_mode(False)
+    @torch.enable_grad()
+    def _try_head(self) -> tuple[bool, bool]:
+        """Whether the head's values are discrete, and whether its draws have a gradient.
+
+        Raises:
+            ValueError: a distribution of which several coordinates are one event.
+        """
+        rows = (1, 1) if self.factor.local else (1,)
+        with torch.random.fork_rng(devices=[]):
+            features = torch.randn(*rows, 1 if self.network is None else self.network.features, requires_grad=True)
+            previous = torch.randn(*rows, self.size) if self.head.residual else None
+            parameters = self.head(features, previous)
+            law = self.head.distribution(parameters)
+            value = self.head.draw(parameters, self.head.noise((*rows, self.size), features))
+        if law.event_shape or law.batch_shape != (*rows, self.size):
+            raise ValueError(
+                f"the head of {self.factor} makes a {type(law).__name__} of batch {tuple(law.batch_shape)} and event "
+                f"{tuple(law.event_shape)}; a head's distribution has one density for each coordinate, here batch "
+                f"{(*rows, self.size)} and no event, so that masks and bounds by step mean something; let latents "
+                "carry what the coordinates have in common"
+            )
+        discrete = law.support is not None and law.support.is_discrete
+        learns = value.requires_grad or not any(parameter.requires_grad for parameter in parameters)
+        return discrete, learns and not discrete  # torch.bernoulli has a gradient, of zero
 
     def check(self, length: int) -> None:
         """Refuses a residual head that reads what the factor does not, at sequences of this length.
@@ -80,7 +107,9 @@ class Conditional(nn.Module):
             return self._in_units(self.head(next(self.head.buffers()).new_ones(shape)))
         read = self._read(parents, batch, lengths)
         features = self.network(read, length, lengths)
-        previous = shift(read[self.factor.child], -1) if self.head.residual else None
+        previous = None
+        if self.head.residual:
+            previous = shift((parents if self._made_in is None else read)[self.factor.child], -1)
         return self._in_units(self.head(features, previous))
 
     def _read(self, values: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> dict[str, Tensor]:
@@ -90,8 +119,13 @@ class Conditional(nn.Module):
         found = {name: values[name] for name in self.parents if name in values}
         return found | {n: self.units[n].of(v, lengths) for n, v in found.items() if n in self.units}
 
+    @property
+    def _made_in(self) -> Units | None:
+        """The units that the head's parameters are put into, where these can be."""
+        return self.units.get(self.factor.child) if self.head.location_scale else None
+
     def _in_units(self, parameters: Parameters) -> Parameters:
-        units = self.units.get(self.factor.child)
+        units = self._made_in
         return parameters if units is None else self.head.in_units(parameters, units.mean, units.scale)
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
@@ -99,7 +133,8 @@ class Conditional(nn.Module):
         if self.network is None:
             return tuple(p.unbind(1) for p in self(given, batch, length))
         state = self.network.start(self._read(given, batch, lengths), batch, length, lengths)
-        own = self.factor.child if self.head.residual else None  # read from the draws, given or not
+        # read from the draws, given or not
+        own = self.factor.child if self.head.residual and self._made_in is not None else None
         live = [name for name in self.units if name in self.parents and (name not in given or name == own)]
         if not live:
             return state
@@ -109,15 +144,16 @@ class Conditional(nn.Module):
         """The head's parameters (B, D) at step t, and the next state."""
         if self.network is None:
             return tuple(p[t] for p in state), state
+        read = drawn
         if isinstance(state, Standardised):
             kept, lengths = state.kept, state.lengths
-            drawn = {**drawn, **{n: self.units[n].drawn(rows, drawn[n], lengths) for n, rows in kept.items()}}
-            features, state.network = self.network.step(state.network, t, drawn)
+            read = {**drawn, **{n: self.units[n].drawn(rows, drawn[n], lengths) for n, rows in kept.items()}}
+            features, state.network = self.network.step(state.network, t, read)
         else:
-            features, state = self.network.step(state, t, drawn)
+            features, state = self.network.step(state, t, read)
         previous = None
         if self.head.residual:
-            previous = at(drawn[self.factor.child], t - 1, features, self.size)
+            previous = at((drawn if self._made_in is None else read)[self.factor.child], t - 1, features, self.size)
         return self._in_units(self.head(features, previous, t)), state
 
     def chain(self, state: Any, direction: int, noise: Tensor) -> tuple[Tensor, Parameters] | None:

@@ -174,7 +174,9 @@ class Audit:
         where = "" if self.steps is None else f" at T = {self.steps} (masks of your own may differ at other lengths)"
         if self.exact:
             return f"exact{where}: the guide reads everything the posterior depends on"
-        return f"not exact{where}: the guide misses what the posterior depends on, so the bound stays below the evidence"
+        return (
+            f"not exact{where}: the guide misses what the posterior depends on, so the bound stays below the evidence"
+        )
 
     def table(self) -> Table:
         """A rich table with one row per guide factor."""

@@ -23,6 +23,9 @@ Parameters = tuple[Tensor, ...]
 class Head(nn.Module):
     """Features to the parameters of a distribution whose first parameter is its location.
 
+    A head of one's own gives `forward`, `distribution` and `draw`, and where the distribution is a location and a scale
+    says so. As it stands, it is one of normals.
+
     Args:
         residual: share of the variable's own previous value that its location keeps, so that features give the rest:
             1 (True) for an offset. Below 1 a free run forgets where it was, and cannot drift without bound. A
@@ -34,6 +37,9 @@ class Head(nn.Module):
 
     deterministic: ClassVar[bool] = False
     """Whether the variable is a function of its parents, without a density."""
+    location_scale: ClassVar[bool] = False
+    """Whether the first two parameters (or the one) are a location and a scale, which `in_units` can put into another
+    unit. Probabilities and rates cannot be."""
 
     def __init__(self, residual: float = False):
         super().__init__()
@@ -65,12 +71,12 @@ class Head(nn.Module):
         raise NotImplementedError
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """The elementwise distribution over (..., D)."""
+        """The elementwise distribution over (..., D): a density for each coordinate, without event dimensions."""
         loc, scale = parameters
         return dist.Normal(loc, scale, validate_args=False)
 
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """The parameters of mean + scale * variable, from those of the variable."""
+        """The parameters of mean + scale * variable, from those of the variable, of a location-scale family."""
         loc, *rest = parameters
         return torch.addcmul(mean, loc, scale), *(rest[:1] and [rest[0] * scale]), *rest[1:]
 
@@ -111,6 +117,8 @@ class Normal:
 
 class NormalHead(Head):
     """See `Normal`."""
+
+    location_scale = True
 
     def __init__(self, spec: Normal, features: int, size: int):
         super().__init__(spec.residual)
@@ -162,6 +170,8 @@ class FixedNormal:
 
 class FixedNormalHead(Head):
     """See `FixedNormal`."""
+
+    location_scale = True
 
     def __init__(self, spec: FixedNormal, features: int, size: int):
         super().__init__(spec.residual)
@@ -223,6 +233,8 @@ class StudentT:
 class StudentTHead(Head):
     """See `StudentT`."""
 
+    location_scale = True
+
     def __init__(self, spec: StudentT, features: int, size: int):
         super().__init__(spec.residual)
         self.min_scale = spec.min_scale
@@ -267,6 +279,7 @@ class DeltaHead(Head):
     """See `Delta`."""
 
     deterministic = True
+    location_scale = True
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         """See `Head.forward`."""
@@ -288,6 +301,7 @@ class DeltaHead(Head):
 class StandardNormal(Head):
     """N(0, I), the prior of a variable without parents; it reads no features."""
 
+    location_scale = True
     zero: Tensor
 
     def __init__(self, size: int):

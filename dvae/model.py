@@ -108,6 +108,7 @@ class DynamicalVAE(nn.Module):
             object.__setattr__(self, "encoder", {name: self.generator[name] for name in self.latents})
         else:
             self.encoder: Any = self._conditionals(self.inference)
+        self._check_latents()
         self.units: Any = nn.ModuleDict()
         self.priors = nn.ModuleDict(dict(priors or {}))
         for name, prior in (priors or {}).items():
@@ -135,6 +136,17 @@ class DynamicalVAE(nn.Module):
             }
         )
 
+    def _check_latents(self) -> None:
+        for name in self.latents:
+            for conditional in (self.generator[name], self.encoder[name]):
+                if conditional.discrete or not (conditional.reparameterised or conditional.factor.kind == "p"):
+                    what = "are discrete" if conditional.discrete else "are not reparameterised"
+                    raise ValueError(
+                        f"the draws of the latent {name} {what} by the head of {conditional.factor}, so that no "
+                        f"gradient would reach the guide through them; give it a continuous head such as "
+                        f"heads.Normal(), or name {name} as observed where it is data"
+                    )
+
     def _check_parts(self) -> None:
         places = sorted(place for part in self.parts.values() for place in part)
         if places != list(range(len(places))):
@@ -156,9 +168,11 @@ class DynamicalVAE(nn.Module):
                 )
 
     def standardise(self, name: str) -> Units:
-        """Has networks read and make a variable without unit, by a mean and a scale that `fit` of the result takes.
+        """Has networks read a variable without unit, by a mean and a scale that `fit` of the result takes.
 
-        Densities and values stay in the variable's own unit; call it before the model is fitted.
+        They make it without unit too where its head is a location and a scale (`Head.location_scale`); probabilities
+        and rates are made as they are. Densities and values stay in the variable's own unit; call it before the model
+        is fitted.
 
         Raises:
             ValueError: an unknown variable.

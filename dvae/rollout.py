@@ -32,18 +32,39 @@ class SelfFeeding:
         probability: of each frame, independently.
         passes: None runs through time, exactly. A number of passes approximates that in parallel: in each, all means
             are computed at once from the last pass's history (T passes are exact).
-        gradient: whether gradients flow through the means that are fed, and so back in time.
+        gradient: whether gradients flow through the means that are fed, and so back in time. Without (as Bengio et al.
+            have it) a step takes half the time or less, and the gradient is not that of the self-fed bound. The means
+            in place of missing entries always carry theirs.
         start: frames at the beginning that stay as they are, such as those that a forecast will have observed.
     """
 
     probability: float
     passes: int | None = None
-    gradient: bool = False
+    gradient: bool = True
     start: int = 0
 
     def __post_init__(self) -> None:
         if not 0 <= self.probability <= 1 or (self.passes is not None and self.passes < 1) or self.start < 0:
             raise ValueError(f"expected a probability in [0, 1], at least one pass and a start from 0, got {self}")
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """Where the model may not read a variable of the data, and reads its own mean.
+
+    Args:
+        entries: (B, T, 1 or D), or (B, D) of a static variable.
+        detached: those of them whose mean is fed without a gradient, or None.
+    """
+
+    entries: Tensor
+    detached: Tensor | None = None
+
+    def fill(self, value: Tensor, mean: Tensor, steps: int | slice = slice(None)) -> Tensor:
+        """The value (B, T, D) with the mean at these entries; at one step, (B, D) both."""
+        if self.detached is not None:
+            mean = torch.where(self.detached[:, steps], mean.detach(), mean)
+        return torch.where(self.entries[:, steps], mean, value)
 
 
 @dataclass
@@ -85,7 +106,8 @@ class Rollout:
         self._block = {name: block for block in self.factorization.blocks for name in block.names}
         self._drawn: dict[str, Tensor] = {}
         self._evaluated: dict[str, tuple[Tensor, Parameters]] = {}
-        self._history: dict[str, Tensor] | None = None
+        self._fed: dict[str, Tensor] = {}
+        self._unfed = list(self.factorization.blocks)
         self._valid = None if self.lengths is None else valid_steps(self.lengths, self.length)[..., None]
 
     @cached_property
@@ -122,8 +144,10 @@ class Rollout:
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)
-        parameters = conditional(self.values, self.batch, self.length, self.lengths)
-        return conditional.head.distribution(tuple(p.repeat(draws, 1) for p in parameters)).to_event(1)
+        known = {**self.values, **self.history(name)}
+        parameters = conditional(known, self.batch, self.length, self.lengths)
+        law = conditional.head.distribution(tuple(p.repeat(draws, 1) for p in parameters))
+        return (law.mask(self.observed[name]) if name in self.observed else law).to_event(1)
 
     def know(self, name: str, value: Tensor) -> None:
         """Record the value of a site, which later sites read."""
@@ -152,7 +176,7 @@ class Rollout:
     def parameters(self, name: str, value: Tensor) -> Parameters:
         """Those of `evaluate`, (B, T, D) each, of which the first is the location; computed once for a value."""
         if name not in self._evaluated or self._evaluated[name][0] is not value:
-            known = {**self.values, name: value, **self.history()}
+            known = {**self.values, name: value, **self.history(name)}
             self._evaluated[name] = (value, self.conditionals[name](known, self.batch, self.length, self.lengths))
         return self._evaluated[name][1]
 
@@ -166,45 +190,53 @@ class Rollout:
             self._drawn.update(self._run(self._block[name]))
         return self._drawn[name]
 
-    def history(self) -> dict[str, Tensor]:
-        """What the model reads as the data's past where it may not read them: its own means."""
-        if self._history is None:
-            hidden = self._hidden()
-            gradient = self.feeding is not None and self.feeding.gradient and torch.is_grad_enabled()
-            with torch.set_grad_enabled(gradient):
-                self._history = self._feed(hidden) if hidden else {}
-        return self._history
+    def history(self, name: str) -> dict[str, Tensor]:
+        """What a variable reads as the data's past where the model may not read them: the model's own means.
 
-    def _hidden(self) -> dict[str, Tensor]:
-        """Name to (B, T, 1 or D) True at the entries of the data that the model may not read."""
-        hidden = {name: ~seen for name, seen in self.observed.items() if name in self.values and not seen.all()}
-        if self.feeding is not None and self.feeding.probability:
-            frames = torch.rand(self.batch, self.length, 1, device=next(iter(self.values.values())).device)
-            fed = frames < self.feeding.probability
-            fed[:, : self.feeding.start] = False
-            for name in self.data & self.values.keys():
-                hidden[name] = fed | hidden[name] if name in hidden else fed
+        They are functions of parameters and latents, so that their gradient is part of the bound's, but where
+        self-feeding asks for none.
+        """
+        if not self.hidden:
+            return {}
+        gradient = any(hidden.detached is None or other in self.observed for other, hidden in self.hidden.items())
+        with torch.set_grad_enabled(gradient and torch.is_grad_enabled()):
+            while self._block[name] in self._unfed:  # blocks read themselves and earlier ones
+                self._fed.update(self._feed(self._unfed.pop(0)))
+        return self._fed
+
+    @cached_property
+    def hidden(self) -> dict[str, Hidden]:
+        """What the model may not read of the data: missing entries, and frames that self-feeding replaces."""
+        missing = {name: ~seen for name, seen in self.observed.items() if name in self.values and not seen.all()}
+        hidden = {name: Hidden(entries) for name, entries in missing.items()}
+        if self.feeding is None or not self.feeding.probability:
+            return hidden
+        frames = torch.rand(self.batch, self.length, 1, device=next(iter(self.values.values())).device)
+        fed = frames < self.feeding.probability
+        fed[:, : self.feeding.start] = False
+        for name in self.data & self.values.keys():
+            if self.factorization.local(name):
+                absent = missing.get(name)
+                entries = fed if absent is None else fed | absent
+                detached = None if self.feeding.gradient else fed if absent is None else fed & ~absent
+                hidden[name] = Hidden(entries, detached)
         return hidden
 
-    def _feed(self, hidden: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        passes = None if self.feeding is None else self.feeding.passes
+    def _feed(self, block: Block) -> dict[str, Tensor]:
+        """The data of a block with own means at the hidden entries."""
+        names = [name for name in block.names if name in self.hidden]
+        if not names or self.feeding is None or self.feeding.passes is None:
+            return self._run(block, self._fed, self.hidden) if names else {}
         fed: dict[str, Tensor] = {}
-        for block in self.factorization.blocks:
-            names = [name for name in block.names if name in hidden]
-            if not names:
-                continue
-            if passes is None:
-                fed.update(self._run(block, fed, hidden))
-                continue
-            for _ in range(passes):
-                known = {**self.values, **fed}
-                for name in names:
-                    mean = self.conditionals[name](known, self.batch, self.length, self.lengths)[0]
-                    fed[name] = self._hide(torch.where(hidden[name], mean, self.values[name]))
+        for _ in range(self.feeding.passes):
+            known = {**self.values, **self._fed, **fed}
+            for name in names:
+                mean = self.conditionals[name](known, self.batch, self.length, self.lengths)[0]
+                fed[name] = self._hide(self.hidden[name].fill(self.values[name], mean))
         return fed
 
     def _run(
-        self, block: Block, fed: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Tensor] | None = None
+        self, block: Block, fed: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Hidden] | None = None
     ) -> dict[str, Tensor]:
         """Values of the unknown variables of a block; with `hidden`, of its data, with own means at those entries."""
         live = [name for name in block.names if (name not in self.values if hidden is None else name in hidden)]
@@ -225,7 +257,7 @@ class Rollout:
             parameters = conditional(given, self.batch, self.length, self.lengths)
             value = conditional.head.draw(parameters, noise[name]) if name in noise else parameters[0]
             if hidden is not None:
-                value = torch.where(hidden[name], value, self.values[name])
+                value = hidden[name].fill(self.values[name], value)
             elif name in self.prefix:
                 seen = self.prefix[name].shape[1]
                 value = torch.cat([self._continue(name, slice(seen), value[:, :seen]), value[:, seen:]], dim=1)
@@ -240,7 +272,7 @@ class Rollout:
         live: list[str],
         given: Mapping[str, Tensor],
         noise: Mapping[str, Tensor],
-        hidden: Mapping[str, Tensor] | None,
+        hidden: Mapping[str, Hidden] | None,
     ) -> dict[str, Tensor]:
         states = {name: self.conditionals[name].start(given, self.batch, self.length, self.lengths) for name in live}
         padded = self._valid is not None and block.direction < 0  # a backward loop meets the padding first
@@ -262,7 +294,7 @@ class Rollout:
                 evaluated[name].append(parameters)
                 value = conditional.head.draw(parameters, steps[name][t]) if name in steps else parameters[0]
                 if hidden is not None:
-                    value = torch.where(hidden[name][:, t], value, self.values[name][:, t])
+                    value = hidden[name].fill(self.values[name][:, t], value, t)
                 elif name in self.prefix and t < self.prefix[name].shape[1]:
                     value = self._continue(name, t, value)
                 if padded:
@@ -282,7 +314,7 @@ class Rollout:
         return torch.where(self.observed[name][:, steps], known, value) if name in self.observed else known
 
     def _hide(self, value: Tensor) -> Tensor:
-        return value if self._valid is None else value * self._valid
+        return value if self._valid is None or value.dim() == 2 else value * self._valid
 
 
 @lru_cache(maxsize=1024)

@@ -69,7 +69,8 @@ class SequenceELBO(ELBO):
     A Pyro ELBO, to be used as any other; `terms` gives it by variable and sequence. The KL of a latent is analytic per
     step where none of its generative parents is its descendant in the guide, and both conditionals are normal; else it
     is the log-ratio at the draw, which is unbiased for every guide. (For a backward guide the analytic form is wrong:
-    it treats parents as fixed that move with the latent.)
+    it treats parents as fixed that move with the latent.) The parents are those of the program as it is run: where x
+    is missing or fed, the model reads its own mean, which moves with the parents of x.
 
     It takes traces as `TraceMeanField_ELBO` does and agrees with it where that is right, but evaluates every
     conditional once, where that would do so for the trace's own log probability too.
@@ -191,8 +192,13 @@ def _closed_forms(model_sites: Mapping[str, Any], guide_sites: Mapping[str, Any]
     """The latents whose KL term may be analytic; none for programs whose factorizations are not known."""
     # In a replayed model the latents' sites carry the guide's notes; those of the data carry its own.
     sites = ([site for site in model_sites.values() if site["is_observed"]], guide_sites.values())
-    pair = [next((s["infer"]["program"] for s in group if "program" in s["infer"]), None) for group in sites]
-    return set() if None in pair else {name for name, right in _analytic(*pair).items() if right}
+    notes = [s["infer"] for group in sites for s in [s for s in group if "program" in s["infer"]][:1]]
+    if len(notes) < 2:
+        return set()
+    pair, run = [note["program"] for note in notes], notes[0]["run"]
+    steps = run.length if any(equations.masks for equations in pair) else 0  # for masks of the user's own alone
+    right = _analytic(*pair, hidden=frozenset(run.hidden), steps=steps)
+    return {name for name, analytic in right.items() if analytic}
 
 
 _analytic = functools.lru_cache(maxsize=256)(analytic_kl)

@@ -89,6 +89,8 @@ class GatedNormal:
 class GatedHead(Head):
     """See `GatedNormal`."""
 
+    location_scale = True
+
     def __init__(self, spec: GatedNormal, size: int):
         super().__init__()
         self.min_variance = spec.min_scale**2

@@ -23,6 +23,7 @@ from ..motion import Skeleton, Windows
 from ..networks import NetworkSpec
 from ..notation import Factor, Factorization
 from ..priors import FlowPrior, MixturePrior, Prior, VampPrior
+from ..rollout import SelfFeeding
 
 SHAPES: dict[str, type[Linear | Cosine | Logistic]] = {"linear": Linear, "cosine": Cosine, "logistic": Logistic}
 EMISSIONS = ("normal", "fixed", "student", "unit")
@@ -47,7 +48,8 @@ class Method:
         warm_up_shape: form of that rise.
         free_bits: nats per frame below which the KL of a latent, averaged over the batch, costs nothing more.
         self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over a
-            third of training, after the first tenth. Nothing is fed to a model that reads no x.
+            third of training, after the first tenth, and carries no gradient. Nothing is fed to a model that reads no
+            x.
 
     Raises:
         ValueError: when an option is out of range.
@@ -151,7 +153,9 @@ class Method:
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
         """The model for data of these sizes, such as {"x": 60}."""
         sizes = {**self.sizes(), **data}
-        return DynamicalVAE(*self.equations(), sizes, self.networks(), self.heads(), self.priors(sizes))
+        model = DynamicalVAE(*self.equations(), sizes, self.networks(), self.heads(), self.priors(sizes))
+        model.feeding = SelfFeeding(0.0, gradient=False)
+        return model
 
     def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
         """What options that are None stand for, with poses of this skeleton; see `presets`."""

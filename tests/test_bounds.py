@@ -6,6 +6,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from dense import exact_bound, library_bound
 from pyro import poutine
 from pyro.infer import Trace_ELBO, TraceMeanField_ELBO
 from pyro.infer.autoguide.initialization import InitMessenger, init_to_value
@@ -14,6 +15,7 @@ from dvae import DynamicalVAE, Oracle, SequenceELBO, heads, importance_bound, tw
 from dvae.distributions import Sequence
 from dvae.inference.bounds import _khat
 from dvae.networks import Attention, Recurrent
+from dvae.rollout import SelfFeeding
 
 B, T = 3, 5
 EQUATIONS = (
@@ -276,3 +278,67 @@ def test_evaluation_leaves_the_mode_and_takes_no_gradient():
     assert model.training
     assert math.isfinite(importance_bound(model.eval(), data(), 2).bound.sum())
     assert not model.training
+
+
+# ------------------------------------------------------------------------------------------------- missing entries
+
+
+def hiding(steps, *hidden):
+    seen = torch.ones(1, steps, 1, dtype=torch.bool)
+    seen[:, list(hidden)] = False
+    return seen
+
+
+def test_a_guide_that_can_be_exact_reaches_the_evidence_where_entries_are_missing():
+    """x_1 and x_2 are missing: x_3 is all there is, and z_1 and z_2 move it through the means of x_1 and x_2."""
+    steps = 3
+    model = twin("p(z_t) p(x_t | z_t, x_{t-1})", "q(z_t | z_{<t}, x_{1:T})", {"z": 1, "x": 1}, steps, scale=1.0)
+    x, seen = torch.randn(1, steps, 1, dtype=torch.float64), hiding(steps, 0, 1)
+
+    @torch.no_grad()
+    def mean(*z):
+        batch = {"x": x, "mask": seen}
+        values = {"z": x.new_tensor(z).reshape(1, steps, 1)}
+        trace = poutine.trace(poutine.condition(model.model, data=values)).get_trace(batch)
+        law = trace.nodes["x"]["fn"].elementwise(x)
+        return law.mean[0, -1, 0], law.stddev[0, -1, 0]
+
+    offset, scale = mean(0, 0, 0)
+    slopes = torch.stack([mean(*row)[0] - offset for row in torch.eye(steps).tolist()])
+    assert (slopes != 0).all()
+    evidence = dist.Normal(offset, (scale**2 + slopes.square().sum()).sqrt()).log_prob(x[0, -1, 0])
+    parameters = list(model.encoder.parameters())
+    optimiser = torch.optim.LBFGS(
+        parameters, max_iter=500, tolerance_grad=1e-10, tolerance_change=1e-14, line_search_fn="strong_wolfe"
+    )
+
+    def closure():
+        optimiser.zero_grad()
+        loss = -library_bound(model, x, seen=seen).sum()
+        loss.backward(inputs=parameters)
+        return loss
+
+    optimiser.step(closure)
+    reached = library_bound(model, x, seen=seen).detach()[0]
+    torch.testing.assert_close(reached, evidence, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "run", [{"seen": hiding(4, 1, 2)}, {"fed": torch.tensor([[False, True, True, False]]), "feeding": SelfFeeding(0.5)}]
+)
+def test_a_backward_guide_has_no_analytic_kl_where_the_model_reads_its_own_means(run):
+    """p(z_t | x_{t-1}) reads a function of z_{t-1} then, which the guide drew from z_t."""
+    model = twin("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | z_{t+1}, x_{1:T})", {"z": 1, "x": 1}, 4, scale=1.5)
+    x = torch.randn(1, 4, 1, dtype=torch.float64)
+    exact = exact_bound(model, x[0], **{name: value[0] for name, value in run.items() if name != "feeding"})
+    torch.testing.assert_close(library_bound(model, x, **run)[0], exact, rtol=0, atol=1e-9)
+
+
+def test_a_static_variable_of_the_data_may_have_missing_entries():
+    model = twin("p(z) p(y | z) p(x_t | z, y)", "q(z | x_{1:T}, y)", {"z": 1, "y": 2, "x": 1}, 3, observed=("x", "y"))
+    batch = {"x": torch.randn(2, 3, 1).double(), "y": torch.randn(2, 2).double()}
+    seen = {"y": torch.tensor([[True, False], [False, False]])}
+    likelihood = SequenceELBO().terms(model, {**batch, "mask": seen}).log_likelihood["y"]
+    assert likelihood[0] != 0
+    assert likelihood[1] == 0
+    assert torch.isfinite(SequenceELBO().terms(model, batch, self_feeding=1.0).bound).all()

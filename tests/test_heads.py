@@ -1,10 +1,13 @@
 """Heads: what they draw is what they say, scales stay positive, and a description is plain data."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
+from torch import nn
 
 import dvae
 from dvae import heads
@@ -163,3 +166,145 @@ def test_a_static_variable_has_no_scales_by_step(equation):
     with pytest.raises(ValueError, match=r"its variable is static, with one value per sequence; .* with steps=0"):
         Conditional(factor, sizes, Recurrent(4), heads.FixedNormal(learned=True, steps=T), generative=False)
     Conditional(factor, sizes, Recurrent(4), heads.FixedNormal(learned=True), generative=False)
+
+
+# -------------------------------------------------------------------------------------------- families of one's own
+
+
+@dataclass(frozen=True)
+class Own:
+    """A head of the user's own, of any class."""
+
+    kind: type
+
+    def build(self, features, size, local=True):
+        return self.kind(features, size)
+
+
+class Bernoulli(heads.Head):
+    """Its location is a probability."""
+
+    def __init__(self, features, size):
+        super().__init__()
+        self.out = nn.Linear(features, size)
+
+    def forward(self, features, previous=None, t=None):
+        return (torch.sigmoid(self.out(features)),)
+
+    def distribution(self, parameters):
+        return dist.Bernoulli(parameters[0], validate_args=False)
+
+    def draw(self, parameters, noise):
+        return torch.bernoulli(parameters[0])
+
+
+class Stuck(Bernoulli):
+    """A continuous family whose draws have no gradient."""
+
+    def distribution(self, parameters):
+        return dist.Normal(parameters[0], 1.0)
+
+    def draw(self, parameters, noise):
+        return (parameters[0] + noise).detach()
+
+
+class OneHot(Bernoulli):
+    """All coordinates are one event."""
+
+    def distribution(self, parameters):
+        return dist.OneHotCategorical(logits=parameters[0], validate_args=False)
+
+    def draw(self, parameters, noise):
+        return self.distribution(parameters).sample()
+
+
+class Correlated(Bernoulli):
+    def distribution(self, parameters):
+        return dist.MultivariateNormal(parameters[0], torch.eye(parameters[0].shape[-1]).to(parameters[0]))
+
+    def draw(self, parameters, noise):
+        return parameters[0] + noise
+
+
+PAIR = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
+
+
+def model(**own):
+    return dvae.DynamicalVAE(*PAIR, {"z": 2, "x": 2}, Recurrent(4), {f"{k[0]}({k[1]})": Own(h) for k, h in own.items()})
+
+
+@pytest.mark.parametrize(("place", "factor"), [("qz", r"q\(z_t \|"), ("pz", r"p\(z_t \|")])
+def test_discrete_latents_are_refused(place, factor):
+    with pytest.raises(ValueError, match=rf"the latent z are discrete by the head of {factor}.*no gradient"):
+        model(**{place: Bernoulli})
+
+
+def test_latents_whose_draws_have_no_gradient_are_refused():
+    with pytest.raises(ValueError, match="latent z are not reparameterised"):
+        model(qz=Stuck)
+    with torch.no_grad():  # the family is what counts, not where the model is made
+        model(pz=Stuck)
+
+
+@pytest.mark.parametrize(
+    ("place", "head"), [("px", OneHot), ("px", Correlated), ("qz", Correlated), ("pz", Correlated)]
+)
+def test_heads_with_events_are_refused(place, head):
+    with pytest.raises(ValueError, match=r"one density for each coordinate, here batch \(1, 1, 2\) and no event"):
+        model(**{place: head})
+
+
+def test_discrete_data_have_a_head_of_their_own():
+    binary = model(px=Bernoulli)
+    x = torch.bernoulli(torch.full((3, 5, 2), 0.5))
+    bound = dvae.SequenceELBO().terms(binary, x).bound.sum()
+    bound.backward()
+    assert all(p.grad is not None for p in binary.encoder.parameters())
+    drawn = binary.sample(4, length=6)
+    assert set(drawn["x"].unique().tolist()) <= {0.0, 1.0}
+    site = pyro.poutine.trace(binary.model).get_trace(length=3).nodes
+    assert not site["x"]["fn"].has_rsample
+    assert site["z"]["fn"].has_rsample
+    assert site["z"]["value"].requires_grad
+
+
+def test_probabilities_are_read_without_unit_and_made_as_they_are():
+    """What the data's units are changes what networks read of them, and no probability by itself."""
+    plain, standard = model(px=Bernoulli), model(px=Bernoulli)
+    standard.load_state_dict(plain.state_dict())
+    x = torch.bernoulli(torch.full((3, 5, 2), 0.3))
+    units = standard.standardise("x")
+    units.fit(x)
+    z = torch.randn(3, 5, 2)
+    law = standard.generator["x"]({"x": x, "z": z}, 3, 5)
+    (expected,) = plain.generator["x"]({"x": units(x), "z": z}, 3, 5)
+    # the first step reads 0 before the sequence, in whatever unit
+    torch.testing.assert_close(law[0], expected)
+    torch.manual_seed(0)
+    assert torch.isfinite(dvae.SequenceELBO().terms(standard, x).bound).all()
+
+
+class Shifted(heads.NormalHead):
+    """A residual normal that cannot be put into units."""
+
+    location_scale = False
+
+    def __init__(self, features, size):
+        super().__init__(heads.Normal(residual=0.5), features, size)
+
+
+def test_a_residual_head_without_units_adds_the_value_as_it_is():
+    residual = model(px=Shifted)
+    x, z = 5 + torch.randn(1, 4, 2), torch.randn(1, 4, 2)
+    units = residual.standardise("x")
+    units.fit(x)
+    conditional = residual.generator["x"]
+    loc, _ = conditional({"x": x, "z": z}, 1, 4)
+    head = conditional.head
+    features = conditional.network({"x": units(x), "z": z}, 4)
+    added = torch.cat([torch.zeros(1, 1, 2), x[:, :-1]], 1)
+    torch.testing.assert_close(loc, head.out(features)[..., :2] + 0.5 * added)
+    state = conditional.start({"z": z}, 1, 4)
+    for t in range(4):
+        (at_t, _), state = conditional.step(state, t, {"x": list(x.unbind(1))})
+        torch.testing.assert_close(at_t, loc[:, t])

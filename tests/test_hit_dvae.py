@@ -231,9 +231,9 @@ def test_schedules_have_the_papers_shares_of_500_epochs(windows):
 def test_options_reach_the_model(windows):
     feeding = {"feeding_passes": 2, "feeding_gradient": True, "frames": 5}
     assert build(windows, **feeding).feeding == dvae.SelfFeeding(0.0, 2, True, 15)
-    assert build(windows, feed_observed=True).feeding == dvae.SelfFeeding(0.0)
+    assert build(windows, feed_observed=True).feeding == dvae.SelfFeeding(0.0, gradient=False)
     assert build(windows, loss="evidence", frames=5, **{"feeding_passes": 3}).feeding == dvae.SelfFeeding(
-        0.0, 3, start=15
+        0.0, 3, gradient=False, start=15
     )
     assert "x" in build(windows).units
     assert not build(windows, standardise=False).units

@@ -1,5 +1,7 @@
 """What the program does with what is not there, not in order, or not a tensor."""
 
+from typing import Any
+
 import numpy as np
 import pyro
 import pytest
@@ -7,8 +9,10 @@ import torch
 from pyro.infer import SVI, Trace_ELBO
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO
-from dvae.networks import Attention, Dense, Recurrent
+from dvae import DynamicalVAE, SequenceELBO, heads
+from dvae.inference.particles import Filter
+from dvae.networks import Attention, Dense, Linear, Recurrent
+from dvae.testing import FactorizationContract
 
 SRNN = ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})")
 
@@ -116,6 +120,60 @@ def test_a_custom_mask_that_turns_ahead_at_some_length_is_refused_there():
     with pytest.raises(ValueError, match=r"the mask {leak} of p\(x_t .* reads x_9 at t=1 of 12 steps"):
         SequenceELBO().terms(model, torch.randn(2, 12, 1))
     with pytest.raises(ValueError, match="keeps its direction at every length"):
+        model.sample(2, length=12)
+
+
+def first(length: int) -> np.ndarray:
+    """The same row for every t."""
+    return np.arange(length)[None] < 1
+
+
+class RowMask(FactorizationContract):
+    """x_t reads z_1 from everywhere, and z_t the x before it: a loop over a mask of one row."""
+
+    network: Any = None
+
+    def build(self, size: int) -> DynamicalVAE:
+        equations = "p(z_t | x_{t-1}) p(x_t | x_{t-1}, z_{first})", "q(z_t | z_{<t}, x_{1:T})"
+        sizes = {"z": size, "x": size}
+        return DynamicalVAE(*equations, sizes, {"default": self.network, "q": Attention(8, 2)}, masks={"first": first})
+
+    def test_particles_move_through_the_loop(self) -> None:
+        """Each of them is weighed as the programs score it."""
+        model = self._model()
+        data = self._data(model)
+        particles = Filter(model, data, 1)
+        with torch.no_grad():
+            bound = particles.run(0.0).bound
+        latents = particles.drawn
+        guide = pyro.poutine.trace(pyro.poutine.condition(model.guide, data=latents)).get_trace(data)
+        guide.compute_log_prob()
+        expected = sum(model.log_joint(data, latents).values()) - guide.nodes["z"]["log_prob"]
+        torch.testing.assert_close(bound, expected, rtol=0, atol=1e-8)
+
+
+class TestRowMaskOfAttention(RowMask):
+    network = Attention(8, 2)
+
+
+class TestRowMaskOfLinear(RowMask):
+    network = Linear(12)
+
+
+def test_a_residual_head_is_held_to_a_custom_mask_at_every_length():
+    def near(length: int) -> np.ndarray:
+        return np.tri(length, k=-1, dtype=bool) if length != 12 else np.tri(length, k=-2, dtype=bool)
+
+    model = DynamicalVAE(
+        "p(z_t) p(x_t | z_t, x_{near})",
+        "q(z_t | x_t)",
+        {"z": 1, "x": 1},
+        Attention(8, 2),
+        heads={"p(x)": heads.Normal(residual=0.5)},
+        masks={"near": near},
+    )
+    model.sample(2, length=11)
+    with pytest.raises(ValueError, match=r"residual head, which adds x_{t-1}, but it does not read that at 12 steps"):
         model.sample(2, length=12)
 
 

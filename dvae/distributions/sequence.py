@@ -25,11 +25,11 @@ class Sequence(TorchDistribution):
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    has_rsample = True
 
     def __init__(self, rollout: Rollout, name: str):
         self.rollout = rollout
         self.name = name
+        self.has_rsample = rollout.conditionals[name].reparameterised
         size = rollout.conditionals[name].size
         super().__init__(torch.Size([rollout.batch]), torch.Size([rollout.length, size]), validate_args=False)
 
@@ -46,6 +46,10 @@ class Sequence(TorchDistribution):
                 "batch, as forecast(samples=...) and importance_bound(particles=...) do"
             )
         return self.rollout.draw(self.name)
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        """`rsample` without its gradient, which variables that are drawn with it keep."""
+        return self.rsample(sample_shape).detach()
 
     def elementwise(self, value: Tensor) -> TorchDistribution:
         """All conditionals at once, over (B, T, D), given `value` and the run's other values."""

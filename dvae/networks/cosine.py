@@ -258,4 +258,3 @@ def _cached_basis(length: int, coefficients: int, dtype: torch.dtype, device: to
 def _basis(length: int, coefficients: int, like: Tensor) -> Tensor:
     """(C, T), see `cosine_basis`."""
     return _cached_basis(length, coefficients, like.dtype, like.device)
-
