@@ -138,7 +138,7 @@ def masked(text, rng, share):
             return parent
         seen, row = rng.random((8, 8)) < 0.6, rng.random((1, 8)) < 0.6
         if not factor.local:
-            return replace(parent, relation=Relation.custom("row", lambda T: row[:, :T]))
+            return replace(parent, relation=Relation.custom("row", lambda T: resized(row, T)))
         shape = row if rng.random() < 0.3 else seen
         return replace(parent, relation=parent.relation & Relation.custom("own", lambda T: resized(shape, T)))
 
