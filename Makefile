@@ -1,5 +1,6 @@
 # make demo    simulated people: fit two methods, print the table, save demo/futures.png
 # make test    lint, types, tests
+# make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
 # make bench   the benchmarks
 # Each makes the environment in .venv when it is missing or out of date.
 
@@ -9,7 +10,7 @@ BIN := .venv/bin
 # One thread: the models are small, and on cores that others use too, two threads wait for each other many times longer.
 export OMP_NUM_THREADS := 1
 
-.PHONY: venv demo test bench clean
+.PHONY: venv demo test fuzz bench clean
 
 venv: .venv/installed
 
@@ -31,6 +32,12 @@ test: venv
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p dvae
 	$(BIN)/pytest -n 2
+
+SECONDS := 600
+SEED := $(shell date +%s)
+
+fuzz: venv
+	DVAE_FUZZ_SECONDS=$(SECONDS) DVAE_FUZZ_SEED=$(SEED) $(BIN)/pytest tests/fuzz -s
 
 bench: venv
 	set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file; done

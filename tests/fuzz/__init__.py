@@ -1,0 +1,1 @@
+"""Hostile and random examples, for as long as one likes."""

@@ -1,0 +1,215 @@
+"""Fuzzing by the clock: hypothesis draws examples until a test's share of the time is over.
+
+All tests of this directory together take DVAE_FUZZ_SECONDS (60 where it is not set), each in proportion to the share
+that it names. DVAE_FUZZ_SEED (0) decides which examples are tried, in which order; time decides how far one gets.
+
+    def test_sums_are_symmetric():
+        fuzz(lambda pair: check(*pair), st.tuples(st.integers(), st.integers()), seconds=5)
+
+A check that may be killed, hang or take all memory goes to a process of its own:
+
+    @limited(5)
+    def test_files_are_read_or_refused(tmp_path):
+        with Isolated(read, tmp_path) as isolated:  # read(example, tmp_path), a function of a module
+            fuzz(isolated, files(), seconds=5)
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+from hypothesis import HealthCheck, given, seed, settings
+from hypothesis.strategies import SearchStrategy
+
+Example = TypeVar("Example")
+
+SECONDS = float(os.environ.get("DVAE_FUZZ_SECONDS", "60"))
+"""Of all tests together."""
+
+SEED = int(os.environ.get("DVAE_FUZZ_SEED", "0"))
+
+EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)
+"""What the command line takes for an answer; anything else it calls a bug."""
+
+SLOWEST, LARGEST = 10.0, 2**30
+"""Seconds and bytes that one call may take."""
+
+_BATCH = 50
+_SHRINKING = 20.0
+
+
+def scaled(seconds: float) -> float:
+    """A share of the default minute, in this run's time."""
+    return seconds * SECONDS / 60
+
+
+def limited(seconds: float) -> pytest.MarkDecorator:
+    """Of a test of that share: the time after which it hangs."""
+    return pytest.mark.timeout(300 + scaled(seconds))
+
+
+def fuzz(check: Callable[[Example], None], examples: SearchStrategy[Example], seconds: float) -> None:
+    """Try examples until the time is over.
+
+    Args:
+        check: raises where an example breaks a law.
+        examples: where they come from. Their `repr` is printed, and tells them apart.
+        seconds: this test's share of the default minute.
+    """
+    end = time.monotonic() + scaled(seconds)
+    failed: set[str] = set()
+    shrunk_by = float("inf")
+    count = 0
+
+    def attempt(example: Example) -> None:
+        nonlocal shrunk_by, count
+        now = time.monotonic()
+        if (now > end and not failed) or (now > shrunk_by and repr(example) not in failed):
+            return
+        count += 1
+        try:
+            check(example)
+        except Exception:
+            failed.add(repr(example))
+            shrunk_by = min(shrunk_by, now + _SHRINKING)
+            raise
+
+    batch = 0
+    while time.monotonic() < end:
+        search = settings(
+            max_examples=_BATCH,
+            derandomize=False,
+            database=None,
+            deadline=None,
+            print_blob=True,
+            report_multiple_bugs=False,
+            suppress_health_check=list(HealthCheck),
+        )(given(examples)(attempt))
+        seed(SEED * 1_000_003 + batch)(search)()
+        batch += 1
+    print(f"{count} examples in {scaled(seconds):.0f} s, DVAE_FUZZ_SEED={SEED}")
+    assert count, "no example was tried within the time"
+
+
+class Isolated:
+    """A check in a process of its own, which may fail, die or hang without taking the test along.
+
+    The law that it adds to the check's own: a call ends within `SLOWEST` seconds and `LARGEST` bytes, by no signal,
+    with no exception but `EXPECTED`, and opens nothing for writing outside its directory.
+
+    Args:
+        check: `check(example, directory)`, importable by its name, for both go through a pipe.
+        directory: the only one that may be written to.
+    """
+
+    def __init__(self, check: Callable[[Any, Path], None], directory: Path):
+        self._check, self._directory = check, directory.resolve()
+        self._process: Any = None
+        self._pipe: Any = None
+
+    def __enter__(self) -> Isolated:
+        self._start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop()
+
+    def __call__(self, example: Any) -> None:
+        if self._process is None:
+            self._start()
+        self._pipe.send(example)
+        try:
+            if not self._pipe.poll(SLOWEST):
+                self._stop()
+                raise AssertionError(f"takes more than {SLOWEST:g} s")
+            failure = self._pipe.recv()
+        except (EOFError, OSError):
+            self._process.join(10)
+            code = self._process.exitcode
+            self._stop()
+            raise AssertionError(f"the process died with exit code {code}, a signal where it is negative") from None
+        if failure is not None:
+            raise AssertionError(failure)
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, there = context.Pipe()
+        self._process = context.Process(target=_serve, args=(there, self._check, self._directory), daemon=True)
+        self._process.start()
+        there.close()
+        if not self._pipe.poll(120) or self._pipe.recv() != "ready":
+            self._stop()
+            raise AssertionError("the process that checks did not start")
+
+    def _stop(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            self._process.close()
+            self._pipe.close()
+            self._process = None
+
+
+def _serve(pipe: Any, check: Callable[[Any, Path], None], directory: Path) -> None:
+    sys.dont_write_bytecode = True
+    pipe.send("ready")
+    watched = False
+    while True:
+        try:
+            example = pipe.recv()
+        except EOFError:
+            return
+        if not watched:  # from here on: what starts a process opens files of its own
+            _bound_memory()
+            _watch(directory)
+            watched = True
+        failure = None
+        try:
+            check(example, directory)
+        except EXPECTED as error:
+            failure = None if str(error) else f"{type(error).__name__} without a word\n{traceback.format_exc()}"
+        except BaseException:
+            failure = traceback.format_exc()
+        pipe.send(failure)
+
+
+def _bound_memory() -> None:
+    """No more than `LARGEST` beyond what the process has; a request for more is a MemoryError."""
+    if not sys.platform.startswith("linux"):  # elsewhere the system keeps no such limit
+        return
+    import resource
+
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * os.sysconf("SC_PAGE_SIZE") + LARGEST
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def _watch(directory: Path) -> None:
+    """Let nothing outside a directory be written, and nothing be run."""
+    changes = {"os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod"}
+    runs = {"os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect", "ctypes.dlopen"}
+    writing = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+
+    def outside(path: Any) -> bool:
+        if not isinstance(path, str | bytes | os.PathLike):
+            return False
+        real = os.path.realpath(os.fsdecode(path))
+        return real != os.devnull and os.path.commonpath([real, directory]) != str(directory)
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        if event in runs:
+            raise AssertionError(f"runs something: {event} {arguments}")
+        if event == "open" and arguments[2] & writing and outside(arguments[0]):
+            raise AssertionError(f"writes outside its directory: {arguments[0]}")
+        if event in changes and any(map(outside, arguments)):
+            raise AssertionError(f"changes something outside its directory: {event} {arguments}")
+
+    sys.addaudithook(hook)
