@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -61,14 +61,16 @@ def defect(clip: Clip, skeleton: Skeleton) -> str | None:
         return f"{where} has {positions.shape[1]} joints, skeleton {skeleton.name!r} has {skeleton.joints}"
     if not len(positions):
         return f"{where} has no frames"
+    with np.errstate(over="ignore"):
+        positions = positions.astype(np.float32, copy=False)
     bad = ~np.isfinite(positions).all(axis=2)
     if bad.any():
         frame, joint = np.argwhere(bad)[0]
         return (
-            f"{where} has NaN or infinite positions: {bad.sum()} joint positions in "
+            f"{where} has NaN or infinite positions, or none that float32 can hold: {bad.sum()} joint positions in "
             f"{bad.any(axis=1).sum()} of {clip.frames} frames, first {skeleton.names[joint]} at frame {frame}"
         )
-    extent = float(np.median(np.ptp(positions.astype(np.float64), axis=1).max(axis=1)))
+    extent = float(np.median((positions.max(axis=1) - positions.min(axis=1).astype(np.float64)).max(axis=1)))
     if not SMALLEST <= extent <= TALLEST:
         unit = "millimetres" if extent >= 300 else "centimetres" if extent >= 30 else "another unit"
         return (
@@ -89,6 +91,7 @@ class MotionSet:
         skeleton: the tree that all of them have.
         name: what to call the set.
         skipped: clips that were left out on reading, as (split, name, reason).
+        copy: False takes over arrays that are float32 already, which nobody else may hold.
 
     Raises:
         ValueError: a clip has NaN, wrong joints, a wrong shape or implausible units, two clips share a key,
@@ -99,37 +102,41 @@ class MotionSet:
     skeleton: Skeleton
     name: str = ""
     skipped: Sequence[tuple[str, str, str]] = ()
+    copy: InitVar[bool] = True
 
-    def __post_init__(self) -> None:
-        for clip in self.clips:
+    def __post_init__(self, copy: bool) -> None:
+        single, what = [], self.name or "motion set"
+        for clip in self.clips:  # once: an iterator need not hold clips that were taken over
             reason = defect(clip, self.skeleton)
             if reason:
-                raise ValueError(f"{self.name or 'motion set'}: {reason}")
-        if not self.clips:
+                raise ValueError(f"{what}: {reason}")
+            positions = np.require(clip.positions, np.float32, ["C", "A", "W"])
+            positions = positions.copy() if copy and np.may_share_memory(positions, clip.positions) else positions
+            single.append(Clip(clip.split, clip.name, positions, clip.labels, clip.truth))
+            del clip, positions
+        if not single:
             dropped = f"; {len(self.skipped)} were skipped, the first: {self.skipped[0][2]}" if self.skipped else ""
-            raise ValueError(f"{self.name or 'motion set'}: no clips{dropped}")
-        twice = [key for key, count in Counter(clip.key for clip in self.clips).items() if count > 1]
+            raise ValueError(f"{what}: no clips{dropped}")
+        twice = [key for key, count in Counter(clip.key for clip in single).items() if count > 1]
         if twice:
-            raise ValueError(f"{self.name or 'motion set'}: clip {'/'.join(twice[0])} is there twice")
-        single = tuple(
-            Clip(
-                clip.split,
-                clip.name,
-                np.array(clip.positions, np.float32, order="C"),
-                clip.labels,
-                clip.truth,
-            )
-            for clip in self.clips
-        )
-        object.__setattr__(self, "clips", single)
+            raise ValueError(f"{what}: clip {'/'.join(twice[0])} is there twice")
+        object.__setattr__(self, "clips", tuple(single))
         object.__setattr__(self, "_index", {clip.key: clip for clip in single})
 
     @classmethod
-    def usable(cls, clips: Iterable[Clip], skeleton: Skeleton, name: str = "") -> MotionSet:
+    def usable(cls, clips: Iterable[Clip], skeleton: Skeleton, name: str = "", copy: bool = True) -> MotionSet:
         """The set of those clips that have no defect; the others are listed in `skipped` with the reason."""
-        reasons = [(clip, defect(clip, skeleton)) for clip in clips]
-        skipped = [(clip.split, clip.name, reason) for clip, reason in reasons if reason]
-        return cls([clip for clip, reason in reasons if not reason], skeleton, name, skipped)
+        skipped: list[tuple[str, str, str]] = []
+
+        def kept() -> Iterator[Clip]:
+            for clip in clips:
+                if reason := defect(clip, skeleton):
+                    skipped.append((clip.split, clip.name, reason))
+                else:
+                    yield clip
+                del clip
+
+        return cls(kept(), skeleton, name, skipped, copy)  # type: ignore[arg-type]
 
     def __len__(self) -> int:
         return len(self.clips)

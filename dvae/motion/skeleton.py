@@ -8,15 +8,74 @@ motion prediction papers use them (Mao, Liu and Salzmann 2021, GSPS).
 from __future__ import annotations
 
 import difflib
+import io
 import json
+import reprlib
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from math import pi
+from math import inf, pi
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+
+MOST_JOINTS = 1000
+"""A body scanner's suit has two hundred markers; matrices here grow with the square of the number."""
+
+MOST_TEXT = 2**25
+"""Bytes of a text file that are read."""
+
+
+def read_text(path: Path) -> str:
+    """What a text file holds.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is larger than any of this kind, or no UTF-8.
+    """
+    if not path.is_file():  # nor a pipe, which would never end
+        raise FileNotFoundError(f"{path}: no such file")
+    with path.open("rb") as file:
+        content = file.read(MOST_TEXT + 1)
+    if len(content) > MOST_TEXT:
+        raise ValueError(f"{path}: it has more than {MOST_TEXT:,} bytes, which no skeleton, labels or paths take")
+    try:
+        return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig").read()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: is no text ({error})") from error
+
+
+def brief(value: Any) -> str:
+    """A value as text, shortened where it is long, deep or a very large number."""
+    try:
+        return reprlib.repr(value)
+    except ValueError:  # more digits than Python writes
+        return f"a number of {value.bit_length()} bits" if isinstance(value, int) else type(value).__name__
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join([*(name if len(name) < 100 else brief(name) for name in names[:8]), *["..."][: len(names) > 8]])
+
+
+def _is(value: Any, kind: type) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
+def _values(given: Any, kind: type, what: str, expected: str) -> tuple[Any, ...]:
+    """A list's values, if each is of a kind."""
+    if isinstance(given, str | bytes | Mapping) or not isinstance(given, Iterable):
+        raise ValueError(f"{what} is {brief(given)}, expected a list of {expected}")
+    values = tuple(given)
+    for place, value in enumerate(values):
+        if not _is(value, kind):
+            raise ValueError(f"{what} has {brief(value)} at place {place}, expected {expected}")
+        if isinstance(value, str) and not value.isprintable():
+            raise ValueError(f"{what} has {brief(value)} at place {place}, expected printable text")
+    return tuple(map(int, values)) if kind is Integral else values
 
 
 @dataclass(frozen=True)
@@ -46,44 +105,49 @@ class Skeleton:
     lengths: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        for field in ("names", "parents", "left", "right", "lengths"):
-            object.__setattr__(self, field, tuple(getattr(self, field)))
+        what = f"skeleton {brief(self.name)}"
+        if not isinstance(self.name, str) or not isinstance(self.up, str):
+            raise ValueError(f"{what}: its name and its up axis are text, the latter is {brief(self.up)}")
+        for field, kind, expected in (
+            ("names", str, "text"),
+            ("parents", Integral, "whole numbers"),
+            ("left", Integral, "whole numbers"),
+            ("right", Integral, "whole numbers"),
+            ("lengths", Real, "numbers"),
+        ):
+            object.__setattr__(self, field, _values(getattr(self, field), kind, f"{what}: {field}", expected))
         joints = len(self.names)
+        if joints > MOST_JOINTS:
+            raise ValueError(f"{what}: {joints:,} joints, expected at most {MOST_JOINTS:,}")
         if len(self.parents) != joints:
-            raise ValueError(f"skeleton {self.name!r}: {joints} names but {len(self.parents)} parents")
-        repeated = sorted({name for name in self.names if self.names.count(name) > 1})
-        if repeated:
-            raise ValueError(f"skeleton {self.name!r}: joint names repeat: {', '.join(repeated)}")
+            raise ValueError(f"{what}: {joints} names but {len(self.parents)} parents")
+        if repeated := sorted(name for name, count in Counter(self.names).items() if count > 1):
+            raise ValueError(f"{what}: joint names repeat: {_listed(repeated)}")
         roots = [self.names[j] for j, parent in enumerate(self.parents) if parent == -1]
         if len(roots) != 1:
-            found = ", ".join(roots) or "none"
-            raise ValueError(f"skeleton {self.name!r}: expected one root (parent -1), found {found}")
+            raise ValueError(f"{what}: expected one root (parent -1), found {_listed(roots) or 'none'}")
         for joint, parent in enumerate(self.parents):
             if not -1 <= parent < joints:
                 raise ValueError(
-                    f"skeleton {self.name!r}: the parent of {self.names[joint]} is joint {parent}, "
+                    f"{what}: the parent of {self.names[joint]} is joint {brief(parent)}, "
                     f"but joints go from 0 to {joints - 1}"
                 )
-        for joint in range(joints):
-            self._path_to_root(joint)
+        if circling := set(range(joints)) - set(self.order):
+            raise ValueError(f"{what}: {self.names[min(circling)]} hangs on a cycle of joints")
         for side in ("left", "right"):
             strangers = [j for j in getattr(self, side) if not 0 <= j < joints]
             if strangers:
-                raise ValueError(f"skeleton {self.name!r}: {side} names joints {strangers} of {joints}")
+                raise ValueError(f"{what}: {side} names joints {brief(strangers)} of {joints}")
+        if twice := [j for j, count in Counter(self.left + self.right).items() if count > 1]:
+            raise ValueError(f"{what}: left and right name {self.names[twice[0]]} twice")
         if self.up not in ("y", "z"):
-            raise ValueError(f"skeleton {self.name!r}: up axis is {self.up!r}, expected 'y' or 'z'")
-        if not self.fps > 0:
-            raise ValueError(f"skeleton {self.name!r}: {self.fps} frames per second, expected more than 0")
+            raise ValueError(f"{what}: up axis is {brief(self.up)}, expected 'y' or 'z'")
+        if not _is(self.fps, Real) or not 0 < self.fps < inf:
+            raise ValueError(f"{what}: {brief(self.fps)} frames per second, expected more than 0")
         if self.lengths and len(self.lengths) != joints - 1:
-            raise ValueError(f"skeleton {self.name!r}: {len(self.lengths)} bone lengths for {joints - 1} bones")
-
-    def _path_to_root(self, joint: int) -> list[int]:
-        path = [joint]
-        while self.parents[path[-1]] != -1:
-            path.append(self.parents[path[-1]])
-            if len(path) > len(self.names):
-                raise ValueError(f"skeleton {self.name!r}: {self.names[joint]} hangs on a cycle of joints")
-        return path
+            raise ValueError(f"{what}: {len(self.lengths)} bone lengths for {joints - 1} bones")
+        if wrong := [length for length in self.lengths if not 0 <= length < inf]:
+            raise ValueError(f"{what}: a bone is {brief(wrong[0])} m long")
 
     @property
     def joints(self) -> int:
@@ -125,8 +189,16 @@ class Skeleton:
 
     @property
     def order(self) -> list[int]:
-        """The joints, every parent before its children."""
-        return sorted(range(self.joints), key=lambda joint: len(self._path_to_root(joint)))
+        """The joints, every parent before its children: generation after generation, each in the order of the names."""
+        children: list[list[int]] = [[] for _ in self.parents]
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                children[parent].append(joint)
+        found, generation = [], [self.root]
+        while generation:
+            found += generation
+            generation = sorted(child for joint in generation for child in children[joint])
+        return found
 
     @property
     def vertical(self) -> int:
@@ -196,28 +268,42 @@ class Skeleton:
         """Read a skeleton file as `to_json` writes it.
 
         Raises:
-            ValueError: the file is no JSON object or lacks joint_names or parents.
+            FileNotFoundError: there is no such file.
+            ValueError: the file is no JSON object, lacks joint_names or parents, or describes no skeleton.
         """
+        path = Path(path)
         try:
-            fields = json.loads(Path(path).read_text(encoding="utf-8"))
-            names, parents = fields["joint_names"], fields["parents"]
-        except (UnicodeDecodeError, json.JSONDecodeError, TypeError, KeyError) as error:
-            raise ValueError(
-                f"{path}: expected JSON with joint_names and parents ({type(error).__name__}: {error})"
-            ) from error
-        lengths = fields.get("bone_lengths_m", ())
-        if lengths:  # the file has one entry per joint, and a zero for the root
-            lengths = [length for length, parent in zip(lengths, parents, strict=True) if parent != -1]
-        return cls(
-            names=names,
-            parents=parents,
-            left=fields.get("joints_left", ()),
-            right=fields.get("joints_right", ()),
-            up=fields.get("up_axis", "y"),
-            fps=fields.get("fps", 30.0),
-            name=fields.get("name", Path(path).parent.name),
-            lengths=lengths,
-        )
+            fields = json.loads(read_text(path))
+        except RecursionError as error:
+            raise ValueError(f"{path}: expected JSON with joint_names and parents (it is nested too deeply)") from error
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{path}: expected JSON with joint_names and parents ({error})") from error
+        except ValueError as error:  # a number of more digits than Python reads
+            raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
+        missing = [key for key in ("joint_names", "parents") if not isinstance(fields, dict) or key not in fields]
+        if missing:
+            found = _listed(list(fields)) if isinstance(fields, dict) else brief(fields)
+            raise ValueError(f"{path}: expected JSON with joint_names and parents, lacks {missing[0]}, found {found}")
+        try:
+            parents = _values(fields["parents"], Integral, "parents", "whole numbers")
+            lengths = _values(fields.get("bone_lengths_m", ()), Real, "bone_lengths_m", "numbers")
+            if lengths and len(lengths) != len(parents):
+                raise ValueError(
+                    f"bone_lengths_m has {len(lengths)} entries, expected one for each of {len(parents)} joints"
+                )
+            return cls(
+                names=fields["joint_names"],
+                parents=parents,
+                left=fields.get("joints_left", ()),
+                right=fields.get("joints_right", ()),
+                up=fields.get("up_axis", "y"),
+                fps=fields.get("fps", 30.0),
+                name=fields.get("name", path.absolute().parent.name),
+                # the file has one entry per joint, and a zero for the root
+                lengths=tuple(length for length, parent in zip(lengths, parents, strict=bool(lengths)) if parent != -1),
+            )
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
     def to_json(self, path: str | Path) -> None:
         """Write the skeleton as a JSON file that people can read."""
