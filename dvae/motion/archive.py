@@ -184,19 +184,22 @@ class Member:
                 raise Refused(
                     f"has shape {shape} and dtype {dtype}, expected one pickled dictionary (shape () and dtype object)"
                 )
-            nested = _Interpreter().run(stream)
+            nested = _Interpreter(2 * stream.left + SMALL).run(stream)
             if stream.left:
                 raise Refused(f"damaged pickle: {stream.left:,} bytes follow its end")
         if isinstance(nested, _Array):  # numpy pickles the 0-dimensional array, not its item
             nested = nested.item()
         if not isinstance(nested, dict) or not all(isinstance(clips, dict) for clips in nested.values()):
             raise Refused(f"{self.name} is no dictionary of dictionaries (split -> clip -> positions)")
-        found = []
+        found, room = [], self._info.file_size + SMALL
         for split, clips in nested.items():
             for name, array in clips.items():
                 if not isinstance(array, _Array):
                     raise Refused(f"clip {split}/{name} is a {_said(array)}, expected a numpy array")
                 found.append((split, name, array.numbers()))
+                room -= array.numbers().nbytes
+                if room < 0:
+                    raise Refused(f"{self.name}: its clips are one array many times over, more than the file holds")
         return found
 
     @contextmanager
@@ -231,13 +234,15 @@ def _dtype(code: Any) -> np.dtype:
     except (TypeError, ValueError, OverflowError):
         dtype = None
     if dtype is None or dtype.kind not in "biufOSU" or not dtype.itemsize:
-        raise Refused(f"refused an array of {str(dtype or code)[:40]}: expected numbers")
+        what = dtype or (code if isinstance(code, str) else _said(code))
+        raise Refused(f"refused an array of {str(what)[:40]}: expected numbers")
     return dtype
 
 
 def _check_size(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str) -> None:
     """Refuse an array that its bytes do not make, and one of a great many places that hold nothing."""
-    if len(shape) > 32 or prod(shape) * dtype.itemsize != size or prod(n or 1 for n in shape) > max(size, _CHUNK):
+    needed, places = prod(shape) * dtype.itemsize, prod(n or 1 for n in shape) * dtype.itemsize
+    if len(shape) > 32 or needed != size or places > max(size, _CHUNK):
         raise Refused(f"{verb} shape {shape} of {dtype}, holds {size:,} bytes")
 
 
@@ -267,7 +272,8 @@ class _Array:
     """An array in the making: nothing, then an array of numbers or text, or a shape and a list of objects."""
 
     def __init__(self, array: np.ndarray | None = None):
-        self._array, self._objects = array, ()
+        self._array = array
+        self._objects: list[Any] | None = None
 
     def build(self, state: Any) -> None:
         if self._array is not None or not isinstance(state, tuple) or len(state) != 5:
@@ -279,16 +285,15 @@ class _Array:
             self._array = _of_bytes(content, kind.dtype, shape, "F" if fortran is True or fortran == 1 else "C")
             return
         if not isinstance(content, list) or len(content) != prod(_shape(shape)):
-            raise Refused(f"an array of objects of shape {_shape(shape)} is not made of as many")
-        _check_size(kind.dtype, shape, len(content) * kind.dtype.itemsize, "an array of objects declares")
-        self._array, self._objects = np.empty(shape, object), tuple(content)
+            raise Refused(f"refused an array of objects of shape {_shape(shape)} that is not made of as many")
+        self._array, self._objects = np.empty((), object), content
 
     def item(self) -> Any:
         """What an array of one object holds."""
-        return self._objects[0] if self._array is not None and self._array.shape == () and self._objects else self
+        return self._objects[0] if self._objects and len(self._objects) == 1 else self
 
     def numbers(self) -> np.ndarray:
-        """The array; one of objects holds none of them."""
+        """The array, or an empty one of objects: these are not used."""
         if self._array is None:
             raise Refused("damaged pickle: an array has no content")
         return self._array
@@ -326,9 +331,17 @@ def _of_bytes(content: Any, dtype: np.dtype, shape: Any, order: Any) -> np.ndarr
 
 
 class _Interpreter:
-    """Follows a pickle, and builds dict, list, tuple, str, numbers and arrays; refuses every other global by name."""
+    """Follows a pickle, and builds dict, list, tuple, str, numbers and arrays; refuses every other global by name.
 
-    def __init__(self) -> None:
+    Whatever a pickle can name again at the price of two bytes is neither copied, nor compared, nor gone through without
+    limit.
+
+    Args:
+        room: bytes of text and content that calls may take, each as often as it is given to one.
+    """
+
+    def __init__(self, room: int) -> None:
+        self.room = room
         self.stack: list[Any] = []
         self.below: list[list[Any]] = []  # the stacks under the marks
         self.memo: dict[int, Any] = {}
@@ -393,7 +406,8 @@ class _Interpreter:
         for key, value in zip(items[::2], items[1::2], strict=True):
             if not isinstance(key, str):  # nothing else is hashed or compared, which can take forever
                 raise Refused(f"refused a {_said(key)} as a key: splits and clips have names")
-            key.encode()  # a name is text
+            if len(key) > 1000 or any("\ud800" <= letter <= "\udfff" for letter in key):
+                raise Refused(f"refused a key of {len(key):,} characters: splits and clips have names")
             target[key] = value
 
     def dictionary(self, _: Any) -> None:
@@ -417,12 +431,20 @@ class _Interpreter:
         function, arguments = self.last(2)
         if not isinstance(function, _Global) or function.call is None or not isinstance(arguments, tuple):
             raise Refused(f"refused to call a {_said(function)}")
+        self.spend(arguments)
         self.push(function.call(*arguments))
+
+    def spend(self, given: Any) -> None:
+        if isinstance(given, tuple) and len(given) <= 8:
+            self.room -= sum(len(value) for value in given if isinstance(value, str | bytes | bytearray))
+        if self.room < 0 or not isinstance(given, tuple) or len(given) > 8:
+            raise Refused("refused an array that is not made as numpy makes it")
 
     def build(self, _: Any) -> None:
         state, target = self.stack.pop(), self.stack[-1]
         if not isinstance(target, _Array | _Type):
             raise Refused(f"refused to set the state of a {_said(target)}")
+        self.spend(state)
         target.build(state)
 
 

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from .archive import archive
 from .formats import read_arrays
 from .skeleton import Skeleton
 
 
 def is_forecasts(path: str | Path) -> bool:
     """Whether a file is an npz with a member `forecasts`."""
-    if not zipfile.is_zipfile(path):
+    try:
+        with archive(path) as members:
+            return "forecasts" in members
+    except (OSError, ValueError):  # whoever reads it says what is wrong with it
         return False
-    with zipfile.ZipFile(path) as archive:
-        return "forecasts.npy" in archive.namelist()
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +106,13 @@ class Forecasts:
                 fps=arrays["fps"].item(),
                 name=arrays["name"].item(),
             )
+            if (arrays["split"].dtype.kind, arrays["clip"].dtype.kind, arrays["start"].dtype.kind) != ("U", "U", "i"):
+                raise ValueError("split and clip are text and start is a whole number; these are not")
             keys = list(zip(*(arrays[name].tolist() for name in ("split", "clip", "start")), strict=True))
-            return cls(skeleton, keys, arrays["forecasts"], arrays["observed"], arrays["truth"])
+            motions = [arrays[name] for name in ("forecasts", "observed", "truth")]
+            if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in motions):
+                raise ValueError("forecasts, observed and truth are numbers, none NaN or infinite; these are not")
+            return cls(skeleton, keys, *motions)
         except KeyError as error:
             raise ValueError(f"{path} lacks {error}: `dvae forecast` writes files with all that is needed") from error
         except (TypeError, ValueError) as error:

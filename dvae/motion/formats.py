@@ -21,8 +21,8 @@ from .archive import archive
 from .data import Clip, MotionSet
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, read_text
 
-MOST_NUMBERS = 2**25
-"""In a csv file of paths, blank rows included: half a million frames of twenty joints."""
+MOST_NUMBERS = 2**24
+"""In a csv file of paths, blank rows included: a quarter of a million frames of twenty joints."""
 
 _ARCHIVES = (
     ({f"S{i}" for i in (1, 5, 6, 7, 8, 9, 11)}, 32, HUMAN36M, HUMAN36M_KEPT),
@@ -234,10 +234,11 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"{path}: it has more than {MOST_NUMBERS:,} numbers")
             values += [np.full(len(header), np.nan)] * blank
             blank = 0
-            values.append(np.array([_number(cell) for cell in cells]))
-            if None in values[-1]:
-                wrong = list(values[-1]).index(None)
+            numbers = [_number(cell) for cell in cells]
+            if None in numbers:
+                wrong = numbers.index(None)
                 raise ValueError(f"{path}: row {number}, {header[wrong]}: {cells[wrong][:100]!r} is no number")
+            values.append(np.array(numbers))
     if not columns or not values:
         raise ValueError(f"{path}: expected a header and one row for each frame")
     table = np.stack(values)
