@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from .skeleton import is_name
+
 LARGEST = 4 * 2**30
 """Bytes that a file may unpack to."""
 
@@ -96,6 +98,8 @@ def _members(file: zipfile.ZipFile, size: int) -> dict[str, Member]:
             raise Refused(
                 f"{name} is compressed by {method}, expected deflate or none; write it with np.savez_compressed"
             )
+        if not is_name(name):
+            raise Refused(f"{name[:40]!r} is no name for a split and a clip")
         if name in members:
             raise Refused(f"{name} is there twice")
         members[name] = Member(name, file, info)
@@ -406,8 +410,8 @@ class _Interpreter:
         for key, value in zip(items[::2], items[1::2], strict=True):
             if not isinstance(key, str):  # nothing else is hashed or compared, which can take forever
                 raise Refused(f"refused a {_said(key)} as a key: splits and clips have names")
-            if len(key) > 1000 or any("\ud800" <= letter <= "\udfff" for letter in key):
-                raise Refused(f"refused a key of {len(key):,} characters: splits and clips have names")
+            if not is_name(key):
+                raise Refused(f"refused the key {key[:40]!r}: splits and clips have names")
             target[key] = value
 
     def dictionary(self, _: Any) -> None:

@@ -19,10 +19,10 @@ import numpy as np
 
 from .archive import archive
 from .data import Clip, MotionSet
-from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, read_text
+from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, read_text
 
-MOST_NUMBERS = 2**24
-"""In a csv file of paths, blank rows included: a quarter of a million frames of twenty joints."""
+MOST_NUMBERS = 2**23
+"""In a csv file of paths, blank rows included: a hundred thousand frames of twenty joints."""
 
 _ARCHIVES = (
     ({f"S{i}" for i in (1, 5, 6, 7, 8, 9, 11)}, 32, HUMAN36M, HUMAN36M_KEPT),
@@ -159,9 +159,11 @@ def _table(path: Path) -> Iterator[tuple[list[str], Iterator[tuple[int, list[str
                 raise ValueError(f"{path}: row {number} has {len(row)} cells, the header {len(header)}")
             yield number, row
 
-    reader = csv.reader(io.StringIO(read_text(path)))
+    reader = csv.reader(io.StringIO(read_text(path)), strict=True)
     try:
         header = next(reader, [])
+        if unnamed := [place for place, name in enumerate(header, 1) if not is_name(name)]:
+            raise ValueError(f"{path}: column {unnamed[0]} is {brief(header[unnamed[0] - 1])}, expected a name")
         yield header, numbered()
     except csv.Error as error:
         raise ValueError(f"{path}: row {reader.line_num} is no row of a csv file ({error})") from error
@@ -234,22 +236,25 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"{path}: it has more than {MOST_NUMBERS:,} numbers")
             values += [np.full(len(header), np.nan)] * blank
             blank = 0
-            numbers = [_number(cell) for cell in cells]
-            if None in numbers:
-                wrong = numbers.index(None)
-                raise ValueError(f"{path}: row {number}, {header[wrong]}: {cells[wrong][:100]!r} is no number")
-            values.append(np.array(numbers))
+            try:
+                values.append(np.array([float(cell) if cell.strip() else np.nan for cell in cells]))
+            except ValueError:
+                wrong = next(place for place, cell in enumerate(cells) if cell.strip() and not _is_number(cell))
+                raise ValueError(
+                    f"{path}: row {number}, {header[wrong]}: {cells[wrong][:100]!r} is no number"
+                ) from None
     if not columns or not values:
         raise ValueError(f"{path}: expected a header and one row for each frame")
     table = np.stack(values)
     return {joint: table[:, places] for joint, places in columns.items()}
 
 
-def _number(cell: str) -> float | None:
+def _is_number(cell: str) -> bool:
     try:
-        return float(cell) if cell.strip() else np.nan
+        float(cell)
     except ValueError:
-        return None
+        return False
+    return True
 
 
 def _read_clips(path: Path) -> list[tuple[str, str, np.ndarray]]:

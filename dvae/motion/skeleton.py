@@ -11,11 +11,12 @@ import difflib
 import io
 import json
 import reprlib
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from math import inf, pi
+from math import pi
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from torch import Tensor
 MOST_JOINTS = 1000
 """A body scanner's suit has two hundred markers; matrices here grow with the square of the number."""
 
-MOST_TEXT = 2**25
+MOST_TEXT = 2**24
 """Bytes of a text file that are read."""
 
 
@@ -57,6 +58,11 @@ def brief(value: Any) -> str:
         return f"a number of {value.bit_length()} bits" if isinstance(value, int) else type(value).__name__
 
 
+def is_name(text: str) -> bool:
+    """Whether a text can be shown as a name: of some length, no terminal's commands, no halves of letters."""
+    return len(text) <= 1000 and not any(unicodedata.category(letter) in ("Cc", "Cs") for letter in text)
+
+
 def _listed(names: Sequence[str]) -> str:
     return ", ".join([*(name if len(name) < 100 else brief(name) for name in names[:8]), *["..."][: len(names) > 8]])
 
@@ -73,8 +79,8 @@ def _values(given: Any, kind: type, what: str, expected: str) -> tuple[Any, ...]
     for place, value in enumerate(values):
         if not _is(value, kind):
             raise ValueError(f"{what} has {brief(value)} at place {place}, expected {expected}")
-        if isinstance(value, str) and not value.isprintable():
-            raise ValueError(f"{what} has {brief(value)} at place {place}, expected printable text")
+        if isinstance(value, str) and not is_name(value):
+            raise ValueError(f"{what} has {brief(value)} at place {place}, expected text that can be printed")
     return tuple(map(int, values)) if kind is Integral else values
 
 
@@ -106,8 +112,8 @@ class Skeleton:
 
     def __post_init__(self) -> None:
         what = f"skeleton {brief(self.name)}"
-        if not isinstance(self.name, str) or not isinstance(self.up, str):
-            raise ValueError(f"{what}: its name and its up axis are text, the latter is {brief(self.up)}")
+        if not isinstance(self.name, str) or not is_name(self.name):
+            raise ValueError(f"{what}: its name is not text that can be printed")
         for field, kind, expected in (
             ("names", str, "text"),
             ("parents", Integral, "whole numbers"),
@@ -140,13 +146,13 @@ class Skeleton:
                 raise ValueError(f"{what}: {side} names joints {brief(strangers)} of {joints}")
         if twice := [j for j, count in Counter(self.left + self.right).items() if count > 1]:
             raise ValueError(f"{what}: left and right name {self.names[twice[0]]} twice")
-        if self.up not in ("y", "z"):
+        if not isinstance(self.up, str) or self.up not in ("y", "z"):
             raise ValueError(f"{what}: up axis is {brief(self.up)}, expected 'y' or 'z'")
-        if not _is(self.fps, Real) or not 0 < self.fps < inf:
+        if not _is(self.fps, Real) or not 0 < self.fps < 1e6:
             raise ValueError(f"{what}: {brief(self.fps)} frames per second, expected more than 0")
         if self.lengths and len(self.lengths) != joints - 1:
             raise ValueError(f"{what}: {len(self.lengths)} bone lengths for {joints - 1} bones")
-        if wrong := [length for length in self.lengths if not 0 <= length < inf]:
+        if wrong := [length for length in self.lengths if not 0 <= length < 1e6]:
             raise ValueError(f"{what}: a bone is {brief(wrong[0])} m long")
 
     @property

@@ -1,0 +1,352 @@
+"""Skeletons, labels and paths that somebody else made: read right, or refused in a sentence."""
+
+import csv
+import json
+import os
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from dvae.motion import HUMAN36M, WALKER, Clip, MotionSet, Skeleton, load, read_paths, save
+from dvae.motion.skeleton import is_name
+
+from .engine import Isolated, fuzz, limited
+
+OF_SKELETONS, OF_TABLES = 8, 7
+
+VALID = {
+    "name": "person",
+    "joint_names": ["hip", "knee", "foot", "hand"],
+    "parents": [-1, 0, 1, 0],
+    "joints_left": [1],
+    "joints_right": [3],
+    "units": "m",
+    "up_axis": "y",
+    "fps": 30,
+    "bone_lengths_m": [0, 0.4, 0.4, 0.5],
+}
+
+
+def skeleton(path, **changes):
+    """A skeleton file with some values replaced."""
+    path.write_text(json.dumps({**VALID, **changes}))
+    return path
+
+
+def told(read, path):
+    """What is said of a file that cannot be read; None if it can."""
+    try:
+        read(path)
+    except (ValueError, FileNotFoundError) as error:
+        sentence = str(error)
+        assert path.name in sentence, f"{sentence!r} does not name the file"
+        assert len(sentence) < 1500, f"{len(sentence)} characters"
+        assert is_name(sentence), f"{sentence!r} has control characters"
+        return sentence
+    return None
+
+
+BROKEN = {
+    "no object": ([1, 2], "expected JSON with joint_names and parents"),
+    "nothing": (None, "expected JSON with joint_names and parents"),
+    "no names": ({"parents": [-1]}, "lacks joint_names"),
+    "no parents": ({"joint_names": ["a"]}, "lacks parents, found joint_names"),
+    "names as text": ({"joint_names": "abcd"}, "names is 'abcd', expected a list of text"),
+    "names as an object": ({"joint_names": {"a": 1}}, "expected a list of text"),
+    "names as numbers": ({"joint_names": [1, 2, 3, 4]}, "names has 1 at place 0, expected text"),
+    "names in lists": ({"joint_names": [["a"], "b", "c", "d"]}, "names has .* at place 0, expected text"),
+    "names repeat": ({"joint_names": ["a", "b", "a", "b"]}, "joint names repeat: a, b"),
+    "names of control characters": ({"joint_names": ["a", "b", "\x1b[2J", "d"]}, "expected text that can be printed"),
+    "names of half a letter": ({"joint_names": ["a", "b", "\ud800", "d"]}, "expected text that can be printed"),
+    "too few names": ({"joint_names": ["a", "b"]}, "2 names but 4 parents|2 names"),
+    "parents as text": ({"parents": "abcd"}, "parents is 'abcd', expected a list of whole numbers"),
+    "parents as a number": ({"parents": 3}, "parents is 3, expected a list"),
+    "parents as fractions": ({"parents": [-1, 0, 1.5, 0]}, "parents has 1.5 at place 2, expected whole numbers"),
+    "parents null": ({"parents": [None, 0, 1, 0]}, "parents has None at place 0"),
+    "parents true": ({"parents": [-1, 0, True, 0]}, "parents has True at place 2"),
+    "a parent out of range": ({"parents": [-1, 0, 1, 4]}, "the parent of hand is joint 4"),
+    "a parent of many digits": ({"parents": [-1, 0, 1, 10**4000]}, "the parent of hand is joint 1000.*000,"),
+    "two roots": ({"parents": [-1, 0, 1, -1]}, "expected one root .* found hip, hand"),
+    "no root": ({"parents": [1, 0, 1, 0]}, "expected one root .* found none"),
+    "a cycle": ({"parents": [-1, 2, 1, 0]}, "knee hangs on a cycle"),
+    "left as a number": ({"joints_left": 1}, "left is 1, expected a list of whole numbers"),
+    "left as names": ({"joints_left": ["knee"]}, "left has 'knee' at place 0, expected whole numbers"),
+    "left null": ({"joints_left": None}, "left is None"),
+    "right out of range": ({"joints_right": [4]}, r"right names joints \[4\] of 4"),
+    "right below range": ({"joints_right": [-1]}, r"right names joints \[-1\] of 4"),
+    "one joint on both sides": ({"joints_right": [1]}, "left and right name knee twice"),
+    "fps as text": ({"fps": "30"}, "'30' frames per second"),
+    "fps null": ({"fps": None}, "None frames per second"),
+    "fps true": ({"fps": True}, "True frames per second"),
+    "fps NaN": ({"fps": float("nan")}, "nan frames per second"),
+    "fps infinite": ({"fps": float("inf")}, "inf frames per second"),
+    "fps of many digits": ({"fps": 10**400}, "1000.* frames per second"),
+    "up as a number": ({"up_axis": 1}, "up axis is 1"),
+    "up as a list": ({"up_axis": ["y"]}, "up axis is .* expected 'y' or 'z'"),
+    "up along x": ({"up_axis": "x"}, "up axis is 'x', expected 'y' or 'z'"),
+    "a name that is a list": ({"name": ["a"]}, r"skeleton \['a'\]: its name"),
+    "lengths as a number": ({"bone_lengths_m": 3}, "bone_lengths_m is 3, expected a list of numbers"),
+    "lengths as text": ({"bone_lengths_m": ["a", 0, 0, 0]}, "bone_lengths_m has 'a' at place 0"),
+    "too few lengths": ({"bone_lengths_m": [0, 1]}, "bone_lengths_m has 2 entries, expected one for each of 4 joints"),
+    "negative lengths": ({"bone_lengths_m": [0, 1, -1, 1]}, "a bone is -1 m long"),
+    "lengths NaN": ({"bone_lengths_m": [0, 1, float("nan"), 1]}, "a bone is nan m long"),
+    "forty thousand joints": (
+        {"joint_names": [f"j{n}" for n in range(40_000)], "parents": [n - 1 for n in range(40_000)]},
+        "40,000 joints, expected at most 1,000",
+    ),
+    "forty thousand names of one": ({"joint_names": ["a"] * 40_000, "parents": [0] * 40_000}, "40,000 joints"),
+    "a thousand names of one": ({"joint_names": ["a"] * 1000, "parents": [0] * 1000}, "joint names repeat: a$"),
+    "a thousand roots": (
+        {"joint_names": [f"{n}" for n in range(999)], "parents": [-1] * 999},
+        r"found 0, 1, .*\.\.\.$",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_what_is_no_skeleton_is_told_in_a_sentence_that_names_the_file(tmp_path, what):
+    changes, message = BROKEN[what]
+    path = tmp_path / "skeleton.json"
+    if isinstance(changes, dict) and not what.startswith("no "):
+        changes = (
+            {**VALID, **changes} if "joint" in what or "lengths" in what else {**VALID, "bone_lengths_m": [], **changes}
+        )
+        if len(changes["joint_names"]) > 4:
+            changes["bone_lengths_m"] = []
+    elif what == "no root":
+        changes = {**VALID, **changes}
+    path.write_text(json.dumps(changes))
+    with pytest.raises(ValueError, match=message):
+        Skeleton.from_json(path)
+    assert told(Skeleton.from_json, path)
+    save(tmp_path / "a.npz", MotionSet([Clip("a", "b", np.random.default_rng(0).uniform(-1, 1, (3, 17, 3)))], WALKER))
+    path.write_text(json.dumps(changes))
+    assert told(lambda _: load(tmp_path / "a.npz"), path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "expected JSON"),
+        (b"\xff\xfe{", "is no text"),
+        (b"{", "expected JSON"),
+        (b"[" * 10**6, "nested too deeply"),
+        (b'{"a":' * 10**6, "nested too deeply"),
+        (b"7" * 10**5, "digits"),
+        (b'{"fps": 1' + b"0" * 10**5 + b"}", "digits"),
+        (b" " * (2**24 + 1), "more than 16,777,216 bytes"),
+        (b'"' + b"a" * 10**6 + b'"', "expected JSON with joint_names"),
+    ],
+    ids=["empty", "utf-16", "cut", "lists", "objects", "digits", "fps", "large", "text"],
+)
+def test_files_that_are_no_json_are_told_too(tmp_path, content, message):
+    path = tmp_path / "skeleton.json"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=rf"skeleton\.json: .*{message}"):
+        Skeleton.from_json(path)
+    assert told(Skeleton.from_json, path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes with names")
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("read", [Skeleton.from_json, read_paths, load])
+def test_what_is_no_file_is_not_waited_for(tmp_path, read):
+    for name in ("pipe.csv", "pipe.npz"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(FileNotFoundError, match=name):
+            read(tmp_path / name)
+
+
+def test_a_long_chain_of_joints_is_a_skeleton(tmp_path):
+    names = [f"joint {n}" for n in range(1000)]
+    chain = Skeleton(tuple(names), (-1, *range(999)))
+    assert chain.order == list(range(1000))
+    chain.to_json(tmp_path / "chain.json")
+    assert Skeleton.from_json(tmp_path / "chain.json") == Skeleton(chain.names, chain.parents, name="")
+
+
+def test_the_order_is_the_same_for_joints_of_one_generation():
+    assert HUMAN36M.order == sorted(range(17), key=lambda j: (depth(HUMAN36M, j), j))
+
+
+def depth(tree, joint):
+    return 0 if tree.parents[joint] == -1 else 1 + depth(tree, tree.parents[joint])
+
+
+# ------------------------------------------------------------------------------------------------ csv files
+
+AXES = [f"{joint}_{axis}" for joint in ("LWrist", "RWrist") for axis in "xyz"]
+PATHS = "\n".join([",".join(AXES), "1,2,3,4,5,6", "", "1,2,,nan,5,-6e-1"]) + "\n"
+LABELS = "split,clip,style\ntrain,walk,happy\ntrain,sit,\n"
+
+
+def labels(path):
+    archive = path.with_name("motion.npz")
+    if not archive.exists():
+        there = np.random.default_rng(0).uniform(-0.8, 0.8, (3, 17, 3)).astype(np.float32)
+        np.savez(archive, **{"train/walk": there, "train/sit": there})
+    return load(archive, WALKER, labels=path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\xff\xfe", "is no text"),
+        (b"split,clip,style\ntrain,walk\n", "row 2 has 2 cells, the header 3"),
+        (b"split,clip,style\ntrain,walk,a,b\n", "row 2 has 4 cells, the header 3"),
+        (b"split,clip,style,style\ntrain,walk,a,b\n", "column 'style' is there twice"),
+        (b"split,clip\ntrain,walk\n" + b"a" * 200_000 + b",b\n", "row 3 is no row of a csv file .*field larger"),
+        (b'split,clip\n"train,walk\n' + b"a\n" * 100_000, "field larger"),
+        (b"", "expected a column named clip"),
+    ],
+)
+def test_labels_that_are_no_table_are_told(tmp_path, content, message):
+    (tmp_path / "labels.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=rf"labels\.csv: .*{message}"):
+        labels(tmp_path / "labels.csv")
+
+
+def test_labels_are_read_with_a_mark_of_their_encoding_and_quotes(tmp_path):
+    text = '\ufeffsplit,clip,style\n\ntrain,walk,"a, ""b"""\n'
+    (tmp_path / "labels.csv").write_text(text, encoding="utf-8")
+    assert labels(tmp_path / "labels.csv")["train", "walk"].labels["style"] == 'a, "b"'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"a_x,a_y,a_z\n1,2,inf\n", "the path of a has inf in frame 0"),
+        (b"a_x,a_y,a_z\n1,2,3\n1,-1e39,3\n", r"the path of a has -1e\+39 in frame 1; expected metres"),
+        (b"a_x,a_y,a_z\n1,2,1e999\n", "the path of a has inf"),
+        (b"a_x,a_y,a_z\n1,2," + b"1" * 200_000 + b"\n", "field larger"),
+        (b"a_x,a_y,a_z\n1,2,\x00\n", "is no number|is no row"),
+        (b'a_x,a_y,a_z\n1,2,"3\n', "is no number|is no row"),
+        (b"\xffa_x,a_y,a_z\n1,2,3\n", "is no text"),
+        (b"x" * 100_000 + b",a_y,a_z\n1,2,3\n", "expected a header of columns|column 1 is .* expected a name"),
+    ],
+)
+def test_paths_that_are_none_are_told(tmp_path, content, message):
+    (tmp_path / "paths.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=rf"paths\.csv: .*({message})"):
+        read_paths(tmp_path / "paths.csv")
+    assert told(read_paths, tmp_path / "paths.csv")
+
+
+@pytest.mark.parametrize("value", [np.inf, 1e300, -np.inf])
+def test_paths_of_an_archive_are_numbers_that_models_can_hold(tmp_path, value):
+    path = np.zeros((4, 3))
+    path[1] = np.nan
+    np.savez(tmp_path / "paths.npz", LWrist=path)
+    read_paths(tmp_path / "paths.npz")
+    path[2, 1] = value
+    np.savez(tmp_path / "paths.npz", LWrist=path)
+    with pytest.raises(ValueError, match=r"paths\.npz: the path of LWrist has .* in frame 2"):
+        read_paths(tmp_path / "paths.npz")
+
+
+def read_large(example, directory):
+    columns, rows, blank, found = example
+    header = ",".join(f"j{n}_{axis}" for n in range(columns // 3) for axis in "xyz")
+    row = ",".join(["1"] * columns)
+    path = directory / "paths.csv"
+    path.write_text("\n".join([header, *[row] * rows, *[""] * blank, row]) + "\n")
+    if found:
+        assert len(read_paths(path)) == columns // 3
+    else:
+        assert told(read_paths, path)
+
+
+@pytest.mark.parametrize(
+    "example",
+    [
+        (60_000, 2, 0, True),
+        (3, 200_000, 0, True),
+        (60_000, 1, 100_000, False),
+        (3, 1, 10**7, False),
+        (6000, 1390, 0, True),
+    ],
+    ids=["columns", "rows", "blank rows of many columns", "blank rows", "both"],
+)
+def test_large_files_of_paths_take_time_in_proportion(isolated_large, example):
+    isolated_large(example)
+
+
+@pytest.fixture(scope="module")
+def isolated_large(tmp_path_factory):
+    with Isolated(read_large, tmp_path_factory.mktemp("large")) as isolated:
+        yield isolated
+
+
+# ------------------------------------------------------------------------------------------------ random ones
+
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-3, 6)
+    | st.integers()
+    | st.sampled_from([2**31, 2**63, 10**400, -(10**30)])
+    | st.floats()
+    | st.text(max_size=4)
+    | st.sampled_from(["y", "z", "hip", "\ud800", "\x1b[2J", "[/x]"]),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=8,
+)
+lists_of_joints = st.lists(st.integers(-2, 6) | values, max_size=6)
+changes = st.dictionaries(st.sampled_from([*VALID, "other"]), values | lists_of_joints, max_size=3)
+edits = st.lists(
+    st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 3), st.binary(max_size=3)),
+    max_size=3,
+)
+
+
+def edited(content, changes):
+    """Some bytes taken out, and others put in."""
+    for place, cut, put in changes:
+        at = int(place * len(content))
+        content = content[:at] + put + content[at + cut :]
+    return content
+
+
+def read_skeleton(example, directory):
+    changes, removed, edits = example
+    path = directory / "skeleton.json"
+    fields = {key: value for key, value in {**VALID, **changes}.items() if key not in removed}
+    path.write_bytes(edited(json.dumps(fields).encode(), edits))
+    if told(Skeleton.from_json, path) is None:
+        read = Skeleton.from_json(path)
+        assert sorted(read.order) == list(range(read.joints))
+        assert len(read.edges) == read.joints - 1
+        read.to_json(directory / "again.json")
+        assert Skeleton.from_json(directory / "again.json") == read
+        assert read.find(read.names[0]) == 0
+        hash(read)
+
+
+@limited(OF_SKELETONS)
+def test_changed_skeletons_are_read_or_refused(tmp_path):
+    examples = st.tuples(changes, st.sets(st.sampled_from(list(VALID)), max_size=1), edits)
+    with Isolated(read_skeleton, tmp_path) as isolated:
+        fuzz(isolated, examples, OF_SKELETONS)
+
+
+def read_table(example, directory):
+    kind, rows, edits = example
+    base = PATHS if kind == "paths" else LABELS
+    path = directory / f"{kind}.csv"
+    with path.open("w", newline="", encoding="utf-8", errors="surrogatepass") as file:
+        file.write(base)
+        csv.writer(file).writerows(rows)
+    path.write_bytes(edited(path.read_bytes(), edits))
+    told(read_paths if kind == "paths" else labels, path)
+
+
+cells = st.sampled_from(["1", "-2.5", "", "nan", "inf", "1e300", "1_0", "x", '"', "\x00", "\r", "٣", "walk", "train"])
+rows = st.lists(st.lists(cells, max_size=7), max_size=4)
+
+
+@limited(OF_TABLES)
+def test_changed_tables_are_read_or_refused(tmp_path):
+    examples = st.tuples(st.sampled_from(["paths", "labels"]), rows, edits)
+    with Isolated(read_table, tmp_path) as isolated:
+        fuzz(isolated, examples, OF_TABLES)
