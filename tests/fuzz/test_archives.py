@@ -170,6 +170,19 @@ LONG_LIST = b"](" + b"K\x01" * 10**5 + b"e\x94"
 ATTACKS = {
     "dtype with fields at an address": one(dtype_state(b"(K\x03\x8c\x01|N\x8c\x01a\x85}K\x08K\x08K\x10t")),
     "dtype with a subarray": one(dtype_state(b"(K\x03\x8c\x01|\x8c\x02f8K\x08\x85\x86NNK\x40K\x01K\x00t")),
+    "dtype of text with an object as its field": one(
+        G
+        + b"(K\x01K\x01\x85cnumpy\ndtype\n\x8c\x02S8\x89\x88\x87R(K\x03\x8c\x01|N\x8c\x01a\x85}\x8c\x01a"
+        + OBJECT
+        + b"K\x00\x86sK\x08K\x01K\x3ftb\x89]Natb"
+    ),
+    "dtype of numbers that are counted as objects": one(
+        G
+        + b"(K\x01K\x03\x85cnumpy\ndtype\n\x8c\x02i8\x89\x88\x87R(K\x03\x8c\x01<NNNJ\xff\xff\xff\xff"
+        + b"J\xff\xff\xff\xffK\x3ftb\x89]("
+        + (b"\x8a\x08" + b"A" * 8) * 3
+        + b"etb"
+    ),
     "dtype of another size": one(dtype_state(b"(K\x03\x8c\x01<NNNJ\x00\x00\x00\x40K\x01K\x00t")),
     "dtype whose numbers are objects": one(dtype_state(b"(K\x03\x8c\x01|NNNK\x08K\x08K\x3ft")),
     "dtype whose fields are text": one(dtype_state(b"(K\x03\x8c\x01<\x8c\x01aNNJ\xff\xff\xff\xffK\x01K\x00t")),
