@@ -149,7 +149,7 @@ def chain(x: Tensor) -> float:
 
 def cache(length: int = 100, samples: int = 50) -> float:
     """Time of recomputing over time of caching, for the same free run."""
-    model = dvae.method("hit-dvae").build({"x": SIZE}).eval()
+    model = dvae.method("hit-dvae", pose_width=8).build({"x": SIZE}).eval()
     parts = model.generator
 
     @torch.no_grad()

@@ -198,7 +198,7 @@ class DynamicalVAE(nn.Module):
         length: int | None = None,
         size: int = 1,
         prefix: Mapping[str, Tensor] | None = None,
-        mean_emission: bool = False,
+        mean_emission: bool | Collection[str] = False,
         self_feeding: SelfFeeding | float | None = None,
         draws: Mapping[str, int] | None = None,
     ) -> dict[str, Tensor]:
@@ -212,7 +212,7 @@ class DynamicalVAE(nn.Module):
             length: T. Beyond the length of the data, the data are a prefix from which the program continues.
             size: B, where the batch does not tell.
             prefix: name to the first values (B, O, D) of a latent.
-            mean_emission: a free run sets the data variables to their means and does not draw them.
+            mean_emission: a free run sets the data variables, or those named, to their means and does not draw them.
             self_feeding: scheduled sampling of the data's history: a `SelfFeeding`, or a probability, in the way of the
                 model's attribute `feeding`.
             draws: latent to a number n: from there on the program goes on n times for each sequence, with a draw
@@ -232,7 +232,8 @@ class DynamicalVAE(nn.Module):
                 )
             self._check(name, value)
         rollout.prefix = {**rollout.prefix, **(prefix or {})}
-        rollout.mean_emission = mean_emission
+        names = self.observed if mean_emission else ()
+        rollout.mean_emission = names if isinstance(mean_emission, bool) else mean_emission
         if isinstance(self_feeding, int | float):
             self_feeding = replace(self.feeding, probability=self_feeding)
         rollout.feeding = self_feeding
@@ -372,7 +373,7 @@ class DynamicalVAE(nn.Module):
         horizon: int,
         samples: int = 1,
         *,
-        draw_emission: bool = False,
+        draw_emission: bool | None = None,
         fix: Mapping[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
         """Continues observed sequences: latents of the past from the guide, then the model runs free.
@@ -381,8 +382,9 @@ class DynamicalVAE(nn.Module):
             batch: the observed data (B, O, D), or a mapping; local context must reach over O + horizon steps.
             horizon: H, the number of steps to continue.
             samples: S, continuations of each sequence.
-            draw_emission: draw the data from their distribution instead of taking its mean, as the papers of human
-                motion do. Predictive densities need the draws.
+            draw_emission: draw the data from their distribution, or (False) take its mean, as the papers of human
+                motion do. Predictive densities need the draws. None for draws of data whose distribution is discrete,
+                of which the mean is no value (.3 of a bit), and for means of others.
             fix: what is the same in all samples: the future (B, H, D) of a data variable, or the value (B, D) of a
                 static latent, such as one sample of an earlier forecast. Later variables read it; latents are not
                 inferred from it.
@@ -403,6 +405,7 @@ class DynamicalVAE(nn.Module):
             raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
         past = data[self.history or self.observed[0]].shape[1]
         fixed = self._fixed(fix or {}, data, horizon)
+        means = [n for n in self.observed if not (self._discrete(n) if draw_emission is None else draw_emission)]
         data, fixed = ({name: repeat(value, samples) for name, value in each.items()} for each in (data, fixed))
         seen = {
             name: value[:, :past] if name in self.context and value.dim() == 3 else value
@@ -414,9 +417,16 @@ class DynamicalVAE(nn.Module):
             program = poutine.condition(self.model, data=statics) if statics else self.model
             prefix = {name: value for name, value in latents.items() if name not in statics}
             data |= {name: value for name, value in fixed.items() if name in self.observed}
-            out = program(data, length=past + horizon, prefix=prefix, mean_emission=not draw_emission)
+            out = program(data, length=past + horizon, prefix=prefix, mean_emission=means)
         out = {name: out[name].unflatten(0, (samples, -1)) for name in (*self.observed, *self.latents)}
         return self._with_whole({n: v[:, :, past:] if n in self.observed else v for n, v in out.items()})
+
+    def _discrete(self, name: str) -> bool:
+        """Whether a data variable has a discrete distribution; any parameters of its head tell."""
+        conditional = self.generator[name]
+        features = like(self).new_zeros(1, 1 if conditional.network is None else conditional.network.features)
+        parameters = conditional.head(features, None, 0 if conditional.factor.local else None)
+        return bool(conditional.head.distribution(parameters).support.is_discrete)
 
     def _fixed(self, fix: Mapping[str, Tensor], data: Mapping[str, Tensor], horizon: int) -> dict[str, Tensor]:
         """The values of `forecast(fix=...)`, those of data over past and future."""
@@ -610,6 +620,7 @@ class DynamicalVAE(nn.Module):
                 raise ValueError(
                     f"{name} holds values that are not finite; where entries are missing, set 'mask' False in the batch"
                 )
+        self._check_context(factorization, values)
         return Rollout(
             factorization=factorization,
             conditionals=conditionals,
@@ -621,6 +632,15 @@ class DynamicalVAE(nn.Module):
             observed=masks,
             prefix=prefix,
         )
+
+    def _check_context(self, factorization: Factorization, values: Mapping[str, Tensor]) -> None:
+        for factor in factorization.factors:
+            if lacking := [p for p in factor.parents if p.name in self.context and p.name not in values]:
+                shapes = ", ".join(f"{p.name} (B, {'T, ' * p.local}{self.sizes[p.name]})" for p in lacking)
+                raise ValueError(
+                    f"{factor} reads {shapes}, context that the batch has to give; it holds "
+                    f"{_shapes(values) or 'nothing'}"
+                )
 
     def _check(self, name: str, value: Tensor) -> None:
         local = self.generative.local(name) if name not in self.context else None

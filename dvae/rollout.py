@@ -6,7 +6,7 @@ known. A `Rollout` holds what is known in one run; every site of the Pyro progra
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -81,7 +81,7 @@ class Rollout:
         observed: name to (B, T, D) True where an entry of the data was observed. The model reads its own mean in
             place of the others, the guide 0.
         prefix: name to (B, O, D) first values of a variable that is then drawn on.
-        mean_emission: data variables are not drawn but set to their means.
+        mean_emission: names of data variables that are not drawn but set to their means.
         feeding: self-feeding of the data's history, or None.
         draws: how many rows each sequence of the data has by now (see `fork`).
     """
@@ -95,7 +95,7 @@ class Rollout:
     lengths: Tensor | None = None
     observed: Mapping[str, Tensor] = field(default_factory=dict)
     prefix: Mapping[str, Tensor] = field(default_factory=dict)
-    mean_emission: bool = False
+    mean_emission: Collection[str] = ()
     feeding: SelfFeeding | None = None
     draws: int = 1
 
@@ -247,7 +247,7 @@ class Rollout:
                 (self.batch, self.length, self.conditionals[name].size), like(self.conditionals[name])
             )
             for name in live
-            if hidden is None and not (self.mean_emission and name in self.data)
+            if hidden is None and name not in self.mean_emission
         }
         if loop:
             return self._loop(block, live, given, noise, hidden)

@@ -97,7 +97,7 @@ class ActionClassifier(Method):
         Raises:
             ValueError: always.
         """
-        raise ValueError("an action classifier needs to know the classes; use build_for(windows)")
+        raise self.needs("an action classifier needs to know the classes")
 
     def build_for(self, windows: Windows) -> ActionClassifierModel:
         """The model for such windows."""

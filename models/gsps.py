@@ -163,6 +163,14 @@ class GSPS(EnergyMethod):
             return (max(2, int(prod(value) ** (1 / count))),) * count
         return (sum(value) / count,) * count
 
+    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
+        """GSPS cannot be built from sizes alone.
+
+        Raises:
+            ValueError: always.
+        """
+        raise self.needs("gsps needs to know the skeleton, its parts, and how many frames are observed")
+
     def build_for(self, windows: Windows) -> GSPSModel:
         """See `Method.build_for`.
 
@@ -287,7 +295,7 @@ class GSPSModel(EnergyModel):
         horizon: int,
         samples: int = 1,
         *,
-        draw_emission: bool = False,
+        draw_emission: bool | None = None,
         fix: Mapping[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
         """See `DynamicalVAE.forecast`; at most as far as the networks' T frames.

@@ -12,7 +12,9 @@ The paper does not maximise the evidence. It draws K motions of the guide's late
     L = lr min_k |x_k - x|^2 + lmm (the same to pseudo ground truths) + lz KL_z + lw KL_w + energies
 
 with means over time, KL_w whole, and the energies of GSPS (diversity, limbs, angles, pose prior) over all frames; in
-training the model soon reads its own output alone. Both are here: loss="best-of-many" and loss="evidence".
+training the model soon reads its own output alone. The paper prints its squared errors as sums; means over time, which
+its weights beside those of GSPS speak for, are one reading of it, and what its weights mean depends on that. Both
+objectives are here: loss="best-of-many" and loss="evidence".
 
 Bie et al., 2022, arXiv 2204.01565. There is no public code. Ours where the paper is silent or cannot be followed:
 
@@ -64,6 +66,7 @@ HUMANEVA: dict[str, Any] = {
     "pose_prior": 0.001,
     "kl_local": 0.5,
     "kl_static": 7.5,
+    "pose_width": 8,
     "samples": 10,
     "decoder": 256,
     "pseudo_minimum": 0.01,
@@ -117,7 +120,8 @@ class HiTDVAE(EnergyMethod):
         layers: of each factor.
         nearest: the last frame that a generative factor may read joins its query; in the paper it is one key of many.
         standardise: networks read and make poses without unit, by the mean pose and one spread (`dvae.units`).
-        pose_width: features of a joint; 0 for poses as they are.
+        pose_width: features of a joint, by graph convolutions; 0 for poses as they are. None for 8 where windows tell
+            that x are poses, and for 0 where a model is built from sizes alone.
         summary: of x for w: "graph" (a graph of `frames` frames) or "attention" (over any length: all frames, in no
             order, of a window in training and of its past in a forecast).
         frames: of the graph's window; None for as many as the protocol observes. The same for all draws of a window in
@@ -166,7 +170,7 @@ class HiTDVAE(EnergyMethod):
     layers: int = 1
     nearest: bool = True
     standardise: bool = True
-    pose_width: int = 8
+    pose_width: int | None = None
     summary: Literal["graph", "attention"] = "graph"
     frames: int | None = None
     guide_past: bool = False
@@ -231,7 +235,7 @@ class HiTDVAE(EnergyMethod):
         return found
 
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
-        """See `Method.build`; without a skeleton there are no energies."""
+        """See `Method.build`; without a skeleton there are no energies, and x are numbers, not poses (`pose_width`)."""
         return self._finished(super().build(data), self.frames or FRAMES)
 
     def _finished(self, model: Any, observed: int) -> Any:
@@ -252,9 +256,9 @@ class HiTDVAE(EnergyMethod):
         """
         suited = replace(self, frames=self.frames or windows.protocol.observed)
         if self.loss == "evidence":
-            return replace(
-                suited, heading=bool(self.heading), decoder=self.decoder or self.preset(windows.skeleton)["decoder"]
-            )
+            preset = self.preset(windows.skeleton)
+            open_ = {name: preset[name] for name in ("decoder", "pose_width") if getattr(self, name) is None}
+            return replace(suited, heading=bool(self.heading), **open_)
         return super(HiTDVAE, suited).suited(windows)
 
     def build_for(self, windows: Windows) -> DynamicalVAE:
@@ -307,7 +311,10 @@ class HiTDVAE(EnergyMethod):
         if self.loss == "evidence":
             return super().objective()
         if self.diversity is None or self.kl_local is None or self.kl_static is None or self.samples is None:
-            raise ValueError("the weights depend on the skeleton; take those of method.suited(windows)")
+            raise ValueError(
+                "the weights depend on the skeleton; take those of method.suited(windows), or for data that are no "
+                "poses the plain bound, loss='evidence'"
+            )
         weights = {"z": self.kl_local, **({"w": self.kl_static} if self.static else {})}
         ramp = SHAPES[self.warm_up_shape]
         likeness = {f"diversity_{part}": weight for part, weight in zip(PARTS, self.diversity, strict=True)}
@@ -369,7 +376,7 @@ class HiTModel(EnergyModel):
         horizon: int,
         samples: int = 1,
         *,
-        draw_emission: bool = False,
+        draw_emission: bool | None = None,
         fix: Mapping[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
         """See `DynamicalVAE.forecast`."""

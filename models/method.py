@@ -106,7 +106,10 @@ class Method:
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """Networks by factor."""
-        raise NotImplementedError
+        raise NotImplementedError(
+            f"{type(self).__name__} says nothing of its networks; give it `def networks(self)` that returns them by "
+            'factor, such as {"default": Recurrent(64)}, or a `build` of its own'
+        )
 
     def heads(self) -> Mapping[str, HeadSpec]:
         """Heads by factor."""
@@ -151,11 +154,21 @@ class Method:
         return {name: kinds[self.prior](guide) for name, guide in guides.items()}
 
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
-        """The model for data of these sizes, such as {"x": 60}."""
+        """The model for data of these sizes, such as {"x": 60}.
+
+        Raises:
+            ValueError: a method that needs to know more, which says so and points to `build_for`.
+        """
         sizes = {**self.sizes(), **data}
         model = DynamicalVAE(*self.equations(), sizes, self.networks(), self.heads(), self.priors(sizes))
         model.feeding = SelfFeeding(0.0, gradient=False)
         return model
+
+    def needs(self, what: str) -> ValueError:
+        """The error of a method that cannot be built from sizes alone, for lack of this."""
+        return ValueError(
+            f"{what}; use build_for(windows), with windows = dvae.motion.windows(motion, protocol, 'train')"
+        )
 
     def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
         """What options that are None stand for, with poses of this skeleton; see `presets`."""

@@ -89,7 +89,7 @@ class PosePrior(Method):
         Raises:
             ValueError: always.
         """
-        raise ValueError("a pose prior needs to know the skeleton; use build_for(windows)")
+        raise self.needs("a pose prior needs to know the skeleton")
 
     def build_for(self, windows: Windows) -> PosePriorModel:
         """The model for poses of the windows' skeleton."""

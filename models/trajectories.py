@@ -104,7 +104,15 @@ class TrajectoryMethod(Method):
         return self.build_on(windows.skeleton, windows.length - 1)
 
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:
-        """See `Method.build`; y, r and s are of the size of x, and options left open are the paper's."""
+        """See `Method.build`; y, r and s are of the size of x, and options left open are the paper's.
+
+        Batches of this model hold y, r and s beside x; that of `build_for` makes them of windows itself.
+
+        Raises:
+            ValueError: no size of x.
+        """
+        if WHOLE not in data:
+            raise ValueError(f"sizes missing for {WHOLE}, 3 J of a pose; given are {', '.join(data) or 'none'}")
         return self.filled(self.presets[HUMAN36M.name])._built(DynamicalVAE, data[WHOLE])
 
     def build_on(self, skeleton: Skeleton, frames: int | None = None) -> TrajectoryModel:
@@ -133,7 +141,7 @@ class TrajectoryMethod(Method):
             ValueError: a weight that is still open, which the skeleton decides.
         """
         if self.beta is None:
-            raise ValueError("beta depends on the skeleton; take the objective of method.suited(windows)")
+            raise ValueError("beta depends on the skeleton; take the objective of method.suited(windows), or give beta")
         return Evidence(kl_weight=self.beta, select="loss")
 
     def feeding(self, steps: int) -> float:
@@ -239,7 +247,7 @@ class TrajectoryModel(DynamicalVAE):
         horizon: int,
         samples: int = 1,
         *,
-        draw_emission: bool = False,
+        draw_emission: bool | None = None,
         fix: Mapping[str, Tensor] | None = None,
         temperature: float = 1.0,
     ) -> dict[str, Tensor]:
@@ -449,7 +457,7 @@ class TrajectoryModel(DynamicalVAE):
     def _means(self, data: Mapping[str, Tensor], latents: Tensor) -> Tensor:
         """Means of x (S, T, D) given latents."""
         rollout = self._rollout(self.generative, self.generator, data, data[GIVEN].shape[1], 1)
-        rollout.mean_emission = True
+        rollout.mean_emission = (WHOLE,)
         rollout.values[self.latents[0]] = latents
         return rollout.draw(WHOLE)
 

@@ -12,6 +12,7 @@ from dvae import energies, motion
 from dvae.models import from_config, runs
 from dvae.models.hit_dvae import PRESETS, HiTModel
 from dvae.motion.body import body_parts
+from dvae.networks.posegraph import PoseFeatures
 
 SMALL = {"latent": 3, "static": 2, "width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "samples": 3}
 QUICK = {**SMALL, "pose_prior": 0.0, "angles": 0.0, "multimodal": 0.0, "heading": False}
@@ -347,6 +348,19 @@ def test_without_a_skeleton_there_are_the_equations_and_their_networks():
     model = dvae.method("hit-dvae").build({"x": 12})
     assert not isinstance(model, HiTModel)
     assert math.isfinite(dvae.SequenceELBO().loss(model, model.guide, torch.randn(2, 4, 12)))
+
+
+@pytest.mark.parametrize("loss", ["best-of-many", "evidence"])
+def test_only_poses_go_through_pose_graphs(windows, loss):
+    def graphs(model):
+        return any(isinstance(module, PoseFeatures) for module in model.modules())
+
+    method = dvae.method("hit-dvae", loss=loss)
+    assert not graphs(method.build({"x": windows.size}))  # numbers that nobody called joints
+    assert graphs(method.build_for(windows))
+    assert method.suited(windows).pose_width == 8
+    assert graphs(replace(method, pose_width=2).build({"x": 12}))
+    assert not graphs(replace(method, pose_width=0).build_for(windows))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 import copy
 import json
+import math
+import re
 import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -17,6 +19,7 @@ from dvae.models.dkf import Gated
 from dvae.testing import FactorizationContract
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DOCS = Path(__file__).parents[1] / "docs"
 SMALL = {
     "vae": {"hidden": (5, 4)},
     "dkf": {"width": 4, "embed": 3, "embed_latent": (3,), "hidden": (4,), "decoder": (4, 5)},
@@ -445,13 +448,29 @@ def test_nothing_is_fed_to_a_model_that_reads_no_data():
 
 
 def test_the_documented_method_is_one_and_is_not_there_already():
-    page = (Path(__file__).parents[1] / "docs" / "methods.md").read_text()
+    page = (DOCS / "methods.md").read_text()
     space = {}
     exec(compile(page.split("```\n")[1], "docs/methods.md", "exec", dont_inherit=True), space)
     kind = space["SecondOrder"]
     assert kind.name not in dvae.methods()
     assert f"{kind.name} = " in page
     assert torch.isfinite(dvae.SequenceELBO().terms(kind(latent=2).build({"x": 3}), torch.randn(2, 4, 3)).bound).all()
+
+
+RESULTS = sorted(page for page in (DOCS / "results").glob("*.md") if "ADE" in page.read_text())  # scores of windows
+
+
+@pytest.mark.parametrize("page", RESULTS, ids=lambda page: page.stem)
+def test_a_page_of_results_says_on_which_windows_its_options_were_chosen(page):
+    _, heading, rest = page.read_text().partition("## Where the options come from\n")
+    section = rest.partition("\n## ")[0]
+    assert heading
+    assert re.search(r"test\s+windows", section)
+    kind = dvae.methods().get(page.stem.replace("_", "-"))
+    published = [preset for name, preset in kind.presets.items() if name] if kind else []
+    for option, value in kind.presets[""].items() if published else ():
+        ours = all(preset[option] != value for preset in published)
+        assert not ours or f"`{option}`" in section, f"{option} is {value}, which is not the paper's"
 
 
 def test_the_gated_transition_is_of_a_variable_on_itself():
@@ -502,6 +521,30 @@ def test_a_method_says_what_it_is(name):
 def test_methods_that_are_not(run, message):
     with pytest.raises(ValueError, match=message):
         run()
+
+
+NEEDS = r"missing 1 required positional argument: 'data'|sizes missing for|use build_for\(windows\)|batch has to give"
+
+
+@pytest.mark.parametrize("data", [None, {}, {"x": 7}], ids=["nothing", "no sizes", "a size"])
+@pytest.mark.parametrize("name", dvae.methods())
+def test_a_method_built_from_sizes_works_or_says_what_it_needs(name, data):
+    refusal = None
+    try:
+        model = dvae.method(name).build(*([] if data is None else [data]))
+        x = torch.randn(2, 4, model.sizes["x"])
+        loss, future = dvae.SequenceELBO().loss(model, model.guide, x), model.forecast(x, 2)["x"]
+    except (TypeError, ValueError) as error:
+        refusal = str(error)
+    assert math.isfinite(loss) and torch.isfinite(future).all() if refusal is None else re.search(NEEDS, refusal)
+
+
+def test_a_method_without_networks_is_told_what_to_write():
+    class Bare(dvae.models.Method):
+        name, source, generative, inference = "bare", "ours", "p(z_t) p(x_t | z_t)", "q(z_t | x_t)"
+
+    with pytest.raises(NotImplementedError, match="Bare says nothing of its networks; give it `def networks"):
+        Bare().build({"x": 1})
 
 
 def test_entry_points_add_methods_and_cannot_replace_any(monkeypatch):

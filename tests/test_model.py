@@ -1,8 +1,10 @@
 """The Pyro program: one declaration of a factorization, and every way of running it agrees with every other."""
 
 import copy
+from functools import partial
 
 import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 from hypothesis import given, settings
@@ -310,6 +312,63 @@ def test_a_seed_repeats_a_forecast_and_emissions_may_be_drawn():
     assert torch.equal(run(1), run(1))
     assert not torch.equal(run(1), run(2))
     assert not torch.equal(run(1), run(1, draw_emission=True))
+
+
+class Bits(heads.Head):
+    """A head of binary data, as one writes it."""
+
+    def __init__(self, features, size):
+        super().__init__()
+        self.out = torch.nn.Linear(features, size)
+
+    def forward(self, features, previous=None, t=None):
+        return (self.out(features).sigmoid(),)
+
+    def distribution(self, parameters):
+        return dist.Bernoulli(parameters[0])
+
+    def noise(self, shape, like):
+        return torch.rand(*shape, dtype=like.dtype)
+
+    def draw(self, parameters, noise):
+        return (noise < parameters[0]).to(noise)
+
+
+class BitsSpec:
+    def build(self, features, size, local=True):
+        return Bits(features, size)
+
+
+@pytest.mark.parametrize("pair", ["srnn", "dkf", "rvae"])  # x in a loop, and at once
+def test_a_forecast_draws_discrete_data_and_takes_the_means_of_others(pair):
+    model = build(pair, heads={"p(x)": BitsSpec()})
+    x = (torch.rand(B, T, 3, dtype=torch.float64) < 0.5).double()
+    forecast = partial(model.forecast, x, 4, 6)
+    assert forecast()["x"].unique().tolist() == [0, 1]
+    assert forecast(draw_emission=True)["x"].unique().tolist() == [0, 1]
+    shares = forecast(draw_emission=False)["x"]
+    assert ((shares > 0) & (shares < 1)).all()
+
+
+def test_discrete_and_other_data_are_forecast_side_by_side():
+    model = build("body parts", heads={"p(y)": BitsSpec()})
+    data = draw(model)
+    data["y"] = (data["y"] > 0).double()
+    out = model.forecast(data, 3, 4)
+    assert out["y"].unique().tolist() == [0, 1]
+    whole = {n: torch.cat([data[n].repeat(4, 1, 1), out[n].flatten(0, 1)], 1) for n in data}
+    expected = means(model, {**whole, "z": out["z"].flatten(0, 1)})["x"][:, T:]
+    torch.testing.assert_close(out["x"].flatten(0, 1), expected)
+
+
+def test_a_batch_without_the_context_that_a_factor_reads_is_refused():
+    model = build("context")
+    data = draw(model)
+    for name, shape in (("c", r"c \(B, T, 1\)"), ("pose", r"pose \(B, 2\)")):
+        rest = {n: value for n, value in data.items() if n != name}
+        for run in (model.guide, model.model, partial(model.forecast, horizon=1), model.reconstruct):
+            with pytest.raises(ValueError, match=rf"\) reads {shape}, context that the batch has to give; it holds x"):
+                run(rest)
 
 
 def test_a_drawn_forecast_has_the_density_of_the_model():

@@ -186,7 +186,7 @@ def test_cvae_rnn_reads_its_own_means_alone(windows):
         means.append(fed.parameters("x", data["x"])[0])
     assert torch.equal(*means)
     free = model._rollout(model.generative, model.generator, {n: told[n] for n in ("s", "y")}, 20, 1)
-    free.mean_emission = True
+    free.mean_emission = ("x",)
     free.values.update(latents)
     assert torch.allclose(free.draw("x"), means[0], atol=1e-10, rtol=0)
 
