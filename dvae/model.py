@@ -405,7 +405,8 @@ class DynamicalVAE(nn.Module):
             raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
         past = data[self.history or self.observed[0]].shape[1]
         fixed = self._fixed(fix or {}, data, horizon)
-        means = [n for n in self.observed if not (self._discrete(n) if draw_emission is None else draw_emission)]
+        drawn = {n: self.generator[n].discrete if draw_emission is None else draw_emission for n in self.observed}
+        means = [name for name in self.observed if not drawn[name]]
         data, fixed = ({name: repeat(value, samples) for name, value in each.items()} for each in (data, fixed))
         seen = {
             name: value[:, :past] if name in self.context and value.dim() == 3 else value
@@ -420,13 +421,6 @@ class DynamicalVAE(nn.Module):
             out = program(data, length=past + horizon, prefix=prefix, mean_emission=means)
         out = {name: out[name].unflatten(0, (samples, -1)) for name in (*self.observed, *self.latents)}
         return self._with_whole({n: v[:, :, past:] if n in self.observed else v for n, v in out.items()})
-
-    def _discrete(self, name: str) -> bool:
-        """Whether a data variable has a discrete distribution; any parameters of its head tell."""
-        conditional = self.generator[name]
-        features = like(self).new_zeros(1, 1 if conditional.network is None else conditional.network.features)
-        parameters = conditional.head(features, None, 0 if conditional.factor.local else None)
-        return bool(conditional.head.distribution(parameters).support.is_discrete)
 
     def _fixed(self, fix: Mapping[str, Tensor], data: Mapping[str, Tensor], horizon: int) -> dict[str, Tensor]:
         """The values of `forecast(fix=...)`, those of data over past and future."""
