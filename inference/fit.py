@@ -6,31 +6,29 @@ varies over time is a schedule of the global step, and every random number comes
 checkpoint stores: a resumed run repeats, bit for bit on a CPU, what the uninterrupted run would have done.
 """
 
-import difflib
 import io
 import math
 import os
 import signal
-import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields, replace
-from numbers import Integral
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import torch
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
+from ..options import Amount, Count, Range, Share, check, nearest
 from .batches import Batch, Sequences, Source, each, sequences
 from .bounds import SequenceELBO, Terms
 from .checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE, CheckpointError, Run, load_weights, weights
 from .objectives import Evidence, Objective
-from .schedules import Constant, Piecewise, Schedule, clamp, schedule, to_config
+from .schedules import Piecewise, Schedule, clamp, levels, schedule, to_config
 from .trackers import JSONLines, Memory, Terminal, Tracker
 
 if TYPE_CHECKING:
@@ -71,47 +69,34 @@ class Training:
         ValueError: when an option is out of range.
     """
 
-    steps: int = 2000
-    batch_size: int = 32
-    learning_rate: float | Schedule = 1e-3
-    decay: float = 0.0
+    steps: Count = 2000
+    batch_size: Annotated[int, Range(1, 16384)] = 32
+    learning_rate: Amount | Schedule = 1e-3
+    decay: Share = 0.0
     optimizer: Literal["adam", "adamw", "sgd"] = "adam"
-    weight_decay: float = 0.0
-    gradient_clip: float | None = 10.0
-    self_feeding: float | Schedule = 0.0
-    particles: int = 1
-    validate_every: int = 100
-    patience: int | None = None
-    log_every: int = 10
+    weight_decay: Amount = 0.0
+    gradient_clip: Annotated[float, Range(0, above=True)] | None = 10.0
+    self_feeding: Share | Schedule = 0.0
+    particles: Annotated[int, Range(1, 4096)] = 1
+    validate_every: Count = 100
+    patience: Count | None = None
+    log_every: Count = 10
     seed: int = 0
     accelerator: str = "auto"
-    devices: int = 1
+    devices: Annotated[int, Range(1, 16)] = 1
     precision: Literal["32-true", "64-true", "bf16-mixed", "bf16-true"] = "32-true"
     progress: bool = True
 
     def __post_init__(self) -> None:
-        counts = ("steps", "batch_size", "particles", "validate_every", "patience", "log_every", "devices")
-        for name in (*counts, "seed"):
-            value = getattr(self, name)
-            if value is None and name == "patience":
-                continue
-            if not isinstance(value, Integral):
-                raise TypeError(f"{name} is {value!r}; it must be a whole number")
-            if name in counts and value < 1:
-                raise ValueError(f"{name} is {value}; it must be at least 1")
-        for name, largest in (("learning_rate", None), ("weight_decay", None), ("decay", 1), ("self_feeding", 1)):
-            value = schedule(getattr(self, name))
-            if isinstance(value, Constant) and not 0 <= value.value <= (largest or sys.float_info.max):
-                expected = "finite and at least 0" if largest is None else f"between 0 and {largest}"
-                raise ValueError(f"{name} is {value.value}; it must be {expected}")
+        check(self)
+        for name, allowed in (("learning_rate", Range(0)), ("self_feeding", Range(0, 1))):
+            for value in levels(getattr(self, name)):
+                if value not in allowed:
+                    raise ValueError(f"{name} is {value}; it must be {allowed}")
         if self.decay and isinstance(self.learning_rate, Schedule):
             raise ValueError(
                 "decay is for a learning rate that is a number; a schedule falls by itself, so leave decay 0"
             )
-        if self.gradient_clip is not None and not self.gradient_clip > 0:
-            raise ValueError(f"gradient_clip is {self.gradient_clip}; it must be positive, or None for no limit")
-        if self.optimizer not in OPTIMISERS:
-            raise ValueError(f"unknown optimizer {self.optimizer!r}; choose {', '.join(OPTIMISERS)}")
 
     @property
     def rate(self) -> Schedule:
@@ -663,9 +648,7 @@ def _plan(
     known = [option.name for option in fields(Training)]
     for name in options:
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {near[0]}?" if near else f"; the options are {', '.join(known)}"
-            raise TypeError(f"fit has no option {name!r}{hint}")
+            raise TypeError(f"fit has no option {name!r}{nearest(name, known)}; the options are {', '.join(known)}")
     training = Training(**options)
     if not stages:
         stages = [Stage(training.steps, Evidence() if objective is None else objective)]

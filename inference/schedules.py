@@ -12,14 +12,21 @@ from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Annotated, Any
+
+from ..options import Range, check
+
+Level = Annotated[float, Range()]
 
 
 @dataclass(frozen=True)
 class Constant:
     """The same value at every step."""
 
-    value: float
+    value: Level
+
+    def __post_init__(self) -> None:
+        check(self)
 
     def __call__(self, step: int) -> float:
         """Return the value at a global step."""
@@ -30,12 +37,13 @@ class Constant:
 class _Ramp:
     """From `start` to `end` in `steps` steps, after `delay` steps at `start`; then constant."""
 
-    start: float
-    end: float
+    start: Level
+    end: Level
     steps: int
     delay: int = 0
 
     def __post_init__(self) -> None:
+        check(self)
         if self.steps < 1 or self.delay < 0:
             name = type(self).__name__
             raise ValueError(
@@ -82,12 +90,7 @@ class Logistic(_Ramp):
         steepness: slope in the middle; the curve is linear as it goes to 0 and a jump as it grows.
     """
 
-    steepness: float = 10.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.steepness <= 0:
-            raise ValueError(f"Logistic got steepness={self.steepness}; it must be positive")
+    steepness: Annotated[float, Range(1e-9, 1e9)] = 10.0
 
     def _share(self, elapsed: float) -> float:
         half = math.tanh(self.steepness / 4)
@@ -108,6 +111,8 @@ class Piecewise:
 
     def __post_init__(self) -> None:
         points = tuple((int(step), float(value)) for step, value in self.points)
+        if not all(math.isfinite(value) for _, value in points):
+            raise ValueError(f"Piecewise got the points {points}; all its values must be finite")
         if not points or any(later[0] < earlier[0] for earlier, later in pairwise(points)):
             raise ValueError(f"Piecewise got the points {points}; it needs at least one, in the order of their steps")
         object.__setattr__(self, "points", points)
@@ -139,6 +144,17 @@ def schedule(value: float | Schedule) -> Schedule:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"expected a number or a schedule ({', '.join(_SCHEDULES)}), got {value!r}")
     return Constant(float(value))
+
+
+def levels(value: float | Schedule) -> tuple[float, ...]:
+    """Values between which, ends included, a number or schedule always stays."""
+    match schedule(value):
+        case Constant(level):
+            return (level,)
+        case Piecewise(points):
+            return tuple(level for _, level in points)
+        case ramp:
+            return ramp.start, ramp.end
 
 
 def clamp(value: Any, steps: int) -> Any:

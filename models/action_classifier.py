@@ -30,6 +30,7 @@ from ..inference.objectives import Evidence, Objective
 from ..model import DynamicalVAE
 from ..motion import Protocol, Skeleton, Windows
 from ..notation import Factorization
+from ..options import Layers, Size
 from .method import Method
 
 CLASS = "c"
@@ -56,16 +57,10 @@ class ActionClassifier(Method):
     use: ClassVar[str] = "score forecasts with: dvae evaluate RUN --classifier {run}"
 
     label: str = "content"
-    hidden: int = 128
-    layers: int = 2
-    features: int = 30
+    hidden: Size = 128
+    layers: Layers = 2
+    features: Size = 30
     classes: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("hidden", "layers", "features"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
 
     def equations(self) -> tuple[Factorization, Factorization]:
         """See `Method.equations`; the guide has no factor."""

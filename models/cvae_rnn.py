@@ -26,6 +26,7 @@ from torch.nn import functional
 from ..networks import Input, Network, NetworkSpec
 from ..networks.base import once, perceptron, share_modules
 from ..networks.recurrent import gru_cell
+from ..options import Amount, Size
 from ..rollout import SelfFeeding
 from .trajectories import FIRST, GIVEN, REST, TrajectoryMethod
 
@@ -46,17 +47,14 @@ class CVAERNN(TrajectoryMethod):
     generative: ClassVar[str] = "p(w) p(x_t | x_{<t}, y_{1:T}, w, s)"
     inference: ClassVar[str] = "q(w | r_{1:T}, y_{1:T}, s)"
 
-    latent: int = 256
-    beta: float | None = 0.1
-    summary: int = 64
-    width: int = 128
-    hidden: tuple[int, ...] = (300, 200, 128)
+    latent: Size = 256
+    beta: Amount | None = 0.1
+    summary: Size = 64
+    width: Size = 128
+    hidden: tuple[Size, ...] = (300, 200, 128)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("summary", "width"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
         if not self.hidden:
             raise ValueError("hidden is empty; a perceptron has at least one layer")
 

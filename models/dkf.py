@@ -21,6 +21,7 @@ from torch.nn import functional
 from ..heads import Head, HeadSpec, Parameters
 from ..networks import Dense, Input, NetworkSpec, Recurrent
 from ..networks.base import Network, at, shift
+from ..options import Extra, Size
 from .method import Method
 
 
@@ -120,12 +121,12 @@ class DKF(Method):
     generative: ClassVar[str] = "p(z_t | z_{t-1}) p(x_t | z_t)"
     inference: ClassVar[str] = "q(z_t | z_{t-1}, x_{t:T})"
 
-    width: int = 64
-    embed: int = 64
-    embed_latent: tuple[int, ...] = (16,)
-    hidden: tuple[int, ...] = (32,)
-    decoder: tuple[int, ...] = (32, 64)
-    transition: tuple[int, ...] = ()
+    width: Size = 64
+    embed: Extra = 64
+    embed_latent: tuple[Size, ...] = (16,)
+    hidden: tuple[Size, ...] = (32,)
+    decoder: tuple[Size, ...] = (32, 64)
+    transition: tuple[Size, ...] = ()
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """A gated transition, a perceptron for the data, a backward network for the guide."""

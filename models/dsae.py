@@ -23,6 +23,7 @@ from ..networks import Dense, Input, NetworkSpec, Recurrent
 from ..networks.base import Network
 from ..networks.recurrent import Memory
 from ..notation import ALL
+from ..options import Size
 from .method import Method
 
 
@@ -114,9 +115,9 @@ class DSAE(Method):
     generative: ClassVar[str] = "p(w) p(z_t | z_{<t}) p(x_t | z_t, w)"
     inference: ClassVar[str] = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
 
-    static: int = 16
-    width: int = 64
-    decoder: tuple[int, ...] = (32, 64)
+    static: Size = 16
+    width: Size = 64
+    decoder: tuple[Size, ...] = (32, 64)
 
     def sizes(self) -> dict[str, int]:
         """Sizes of w and z."""

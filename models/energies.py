@@ -11,8 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +22,7 @@ from ..model import WHOLE, Batch, DynamicalVAE
 from ..motion import Skeleton, Windows, face_forward, rotate_about_up
 from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
 from ..motion.truths import PseudoTruths, WithPseudoTruths
+from ..options import Amount, Count, Positive, Range, Size
 from ..priors import VampPrior
 from .method import Method
 from .pose_prior import PosePrior, PosePriorModel, fit_pose_prior
@@ -51,35 +51,22 @@ class EnergyMethod(Method):
             scores: they compare with those of models that turn them too, and with no others.
     """
 
-    positive: ClassVar[tuple[str, ...]] = ("diversity_scale", "pseudo_most", "pool_stride")
     weights: ClassVar[tuple[str, ...]] = ("reconstruction", "multimodal", "diversity", "limb", "angles", "pose_prior")
 
-    reconstruction: float | None = None
-    multimodal: float | None = None
-    diversity: tuple[float, ...] | None = None
-    diversity_scale: tuple[float, ...] | None = None
-    limb: float | None = None
-    angles: float | None = None
-    pose_prior: float | None = None
+    reconstruction: Amount | None = None
+    multimodal: Amount | None = None
+    diversity: tuple[Amount, ...] | None = None
+    diversity_scale: tuple[Positive, ...] | None = None
+    limb: Amount | None = None
+    angles: Amount | None = None
+    pose_prior: Amount | None = None
     pose_prior_run: str = ""
-    angle_quantile: float = 0.0
-    pseudo_threshold: float = 0.5
-    pseudo_minimum: float | None = None
-    pseudo_most: int = 10
-    pool_stride: int | None = None
+    angle_quantile: Annotated[float, Range(0, 0.5, below=True)] = 0.0
+    pseudo_threshold: Amount = 0.5
+    pseudo_minimum: Amount | None = None
+    pseudo_most: Size = 10
+    pool_stride: Count | None = None
     heading: bool | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in (*self.positive, *self.weights):
-            value = getattr(self, name)
-            for number in value if isinstance(value, tuple) else () if value is None else (value,):
-                if not number > 0 if name in self.positive else not 0 <= number < inf:
-                    raise ValueError(
-                        f"{name} is {value}; it must be {'positive' if name in self.positive else 'at least 0'}"
-                    )
-        if not 0 <= self.angle_quantile < 0.5:
-            raise ValueError(f"angle_quantile is {self.angle_quantile}; it must be at least 0 and below 0.5")
 
     def refuse_root(self, windows: Windows) -> None:
         """Refuses windows with a root.

@@ -9,6 +9,7 @@ from typing import ClassVar
 from ..model import DynamicalVAE
 from ..networks import Attention, Dense, Linear, NetworkSpec, Recurrent
 from ..notation import Factorization
+from ..options import Size
 from .method import Method
 
 
@@ -31,8 +32,8 @@ class Equations(Method):
     generative: str = "p(z_t | z_{t-1}) p(x_t | z_t)"  # type: ignore[misc]
     inference: str = "q(z_t | z_{t-1}, x_{1:T})"  # type: ignore[misc]
     network: str = "recurrent"
-    width: int = 64
-    latents: dict[str, int] = field(default_factory=dict)
+    width: Size = 64
+    latents: dict[str, Size] = field(default_factory=dict)
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """One kind for every factor."""

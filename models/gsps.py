@@ -39,6 +39,7 @@ from ..motion import Skeleton, Windows
 from ..motion.body import body_parts
 from ..networks import GraphConv
 from ..notation import Factorization
+from ..options import Amount, Layers, Size
 from ..rollout import Rollout
 from .energies import EnergyMethod, EnergyModel
 from .method import Method
@@ -104,21 +105,18 @@ class GSPS(EnergyMethod):
     unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method)) - {"latent"}
     likelihood: ClassVar[bool] = False
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
-    positive: ClassVar[tuple[str, ...]] = (*EnergyMethod.positive, "coefficients", "width", "blocks", "draws")
-    weights: ClassVar[tuple[str, ...]] = (*EnergyMethod.weights, "history")
-
-    latent: int = 64
+    latent: Size = 64
     parts: tuple[str, ...] = ("lower", "upper")
-    coefficients: int | None = None
-    width: int | None = None
-    blocks: int = 4
-    draws: tuple[int, ...] | None = None
-    reconstruction: float = 2.0
-    multimodal: float = 1.0
-    history: float = 100.0
-    limb: float = 500.0
-    angles: float = 100.0
-    pose_prior: float = 0.01
+    coefficients: Size | None = None
+    width: Size | None = None
+    blocks: Layers = 4
+    draws: tuple[Size, ...] | None = None
+    reconstruction: Amount = 2.0
+    multimodal: Amount = 1.0
+    history: Amount = 100.0
+    limb: Amount = 500.0
+    angles: Amount = 100.0
+    pose_prior: Amount = 0.01
 
     def __post_init__(self) -> None:
         super().__post_init__()

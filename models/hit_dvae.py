@@ -36,7 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, cast
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -52,6 +52,7 @@ from ..motion.body import body_parts
 from ..networks import Attention, FrameGraph, NetworkSpec, PoseGraph, Recurrent, SelfAttention
 from ..networks.extract import share
 from ..notation import Factorization
+from ..options import Amount, Delay, Extra, Layers, Range, Share, Size
 from ..rollout import Rollout, SelfFeeding
 from .energies import EnergyMethod, EnergyModel
 from .method import SHAPES
@@ -142,47 +143,31 @@ class HiTDVAE(EnergyMethod):
     generative: ClassVar[str] = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
     inference: ClassVar[str] = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
-    positive: ClassVar[tuple[str, ...]] = (
-        *EnergyMethod.positive,
-        "width",
-        "heads_count",
-        "decoder",
-        "layers",
-        "frames",
-    )
-    weights: ClassVar[tuple[str, ...]] = (
-        *EnergyMethod.weights,
-        *("kl_local", "kl_static", "static", "pose_width", "feeding_passes"),
-    )
-
-    residual: float = 0.5
-    self_feeding: float = 1.0
-    warm_up: int | None = None
+    residual: Share = 0.5
+    self_feeding: Share = 1.0
+    warm_up: Delay | None = None
     loss: Literal["best-of-many", "evidence"] = "best-of-many"
-    samples: int | None = None
-    kl_local: float | None = None
-    kl_static: float | None = None
-    static: int = 32
+    samples: Annotated[int, Range(2, 4096)] | None = None
+    kl_local: Amount | None = None
+    kl_static: Amount | None = None
+    static: Extra = 32
     attention: bool = True
-    width: int = 64
-    heads_count: int = 4
-    decoder: int | None = None
-    layers: int = 1
+    width: Size = 64
+    heads_count: Size = 4
+    decoder: Size | None = None
+    layers: Layers = 1
     nearest: bool = True
     standardise: bool = True
-    pose_width: int | None = None
+    pose_width: Extra | None = None
     summary: Literal["graph", "attention"] = "graph"
-    frames: int | None = None
+    frames: Size | None = None
     guide_past: bool = False
     feed_observed: bool = False
-    feeding_passes: int = 0
+    feeding_passes: Extra = 0
     feeding_gradient: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, known in (("loss", ("best-of-many", "evidence")), ("summary", ("graph", "attention"))):
-            if getattr(self, name) not in known:
-                raise ValueError(f"unknown {name} {getattr(self, name)!r}; known: {', '.join(known)}")
         if self.loss == "best-of-many" and self.emission not in ("fixed", "unit"):
             raise ValueError(
                 f"emission={self.emission!r} needs loss='evidence'; with best-of-many it is 'fixed' or 'unit'"
@@ -190,8 +175,6 @@ class HiTDVAE(EnergyMethod):
         own = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run")
         if self.loss == "evidence" and (given := [name for name in own if getattr(self, name)]):
             raise ValueError(f"loss='evidence' has no {', '.join(given)}; these are of loss='best-of-many'")
-        if self.samples is not None and self.samples < 2:
-            raise ValueError(f"samples is {self.samples}; the best of many is of at least 2")
         for name in ("diversity", "diversity_scale"):
             values = getattr(self, name)
             if values is not None and len(values) != len(PARTS):

@@ -26,7 +26,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -40,6 +40,7 @@ from ..model import Batch, DynamicalVAE, repeat
 from ..networks import Dense, Input, Network, NetworkSpec
 from ..networks.base import valid_steps
 from ..networks.recurrent import lstm_cell
+from ..options import Range, Size
 from .method import Method
 
 
@@ -63,19 +64,13 @@ class KVAE(Method):
     generative: ClassVar[str] = "p(a_t | a_{<t}) p(x_t | a_t)"
     inference: ClassVar[str] = "q(a_t | x_t)"
 
-    latent: int = 8
-    auxiliary: int = 16
-    components: int = 3
-    width: int = 50
-    hidden: tuple[int, ...] = (256, 128)
+    latent: Annotated[int, Range(1, 256)] = 8
+    auxiliary: Annotated[int, Range(1, 256)] = 16
+    components: Annotated[int, Range(1, 64)] = 3
+    width: Size = 50
+    hidden: tuple[Size, ...] = (256, 128)
     learn_noise: bool = False
     phases: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("auxiliary", "components", "width"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
 
     def sizes(self) -> dict[str, int]:
         """The size of a, the only latent that is drawn."""

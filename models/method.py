@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from torch import nn
@@ -22,12 +20,11 @@ from ..model import DynamicalVAE
 from ..motion import Skeleton, Windows
 from ..networks import NetworkSpec
 from ..notation import Factor, Factorization
+from ..options import Amount, Delay, Range, Share, Size, check, nearest
 from ..priors import FlowPrior, MixturePrior, Prior, VampPrior
 from ..rollout import SelfFeeding
 
 SHAPES: dict[str, type[Linear | Cosine | Logistic]] = {"linear": Linear, "cosine": Cosine, "logistic": Logistic}
-EMISSIONS = ("normal", "fixed", "student", "unit")
-PRIORS = ("standard", "mixture", "vamp", "flow")
 
 
 @dataclass(frozen=True)
@@ -66,30 +63,19 @@ class Method:
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"": {}}  # by the skeleton's name, and "" for any other
     use: ClassVar[str] = "score it with: dvae evaluate {run}"  # what to do with a fitted run
 
-    latent: int = 16
+    latent: Size = 16
     emission: Literal["fixed", "unit", "normal", "student"] = "fixed"
-    residual: float = 0.0
+    residual: Share = 0.0
     prior: Literal["standard", "mixture", "vamp", "flow"] = "standard"
-    prior_components: int = 16
-    prior_steps: int = 16
-    warm_up: int | None = 500
+    prior_components: Annotated[int, Range(1, 1024)] = 16
+    prior_steps: Annotated[int, Range(1, 1024)] = 16
+    warm_up: Delay | None = 500
     warm_up_shape: Literal["linear", "cosine", "logistic"] = "linear"
-    free_bits: float = 0.0
-    self_feeding: float = 0.0
+    free_bits: Amount = 0.0
+    self_feeding: Share = 0.0
 
     def __post_init__(self) -> None:
-        for name, least in (("latent", 1), ("prior_components", 1), ("prior_steps", 1), ("warm_up", 0)):
-            if (value := getattr(self, name)) is not None and value < least:
-                raise ValueError(f"{name} is {value}; it must be at least {least}")
-        for name, known in (("emission", EMISSIONS), ("prior", PRIORS), ("warm_up_shape", SHAPES)):
-            if getattr(self, name) not in known:
-                raise ValueError(f"unknown {name} {getattr(self, name)!r}; known: {', '.join(known)}")
-        if not 0 <= self.free_bits < math.inf:
-            raise ValueError(f"free_bits is {self.free_bits}; it must be finite and at least 0")
-        if not 0 <= self.residual <= 1:
-            raise ValueError(f"residual is {self.residual}; it must be a share, between 0 and 1")
-        if not 0 <= self.self_feeding <= 1:
-            raise ValueError(f"self_feeding is {self.self_feeding}; it must be a probability, between 0 and 1")
+        check(self)
 
     @property
     def selects(self) -> Literal["bound", "loss"]:
@@ -289,12 +275,12 @@ def method(name: str, **options: Any) -> Method:
     """
     table = methods()
     if name not in table:
-        raise ValueError(f"unknown method {name!r}{_nearest(name, table)}; known: {', '.join(table)}")
+        raise ValueError(f"unknown method {name!r}{nearest(name, table)}; known: {', '.join(table)}")
     known = {field.name for field in fields(table[name])}
     for option in options:
         if option not in known:
             raise ValueError(
-                f"{name} has no option {option!r}{_nearest(option, known)}; it has {', '.join(sorted(known))}"
+                f"{name} has no option {option!r}{nearest(option, known)}; it has {', '.join(sorted(known))}"
             )
     return table[name](**options)
 
@@ -305,8 +291,3 @@ def from_config(config: Mapping[str, Any]) -> Method:
     if "method" not in config:
         raise ValueError(f"the configuration names no method: it holds {', '.join(config) or 'nothing'}")
     return method(config["method"], **options)
-
-
-def _nearest(name: str, known: Any) -> str:
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""

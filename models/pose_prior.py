@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from math import pi
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import pyro
 import torch
@@ -35,6 +35,7 @@ from ..inference.result import progress_bar
 from ..model import DynamicalVAE
 from ..motion import Skeleton, Windows, face_forward, rotate_about_up
 from ..notation import Factorization
+from ..options import Layers, Range
 from .method import Method
 
 
@@ -61,18 +62,14 @@ class PosePrior(Method):
     forecasts: ClassVar[bool] = False
     use: ClassVar[str] = "score the poses of forecasts with: dvae evaluate RUN --pose-prior {run}"
 
-    layers: int = 3
-    noise: float = 0.002
+    layers: Layers = 3
+    noise: Annotated[float, Range(0, 1, below=True)] = 0.002
     turned: bool = False
     heading: bool = False
     whiten: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.layers < 1:
-            raise ValueError(f"layers is {self.layers}; it must be at least 1")
-        if not 0 <= self.noise < 1:
-            raise ValueError(f"noise is {self.noise}; it must be a length in metres, from 0 to below 1")
         if self.turned and self.heading:
             raise ValueError("heading fixes the direction that turned would draw; choose one")
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..networks import NetworkSpec, Recurrent
+from ..options import Size
 from .method import Method
 
 
@@ -32,8 +33,8 @@ class CausalRVAE(Method):
     generative: ClassVar[str] = "p(z_t) p(x_t | z_{<=t})"
     inference: ClassVar[str] = "q(z_t | z_{<t}, x_{t:T})"
 
-    width: int = 64
-    hidden: tuple[int, ...] = ()
+    width: Size = 64
+    hidden: tuple[Size, ...] = ()
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """A recurrent state for each variable and direction."""

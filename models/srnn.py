@@ -16,6 +16,7 @@ from typing import ClassVar
 from ..model import DynamicalVAE
 from ..networks import NetworkSpec, Recurrent
 from ..networks.recurrent import tie
+from ..options import Extra, Size
 from .method import Method
 
 
@@ -35,10 +36,10 @@ class SRNN(Method):
     generative: ClassVar[str] = "p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)"
     inference: ClassVar[str] = "q(z_t | z_{t-1}, x_{1:T})"
 
-    width: int = 64
-    embed: int = 64
-    hidden: tuple[int, ...] = (32,)
-    decoder: tuple[int, ...] = (64,)
+    width: Size = 64
+    embed: Extra = 64
+    hidden: tuple[Size, ...] = (32,)
+    decoder: tuple[Size, ...] = (64,)
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """A recurrent network for each factor; `build` ties their forward states."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..networks import NetworkSpec, Recurrent
+from ..options import Extra, Size
 from .method import Method
 
 
@@ -34,10 +35,10 @@ class STORN(Method):
     generative: ClassVar[str] = "p(z_t) p(x_t | x_{<t}, z_{<=t})"
     inference: ClassVar[str] = "q(z_t | x_{<=t})"
 
-    width: int = 64
-    embed: int = 64
-    embed_latent: int = 32
-    hidden: tuple[int, ...] = (32,)
+    width: Size = 64
+    embed: Extra = 64
+    embed_latent: Extra = 32
+    hidden: tuple[Size, ...] = (32,)
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """A recurrent network for the guide, another for the data."""

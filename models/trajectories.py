@@ -28,6 +28,7 @@ from ..inference.objectives import Evidence, Objective
 from ..model import WHOLE, Batch, DynamicalVAE, repeat
 from ..motion import HUMAN36M, PROTOCOLS, Clip, Skeleton, Windows, rotate_about_up
 from ..motion.data import defect
+from ..options import Amount, Share
 from .method import Method
 
 FIRST, GIVEN, REST = "s", "y", "r"
@@ -58,8 +59,8 @@ class TrajectoryMethod(Method):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
     unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method)) - {"latent"}
 
-    beta: float | None = None
-    keep: float = 0.15
+    beta: Amount | None = None
+    keep: Share = 0.15
     complement: bool = True
     rotate: bool = True
     heading: bool | None = None
@@ -69,10 +70,6 @@ class TrajectoryMethod(Method):
         for option in fields(self):
             if option.name in self.unused and getattr(self, option.name) != option.default:
                 raise ValueError(f"{self.name} has no {option.name}; leave it at {option.default!r}")
-        if not 0 <= self.keep <= 1:
-            raise ValueError(f"keep is {self.keep}; it must be a probability, between 0 and 1")
-        if self.beta is not None and not 0 <= self.beta < float("inf"):
-            raise ValueError(f"beta is {self.beta}; it must be finite and at least 0")
 
     def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
         """See `Method.preset`; where left and right are unknown, so are headings."""

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from ..motion import Skeleton
 from ..networks import CosineEncoder, MotionDecoder, NetworkSpec
 from ..networks.base import share_modules
 from ..notation import Factorization
+from ..options import Extra, Layers, Range, Size
 from .trajectories import TrajectoryMethod
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -82,23 +83,18 @@ class TrajeVAE(TrajectoryMethod):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
     projected: ClassVar[bool] = False
 
-    latent: int | None = None  # type: ignore[assignment]  # chosen by the skeleton, as the next ones
-    components: int | None = None
-    width: int | None = None
-    feedforward: int | None = None
-    heads_count: int = 4
-    layers: int | None = None
-    dropout: float | None = None
+    latent: Size | None = None  # type: ignore[assignment]  # chosen by the skeleton, as the next ones
+    components: Extra | None = None
+    width: Size | None = None
+    feedforward: Size | None = None
+    heads_count: Size = 4
+    layers: Layers | None = None
+    dropout: Annotated[float, Range(0, 1, below=True)] | None = None
     learned_prior: bool = True
     cosine: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, least in (("components", 0), *((n, 1) for n in ("width", "feedforward", "heads_count", "layers"))):
-            if (value := getattr(self, name)) is not None and value < least:
-                raise ValueError(f"{name} is {value}; it must be at least {least}")
-        if self.dropout is not None and not 0 <= self.dropout < 1:
-            raise ValueError(f"dropout is {self.dropout}; it must be a share, at least 0 and below 1")
         if self.width is not None and 2 * self.width % self.heads_count:
             raise ValueError(
                 f"{self.heads_count} heads do not divide the transformers' {2 * self.width} features; take a width "

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..networks import Dense, NetworkSpec
+from ..options import Size
 from .method import Method
 
 
@@ -30,7 +31,7 @@ class VAE(Method):
     generative: ClassVar[str] = "p(z_t) p(x_t | z_t)"
     inference: ClassVar[str] = "q(z_t | x_t)"
 
-    hidden: tuple[int, ...] = (32,)
+    hidden: tuple[Size, ...] = (32,)
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """Perceptrons, frame by frame."""

@@ -17,6 +17,7 @@ from typing import ClassVar
 from ..model import DynamicalVAE
 from ..networks import NetworkSpec, Recurrent
 from ..networks.recurrent import tie
+from ..options import Size
 from .method import Method
 
 
@@ -36,10 +37,10 @@ class VRNN(Method):
     generative: ClassVar[str] = "p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})"
     inference: ClassVar[str] = "q(z_t | x_{<=t}, z_{<t})"
 
-    width: int = 64
-    embed: tuple[int, ...] = (64,)
-    embed_latent: tuple[int, ...] = (16, 32)
-    hidden: tuple[int, ...] = ()
+    width: Size = 64
+    embed: tuple[Size, ...] = (64,)
+    embed_latent: tuple[Size, ...] = (16, 32)
+    hidden: tuple[Size, ...] = ()
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """One kind for each factor; `build` ties them."""

@@ -506,7 +506,7 @@ def test_malformed_data_are_refused(train, message):
 
 
 def test_options_that_do_not_exist_or_make_sense_are_refused():
-    with pytest.raises(TypeError, match=r"no option 'step'; did you mean steps?"):
+    with pytest.raises(TypeError, match=r"no option 'step' \(did you mean 'steps'\?\)"):
         run(step=5)
     with pytest.raises(TypeError, match="no option 'qqq'; the options are steps, batch_size"):
         run(qqq=5)
@@ -523,7 +523,7 @@ def test_options_that_do_not_exist_or_make_sense_are_refused():
         with pytest.raises(ValueError, match=r"must be|unknown optimizer|leave decay 0"):
             Training(**wrong)
     for wrong in ({"steps": 2.5}, {"seed": "one"}, {"learning_rate": "fast"}):
-        with pytest.raises(TypeError, match=r"must be a whole number|expected a number or a schedule"):
+        with pytest.raises(TypeError, match=r"must be a whole number|must be a number"):
             Training(**wrong)
 
 

@@ -511,7 +511,7 @@ def test_a_method_says_what_it_is(name):
         (lambda: dvae.method("srnn", latents=3), r"srnn has no option 'latents' \(did you mean 'latent'\?\); it has"),
         (
             lambda: dvae.method("vae", emission="gamma").build({"x": 1}),
-            "unknown emission 'gamma'; known: normal, fixed",
+            "unknown emission 'gamma'; known: fixed, unit, normal, student",
         ),
         (lambda: dvae.method("equations", network="gru").build({"x": 1}), "unknown network 'gru'; known: recurrent"),
         (lambda: from_config({"latent": 3}), "the configuration names no method: it holds latent"),

@@ -568,8 +568,8 @@ class TestWindows:
         [
             ({"observed": 0}, "observed is 0"),
             ({"test_stride": 0}, "test_stride is 0"),
-            ({"root": "keep"}, "root is 'keep', expected drop or relative"),
-            ({"sampling": "uniform"}, "expected clip or length or subject"),
+            ({"root": "keep"}, "unknown root 'keep'; known: drop, relative"),
+            ({"sampling": "uniform"}, "unknown sampling 'uniform'; known: clip, length, subject"),
             ({"validation": 1.0}, "validation is 1.0"),
             ({"heading": True, "rotate": True}, "choose one"),
         ],

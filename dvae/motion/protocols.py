@@ -23,13 +23,16 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import astuple, dataclass
 from math import pi
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
 
+from ..options import Amount, Range, check
 from .data import Clip, MotionSet
 from .skeleton import rotate_about_up
+
+Frames = Annotated[int, Range(1, 100_000)]
 
 
 @dataclass(frozen=True)
@@ -58,34 +61,26 @@ class Protocol:
     """
 
     name: str
-    observed: int
-    predicted: int
-    fps: float
-    train_stride: int
-    test_stride: int
+    observed: Frames
+    predicted: Frames
+    fps: Annotated[float, Range(0.001, 100_000)]
+    train_stride: Frames
+    test_stride: Frames
     root: Literal["drop", "relative"] = "drop"
-    multimodal_threshold: float = 0.5
+    multimodal_threshold: Amount = 0.5
     split_by: str = "split"
     train: tuple[str, ...] = ("train",)
     test: tuple[str, ...] = ("test",)
-    validation: float = 0.1
+    validation: Annotated[float, Range(0, 1, below=True)] = 0.1
     sampling: Literal["clip", "length", "subject"] = "clip"
     heading: bool = False
     rotate: bool = False
 
     def __post_init__(self) -> None:
-        for field in ("observed", "predicted", "train_stride", "test_stride"):
-            if getattr(self, field) < 1:
-                raise ValueError(f"protocol {self.name}: {field} is {getattr(self, field)}, expected 1 or more")
-        for field, choices in (("root", ("drop", "relative")), ("sampling", ("clip", "length", "subject"))):
-            if getattr(self, field) not in choices:
-                raise ValueError(
-                    f"protocol {self.name}: {field} is {getattr(self, field)!r}, expected {' or '.join(choices)}"
-                )
-        if not 0 <= self.validation < 1:
-            raise ValueError(
-                f"protocol {self.name}: validation is {self.validation}, expected a part from 0 to below 1"
-            )
+        try:
+            check(self)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"protocol {self.name}: {error}") from None
         if self.heading and self.rotate:
             raise ValueError(f"protocol {self.name}: heading fixes the direction that rotate would draw; choose one")
 

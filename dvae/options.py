@@ -1,0 +1,154 @@
+"""Options are fields of frozen dataclasses, whose types say what they can be: `check` holds every value to its type.
+
+    width: Size = 64                                       at least 1 and at most 4096
+    keep: Share = 0.15                                     between 0 and 1
+    noise: Annotated[float, Range(0, 1, below=True)] = 0   at least 0 and below 1
+    loss: Literal["evidence", "best-of-many"] = ...        one of these
+
+Options are also read from the files of a run, which may be anybody's: a width of a million or 40 processes are refused
+before anything is made of them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import reprlib
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from math import inf
+from numbers import Integral, Real
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+LONGEST = 10_000
+"""Characters of a text, entries of a tuple or mapping."""
+DEEPEST = 64
+"""Layers: entries of a tuple of numbers."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """The values of a number.
+
+    Args:
+        least, most: its ends.
+        above, below: whether the one or the other is left out. Infinity is always.
+    """
+
+    least: float = -inf
+    most: float = inf
+    above: bool = False
+    below: bool = False
+
+    def __contains__(self, value: Any) -> bool:
+        low = value > self.least if self.above or self.least == -inf else value >= self.least
+        return low and (value < self.most if self.below or self.most == inf else value <= self.most)
+
+    def __str__(self) -> str:
+        if (self.least, self.most, self.above, self.below) == (0, 1, False, False):
+            return "between 0 and 1"
+        low = f"{'above' if self.above else 'at least'} {self.least}"
+        if self.least == -inf or self.most == inf:
+            return "finite" if self.least == -inf else f"finite and {low}"
+        return f"{low} and {'below' if self.below else 'at most'} {self.most}"
+
+
+Count = Annotated[int, Range(1, 10**9)]
+"""Of steps, draws or frames."""
+Delay = Annotated[int, Range(0, 10**9)]
+"""Steps, possibly none."""
+Size = Annotated[int, Range(1, 4096)]
+"""Of a variable, a layer or a state."""
+Extra = Annotated[int, Range(0, 4096)]
+"""Of a variable or layer that may be left out."""
+Layers = Annotated[int, Range(1, DEEPEST)]
+Share = Annotated[float, Range(0, 1)]
+"""A share or probability."""
+Amount = Annotated[float, Range(0)]
+"""Such as a weight, which is finite."""
+Positive = Annotated[float, Range(0, above=True)]
+
+
+def check(options: Any) -> None:
+    """Refuses a dataclass with a value that is not of its field's type, or out of its range.
+
+    Raises:
+        TypeError: another type.
+        ValueError: out of range, or an unknown name, with the nearest known one.
+    """
+    kind: Any = type(options)
+    for name, hint in _hints(kind).items():
+        if (error := problem(name, getattr(options, name), hint)) is not None:
+            raise error
+
+
+def problem(name: str, value: Any, hint: Any) -> Exception | None:
+    """What is wrong with a value; None if it is of the type."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    given = f"{name} is {reprlib.repr(value)}"
+    if origin is Annotated:
+        ranges = [each for each in arguments[1:] if isinstance(each, Range)]
+        found = problem(name, value, arguments[0])
+        if found is None and ranges and value not in ranges[0]:
+            found = ValueError(f"{given}; it must be {ranges[0]}")
+        return found
+    if origin in (Union, UnionType):
+        problems = [problem(name, value, each) for each in arguments]
+        own = [each for each, hint in zip(problems, arguments, strict=True) if hint is not NoneType]
+        return None if None in problems else next((each for each in own if isinstance(each, ValueError)), own[0])
+    if origin is Literal:
+        if any(type(value) is type(each) and value == each for each in arguments):
+            return None
+        meant = nearest(value, filter(lambda each: isinstance(each, str), arguments)) if isinstance(value, str) else ""
+        return ValueError(f"unknown {name} {reprlib.repr(value)}{meant}; known: {', '.join(map(str, arguments))}")
+    if origin is tuple and arguments[1:] == (Ellipsis,):
+        return _problem_of_entries(name, value, arguments[0])
+    if hint is int:
+        if not isinstance(value, Integral) or isinstance(value, bool):
+            return TypeError(f"{given}; it must be a whole number")
+        return (
+            None if -(2**63) <= int(value) < 2**63 else ValueError(f"{given}; it must be at least -2^63 and below 2^63")
+        )
+    if hint is float:
+        if not isinstance(value, Real):
+            return TypeError(f"{given}; it must be a number")
+        whole = isinstance(value, Integral) and abs(int(value)) > sys.float_info.max
+        return ValueError(f"{given}; it must be a number that a float holds") if whole or value != value else None
+    kind = origin or hint
+    if isinstance(kind, type) and not isinstance(value, kind):
+        return TypeError(f"{given}; it must be {'true or false' if kind is bool else 'of type ' + kind.__name__}")
+    if isinstance(value, str | Mapping) and len(value) > LONGEST:
+        return ValueError(f"{given}, with {len(value)} characters or entries; it must have {LONGEST} at most")
+    if isinstance(value, Mapping) and len(arguments) == 2:
+        parts = [(f"{name}'s key", key, arguments[0]) for key in value]
+        parts += [(f"{name}[{key!r}]", item, arguments[1]) for key, item in value.items()]
+        return next((found for part in parts if (found := problem(*part)) is not None), None)
+    return None
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The known name that is meant, in words; empty where none is near."""
+    close = difflib.get_close_matches(name[:LONGEST], list(known), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def _problem_of_entries(name: str, value: Any, hint: Any) -> Exception | None:
+    if not isinstance(value, tuple | list):
+        return TypeError(f"{name} is {reprlib.repr(value)}; it must be a tuple")
+    longest = LONGEST if hint is str else DEEPEST
+    if len(value) > longest:
+        return ValueError(f"{name} has {len(value)} entries; it must have {longest} at most")
+    problems = (problem(f"{name}[{place}]", each, hint) for place, each in enumerate(value))
+    return next((found for found in problems if found is not None), None)
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    """Types by field; none where a type's name means nothing outside of the file that has it."""
+    try:
+        hints = get_type_hints(kind, include_extras=True)
+    except NameError:
+        return {}
+    return {field.name: hints[field.name] for field in fields(kind)}
