@@ -29,6 +29,7 @@ from .networks.base import valid_steps
 from .notation import Factorization, check_pair
 from .priors import Prior
 from .rollout import Rollout, SelfFeeding, like
+from .turns import alone
 from .units import Units
 
 _COUNT = itertools.count()
@@ -351,6 +352,7 @@ class DynamicalVAE(nn.Module):
 
     # What is done with it ------------------------------------------------------------------------------------------
 
+    @alone
     @torch.no_grad()
     def sample(self, n: int = 1, length: int | None = None, batch: Batch | None = None) -> dict[str, Tensor]:
         """Free runs from the prior.
@@ -366,6 +368,7 @@ class DynamicalVAE(nn.Module):
         with self._evaluating():
             return self._with_whole(self.model(batch, length=length, size=n))
 
+    @alone
     @torch.no_grad()
     def forecast(
         self,
@@ -449,6 +452,7 @@ class DynamicalVAE(nn.Module):
         whole = torch.cat([values[name] for name in self.parts], dim=-1)
         return {**values, WHOLE: whole[..., places.argsort().to(whole.device)]}
 
+    @alone
     @torch.no_grad()
     def reconstruct(self, batch: Batch, samples: int = 1) -> dict[str, Tensor]:
         """Means of the data given latents from the guide, teacher-forced; missing entries are filled in so.
@@ -469,6 +473,7 @@ class DynamicalVAE(nn.Module):
                     means[name] = rollout.evaluate(name, rollout.values[name]).mean
         return self._with_whole({name: mean.unflatten(0, (samples, -1)) for name, mean in means.items()})
 
+    @alone
     @torch.no_grad()
     def log_joint(self, batch: Batch, latents: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint.

@@ -19,8 +19,10 @@ from .heads import FixedNormal, FixedNormalHead, StandardNormal
 from .model import DynamicalVAE
 from .networks.linear import Linear, LinearNetwork
 from .notation import Factorization
+from .turns import alone
 
 
+@alone
 def twin(
     generative: str | Factorization,
     inference: str | Factorization,
@@ -205,6 +207,7 @@ class Oracle:
         return float(self.gap().detach())
 
 
+@alone
 def price(
     generative: str | Factorization,
     inference: str | Factorization,

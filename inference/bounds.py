@@ -26,6 +26,7 @@ from ..graph import analytic_kl
 from ..model import Batch, DynamicalVAE, repeat
 from ..networks.base import computing_once
 from ..rollout import Rollout
+from ..turns import alone
 
 
 @dataclass
@@ -82,6 +83,7 @@ class SequenceELBO(ELBO):
     def __init__(self, num_particles: int = 1):
         super().__init__(num_particles=num_particles)
 
+    @alone
     def terms(
         self, model: Callable[..., Any], batch: Batch, guide: Callable[..., Any] | None = None, **options: Any
     ) -> Terms:
@@ -281,6 +283,7 @@ class ImportanceBound:
     particles: int
 
 
+@alone
 @torch.no_grad()
 def importance_bound(
     model: DynamicalVAE, batch: Batch, particles: int = 100, *, chunk: int = 4096, **options: Any

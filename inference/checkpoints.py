@@ -9,13 +9,20 @@
 `state.json` is the commit record. New files are first written whole under a temporary name, then `state.json`
 is replaced, then they take their names; whenever a run is killed, the files that match `state.json` are on
 the disk.
+
+The directory may come from anybody. Its files are opened as `files` does, never through a link, and read up to the size
+that the model gives them.
 """
 
 import hashlib
 import io
 import json
+import math
 import os
-from collections.abc import Iterator, Mapping
+import pickletools
+import threading
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,6 +32,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
+from torch.nn.modules.module import (
+    register_module_buffer_registration_hook,
+    register_module_parameter_registration_hook,
+)
+
+from .. import files
 
 try:
     import fcntl
@@ -33,6 +46,22 @@ except ImportError:  # no locks on Windows
 
 BEST, LAST, OPTIMISER = "best.safetensors", "last.safetensors", "last.state.pt"
 STATE, CONFIG, LOCK = "state.json", "config.json", ".lock"
+LARGEST_TEXT = 2**24
+"""Bytes of `config.json` and `state.json`."""
+LARGEST_WEIGHTS = 2**32
+"""Bytes of a model's weights."""
+
+STATUSES: tuple[str, ...] = ("running", "finished", "stopped early", "interrupted", "failed")
+
+# what state.json holds of a run, and what makes a value of it sound
+_NUMBER = "a whole number from 0"
+_STORED: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "step": (lambda value: _count(value), _NUMBER),
+    "best_step": (lambda value: value is None or _count(value), f"{_NUMBER} or null"),
+    "best_bound": (lambda v: v is None or (isinstance(v, float) and math.isfinite(v)), "a finite number or null"),
+    "waited": (lambda value: _count(value), _NUMBER),
+    "status": (lambda value: value in STATUSES, "one of the known ones"),
+}
 
 
 class CheckpointError(RuntimeError):
@@ -55,7 +84,7 @@ class Run:
     @property
     def exists(self) -> bool:
         """Whether the directory holds a checkpoint."""
-        return (self.path / STATE).exists()
+        return os.path.lexists(self.path / STATE)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -71,10 +100,19 @@ class Run:
         """
         state = self._json(STATE)
         fingerprints = state.get("fingerprints")
+        wrong = [
+            f"{name} missing or not {sound}"
+            for name, (test, sound) in _STORED.items()
+            if not test(state.get(name, ...))
+        ]
         if not isinstance(fingerprints, dict) or not all(isinstance(value, str) for value in fingerprints.values()):
             problem = "its fingerprints are no object of texts"
+        elif unknown := fingerprints.keys() - {BEST, LAST, OPTIMISER}:
+            problem = f"it has a fingerprint of {min(unknown)[:50]!r}, which is no file of a checkpoint"
         elif lacking := {LAST, *([BEST] if state.get("best_step") is not None else [])} - fingerprints.keys():
             problem = f"it has no fingerprint of {' and '.join(sorted(lacking))}"
+        elif wrong:
+            problem = ", ".join(wrong)
         else:
             return state
         raise CheckpointError(f"{self.path / STATE} is damaged: {problem}; copy the run directory whole, or fit again")
@@ -87,7 +125,9 @@ class Run:
             CheckpointError: when another process holds it.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        with (self.path / LOCK).open("w") as file:
+        with _refusing():
+            lock = files.open_plain(self.path / LOCK, os.O_RDWR | os.O_CREAT)
+        with lock as file:
             if fcntl is not None:
                 try:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -123,20 +163,19 @@ class Run:
         for name in files:
             os.replace(self.path / f"{name}.new", self.path / name)
 
-    def read(self, name: str) -> bytes:
-        """Return a file of the checkpoint after checking its fingerprint.
+    def read(self, name: str, most: int = LARGEST_WEIGHTS) -> bytes:
+        """Return a file of the checkpoint, of at most so many bytes, after checking its fingerprint.
 
         Raises:
-            CheckpointError: when the file is missing or is not the one that was written.
+            CheckpointError: when the file is missing, no plain file, too large, or is not the one that was written.
         """
         expected = self.state["fingerprints"].get(name)
         if expected is None:
             raise CheckpointError(f"{self.path / STATE} lists no {name}; the run has not written it")
-        self._settle(name, expected)
+        self._settle(name, expected, most)
         path = self.path / name
-        if not path.exists():
+        if (content := _content(path, most)) is None:
             raise CheckpointError(f"{path} is missing; copy the run directory whole, or fit again")
-        content = path.read_bytes()
         found = hashlib.sha256(content).hexdigest()
         if found != expected:
             raise CheckpointError(
@@ -145,24 +184,47 @@ class Run:
             )
         return content
 
-    def optimiser_state(self) -> dict[str, Any]:
-        """Return the optimiser and random number states of the last checkpoint, on the CPU."""
-        content = self.read(OPTIMISER)
+    def size(self) -> int:
+        """Bytes of the weights that `load_weights` takes.
+
+        Raises:
+            CheckpointError: when there are none.
+        """
+        name = BEST if BEST in self.state["fingerprints"] else LAST
+        self._settle(name, self.state["fingerprints"][name])
         try:
+            with _refusing(), files.open_plain(self.path / name) as file:
+                return os.fstat(file.fileno()).st_size
+        except FileNotFoundError:
+            raise CheckpointError(
+                f"{self.path / name} is missing; copy the run directory whole, or fit again"
+            ) from None
+
+    def optimiser_state(self, most: int = 2 * LARGEST_WEIGHTS) -> dict[str, Any]:
+        """Return the optimiser and random number states of the last checkpoint, on the CPU.
+
+        Raises:
+            CheckpointError: when the file has more bytes than `most`, or is no state that torch wrote.
+        """
+        content = self.read(OPTIMISER, most)
+        try:
+            _check_archive(content)
             return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
         except Exception as error:  # torch raises many types for a file that it did not write
             raise CheckpointError(f"{self.path / OPTIMISER} is no optimiser state of torch: {error}") from error
 
-    def _settle(self, name: str, expected: str) -> None:
+    def _settle(self, name: str, expected: str, most: int = LARGEST_WEIGHTS) -> None:
         """Give a committed file its name, if the process was killed between the commit and the renaming."""
         new = self.path / f"{name}.new"
-        if new.exists() and hashlib.sha256(new.read_bytes()).hexdigest() == expected:
+        content = _content(new, most)
+        if content is not None and hashlib.sha256(content).hexdigest() == expected:
             os.replace(new, self.path / name)
 
     def _json(self, name: str) -> dict[str, Any]:
         path = self.path / name
         try:
-            content = json.loads(path.read_text())
+            with _refusing():
+                content = json.loads(files.read(path, LARGEST_TEXT))
         except FileNotFoundError:
             raise CheckpointError(
                 f"{self.path} is no run directory: it has no {name}; give the folder that fit wrote (out=… in "
@@ -172,8 +234,10 @@ class Run:
             raise CheckpointError(
                 f"{self.path} is a file and no run directory; leave it out, or give the folder that fit wrote"
             ) from None
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise CheckpointError(f"{path} is damaged, it is not JSON ({error}); fit again") from error
+        if _depth(content) > 32:
+            raise CheckpointError(f"{path} is damaged, it nests deeper than any that fit writes; fit again")
         if not isinstance(content, dict):
             raise CheckpointError(f"{path} is damaged, it holds no JSON object but {type(content).__name__}; fit again")
         return content
@@ -188,9 +252,8 @@ def save_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
     """Write a model's weights to a safetensors file, which replaces an older one only when it is complete."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_name(f"{path.name}.new")
-    _write(new, save_tensors(weights(model)))
-    os.replace(new, path)
+    with files.written(path) as file:
+        file.write(save_tensors(weights(model)))
 
 
 def load_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
@@ -202,26 +265,86 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
             in a run directory, fingerprints are checked.
 
     Raises:
-        CheckpointError: when the file is missing, damaged, or of another model.
+        CheckpointError: when the file is missing, damaged, of another model, or holds a number that is not finite.
     """
     path = Path(path)
+    most = state_bytes(model)
     if path.is_dir():
         path = path / (BEST if BEST in Run(path).state["fingerprints"] else LAST)
     run = Run(path.parent)
     if run.exists and (path.name in (BEST, LAST) or path.name in run.state["fingerprints"]):
-        content = run.read(path.name)
-    elif path.exists():
-        content = path.read_bytes()
+        content = run.read(path.name, most)
+    elif (found := _content(path, most, links=True)) is not None:
+        content = found
     else:
         raise CheckpointError(f"{path} does not exist; give a run directory or a safetensors file")
+    model.load_state_dict(read_weights(model, content, path))
+
+
+def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tensor]:
+    """The weights that a safetensors file of this path holds, which are a model's in names, shapes and kinds.
+
+    Raises:
+        CheckpointError: when they are not, or one is not finite.
+    """
     try:
         tensors = load_tensors(content)
-    except SafetensorError as error:
+    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:  # also for types it has none for
         raise CheckpointError(
             f"{path} is damaged or no safetensors file ({error}); copy it again, or fit again"
         ) from error
     _check_names_and_shapes(model, tensors, path)
-    model.load_state_dict(tensors)
+    for name, value in model.state_dict().items():
+        found = tensors[name]
+        if found.dtype not in (_FLOATING if value.is_floating_point() else (value.dtype,)):
+            raise CheckpointError(f"{path} is damaged: {name} is {found.dtype}, the model's is {value.dtype}")
+        if value.is_floating_point() and not torch.isfinite(found).all():
+            raise CheckpointError(
+                f"{path} holds no usable weights: {name} has entries that are NaN or infinite, so the run had failed; "
+                "fit again, with a lower learning rate"
+            )
+    return tensors
+
+
+def state_bytes(model: nn.Module, copies: int = 1) -> int:
+    """Bytes that so many copies of a model's weights can take in a file, in any floating type, with their names."""
+    state = model.state_dict()
+    return copies * sum(8 * value.numel() + 1024 + 4 * len(name) for name, value in state.items()) + 2**16
+
+
+@contextmanager
+def at_most(size: int, what: str) -> Iterator[None]:
+    """Within it, this thread makes no modules whose parameters and buffers outnumber the bytes of a file of weights.
+
+    A file of weights tells how large the model is that it is of. What is shared or made anew counts several times; a
+    number takes four bytes in a file, or two.
+
+    Raises:
+        CheckpointError: when they do.
+    """
+    if size > LARGEST_WEIGHTS:
+        raise CheckpointError(f"{what} has {size} bytes of weights, and can have {LARGEST_WEIGHTS} at most")
+    left, thread = size + 2**24, threading.get_ident()
+
+    def count(module: nn.Module, name: str, value: Tensor | None) -> None:
+        nonlocal left
+        if threading.get_ident() == thread and value is not None:
+            left -= value.numel()
+            if left < 0:
+                raise CheckpointError(
+                    f"{what} asks for a model that is larger than its weights, which take {size} bytes; it is damaged, "
+                    "or the weights are those of another run"
+                )
+
+    hooks = [
+        register(count)
+        for register in (register_module_parameter_registration_hook, register_module_buffer_registration_hook)
+    ]
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
 
 
 def _check_names_and_shapes(model: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> None:
@@ -243,9 +366,71 @@ def _check_names_and_shapes(model: nn.Module, tensors: Mapping[str, Tensor], pat
     )
 
 
+_FLOATING = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
+
+# all that torch writes into the state of an optimiser and of random number generators
+_STORAGES = {f"torch {kind}Storage" for kind in ("Float", "Double", "BFloat16", "Half", "Byte", "Long", "Int")}
+_KNOWN = _STORAGES | {"torch._utils _rebuild_tensor_v2", "collections OrderedDict"}
+
+
+def _check_archive(content: bytes) -> None:
+    """Refuse an archive that would grow when it is read, or whose pickle asks for more than tensors in dicts.
+
+    Pickles share objects by name, so that forty tuples, each of two of the one before, are hashed for years.
+
+    Raises:
+        ValueError: saying why.
+    """
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = archive.infolist()
+        if any(each.compress_type != zipfile.ZIP_STORED for each in members):
+            raise ValueError("it is compressed")
+        if sum(each.file_size for each in members) > len(content):
+            raise ValueError("its members are larger than itself")
+        (pickled,) = [each for each in members if each.filename.endswith("/data.pkl")]
+        operations = [(code.name, argument) for code, argument, _ in pickletools.genops(archive.read(pickled))]
+    tuples, before = set(), ""
+    for name, argument in operations:
+        if name in ("GLOBAL", "STACK_GLOBAL", "INST") and argument not in _KNOWN:
+            raise ValueError(f"it asks for {str(argument)[:80]!r}")
+        if name in ("BINPUT", "LONG_BINPUT") and before.startswith("TUPLE"):
+            tuples.add(argument)
+        if name == "DUP" or (name in ("BINGET", "LONG_BINGET") and argument in tuples):
+            raise ValueError("it shares a tuple")
+        before = name
+
+
+def _count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 10**9
+
+
+def _depth(value: Any) -> int:
+    """How deep lists and objects nest."""
+    depth, level = 0, [value]
+    while level := [each for each in level if isinstance(each, dict | list)]:
+        depth += 1
+        level = [inner for each in level for inner in (each.values() if isinstance(each, dict) else each)]
+    return depth
+
+
+def _content(path: Path, most: int, links: bool = False) -> bytes | None:
+    """What a file holds; None if there is none."""
+    try:
+        with _refusing():
+            return files.read(path, most, links)
+    except FileNotFoundError:
+        return None
+
+
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """What is no plain file, or too large, is no part of a checkpoint."""
+    try:
+        yield
+    except files.FileRefused as error:
+        raise CheckpointError(f"{error}; a run directory holds plain files, as fit writes them") from error
+
+
 def _write(path: Path, content: bytes) -> None:
     """Write and force to the disk, so that a later rename never reveals a half-written file."""
-    with path.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
+    files.write(path, content)

@@ -50,6 +50,7 @@ from torch import Tensor, nn
 from .. import distributions
 from ..model import repeat
 from ..networks.base import valid_steps
+from ..turns import alone
 from .batches import Batch, each, leaves, sequences
 from .bounds import KHAT_PARTICLES, SequenceELBO, importance_bound, require_likelihood, site_log_prob, sites_of
 from .evaluate import (
@@ -508,6 +509,7 @@ class _Parts:
         return cls(float(by_seed.mean()), common, float(by_seed.var(ddof=1)) / count, rest)
 
 
+@alone
 def compare(
     models: Mapping[str, nn.Module | Sequence[nn.Module]],
     data: HeldOutWindows | Tensor | np.ndarray | Batch,

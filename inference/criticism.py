@@ -29,6 +29,7 @@ from torch import Tensor
 
 from ..model import Batch, DynamicalVAE, repeat
 from ..motion import Skeleton
+from ..turns import alone
 from .bounds import require_likelihood
 from .evaluate import evaluating, hold, on_device_of, plain
 from .result import Result, progress_bar
@@ -239,6 +240,7 @@ class Calibration(Result):
         return np.stack([_likeliest_normal(counts, self.draws)[0] for counts in self.counts])
 
 
+@alone
 def calibrate(
     model: DynamicalVAE,
     length: int,
@@ -644,6 +646,7 @@ class PredictiveChecks(Result):
         return " · ".join(part for part in parts if part)
 
 
+@alone
 def predictive_checks(
     model: DynamicalVAE | Mapping[str, DynamicalVAE],
     windows: Any,
@@ -840,6 +843,7 @@ class Traversal:
         return figure
 
 
+@alone
 @torch.no_grad()
 def traverse(
     model: DynamicalVAE,

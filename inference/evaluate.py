@@ -44,6 +44,7 @@ from rich.table import Table
 from torch import Tensor, nn
 
 from ..energies import pose_prior_energy
+from ..turns import alone
 from . import metrics
 from .batches import each
 from .bounds import SequenceELBO, importance_bound
@@ -487,6 +488,7 @@ def nearest_neighbours(observed: Tensor, training: Tensor, samples: int = 50) ->
     return training[distances.topk(samples, largest=False).indices.T, frames:]
 
 
+@alone
 def evaluate(
     model: nn.Module | Mapping[str, nn.Module],
     windows: HeldOutWindows,

@@ -19,14 +19,25 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import torch
-from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
 from ..options import Amount, Count, Range, Share, check, nearest
+from ..turns import alone
 from .batches import Batch, Sequences, Source, each, sequences
 from .bounds import SequenceELBO, Terms
-from .checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE, CheckpointError, Run, load_weights, weights
+from .checkpoints import (
+    BEST,
+    CONFIG,
+    LAST,
+    OPTIMISER,
+    CheckpointError,
+    Run,
+    load_weights,
+    read_weights,
+    state_bytes,
+    weights,
+)
 from .objectives import Evidence, Objective
 from .schedules import Piecewise, Schedule, clamp, levels, schedule, to_config
 from .trackers import JSONLines, Memory, Terminal, Tracker
@@ -246,6 +257,7 @@ class Interrupted(KeyboardInterrupt):
         self.signal = signal
 
 
+@alone
 def fit(
     model: nn.Module,
     train: Any,
@@ -263,7 +275,8 @@ def fit(
     """Fit a model and its guide.
 
     Afterwards the model is in evaluation mode and holds the weights of the best unweighted validation bound,
-    or without validation data the last ones. The caller's random state is left as it was.
+    or without validation data the last ones. The caller's random state is left as it was. Threads take turns, as Pyro's
+    handlers and torch's random state are the process's: another fit or forecast waits until this one is done.
 
     Args:
         model: a `DynamicalVAE`, or any module that `SequenceELBO` takes.
@@ -541,21 +554,23 @@ class _Loop:
         Raises:
             CheckpointError: when its files are damaged, of another model, another optimiser or another number
                 of processes.
+            ValueError: when it has taken more steps than it is to take.
         """
         assert self.run is not None
-        stored, content = self.run.state, self.run.optimiser_state()
-        if wrong := [name for name, kind in _STORED.items() if not isinstance(stored.get(name, ...), kind)]:
-            raise CheckpointError(
-                f"{self.run.path / STATE} is damaged: {', '.join(wrong)} missing or of another type; copy the run "
-                "directory whole, or fit again"
+        stored, model = self.run.state, self.state.model
+        if stored["step"] > self.training.steps:
+            raise ValueError(
+                f"steps is {self.training.steps}, but {self.run.path} has taken {stored['step']} steps already; steps "
+                f"counts all of a run, so give more than {stored['step']} to go on"
             )
-        load_weights(self.state.model, self.run.path / LAST)
+        content = self.run.optimiser_state(state_bytes(model, 4) + 2**20)
+        load_weights(model, self.run.path / LAST)
+        self._check_state(content, stored["step"])
         if content["name"] != self.training.optimizer:
             raise CheckpointError(
                 f"{self.run.path} was fitted with optimizer={content['name']!r}, not "
                 f"{self.training.optimizer!r}; resume with the same optimiser"
             )
-        self.optimizer.load_state_dict(content["optimizer"])
         processes = len(content["random"]["generator"])
         if processes != self.fabric.world_size:
             raise CheckpointError(
@@ -564,14 +579,73 @@ class _Loop:
             )
         # a copy: set_state reads the storage, so it takes another row's bytes for a view, or crashes
         random = {name: value[self.fabric.global_rank].clone() for name, value in content["random"].items()}
-        self.generator.set_state(random["generator"])
-        torch.set_rng_state(random["torch"])
-        if "cuda" in random and self.fabric.device.type == "cuda":
-            torch.cuda.set_rng_state(random["cuda"], self.fabric.device)
+        try:
+            # options such as the weight decay are those of this call
+            options = self.optimizer.state_dict()["param_groups"]
+            self.optimizer.load_state_dict({"state": content["optimizer"]["state"], "param_groups": options})
+            self.generator.set_state(random["generator"])
+            torch.set_rng_state(random["torch"])
+            if "cuda" in random and self.fabric.device.type == "cuda":
+                torch.cuda.set_rng_state(random["cuda"], self.fabric.device)
+        except (RuntimeError, TypeError, ValueError) as error:
+            raise self._damaged(str(error)) from error
         for name in _STORED:
             setattr(self.state, name, stored[name])
         if BEST in stored["fingerprints"]:
-            self.best = load_tensors(self.run.read(BEST))
+            self.best = read_weights(model, self.run.read(BEST, state_bytes(model)), self.run.path / BEST)
+
+    def _check_state(self, content: Any, step: int) -> None:
+        """Refuse a state of optimiser and random numbers that no run of this model writes at this step.
+
+        Raises:
+            CheckpointError: naming what is wrong.
+        """
+        parts = {"name": str, "optimizer": dict, "random": dict}
+        if not isinstance(content, dict) or not all(isinstance(content.get(key), kind) for key, kind in parts.items()):
+            raise self._damaged(f"it holds no {', '.join(parts)}")
+        moments, own = content["optimizer"].get("state"), self._random_state()
+        if not isinstance(moments, dict):
+            raise self._damaged("its optimizer has no state")
+        for place, kept in moments.items():
+            if type(place) is not int or not 0 <= place < len(self.parameters) or not isinstance(kept, dict):
+                raise self._damaged(f"optimizer.state[{place!r}] is of no parameter")
+            if (missing := _KEPT[self.training.optimizer] - kept.keys()) and content["name"] == self.training.optimizer:
+                raise self._damaged(f"optimizer.state[{place}] has no {' and no '.join(sorted(missing))}")
+            for key, value in kept.items():
+                if (key, value) != ("momentum_buffer", None) and not self._sound(
+                    key, value, self.parameters[place], step
+                ):
+                    raise self._damaged(
+                        f"optimizer.state[{place}][{key!r}] is not as the optimiser writes it, finite and of shape "
+                        f"{tuple(self.parameters[place].shape)}"
+                    )
+        for key, value in content["random"].items():
+            size = own[key].numel() if key in own else None
+            known = isinstance(value, Tensor) and value.dtype == torch.uint8 and value.ndim == 2
+            if not known or size not in (None, value.shape[1]) or key not in ("generator", "torch", "cuda"):
+                raise self._damaged(f"random[{key!r}] is no state of a random number generator")
+        rows = {key: len(value) for key, value in content["random"].items()}
+        if missing := {"generator", "torch"} - rows.keys():
+            raise self._damaged(f"random has no {' and no '.join(sorted(missing))}")
+        if len(set(rows.values())) > 1:
+            raise self._damaged(f"random has states of {' and '.join(map(str, rows.values()))} processes")
+
+    @staticmethod
+    def _sound(key: Any, value: Any, parameter: Tensor, step: int) -> bool:
+        """Whether a value of the optimiser's state is one: its count of steps, or a moment of the parameter."""
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            return False
+        if key == "step":
+            return value.ndim == 0 and 0 <= value.item() <= step and value.item() % 1 == 0
+        if key not in ("exp_avg", "exp_avg_sq", "momentum_buffer") or value.shape != parameter.shape:
+            return False
+        return bool(torch.isfinite(value).all() and (key != "exp_avg_sq" or (value >= 0).all()))
+
+    def _damaged(self, problem: str) -> CheckpointError:
+        assert self.run is not None
+        return CheckpointError(
+            f"{self.run.path / OPTIMISER} is damaged: {problem}; copy the run directory whole, or fit again"
+        )
 
     def _terms(self, batch: Batch, objective: Objective, where: str, feeding: float = 0.0) -> Terms:
         """Terms of a batch that the objective needs, on the device and in the precision of the model."""
@@ -613,8 +687,12 @@ class _Loop:
             self.run.commit({**self.run.state, "status": "failed"}, {})
 
 
-# what state.json holds of `State`, and of which type
-_STORED = {"step": int, "best_step": int | None, "best_bound": float | None, "waited": int, "status": str}
+# what an optimiser needs of every parameter that it has moved
+_KEPT: dict[str, set[str]] = {"adam": {"step", "exp_avg", "exp_avg_sq"}, "sgd": set()}
+_KEPT["adamw"] = _KEPT["adam"]
+
+# what state.json holds of `State`
+_STORED = ("step", "best_step", "best_bound", "waited", "status")
 
 
 class _Signals:

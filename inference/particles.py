@@ -27,6 +27,7 @@ from ..networks.base import computing_once, valid_steps
 from ..networks.rows import Rows, pick, select
 from ..notation import Factor, Parent
 from ..rollout import Rollout, like
+from ..turns import alone
 from .batches import each
 from .bounds import require_likelihood
 
@@ -48,6 +49,7 @@ class ParticleBound:
     particles: int
 
 
+@alone
 @torch.no_grad()
 def particle_bound(
     model: DynamicalVAE, batch: Batch, particles: int = 16, *, resample_below: float = 0.5, chunk: int = 4096

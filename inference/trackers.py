@@ -15,7 +15,12 @@ from typing import Any, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from .. import files
+from .checkpoints import CheckpointError
+
 Row = Mapping[str, float]
+LARGEST_LOG = 2**28
+"""Bytes of a file of JSON lines."""
 
 
 class Tracker(Protocol):
@@ -65,32 +70,52 @@ class JSONLines:
 
     def start(self, step: int) -> None:
         """Drop rows after `step`, and a last line that was cut off, then open the file for appending."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         kept = [json.dumps(row) + "\n" for row in self.read() if row["step"] <= step]
-        new = self.path.with_name(f"{self.path.name}.new")
-        new.write_text("".join(kept))
-        os.replace(new, self.path)
-        self._file = self.path.open("a")
+        with files.written(self.path) as new:  # a file of its own, to which nothing else leads
+            new.write("".join(kept).encode())
+        self._file = files.open_plain(self.path, os.O_WRONLY | os.O_APPEND)
 
     def log(self, step: int, row: Row) -> None:
-        """Append a row and flush it."""
-        self._file.write(json.dumps({"step": step, **row}) + "\n")
-        self._file.flush()
+        """Append a row."""
+        with files.naming(self.path):
+            files.put(self._file, (json.dumps({"step": step, **row}) + "\n").encode())
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
     def read(self) -> list[dict[str, Any]]:
-        """Return the rows of the file, up to the first line that is not JSON; none if there is no file."""
+        """Return the rows of the file, without a last line that was cut off; none if there is no file.
+
+        Raises:
+            CheckpointError: a line that is no row of numbers, or a path that is no plain file.
+        """
+        try:
+            lines = files.read(self.path, LARGEST_LOG).split(b"\n")
+        except FileNotFoundError:
+            return []
+        except files.FileRefused as error:
+            raise CheckpointError(f"{error}; move it away to go on without the history of the run") from error
         rows: list[dict[str, Any]] = []
-        if self.path.exists():
-            for line in self.path.read_text().splitlines():
-                try:
-                    rows.append(json.loads(line))
-                except ValueError:
-                    break
+        for number, line in enumerate(lines[:-1], 1):  # the last one has no end
+            try:
+                row = json.loads(line)
+            except (ValueError, RecursionError):
+                row = None
+            if not _is_row(row):
+                raise CheckpointError(
+                    f"{self.path} is damaged: line {number} is no row of numbers with a step; take the line out, or "
+                    "move the file away to go on without the history of the run"
+                )
+            rows.append(row)
         return rows
+
+
+def _is_row(row: Any) -> bool:
+    """Whether it maps "step" to a count and every name to a number."""
+    if not isinstance(row, dict) or type(row.get("step")) is not int or not 0 <= row["step"] <= 10**9:
+        return False
+    return all(isinstance(value, int | float) for value in row.values())
 
 
 class TensorBoard:
@@ -107,16 +132,19 @@ class TensorBoard:
         """Open an event file that hides rows after `step`."""
         from torch.utils.tensorboard import SummaryWriter  # slow to import, so only where it is wanted
 
-        self._writer = SummaryWriter(self.directory, purge_step=step + 1)
+        with files.naming(self.directory):
+            self._writer = SummaryWriter(self.directory, purge_step=step + 1)
 
     def log(self, step: int, row: Row) -> None:
         """Write each number of a row as a scalar."""
-        for name, value in row.items():
-            self._writer.add_scalar(name, value, step)
+        with files.naming(self.directory):
+            for name, value in row.items():
+                self._writer.add_scalar(name, value, step)
 
     def close(self) -> None:
         """Close the event file."""
-        self._writer.close()
+        with files.naming(self.directory):
+            self._writer.close()
 
 
 class Terminal:

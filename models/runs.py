@@ -7,7 +7,6 @@ folder can be moved.
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,12 +17,13 @@ from typing import Any
 import torch
 
 from .. import motion
-from ..inference.checkpoints import CONFIG, CheckpointError, Run, load_weights
+from ..inference.checkpoints import CONFIG, CheckpointError, Run, at_most, load_weights
 from ..inference.fit import Callback, Fit, Training
 from ..inference.fit import fit as fit_model
 from ..inference.schedules import from_config as option_from_config
 from ..inference.trackers import Tracker
 from ..motion import PROTOCOLS, MotionSet, Protocol, Windows
+from ..options import check, nearest
 from .method import Method, from_config
 
 SIMULATED = "simulated"
@@ -117,9 +117,7 @@ def named_protocol(name: str) -> Protocol:
         ValueError: an unknown name, with the nearest known one.
     """
     if name not in PROTOCOLS:
-        close = difflib.get_close_matches(name, PROTOCOLS, n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
-        raise ValueError(f"unknown protocol {name!r}{hint}; known: {', '.join(PROTOCOLS)}")
+        raise ValueError(f"unknown protocol {name!r}{nearest(name, PROTOCOLS)}; known: {', '.join(PROTOCOLS)}")
     return PROTOCOLS[name]
 
 
@@ -192,10 +190,7 @@ def resume(
     Raises:
         CheckpointError: no run, a damaged one, or one whose data have changed.
     """
-    run = load(path, data)
-    with reading_config(path):
-        recorded = Run(path).config["training"]
-        training = Training(**{name: option_from_config(value) for name, value in recorded.items()})
+    run, training = load(path, data), read_config(path).training
     steps = options.get("steps", training.steps)
     return fit_model(
         run.model,
@@ -220,16 +215,11 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
     Raises:
         CheckpointError: no run, a damaged one, or one whose data have changed.
     """
-    with reading_config(path):
-        config = Run(path).config
-        method, source = from_config(config["method"]), config["data"]
-        protocol = Protocol(**tuples(config["protocol"]))
-        recorded, expected, skip_bad = source["path"], source["fingerprint"], source["skip_bad"]
-        if not isinstance(recorded, str) or not isinstance(expected, str):
-            raise TypeError(f"path and fingerprint of the data are texts, not {recorded!r} and {expected!r}")
+    config, size = read_config(path), Run(path).size()
+    recorded, expected = config.source, config.fingerprint
     where = os.fspath(data or recorded)
     try:
-        opened = Data.open(where, protocol, skip_bad)
+        opened = Data.open(where, config.protocol, config.skip_bad)
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{path} was fitted on {recorded}, but {where} is not here; relative paths count from the "
@@ -240,10 +230,52 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
             f"{where} has changed since {path} was fitted on it: its fingerprint is {found[:12]}…, the run's "
             f"{expected[:12]}…; restore the file, or fit again"
         )
-    with reading_config(path):  # the data are those of the run: if they do not fit, the config is not
-        model = method.build_for(opened.windows("train"))
+    # the data are those of the run: if they do not fit, the config is not
+    with reading_config(path), at_most(size, f"{Path(path) / CONFIG}"):
+        model = config.method.build_for(opened.windows("train"))
     load_weights(model, path)
-    return Loaded(Path(path), method, model.eval(), opened)
+    return Loaded(Path(path), config.method, model.eval(), opened)
+
+
+@dataclass(frozen=True)
+class Config:
+    """What `config.json` of a run says.
+
+    Args:
+        method: with its options.
+        source, fingerprint, skip_bad: of the data, see `Data`.
+        protocol: how windows are cut from them.
+        training: how it was fitted.
+    """
+
+    method: Method
+    source: str
+    fingerprint: str
+    skip_bad: bool
+    protocol: Protocol
+    training: Training
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+def read_config(path: str | os.PathLike[str]) -> Config:
+    """Reads and checks the config of a run.
+
+    Raises:
+        CheckpointError: no run, or a damaged one.
+    """
+    with reading_config(path):
+        config = Run(path).config
+        data, training = config["data"], config["training"]
+        return Config(
+            from_config(config["method"]),
+            data["path"],
+            data["fingerprint"],
+            data["skip_bad"],
+            Protocol(**tuples(config["protocol"])),
+            Training(**{name: option_from_config(value) for name, value in training.items()}),
+        )
 
 
 @contextmanager
@@ -251,13 +283,17 @@ def reading_config(path: str | os.PathLike[str]) -> Iterator[None]:
     """What fails within it is the config of a run."""
     try:
         yield
-    except CheckpointError:
+    except (CheckpointError, OSError):
         raise
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except Exception as error:  # a method of somebody else's may fail in any way at options that are not its own
         raise CheckpointError(
-            f"{Path(path) / CONFIG} does not tell method, data, protocol and training ({error!r}); it is damaged, or "
-            "was not written by `dvae fit` with these methods"
+            f"{Path(path) / CONFIG} does not tell method, data, protocol and training ({_shortened(repr(error))}); it "
+            "is damaged, or was not written by `dvae fit` with these methods"
         ) from error
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= 400 else f"{text[:400]}…"
 
 
 def tuples(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,14 +33,16 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from .. import files
 from ..inference import fit as loop
 from ..inference.checkpoints import Run
 from ..inference.fit import Fit, State, Training
 from ..inference.schedules import clamp
-from ..inference.schedules import from_config as option_from_config
+from ..inference.trackers import LARGEST_LOG
 from ..motion import Protocol
-from .method import Method, from_config
-from .runs import SIMULATED, Data, fit, reading_config, resume, tuples
+from ..turns import alone
+from .method import Method
+from .runs import SIMULATED, Data, fit, read_config, resume
 
 ENDED = ("finished", "stopped early")
 
@@ -148,7 +150,7 @@ def sweep(
     notes: list[str] = []
     received, blind = None, False
     out.mkdir(parents=True, exist_ok=True)
-    lease.touch()
+    lease.touch(exist_ok=False)
     with _Progress(waiting, training) as progress, _Stop(lease) as stop:
         try:
             for result in results.values():
@@ -194,15 +196,12 @@ class _Run:
     owner: int = field(default_factory=os.getpid)
 
 
-_alone = threading.Lock()  # torch's random state is the process's: threads of one process take turns
-
-
 def _fit(run: _Run) -> tuple[Result, list[str]]:
     """Fits or resumes a run in a worker; its result, and the warnings."""
     parent = multiprocessing.parent_process()
     if parent is not None and parent.pid == run.owner:
         _ignore_signals()  # from here on: workers that the pool starts later are not among the first ones
-    with _alone, _one_thread(), warnings.catch_warnings(record=True) as caught:
+    with alone, _one_thread(), warnings.catch_warnings(record=True) as caught:
         begin, status, error = time.monotonic(), "interrupted", ""
         ended, leased = Fit([], 0, None, None, status, run.path), _Leased(run.lease)
         try:
@@ -329,18 +328,14 @@ def _earlier(run: _Run) -> Result | None:
         ValueError: the directory holds a run of other options.
     """
     earlier = Run(run.path)
+    if run.path.is_symlink():
+        raise ValueError(f"{run.path} is a link, which could lead anywhere; put the run's own directory in its place")
     if not earlier.exists:
         if run.path.is_file():
             raise ValueError(f"{run.path} is a file, where a run is to go; choose another directory for the sweep")
         return None
-    with reading_config(run.path):
-        config, state = earlier.config, earlier.state
-        there = _options(
-            from_config(config["method"]),
-            Protocol(**tuples(config["protocol"])),
-            Training(**{name: option_from_config(value) for name, value in config["training"].items()}),
-            config["data"]["fingerprint"],
-        )
+    config, state = read_config(run.path), earlier.state
+    there = _options(config.method, config.protocol, config.training, config.fingerprint)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run itself tells which schedules it makes shorter
         training = clamp(run.training, run.training.steps)
@@ -386,9 +381,9 @@ class _Log:
         if began:
             self.begin = time.monotonic()
         if self.begin is not None:
-            with suppress(OSError), self.path.open("rb") as file:
+            with suppress(OSError, files.FileRefused), files.open_plain(self.path) as file:
                 file.seek(self._read)
-                whole, end, _ = file.read().rpartition(b"\n")
+                whole, end, _ = file.read(LARGEST_LOG).rpartition(b"\n")
                 self._read += len(whole + end)
                 for row in map(json.loads, whole.splitlines()):
                     self.step = row["step"]

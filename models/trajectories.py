@@ -29,6 +29,7 @@ from ..model import WHOLE, Batch, DynamicalVAE, repeat
 from ..motion import HUMAN36M, PROTOCOLS, Clip, Skeleton, Windows, rotate_about_up
 from ..motion.data import defect
 from ..options import Amount, Share
+from ..turns import alone
 from .method import Method
 
 FIRST, GIVEN, REST = "s", "y", "r"
@@ -237,6 +238,7 @@ class TrajectoryModel(DynamicalVAE):
             values.setdefault(REST, torch.where(given == 0, x, 0.0) if self.method.complement else x)
         return values
 
+    @alone
     @torch.no_grad()
     def forecast(
         self,
@@ -330,6 +332,7 @@ class TrajectoryModel(DynamicalVAE):
         """See `DynamicalVAE.reconstruct`."""
         return self._back(super().reconstruct(batch, samples), batch)
 
+    @alone
     def complete(
         self,
         initial_pose: Any,

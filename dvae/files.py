@@ -1,0 +1,140 @@
+"""Files that somebody else may have laid: only plain ones are opened, up to a bound, and ours are written whole.
+
+A folder that was copied from elsewhere may hold links to files of ours, FIFOs and devices, whose content never ends or
+never comes, and files that are larger than memory. So what lies in a run directory is opened here and nowhere else. The
+path of the folder itself is what the user typed, and may be a link.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+from uuid import uuid4
+
+# neither follows a link at the end of the path nor waits for the other end of a FIFO; Windows has no such flags
+_PLAIN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+class FileRefused(ValueError):
+    """A path that is no plain file, or one that is larger than it can rightly be."""
+
+
+def open_plain(path: str | os.PathLike[str], flags: int = os.O_RDONLY, links: bool = False) -> BinaryIO:
+    """Open a plain file, unbuffered, without ever cutting it short.
+
+    Args:
+        path: the file.
+        flags: of `os.open`.
+        links: follow a link, for a path that the user typed.
+
+    Raises:
+        FileRefused: a link, a directory, a FIFO, a socket or a device.
+        OSError: there is no such file, or it cannot be opened.
+    """
+    path = Path(path)
+    if not links and path.is_symlink():
+        raise FileRefused(f"{path} is a link, which could lead to any file; put the file itself in its place")
+    try:
+        number = os.open(path, flags | (_PLAIN & ~getattr(os, "O_NOFOLLOW", 0) if links else _PLAIN), 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV):
+            raise FileRefused(f"{path} is no file but a link, a directory, a FIFO, a socket or a device") from error
+        raise
+    if not stat.S_ISREG(os.fstat(number).st_mode):
+        os.close(number)
+        raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device")
+    return os.fdopen(number, "r+b" if flags & os.O_RDWR else "wb" if flags & os.O_WRONLY else "rb", buffering=0)
+
+
+def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
+    """The content of a plain file of at most `most` bytes.
+
+    Raises:
+        FileRefused: no plain file, or a larger one.
+        OSError: there is no such file, or it cannot be read.
+    """
+    with open_plain(path, links=links) as file, naming(path):
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise FileRefused(f"{path} has {size} bytes, and can rightly have {most} at most")
+        parts, left = [], most + 1
+        while left and (part := file.read(min(left, 1 << 24))):  # what it holds now, which may differ from its size
+            parts.append(part)
+            left -= len(part)
+    if not left:
+        raise FileRefused(f"{path} grows while it is read, beyond {most} bytes")
+    return b"".join(parts)
+
+
+def write(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write a new file in place of whatever has this name, and force it to the disk.
+
+    Raises:
+        OSError: it cannot be written; the error names it.
+    """
+    Path(path).unlink(missing_ok=True)  # a link, not where it leads
+    with open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as file, naming(path):
+        put(file, content)
+        os.fsync(file.fileno())
+
+
+def put(file: BinaryIO, content: bytes) -> None:
+    """Write everything to an unbuffered file, which may take it piece by piece."""
+    left = memoryview(content)
+    while left:
+        left = left[file.write(left) :]
+
+
+@contextmanager
+def written(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """A file to write to, which takes the place of an older one, or of a link, once it is whole; its folder is made.
+
+    Raises:
+        FileRefused: the path is a directory, a FIFO or a device.
+        OSError: it cannot be written; the error names it.
+    """
+    path = Path(path)
+    if _special(path):
+        raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device; choose another name")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_name(f".{uuid4().hex}.new")
+    try:
+        with naming(path, new):
+            number = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL | _PLAIN, 0o666)
+            with os.fdopen(number, "w+b") as file:
+                yield file
+            os.replace(new, path)
+    finally:
+        with suppress(OSError):
+            new.unlink()
+
+
+@contextmanager
+def naming(path: str | os.PathLike[str], temporary: Path | None = None) -> Iterator[None]:
+    """What fails within it for want of space, rights or a sound disk says which file it was about.
+
+    Args:
+        path: the file.
+        temporary: what it is called until it is whole.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None and error.filename not in (temporary, str(temporary)):
+            raise
+        if error.errno is None:  # of a library
+            raise OSError(f"{path}: {error}") from error
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from error
+
+
+def _special(path: Path) -> bool:
+    """Whether there is something that is neither a file nor a link."""
+    with suppress(OSError):
+        mode = os.lstat(path).st_mode
+        return not (stat.S_ISREG(mode) or stat.S_ISLNK(mode))
+    return False
