@@ -11,6 +11,11 @@
 {'z': ('z_{<t}',)}
 """
 
+import sys
+
+if sys.flags.optimize > 1:  # Pyro fills in its docstrings as it is imported
+    raise ImportError("dvae needs Pyro, which needs docstrings: run python without -OO (PYTHONOPTIMIZE=2); -O is fine")
+
 import pyro
 
 # Without it a second model silently receives the first one's parameters from Pyro's global store.

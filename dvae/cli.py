@@ -14,8 +14,9 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, make_dataclass, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -24,13 +25,13 @@ from joblib import parallel_config
 from rich.console import Console
 from rich.table import Table
 
-from . import motion
+from . import files, motion
 from .graph import audit
 from .inference.checkpoints import Run
 from .inference.compare import compare as compare_models
 from .inference.criticism import Calibration, PredictiveChecks, calibrate, predictive_checks
 from .inference.evaluate import evaluate as evaluate_models
-from .inference.fit import Fit, Interrupted, Training
+from .inference.fit import Fit, Interrupted, Training, reason
 from .inference.trackers import TensorBoard
 from .models import method as method_by_name
 from .models import methods, runs
@@ -40,6 +41,7 @@ from .models.sweep import Interrupted as SweepInterrupted
 from .models.sweep import sweep as sweep_methods
 from .models.trajectories import TrajectoryModel
 from .notation import Factorization
+from .options import nearest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -373,7 +375,7 @@ def evaluate(
         raise UsageError("give at least one run directory")
     _at_least(1, samples=samples, batch_size=batch_size)
     _at_least(0, bound_particles=bound_particles)
-    _check_file(out, "out")
+    _check_file(out, "out", ".json")
     _check_figure(figure, "figure")
     loaded, windows = _on_the_same_windows(run, data)
     _note_unfinished(loaded)
@@ -405,7 +407,6 @@ def evaluate(
     kind = "-".join(["evaluation", *(given or ()), *([f"exchanged-{exchange:g}"] if exchange is not None else ())])
     kind += "" if temperature is None else f"-temperature-{temperature:g}"
     for path in [out] if out is not None else [each.path / f"{kind}.json" for each in loaded]:
-        path.parent.mkdir(parents=True, exist_ok=True)
         result.save(path)
         ERROR.print(f"wrote {path}")
     if figure is not None:
@@ -447,20 +448,20 @@ def criticise(
     """
     _at_least(1, simulations=simulations, draws=draws, ranked_steps=ranked_steps, batch_size=batch_size)
     _at_least(19, samples=samples)
-    _check_file(out, "out")
+    _check_file(out, "out", ".json")
     _check_figure(figure, "figure")
     loaded = _load(run, data)
     _note_unfinished([loaded])
     windows = loaded.data.windows("test")
     steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
     out = out or run / "criticism.json"
-    out.parent.mkdir(parents=True, exist_ok=True)
     document = {}
 
     def keep(part: str, result: Calibration | PredictiveChecks, figure_part: str) -> None:
         OUT.print(result.table())
         document[part] = result.document()
-        out.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        with files.written(out) as file:
+            file.write((json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
         ERROR.print(f"wrote {out}: {part}")
         if figure is not None:
             _save_figure(result.plot(), figure.with_stem(f"{figure.stem}-{figure_part}"))
@@ -522,7 +523,7 @@ def compare(
         raise UsageError("give at least one run directory")
     _at_least(1, particles=particles, estimates=estimates, samples=samples, batch_size=batch_size, stride=stride)
     _at_least(0, contrasts=contrasts)
-    _check_file(out, "out")
+    _check_file(out, "out", ".json")
     _check_figure(figure, "figure")
     loaded, windows = _on_the_same_windows(run, data)
     if unfinished := _unfinished(loaded):
@@ -545,7 +546,6 @@ def compare(
     )
     OUT.print(result.table())
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         result.save(out)
         ERROR.print(f"wrote {out}")
     if figure is not None:
@@ -582,7 +582,7 @@ def forecast(
         figure: save a figure of the first window's futures.
     """
     _at_least(1, samples=samples, horizon=horizon)
-    _check_file(out, "out")
+    _check_file(out, "out", ".npz")
     _check_figure(figure, "figure")
     loaded = _load(run, data)
     windows = _windows_of(loaded, clip)
@@ -633,7 +633,7 @@ def complete(
     """
     _at_least(1, samples=samples)
     _at_least(0, window=window)
-    _check_file(out, "out")
+    _check_file(out, "out", ".npz")
     _check_figure(figure, "figure")
     loaded = _load(run, data)
     if not isinstance(loaded.model, TrajectoryModel):
@@ -712,9 +712,7 @@ def animate(
 
     _at_least(1, samples=samples, every=every)
     _at_least(0, window=window)
-    _check_file(out, "out")
-    if out.suffix.lower() not in (".html", ".htm"):
-        raise UsageError(f"--out {out}: what is written is a page; end its name in .html")
+    _check_file(out, "out", ".html", ".htm")
     _check_figure(figure, "figure")
     if Path(source).is_dir():
         loaded = _load(Path(source), data)
@@ -739,7 +737,6 @@ def animate(
     else:
         clips = motion.simulate() if source == runs.SIMULATED else motion.load(source)
         shown = clips.clips[0] if clip is None else _clip(clips, clip)
-        out.parent.mkdir(parents=True, exist_ok=True)
         save_html(animation(clips.skeleton, shown.positions, every=every, title="/".join(shown.key)), out)
         ERROR.print(f"wrote {out}: {'/'.join(shown.key)}, {shown.frames} frames")
         return
@@ -752,7 +749,6 @@ def animate(
         every=every,
         title=_title(futures),
     )
-    out.parent.mkdir(parents=True, exist_ok=True)
     save_html(page, out)
     ERROR.print(f"wrote {out}: window {chosen}, {_title(futures)}")
     if figure is not None:
@@ -776,6 +772,22 @@ def data_info(
 
 app.command(data_app, name="data", help="Look into motion files.")
 
+COMMANDS: dict[str, Any] = {
+    "list": list_methods,
+    "show": show,
+    "fit": fit,
+    "resume": resume,
+    "sweep": sweep,
+    "evaluate": evaluate,
+    "criticise": criticise,
+    "compare": compare,
+    "forecast": forecast,
+    "complete": complete,
+    "animate": animate,
+    "data": data_info,
+}
+DATA_COMMANDS = {"info": data_info}
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code.
@@ -788,6 +800,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = [argument for argument in given if argument != "--debug"]
     warnings.showwarning = _note
     try:
+        if given and not given[0].startswith("-") and given[0] not in COMMANDS:
+            raise UsageError(f"unknown command {given[0]!r}{nearest(given[0], COMMANDS)}; known: {', '.join(COMMANDS)}")
         app.cli(
             prog="dvae",
             description="Dynamical variational autoencoders from their factorizations. "
@@ -797,6 +811,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return 0
     except SystemExit as stop:  # tyro, after --help or wrong arguments
+        if stop.code:
+            for meant in _meant(given):
+                ERROR.print(meant, markup=False)
         return stop.code if isinstance(stop.code, int) else 2
     except Interrupted as stop:
         ERROR.print(f"interrupted after step {stop.fit.step}; resume with: dvae resume {stop.fit.run}")
@@ -813,8 +830,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
         expected = isinstance(error, ValueError | OSError | RuntimeError | FloatingPointError)
         hint = "" if expected or debug else " (this looks like a bug: --debug shows the traceback)"
         ERROR.print("[bold red]error:[/bold red] ", end="")
-        ERROR.print((str(error) or type(error).__name__) + hint, markup=False)
+        ERROR.print((reason(error) or type(error).__name__) + hint, markup=False)
         return 2 if isinstance(error, UsageError) else 1
+
+
+def _meant(given: Sequence[str]) -> Iterator[str]:
+    """Sentences on names that are none, but near to one: of methods, of commands, and the choices of options."""
+    command, *rest = given or [""]
+    loose = [
+        word
+        for before, word in zip(["", *rest[:-1]], rest, strict=True)
+        if not word.startswith("-") and (command == "sweep" or not before.startswith("-"))
+    ]
+    names = {"fit": list(methods()), "data": list(DATA_COMMANDS)}.get(command, [])
+    for word in loose[:1] if not set(names) & set(rest) else []:
+        if meant := nearest(word, names):
+            yield f"{word!r} is unknown{meant}"
+    hints = [get_type_hints(COMMANDS[command])] if command in COMMANDS else []
+    hints += [get_type_hints(kind) for kind in methods().values()] if command in ("fit", "sweep") else []
+    choices = {name: _choices(hint) for each in reversed(hints) for name, hint in each.items() if _choices(hint)}
+    if command == "sweep":
+        loose = [word for word in loose if word not in choices["method"]]
+    for option, word in pairwise(rest):
+        known = choices.get(option.removeprefix("--").replace("-", "_"), []) if option.startswith("--") else []
+        if known and word not in known and (meant := nearest(word, known)):
+            yield f"{option} {word!r} is unknown{meant}"
+    for word in loose if command == "sweep" else []:
+        if meant := nearest(word, choices["method"]):
+            yield f"{word!r} is unknown{meant}"
+
+
+def _choices(hint: Any) -> list[str]:
+    """The names that a type allows, wherever in it they are."""
+    if get_origin(hint) is Literal:
+        return [name for name in get_args(hint) if isinstance(name, str)]
+    return [name for part in get_args(hint) for name in _choices(part)]
 
 
 def _note(message: Warning | str, *_: object, **__: object) -> None:
@@ -856,10 +906,12 @@ def _at_least(smallest: int, **options: int | None) -> None:
             raise UsageError(f"--{name.replace('_', '-')} is {value}; it must be at least {smallest}")
 
 
-def _check_file(path: Path | None, option: str) -> None:
-    """Refuse, before any work, a path that cannot become a file."""
+def _check_file(path: Path | None, option: str, *suffixes: str) -> None:
+    """Refuse, before any work, a path that cannot become a file, or whose name ends as that of another kind of file."""
     if path is not None and path.is_dir():
         raise UsageError(f"--{option} {path} is a directory; name a file")
+    if path is not None and path.suffix.lower() not in (suffixes or (path.suffix.lower(),)):
+        raise UsageError(f"--{option} {path}: what is written is {suffixes[0][1:]}; end its name in {suffixes[0]}")
 
 
 def _check_figure(path: Path | None, option: str) -> None:
@@ -1021,7 +1073,8 @@ def _names(loaded: Sequence[runs.Loaded]) -> list[str]:
 def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
     found = [clip for clip in clips if name in (clip.name, f"{clip.split}/{clip.name}")]
     if not found:
-        raise ValueError(f"no clip {name!r} in {clips.name}; `dvae data info` tells what is there")
+        meant = nearest(name, [known for clip in clips for known in (clip.name, f"{clip.split}/{clip.name}")])
+        raise ValueError(f"no clip {name!r}{meant} in {clips.name}; `dvae data info` tells what is there")
     if len(found) > 1:
         keys = " or ".join("/".join(clip.key) for clip in found)
         raise ValueError(f"{name!r} is the name of {len(found)} clips; say {keys}")
@@ -1107,8 +1160,8 @@ def _save_futures(futures: motion.Forecasts, path: Path, paths: Mapping[str, Any
 
 
 def _save_figure(figure: Figure, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    with files.written(path) as file:
+        figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=150)
     ERROR.print(f"wrote {path}")
 
 

@@ -50,6 +50,7 @@ from torch import Tensor, nn
 from .. import distributions
 from ..model import repeat
 from ..networks.base import valid_steps
+from ..options import nearest
 from ..turns import alone
 from .batches import Batch, each, leaves, sequences
 from .bounds import KHAT_PARTICLES, SequenceELBO, importance_bound, require_likelihood, site_log_prob, sites_of
@@ -366,13 +367,15 @@ class Comparison(Result):
     @classmethod
     def load(cls, path: str | Path) -> "Comparison":
         """Read the file that `save` wrote; errors as in `from_json`."""
-        return cls.from_json(Path(path).read_text(encoding="utf-8"))
+        return cls.from_json(cls.read(path))
 
     # Estimates
 
     def _row(self, name: str) -> Contender:
         if name not in self.rows:
-            raise KeyError(f"no model {name!r} in this comparison; it has {', '.join(self.rows)}")
+            raise KeyError(
+                f"no model {name!r} in this comparison{nearest(name, self.rows)}; it has {', '.join(self.rows)}"
+            )
         return self.rows[name]
 
     @property
@@ -388,7 +391,7 @@ class Comparison(Result):
         row = self._row(name)
         if metric not in {*row.bounds, *row.free_running} - {"k-hat"}:
             known = [known for known in (*row.bounds, *row.free_running) if known != "k-hat"]
-            raise KeyError(f"{name!r} has no score {metric!r}; it has {', '.join(known)}")
+            raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, known)}; it has {', '.join(known)}")
         places = self._places()
         weights = np.bincount(places, weights=self.frames)
         if metric in row.free_running:

@@ -44,6 +44,7 @@ from rich.table import Table
 from torch import Tensor, nn
 
 from ..energies import pose_prior_energy
+from ..options import nearest
 from ..turns import alone
 from . import metrics
 from .batches import each
@@ -191,7 +192,8 @@ class Evaluation(Result):
         for method in (first, second):
             row = self._row(method)
             if metric not in row.clip_means:
-                raise KeyError(f"{method!r} has no score {metric!r}; it has {', '.join(row.clip_means)}")
+                meant = nearest(metric, row.clip_means)
+                raise KeyError(f"{method!r} has no score {metric!r}{meant}; it has {', '.join(row.clip_means)}")
             means.append(np.array(row.clip_means[metric]))
         return self._score(metric, means[0] - means[1])
 
@@ -269,11 +271,13 @@ class Evaluation(Result):
     @classmethod
     def load(cls, path: str | Path) -> "Evaluation":
         """Read the file that `save` wrote; errors as in `from_json`."""
-        return cls.from_json(Path(path).read_text(encoding="utf-8"))
+        return cls.from_json(cls.read(path))
 
     def _row(self, method: str) -> Row:
         if method not in self.rows:
-            raise KeyError(f"no method {method!r} in this evaluation; it has {', '.join(self.rows)}")
+            raise KeyError(
+                f"no method {method!r} in this evaluation{nearest(method, self.rows)}; it has {', '.join(self.rows)}"
+            )
         return self.rows[method]
 
     def _score(self, metric: str, clip_means: np.ndarray) -> Score:

@@ -9,6 +9,7 @@ checkpoint stores: a resumed run repeats, bit for bit on a CPU, what the uninter
 import io
 import math
 import os
+import re
 import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,7 +34,6 @@ from .checkpoints import (
     OPTIMISER,
     CheckpointError,
     Run,
-    load_weights,
     read_weights,
     state_bytes,
     weights,
@@ -232,6 +232,11 @@ class Fit:
         if not likelihood:
             terms.set_yscale("log")  # their scales differ by orders of magnitude; weights make up for it
         return figure
+
+
+def reason(error: BaseException) -> str:
+    """What an error says, without the table of shapes that Pyro appends where it passes a program."""
+    return re.split(r"\n\s*Trace Shapes:", str(error))[0]
 
 
 class NonFiniteError(FloatingPointError):
@@ -564,7 +569,8 @@ class _Loop:
                 f"counts all of a run, so give more than {stored['step']} to go on"
             )
         content = self.run.optimiser_state(state_bytes(model, 4) + 2**20)
-        load_weights(model, self.run.path / LAST)
+        held = read_weights(model, self.run.read(LAST, state_bytes(model)), self.run.path / LAST)
+        model.load_state_dict(held)
         self._check_state(content, stored["step"])
         if content["name"] != self.training.optimizer:
             raise CheckpointError(
@@ -661,7 +667,7 @@ class _Loop:
             if "invalid values" not in str(error) and "within the support" not in str(error):
                 raise
             self._mark_failed()
-            raise NonFiniteError(f"{where}: {str(error).partition(chr(10))[0]}") from error
+            raise NonFiniteError(f"{where}: {reason(error).partition(chr(10))[0]}") from error
 
     def _total(self, value: Tensor) -> Tensor:
         """The sum over the processes."""

@@ -6,6 +6,11 @@ from pathlib import Path
 from rich.console import Console, RenderableType
 from rich.progress import Progress
 
+from .. import files
+
+LARGEST = 2**28
+"""Bytes of a result."""
+
 
 class Result:
     """A result with a `table` and a `to_json`; it shows itself as the one and is kept as the other."""
@@ -19,8 +24,22 @@ class Result:
         raise NotImplementedError
 
     def save(self, path: str | Path) -> None:
-        """Write `to_json()` to a file."""
-        Path(path).write_text(self.to_json() + "\n", encoding="utf-8")
+        """Write `to_json()` to a file, which takes the place of an older one once it is whole.
+
+        Raises:
+            OSError, ValueError: it cannot be written.
+        """
+        with files.written(path) as file:
+            file.write((self.to_json() + "\n").encode())
+
+    @staticmethod
+    def read(path: str | Path) -> str:
+        """What `save` wrote, as text.
+
+        Raises:
+            OSError, ValueError: there is no such file, or it is no plain one, or no text.
+        """
+        return files.read(path, LARGEST, links=True).decode()
 
     def __rich__(self) -> RenderableType:
         return self.table()

@@ -9,7 +9,7 @@ from typing import ClassVar
 from ..model import DynamicalVAE
 from ..networks import Attention, Dense, Linear, NetworkSpec, Recurrent
 from ..notation import Factorization
-from ..options import Size
+from ..options import Size, nearest
 from .method import Method
 
 
@@ -44,7 +44,9 @@ class Equations(Method):
             "linear": Linear(steps=512),
         }
         if self.network not in kinds:
-            raise ValueError(f"unknown network {self.network!r}; known: {', '.join(kinds)}")
+            raise ValueError(
+                f"unknown network {self.network!r}{nearest(self.network, kinds)}; known: {', '.join(kinds)}"
+            )
         return {"default": kinds[self.network]}
 
     def build(self, data: Mapping[str, int]) -> DynamicalVAE:

@@ -36,6 +36,7 @@ from ..model import DynamicalVAE
 from ..motion import Skeleton, Windows, face_forward, rotate_about_up
 from ..notation import Factorization
 from ..options import Layers, Range
+from ..turns import alone
 from .method import Method
 
 
@@ -197,6 +198,7 @@ class PosePriorModel(nn.Module):
         return self.flow.distribution().sample((count,))
 
 
+@alone
 def fit_pose_prior(
     windows: Windows, steps: int = 1000, seed: int = 0, progress: bool = True, **options: Any
 ) -> PosePriorModel:

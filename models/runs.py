@@ -24,6 +24,7 @@ from ..inference.schedules import from_config as option_from_config
 from ..inference.trackers import Tracker
 from ..motion import PROTOCOLS, MotionSet, Protocol, Windows
 from ..options import check, nearest
+from ..turns import alone
 from .method import Method, from_config
 
 SIMULATED = "simulated"
@@ -121,6 +122,7 @@ def named_protocol(name: str) -> Protocol:
     return PROTOCOLS[name]
 
 
+@alone
 def fit(
     method: Method,
     data: Data,
@@ -168,6 +170,7 @@ def fit(
     )
 
 
+@alone
 def resume(
     path: str | os.PathLike[str],
     data: str | os.PathLike[str] | None = None,
@@ -205,6 +208,7 @@ def resume(
     )
 
 
+@alone
 def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> Loaded:
     """Reads a run back: method, model with its best weights, data and protocol.
 

@@ -220,7 +220,7 @@ def _fit(run: _Run) -> tuple[Result, list[str]]:
             if isinstance(stop, loop.Interrupted):
                 ended = stop.fit
         except Exception as failure:  # of any type, and it may not survive the way to the sweep's process
-            status, error = "failed", f"{type(failure).__name__}: {failure}"
+            status, error = "failed", f"{type(failure).__name__}: {loop.reason(failure)}"
         seconds = time.monotonic() - begin
     result = Result(run.path, run.method, run.training.seed, status, ended.step, ended.best_bound, seconds, error)
     return result, [str(warning.message) for warning in caught]

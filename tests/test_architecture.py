@@ -12,7 +12,7 @@ import pytest
 import dvae
 
 ROOT = Path(__file__).parent.parent
-LAYERS = {"dvae": 0, "dvae.inference": 1, "dvae.models": 2, "dvae.testing": 3, "dvae.cli": 4}
+LAYERS = {"dvae": 0, "dvae.inference": 1, "dvae.models": 2, "dvae.testing": 3, "dvae.cli": 4, "dvae.command": 5}
 
 
 def sources():

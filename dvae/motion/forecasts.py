@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import files
 from .archive import archive
 from .formats import read_arrays
 from .skeleton import Skeleton
@@ -35,6 +36,7 @@ class Forecasts:
 
     Raises:
         ValueError: the shapes do not fit each other or the skeleton, or there is nothing.
+        FloatingPointError: a position is NaN or infinite, naming window and clip.
     """
 
     skeleton: Skeleton
@@ -53,6 +55,11 @@ class Forecasts:
                 f"expected forecasts (S, {windows}, H, {joint[0]}, 3), observed ({windows}, O, {joint[0]}, 3) and "
                 f"truth ({windows}, up to H, {joint[0]}, 3), got {shapes[0]}, {shapes[1]} and {shapes[2]}"
             )
+        for what, array in (("futures", self.forecasts), ("observed frames", self.observed), ("truth", self.truth)):
+            finite = np.isfinite(array).all((*range(array.ndim - 4), -3, -2, -1))
+            if not finite.all():
+                split, clip, start = self.keys[int(finite.argmin())]
+                raise FloatingPointError(f"the {what} of clip {clip!r} ({split}), frame {start}, are NaN or infinite")
 
     def window(self, n: int, samples: int | None = None) -> Forecasts:
         """The first of the futures, or all, of window n alone."""
@@ -68,8 +75,7 @@ class Forecasts:
         `fps`.
         """
         split, clip, start = zip(*self.keys, strict=True)
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        with Path(path).open("wb") as file:  # an open file: numpy would append .npz to a name
+        with files.written(path) as file:  # an open file: numpy would append .npz to a name
             np.savez_compressed(
                 file,
                 forecasts=self.forecasts,

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 
+from .. import files
 from .skeleton import Skeleton, rotate_about_up
 
 PAST, TRUTH, FIXED, GIVEN = "black", "#1a7f37", "#4a4f57", "#cf222e"
@@ -290,7 +291,9 @@ def animate(
 
 def save_html(figure: go.Figure, path: str | PathLike[str]) -> None:
     """Write the figure of `animate` as one HTML file, which needs no network and plays at the motion's own speed."""
-    figure.write_html(path, auto_play=False, post_script=_PLAYER, config={"displaylogo": False})
+    page = figure.to_html(auto_play=False, post_script=_PLAYER, config={"displaylogo": False})
+    with files.written(path) as file:
+        file.write(page.encode())
 
 
 def _player(seconds: dict[str, float], spacing: float) -> dict[str, Any]:

@@ -1,0 +1,34 @@
+"""The program `dvae`: its imports, in which Ctrl-C and a missing piece end it in a sentence, and then `dvae.cli`.
+
+Torch takes seconds to import, and whatever imports a part of dvae imports torch. So this package is installed under a
+second name, `dvae_command`, beside dvae and not within it.
+"""
+
+import os
+import signal
+import sys
+from types import FrameType
+
+
+def main() -> int:
+    """Run the command line and return its exit code."""
+    handled = signal.getsignal(signal.SIGINT) == signal.default_int_handler  # else it is ignored, as by nohup
+    if handled:
+        signal.signal(signal.SIGINT, _interrupted)  # a KeyboardInterrupt amid an import can come out as anything
+    try:
+        from dvae.cli import main
+    except ImportError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    if handled:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    return main()
+
+
+def _interrupted(number: int, _: FrameType | None) -> None:
+    os.write(2, b"interrupted\n")
+    os._exit(128 + number)  # nothing has begun, so there is nothing to end
+
+
+if __name__ == "__main__":
+    sys.exit(main())

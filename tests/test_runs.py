@@ -1,0 +1,519 @@
+"""Run directories that somebody else may have laid: what is no plain file, too large or out of range is refused."""
+
+import errno
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pyro
+import pytest
+import torch
+from safetensors.torch import load_file, save
+
+import dvae
+from dvae import files, motion
+from dvae.cli import main
+from dvae.inference import trackers
+from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE, CheckpointError, Run, at_most
+from dvae.inference.fit import reason
+from dvae.inference.trackers import JSONLines
+from dvae.models import runs
+from dvae.models.sweep import sweep
+from dvae.options import Range
+
+ROOT = Path(__file__).parent.parent
+METHOD = dvae.method("vrnn", latent=2, width=4, embed=(4,), embed_latent=(4,), warm_up=1)
+TRAINING = dvae.Training(steps=4, batch_size=2, validate_every=2, log_every=1, progress=False)
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "people.npz"
+    motion.save(path, motion.simulate(clips=14, frames=80, seed=1))
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(people, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "fitted"
+    runs.fit(METHOD, runs.Data.open(people), out, TRAINING)
+    return out
+
+
+@pytest.fixture
+def run(fitted, tmp_path):
+    """A copy of a run, to be damaged."""
+    return Path(shutil.copytree(fitted, tmp_path / "run"))
+
+
+@pytest.fixture
+def canary(tmp_path):
+    path = tmp_path / "mine.txt"
+    path.write_text("of value")
+    yield path
+    assert path.read_text() == "of value"
+
+
+def failure(capsys, *arguments, code=1):
+    """The sentence with which a command fails."""
+    capsys.readouterr()
+    assert main([str(each) for each in arguments]) == code
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert "looks like a bug" not in error
+    return " ".join(error.split())
+
+
+def change(run, file, *keys, value):
+    """Set one value of a JSON file of a run."""
+    content = json.loads((run / file).read_text())
+    inner = content
+    for key in keys[:-1]:
+        inner = inner[key]
+    inner[keys[-1]] = value
+    (run / file).write_text(json.dumps(content))
+
+
+def recommit(run, name, content):
+    """Replace a file of a checkpoint together with its fingerprint, as an attacker would."""
+    Run(run).commit(json.loads((run / STATE).read_text()), {name: content})
+
+
+# Links, FIFOs, sizes --------------------
+
+WRITTEN = (".lock", f"{CONFIG}.new", f"{LAST}.new", f"{OPTIMISER}.new", f"{STATE}.new", f"{BEST}.new", "log.jsonl.new")
+READ = (CONFIG, STATE, BEST, LAST, OPTIMISER, "log.jsonl")
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_nothing_is_written_through_a_link(run, canary, name):
+    (run / name).unlink(missing_ok=True)
+    (run / name).symlink_to(canary)
+    if name == ".lock":
+        with pytest.raises(CheckpointError, match=r"\.lock is a link"):
+            runs.resume(run, steps=6, progress=False)
+        (run / name).unlink()
+        os.link(canary, run / name)
+    if name in (f"{OPTIMISER}.new", f"{LAST}.new", f"{BEST}.new"):  # these are read first
+        with pytest.raises(CheckpointError, match="is a link"):
+            runs.resume(run, steps=6, progress=False)
+    else:
+        assert runs.resume(run, steps=6, progress=False).step == 6
+
+
+@pytest.mark.parametrize("name", ["evaluation.json", "criticism.json", "scores.png"])
+def test_results_take_the_place_of_a_link(run, canary, name):
+    (run / name).symlink_to(canary)
+    if name == "criticism.json":
+        few = ("--simulations", "20", "--draws", "19", "--ranked-steps", "1", "--samples", "19")
+        assert main(["criticise", str(run), *few]) == 0
+    else:
+        assert main(["evaluate", str(run), "--samples", "1", "--figure", str(run / "scores.png")]) == 0
+    assert not (run / name).is_symlink()
+    assert (run / name).stat().st_size > 100
+
+
+@pytest.mark.parametrize("name", READ)
+@pytest.mark.parametrize("kind", ["link", "device", "fifo", "directory"])
+def test_what_is_no_plain_file_is_refused_at_once(run, canary, name, kind):
+    path = run / name
+    path.unlink()
+    if kind == "directory":
+        path.mkdir()
+    elif kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(canary if kind == "link" else "/dev/zero")
+    began = time.monotonic()
+    with pytest.raises(CheckpointError, match=f"{path} is (a link|no file)"):
+        runs.resume(run, steps=6, progress=False)
+    if name in (CONFIG, STATE, BEST):
+        with pytest.raises(CheckpointError, match=f"{path} is (a link|no file)"):
+            dvae.load(run)
+    assert time.monotonic() - began < 10
+
+
+def test_the_directory_that_the_user_names_may_be_a_link(run, tmp_path):
+    (tmp_path / "latest").symlink_to(run)
+    assert runs.resume(tmp_path / "latest", steps=5, progress=False).step == 5
+
+
+def test_a_run_of_a_sweep_is_no_link(fitted, people, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "vrnn-seed0").symlink_to(elsewhere)
+    with pytest.raises(ValueError, match="vrnn-seed0 is a link"):
+        sweep([METHOD], runs.Data.open(people), tmp_path / "out", [0], TRAINING, jobs=1)
+    assert not list(elsewhere.iterdir())
+
+
+@pytest.mark.parametrize("name", READ)
+def test_a_file_larger_than_it_can_be_is_not_read(run, name, monkeypatch):
+    with (run / name).open("r+b") as file:
+        file.truncate(2**40)  # takes no space
+    monkeypatch.setattr(trackers, "LARGEST_LOG", 2**20)
+    with pytest.raises(CheckpointError, match=f"{name} has {2**40} bytes|asks for|bytes of weights"):
+        runs.resume(run, steps=6, progress=False)
+
+
+def test_a_state_names_no_file_but_those_of_a_checkpoint(run, canary):
+    change(run, STATE, "fingerprints", "../mine.txt", value="0" * 64)
+    with pytest.raises(CheckpointError, match=r"a fingerprint of '../mine.txt', which is no file of a checkpoint"):
+        Run(run).commit(json.loads((run / STATE).read_text()), {})
+
+
+def test_an_archive_that_would_grow_or_hang_is_refused(run):
+    content = (run / OPTIMISER).read_bytes()
+    packed, bomb = io.BytesIO(), io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as new:
+        for each in old.infolist():
+            new.writestr(each.filename, old.read(each))
+    recommit(run, OPTIMISER, packed.getvalue())
+    with pytest.raises(CheckpointError, match=r"no optimiser state of torch: it is compressed"):
+        Run(run).optimiser_state()
+    doubling = b"\x80\x02}" + b"N\x85q\x00" + b"".join(b"h%ch%c\x86q%c" % (n, n, n + 1) for n in range(40)) + b"K\x01s."
+    with zipfile.ZipFile(bomb, "w") as new:
+        new.writestr("archive/data.pkl", doubling)
+        new.writestr("archive/version", "3\n")
+    recommit(run, OPTIMISER, bomb.getvalue())
+    with pytest.raises(CheckpointError, match=r"no optimiser state of torch: it shares a tuple"):
+        Run(run).optimiser_state()
+
+
+# Values --------------------
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "message"),
+    [
+        (("method", "width"), 20_000, "width is 20000; it must be at least 1 and at most 4096"),
+        (("method", "width"), -3, "width is -3; it must be at least 1"),
+        (("method", "width"), 10**400, "width is .*; it must be at least"),
+        (("method", "hidden"), [8] * 100_000, "hidden has 100000 entries; it must have 64 at most"),
+        (("method", "hidden"), [8, "8"], r"hidden\[1\] is .*; it must be a whole number"),
+        (("method", "residual"), float("nan"), "residual is nan; it must be"),
+        (("method", "emission"), "fixd", r"unknown emission .*did you mean .*fixed"),
+        (("method", "latent"), 4096, "asks for a model that is larger than its weights|weights of another model"),
+        (("training", "devices"), 40, "devices is 40; it must be at least 1 and at most 16"),
+        (("training", "steps"), True, "steps is True; it must be a whole number"),
+        (("training", "batch_size"), 10**6, "batch_size is 1000000; it must be at least 1 and at most 16384"),
+        (("training", "precision"), "8", "unknown precision '8'"),
+        (("training", "learning_rate"), {"schedule": "Constant", "value": -1}, "learning_rate is -1"),
+        (
+            ("training", "learning_rate"),
+            {"schedule": "Linear", "start": 0, "end": float("inf"), "steps": 3},
+            "end is inf",
+        ),
+        (("protocol", "fps"), 0, "fps is 0; it must be at least 0.001"),
+        (("protocol", "observed"), 10**9, "observed is 1000000000; it must be"),
+        (("data", "skip_bad"), "yes", "skip_bad is 'yes'; it must be true or false"),
+        (("data", "path"), ["people.npz"], "source is .*; it must be of type str"),
+    ],
+)
+def test_a_config_out_of_range_is_refused_by_file_key_and_value(run, keys, value, message):
+    change(run, CONFIG, *keys, value=value)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        dvae.load(run)
+    assert str(run) in str(caught.value)
+    assert len(str(caught.value)) < 2000
+
+
+def test_nesting_is_bounded(run):
+    for depth in (40, 100_000):
+        (run / CONFIG).write_text('{"a": ' * depth + "1" + "}" * depth)
+        with pytest.raises(CheckpointError, match=r"config.json is damaged, it (nests deeper|is not JSON)"):
+            Run(run).config
+
+
+def test_every_option_of_a_method_has_a_type_that_is_checked():
+    for kind in dvae.methods().values():
+        for name in vars(kind()):
+            with pytest.raises((TypeError, ValueError), match=f"{name} .*(must be|known:)"):
+                kind(**{name: object()})
+
+
+def test_a_range_says_what_it_holds():
+    for low, high, above, below in ((0, 1, False, False), (1, 5, True, False), (1, 5, False, True)):
+        allowed = Range(low, high, above, below)
+        assert (low in allowed, high in allowed) == (not above, not below)
+        assert not any(value in allowed for value in (low - 1, high + 1, float("nan"), float("inf")))
+        assert str(low) in str(allowed)
+        assert str(high) in str(allowed)
+
+
+def test_a_model_is_no_larger_than_its_weights():
+    with at_most(2**12, "this"):
+        torch.nn.Linear(64, 16)
+    with (
+        pytest.raises(CheckpointError, match="this asks for a model that is larger than its weights"),
+        at_most(2, "this"),
+    ):
+        [torch.nn.Linear(4096, 4096) for _ in range(2)]
+    torch.nn.Linear(4096, 4097)
+
+
+def weights_with(run, name, make):
+    tensors = load_file(run / LAST)
+    first = next(key for key, value in tensors.items() if value.ndim == 2)
+    tensors[first] = make(tensors[first])
+    recommit(run, name, save(tensors))
+    return first
+
+
+@pytest.mark.parametrize("name", [BEST, LAST])
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda value: torch.full_like(value, float("nan")), "has entries that are NaN or infinite"),
+        (lambda value: value / 0, "has entries that are NaN or infinite"),
+        (lambda value: value.long(), r"is torch.int64, the model's is torch.float32"),
+        (lambda value: value.to(torch.complex64), r"is torch.complex64, the model's is|no safetensors file"),
+        (lambda value: value[:1], "holds the weights of another model"),
+    ],
+)
+def test_weights_of_another_kind_or_without_a_value_are_refused(run, name, make, message):
+    first = weights_with(run, name, make)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        runs.resume(run, steps=6, progress=False)
+    assert f"{run / name}" in str(caught.value)
+    assert first in str(caught.value)
+
+
+def damage_first(key, value):
+    def change(content):
+        content["optimizer"]["state"][0][key] = value(content["optimizer"]["state"][0][key])
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda content: content.clear(), "it holds no name, optimizer, random"),
+        (lambda content: content["optimizer"].clear(), "its optimizer has no state"),
+        (lambda content: content["optimizer"]["state"].update({99: {}}), r"optimizer.state\[99\] is of no parameter"),
+        (lambda content: content["optimizer"]["state"][0].pop("exp_avg"), r"optimizer.state\[0\] has no exp_avg"),
+        (damage_first("exp_avg", lambda value: value[:1]), r"\['exp_avg'\] is not as the optimiser writes it"),
+        (damage_first("exp_avg", lambda value: value / 0), r"\['exp_avg'\] is not"),
+        (damage_first("exp_avg_sq", lambda value: value - 1), r"\['exp_avg_sq'\] is not"),
+        (damage_first("exp_avg", lambda value: value.long()), r"\['exp_avg'\] is not"),
+        (damage_first("step", lambda value: -value), r"\['step'\] is not"),
+        (damage_first("step", lambda value: 1e9 * value), r"\['step'\] is not"),
+        (damage_first("step", lambda value: "one"), r"\['step'\] is not"),
+        (lambda content: content["random"].pop("torch"), "random has no torch"),
+        (
+            lambda content: content["random"].update(torch=torch.zeros(1, 8, dtype=torch.uint8)),
+            r"random\['torch'\] is no",
+        ),
+        (lambda content: content["random"].update(generator="seed"), r"random\['generator'\] is no"),
+        (lambda content: content["random"]["generator"].fill_(255), "mt19937"),
+    ],
+)
+def test_a_state_that_no_run_writes_is_refused_by_its_key(run, change, message):
+    content, buffer = Run(run).optimiser_state(), io.BytesIO()
+    change(content)
+    torch.save(content, buffer)
+    recommit(run, OPTIMISER, buffer.getvalue())
+    with pytest.raises(CheckpointError, match=message) as caught:
+        runs.resume(run, steps=6, progress=False)
+    assert str(run / OPTIMISER) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("step", -1),
+        ("step", True),
+        ("best_bound", float("nan")),
+        ("waited", -1),
+        ("status", "fine"),
+        ("best_step", 1.5),
+    ],
+)
+def test_a_state_out_of_range_is_refused_wherever_it_is_read(run, capsys, key, value):
+    change(run, STATE, key, value=value)
+    for command in (("resume", run), ("evaluate", run), ("forecast", run, "--out", run / "f.npz")):
+        assert f"{run / STATE} is damaged: {key} missing or not" in failure(capsys, *command)
+
+
+@pytest.mark.parametrize("line", ["3", "[]", "{}", '{"step": "one"}', '{"step": 1, "loss": "low"}', '{"step"', "\0"])
+def test_a_damaged_log_is_refused_by_its_line(run, line):
+    path = run / "log.jsonl"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], line, *lines[1:]]) + "\n")
+    with pytest.raises(CheckpointError, match=f"{path} is damaged: line 2 is no row of numbers with a step"):
+        runs.resume(run, steps=6, progress=False)
+
+
+def test_a_forecast_that_is_not_finite_is_refused_by_its_clip(run, capsys):
+    huge = {name: value * 0 + 3e38 for name, value in load_file(run / BEST).items()}
+    recommit(run, BEST, save(huge))
+    out = run / "futures.npz"
+    assert "of clip 'person_" in failure(capsys, "forecast", run, "--out", out)
+    assert "of clip 'person_" in failure(capsys, "evaluate", run)
+    assert not out.exists()
+
+
+def test_futures_are_finite():
+    walks = motion.simulate(clips=2, frames=30)
+    joints = walks.skeleton.joints
+    arrays = [np.zeros((3, 2, 4, joints, 3)), np.zeros((2, 5, joints, 3)), np.zeros((2, 4, joints, 3))]
+    for place, array in enumerate(arrays):
+        arrays[place] = array.copy()
+        arrays[place][..., 1, 2, 3, 1] = np.nan
+        with pytest.raises(FloatingPointError, match=r"clip 'b' \(test\), frame 7, are NaN"):
+            motion.Forecasts(walks.skeleton, [("test", "a", 0), ("test", "b", 7)], *arrays)
+        arrays[place] = array
+
+
+# A full disk --------------------
+
+
+def test_a_full_disk_names_the_file(run, tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with (
+        pytest.raises(OSError, match=f"No space left on device.*{tmp_path / 'a.txt'}"),
+        files.written(tmp_path / "a.txt"),
+    ):
+        full()
+    assert not [path for path in tmp_path.iterdir() if path != run]
+    with monkeypatch.context() as patch:
+        patch.setattr(files.os, "fsync", full)
+        assert f"No space left on device: '{run / CONFIG}.new'" in failure(capsys, "resume", run, "--steps", "6")
+    log = JSONLines(run / "log.jsonl")
+    log.start(4)
+    log._file.close()
+    with open("/dev/full", "wb", buffering=0) as log._file, pytest.raises(OSError, match=r"log\.jsonl"):
+        log.log(5, {"loss": 1.0})
+
+
+# The command line --------------------
+
+
+def test_a_run_that_is_longer_than_asked_for_says_so(run, capsys):
+    error = failure(capsys, "resume", run, "--steps", "2")
+    assert f"steps is 2, but {run} has taken 4 steps already" in error
+    assert "give more than 4" in error
+    assert main(["resume", str(run), "--steps", "4"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        ("fitt", "unknown command 'fitt' (did you mean 'fit'?)"),
+        ("fit srn --out x", "'srn' is unknown (did you mean 'srnn'?)"),
+        ("fit --steps 3 --out x hitdvae", "'hitdvae' is unknown (did you mean 'hit-dvae'?)"),
+        ("fit vae --out x --protocol cmu", "--protocol 'cmu' is unknown (did you mean 'cmu8'?)"),
+        ("fit vae --emission nrmal --out x", "--emission 'nrmal' is unknown (did you mean 'normal'?)"),
+        ("sweep vae srn --out x", "'srn' is unknown (did you mean 'srnn'?)"),
+        ("data inf", "'inf' is unknown (did you mean 'info'?)"),
+    ],
+)
+def test_the_name_that_was_meant_is_told(capsys, arguments, meant):
+    assert meant in failure(capsys, *arguments.split(), code=2)
+
+
+def test_nothing_is_suggested_where_nothing_is_near(capsys):
+    assert "did you mean" not in failure(capsys, "fit", "qqqqqq", "--out", "x", code=2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "end"),
+    [
+        ("forecast RUN --out f.txt", ".npz"),
+        ("forecast RUN --out futures", ".npz"),
+        ("complete RUN --out f.json", ".npz"),
+        ("evaluate RUN --out scores.csv", ".json"),
+        ("criticise RUN --out f.npz", ".json"),
+        ("compare RUN --out f.txt", ".json"),
+        ("animate RUN --out f.png", ".html"),
+    ],
+)
+def test_a_file_ends_in_what_is_written(capsys, tmp_path, monkeypatch, arguments, end):
+    monkeypatch.chdir(tmp_path)
+    assert f"end its name in {end}" in failure(capsys, *arguments.split(), code=2)
+    assert not list(tmp_path.iterdir())
+
+
+def test_pyros_table_of_shapes_is_cut():
+    def program():
+        pyro.sample("x", pyro.distributions.Normal(torch.zeros(2), -torch.ones(2)))
+
+    with pytest.raises(ValueError) as caught:
+        pyro.poutine.trace(program).get_trace()
+    assert "Trace Shapes:" in str(caught.value)
+    assert "parameter scale" in reason(caught.value)
+    assert "Trace Shapes:" not in reason(caught.value)
+
+
+PROGRAM = str(ROOT / "dvae" / "command" / "__init__.py")
+
+
+def python(*arguments, path=ROOT):
+    environment = os.environ | {"PYTHONPATH": str(path), "OMP_NUM_THREADS": "1"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen([sys.executable, *arguments], env=environment, text=True, **pipes)
+
+
+def test_ctrl_c_while_importing_is_a_sentence(tmp_path):
+    (tmp_path / "dvae").mkdir()
+    (tmp_path / "dvae" / "__init__.py").write_text("")
+    (tmp_path / "dvae" / "cli.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
+    program = python(PROGRAM, "list", path=tmp_path)
+    assert program.stdout.readline() == "importing\n"
+    program.send_signal(signal.SIGINT)
+    _, error = program.communicate(timeout=60)
+    assert (program.returncode, error) == (130, "interrupted\n")
+
+
+def test_without_docstrings_pyro_is_missed_in_a_sentence():
+    program = python("-OO", PROGRAM, "list")
+    _, error = program.communicate(timeout=120)
+    assert program.returncode == 1
+    assert error.startswith("error: dvae needs Pyro, which needs docstrings: run python without -OO")
+    assert "Traceback" not in error
+
+
+# Threads --------------------
+
+
+def test_threads_take_turns(people, fitted, tmp_path):
+    """Two fits, and a forecast amid them, give what they give one after the other."""
+    data = runs.Data.open(people)
+    model, x = dvae.load(fitted).model, data.windows("test").all()["x"][:2, :15]
+
+    def forecast():
+        torch.manual_seed(0)
+        return model.forecast({"x": x}, 4, 2)["x"]
+
+    found, errors = {}, []
+
+    def work(name, action):
+        try:
+            found[name] = action()
+        except BaseException as error:
+            errors.append(error)
+
+    actions = {name: lambda name=name: runs.fit(METHOD, data, tmp_path / name, TRAINING) for name in ("a", "b")}
+    actions["forecast"] = lambda: model.forecast({"x": x}, 4, 2)["x"].shape
+    threads = [threading.Thread(target=work, args=each) for each in actions.items()]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not errors
+    assert found["forecast"] == forecast().shape
+    for name in ("a", "b"):
+        assert (tmp_path / name / LAST).read_bytes() == (fitted / LAST).read_bytes()
