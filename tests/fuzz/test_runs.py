@@ -1,0 +1,215 @@
+"""Run directories that somebody else made: a run goes on, or is refused in a sentence, whatever lies in them."""
+
+import contextlib
+import hashlib
+import io
+import json
+import math
+import os
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import lightning_fabric  # noqa: F401  # before anything is watched
+import matplotlib.figure  # noqa: F401
+import torch
+from hypothesis import strategies as st
+from safetensors.torch import load, save
+
+import dvae
+from dvae import cli, motion
+from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE
+from dvae.models import runs
+
+from .engine import Isolated, fuzz, limited
+
+SHARE = 15
+FILES = (CONFIG, STATE, BEST, LAST, OPTIMISER, "log.jsonl", "evaluation.json", ".lock")
+FILES += (f"{STATE}.new", f"{LAST}.new", f"{OPTIMISER}.new", f"{CONFIG}.new")
+NOTHING_LEFT = (OSError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, MemoryError)
+"""Of a change to what an earlier one has already broken."""
+TARGETS = ("mine.txt", "nowhere", "fifo")
+CALLS = ("load", "resume", "forecast", "evaluate")
+
+
+def values():
+    """What a key may hold: each type, the ends of its range and beyond."""
+    numbers = [-1, 0, 1, 2, 40, 4096, 20_000, 100_000, 10**9, 2**63, 10**400, 0.5, -0.0, 1e308, math.nan, math.inf]
+    texts = ["", "vae", "gsps", "../mine.txt", "/dev/zero", "simulated", "\0", "[/red]", "é" * 20_000]
+    return st.recursive(
+        st.sampled_from([None, True, False, *numbers, *texts]),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["schedule", "a", "step"]), inner),
+        max_leaves=4,
+    )
+
+
+def mutations():
+    places, byte = st.integers(0, 2**20), st.integers(0, 255)
+    binary = st.sampled_from([BEST, LAST, OPTIMISER])
+    return st.one_of(
+        st.tuples(st.just("value"), st.sampled_from([CONFIG, STATE]), places, values()),
+        st.tuples(st.just("value"), st.just(CONFIG), places, values()),
+        st.tuples(st.just("without"), st.sampled_from([CONFIG, STATE]), places),
+        st.tuples(st.just("text"), st.sampled_from([CONFIG, STATE, "log.jsonl"]), places, st.binary(max_size=20)),
+        st.tuples(st.just("bytes"), binary, st.lists(st.tuples(places, byte), min_size=1, max_size=4), st.booleans()),
+        st.tuples(st.just("shorter"), binary, places, st.booleans()),
+        st.tuples(st.just("longer"), st.sampled_from(FILES[:6]), st.sampled_from([1, 2**20, 2**36]), st.booleans()),
+        st.tuples(st.just("link"), st.sampled_from(FILES), st.sampled_from(TARGETS)),
+        st.tuples(st.just("special"), st.sampled_from(FILES), st.sampled_from(["fifo", "directory", "nothing"])),
+        st.tuples(st.just("weights"), st.sampled_from([BEST, LAST]), places, st.sampled_from(sorted(DAMAGES))),
+        st.tuples(st.just("state"), places, values() | st.sampled_from(sorted(DAMAGES))),
+    )
+
+
+DAMAGES = {
+    "NaN": lambda value: value * math.nan,
+    "infinite": lambda value: value * math.inf,
+    "huge": lambda value: value * 0 + 3e38,
+    "negative": lambda value: -value - 1,
+    "whole": lambda value: value.long(),
+    "complex": lambda value: value.to(torch.complex64),
+    "bfloat16": lambda value: value.to(torch.bfloat16),
+    "bytes": lambda value: value.to(torch.uint8),
+    "empty": lambda value: value.flatten()[:0],
+    "flat": lambda value: value.flatten(),
+    "missing": None,
+}
+
+
+def paths(value: Any, before: tuple = ()) -> list[tuple]:
+    """The keys that lead to every value of a nest of dicts and lists."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path for key, each in inner for path in [(*before, key), *paths(each, (*before, key))]]
+
+
+def at(value: Any, path: tuple) -> Any:
+    for key in path:
+        value = value[key]
+    return value
+
+
+def commit(run: Path, name: str, content: bytes, signed: bool) -> None:
+    """Replace a file, and its fingerprint too if its author is not clumsy."""
+    (run / name).write_bytes(content)
+    if signed:
+        state = json.loads((run / STATE).read_text())
+        state["fingerprints"][name] = hashlib.sha256(content).hexdigest()
+        (run / STATE).write_text(json.dumps(state))
+
+
+def mutate(run: Path, kind: str, *arguments: Any) -> None:
+    if kind in ("value", "without"):
+        name, place, *new = arguments
+        content = json.loads((run / name).read_text())
+        *to, last = (found := paths(content))[place % len(found)]
+        if new:
+            at(content, tuple(to))[last] = new[0]
+        else:
+            del at(content, tuple(to))[last]
+        (run / name).write_text(json.dumps(content))
+    elif kind == "text":
+        name, place, text = arguments
+        content = (run / name).read_bytes()
+        place %= len(content)
+        (run / name).write_bytes(content[:place] + text + content[place + len(text) // 2 :])
+    elif kind == "bytes":
+        name, changes, signed = arguments
+        content = bytearray((run / name).read_bytes())
+        for place, byte in changes:
+            content[place % min(len(content), 4096 if place % 2 else len(content))] = byte  # where the headers are
+        commit(run, name, bytes(content), signed)
+    elif kind == "shorter":
+        name, place, signed = arguments
+        content = (run / name).read_bytes()
+        commit(run, name, content[: place % len(content)], signed)
+    elif kind == "longer":
+        name, size, _ = arguments
+        with (run / name).open("r+b") as file:
+            file.truncate(file.seek(0, 2) + size)
+    elif kind in ("link", "special"):
+        name, what = arguments
+        (run / name).unlink(missing_ok=True)
+        if kind == "link":
+            (run / name).symlink_to(run.parent / what)
+        elif what == "fifo":
+            os.mkfifo(run / name)
+        elif what == "directory":
+            (run / name).mkdir()
+    elif kind == "weights":
+        name, place, damage = arguments
+        tensors = load((run / name).read_bytes())
+        key = sorted(tensors)[place % len(tensors)]
+        value = tensors.pop(key)
+        if DAMAGES[damage] is not None:
+            tensors[key] = DAMAGES[damage](value)
+        commit(run, name, save(tensors), True)
+    elif kind == "state":
+        place, new = arguments
+        content, buffer = torch.load(io.BytesIO((run / OPTIMISER).read_bytes()), weights_only=True), io.BytesIO()
+        *to, last = (found := paths(content))[place % len(found)]
+        inner = at(content, tuple(to))
+        if isinstance(new, str) and isinstance(inner[last], torch.Tensor) and DAMAGES.get(new) is not None:
+            inner[last] = DAMAGES[new](inner[last].float())
+        elif new == "missing":
+            del inner[last]
+        else:
+            inner[last] = new
+        torch.save(content, buffer)
+        commit(run, OPTIMISER, buffer.getvalue(), True)
+
+
+def clear(place: Path) -> None:
+    """Remove a folder, each file by its path: what `shutil.rmtree` removes has none that the engine could judge."""
+    for folder, inner, names in os.walk(place, topdown=False):
+        for name in names:
+            os.unlink(os.path.join(folder, name))
+        for name in inner:
+            os.rmdir(os.path.join(folder, name))
+    if place.exists():
+        place.rmdir()
+
+
+def check(example: tuple, directory: Path) -> None:
+    """Damage a copy of the run and use it; the files outside of it stay as they are."""
+    call, changes = example
+    place = directory / "inside"
+    clear(place)
+    run = place / "run"
+    shutil.copytree(directory / "fitted", run)
+    canary = place / "mine.txt"
+    canary.write_text("of value")
+    os.mkfifo(place / "fifo")
+    before = sorted(each.name for each in place.iterdir())
+    for change in changes:
+        with contextlib.suppress(*NOTHING_LEFT):
+            mutate(run, *change)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            use(call, run, directory / "people.npz")
+    finally:
+        assert canary.read_text() == "of value"
+        assert sorted(each.name for each in place.iterdir()) == before
+
+
+def use(call: str, run: Path, data: Path) -> None:
+    if call == "load":
+        dvae.load(run, data)
+    elif call == "resume":
+        runs.resume(run, data, steps=6, progress=False)
+    elif call == "forecast":
+        cli.forecast(run, run / "futures.npz", samples=1, horizon=2, data=str(data))
+    else:
+        cli.evaluate((run,), samples=1, data=str(data))
+
+
+@limited(SHARE)
+def test_runs_go_on_or_are_refused(tmp_path):
+    motion.save(tmp_path / "people.npz", motion.simulate(clips=12, frames=76, seed=1))
+    method = dvae.method("vrnn", latent=2, width=4, embed=(4,), embed_latent=(4,), warm_up=1)
+    training = dvae.Training(steps=4, batch_size=2, validate_every=2, log_every=1, progress=False)
+    runs.fit(method, runs.Data.open(tmp_path / "people.npz"), tmp_path / "fitted", training)
+    examples = st.tuples(st.sampled_from(CALLS), st.lists(mutations(), min_size=1, max_size=2))
+    with Isolated(check, tmp_path) as isolated:
+        fuzz(isolated, examples, seconds=SHARE)
