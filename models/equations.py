@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -34,6 +35,14 @@ class Equations(Method):
     network: str = "recurrent"
     width: Size = 64
     latents: dict[str, Size] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("generative", "inference"):
+            if lag := re.search(r"\d{4,}", getattr(self, name)):
+                raise ValueError(
+                    f"{name} reads {lag[0][:20]} steps away; a lag is at most 999, or write {{<t}} for any"
+                )
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """One kind for every factor."""

@@ -368,11 +368,11 @@ def test_only_poses_go_through_pose_graphs(windows, loss):
     [
         ({"loss": "elbo"}, "unknown loss 'elbo'; known: best-of-many, evidence"),
         ({"summary": "mean"}, "unknown summary 'mean'; known: graph, attention"),
-        ({"samples": 1}, "samples is 1; the best of many is of at least 2"),
+        ({"samples": 1}, "samples is 1; it must be at least 2"),
         ({"emission": "student"}, "emission='student' needs loss='evidence'"),
         ({"diversity": (1.0,)}, "diversity is .*; expected one number for each of lower, upper"),
-        ({"kl_static": -1.0}, "kl_static is -1.0; it must be at least 0"),
-        ({"frames": 0}, "frames is 0; it must be positive"),
+        ({"kl_static": -1.0}, "kl_static is -1.0; it must be finite and at least 0"),
+        ({"frames": 0}, "frames is 0; it must be at least 1"),
         ({"loss": "evidence", "kl_local": 9.0, "samples": 7}, "loss='evidence' has no kl_local, samples"),
     ],
 )

@@ -180,7 +180,7 @@ def test_it_survives_its_configuration():
     ("run", "message"),
     [
         (lambda: PosePrior(layers=0), "layers is 0; it must be at least 1"),
-        (lambda: PosePrior(noise=-0.1), "noise is -0.1; it must be a length in metres"),
+        (lambda: PosePrior(noise=-0.1), "noise is -0.1; it must be at least 0 and below 1"),
         (lambda: PosePrior(noise=float("nan")), "noise is nan"),
         (lambda: PosePrior(turned=True, heading=True), "heading fixes the direction that turned would draw"),
         (lambda: PosePrior().build({"x": 48}), r"needs to know the skeleton; use build_for\(windows\)"),

@@ -216,6 +216,11 @@ def test_an_archive_that_would_grow_or_hang_is_refused(run):
         ),
         (("protocol", "fps"), 0, "fps is 0; it must be at least 0.001"),
         (("protocol", "observed"), 10**9, "observed is 1000000000; it must be"),
+        (
+            ("method",),
+            {"method": "equations", "generative": "p(z_t | z_{t-99999999:t-1}) p(x_t | z_t)"},
+            "99999999 steps",
+        ),
         (("data", "skip_bad"), "yes", "skip_bad is 'yes'; it must be true or false"),
         (("data", "path"), ["people.npz"], "source is .*; it must be of type str"),
     ],

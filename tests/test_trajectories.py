@@ -196,7 +196,7 @@ def test_cvae_rnn_reads_its_own_means_alone(windows):
     [
         (lambda: small(emission="normal"), "trajevae has no emission"),
         (lambda: small("cvae-rnn", self_feeding=0.5), "cvae-rnn has no self_feeding"),
-        (lambda: small(keep=1.5), "keep is 1.5; it must be a probability"),
+        (lambda: small(keep=1.5), "keep is 1.5; it must be between 0 and 1"),
         (lambda: small(beta=-1.0), "beta is -1.0"),
         (lambda: small(dropout=1.0), "dropout is 1.0"),
         (lambda: small(components=-1), "components is -1; it must be at least 0"),

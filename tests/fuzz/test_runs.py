@@ -15,6 +15,7 @@ import lightning_fabric  # noqa: F401  # before anything is watched
 import matplotlib.figure  # noqa: F401
 import torch
 from hypothesis import strategies as st
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 import dvae
@@ -27,8 +28,19 @@ from .engine import Isolated, fuzz, limited
 SHARE = 15
 FILES = (CONFIG, STATE, BEST, LAST, OPTIMISER, "log.jsonl", "evaluation.json", ".lock")
 FILES += (f"{STATE}.new", f"{LAST}.new", f"{OPTIMISER}.new", f"{CONFIG}.new")
-NOTHING_LEFT = (OSError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, MemoryError)
+NOTHING_LEFT = (
+    SafetensorError,
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+)
 """Of a change to what an earlier one has already broken."""
+LAST_OF_ALL = ("longer", "link", "special")
+"""Changes after which a file can no longer be read here either."""
 TARGETS = ("mine.txt", "nowhere", "fifo")
 CALLS = ("load", "resume", "forecast", "evaluate")
 
@@ -181,7 +193,7 @@ def check(example: tuple, directory: Path) -> None:
     canary.write_text("of value")
     os.mkfifo(place / "fifo")
     before = sorted(each.name for each in place.iterdir())
-    for change in changes:
+    for change in sorted(changes, key=lambda change: LAST_OF_ALL.index(change[0]) if change[0] in LAST_OF_ALL else -1):
         with contextlib.suppress(*NOTHING_LEFT):
             mutate(run, *change)
     try:
