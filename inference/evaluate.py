@@ -488,7 +488,9 @@ def nearest_neighbours(observed: Tensor, training: Tensor, samples: int = 50) ->
         )
     if len(training) < samples:
         raise ValueError(f"{samples} neighbours were asked of {len(training)} training windows; use fewer")
-    distances = torch.cdist(observed[:, -1], training[:, frames - 1])
+    # Matrix-product distances would lose what tells poses apart that lie far from the origin.
+    exact = "donot_use_mm_for_euclid_dist"
+    distances = torch.cdist(observed[:, -1], training[:, frames - 1], compute_mode=exact)
     return training[distances.topk(samples, largest=False).indices.T, frames:]
 
 

@@ -290,7 +290,8 @@ class Law:
 
 def effective_size(log_weights: Tensor) -> Tensor:
     """(B,) effective sample size of weights (K, B): (sum w)^2 / sum w^2."""
-    return (2 * log_weights.logsumexp(0) - (2 * log_weights).logsumexp(0)).exp()
+    weights = (log_weights - log_weights.amax(0)).exp()  # a difference of two large logs would have no digits left
+    return weights.sum(0).square() / weights.square().sum(0)
 
 
 def ancestors(log_weights: Tensor, chosen: Tensor) -> Tensor:

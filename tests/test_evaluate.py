@@ -102,6 +102,13 @@ def test_neighbours_of_training_windows_are_themselves_first_and_then_farther():
     assert (distances.diff() >= 0).all()
 
 
+def test_neighbours_are_the_same_wherever_the_origin_is():
+    """In steps that float32 holds at a thousand metres from the origin."""
+    training = (64 * draw(60, 9, 3)).round().float() / 64
+    here, there = (nearest_neighbours(x[:40, :4], x, samples=1) for x in (training, training + 1024))
+    assert torch.equal(there, here + 1024)
+
+
 @pytest.mark.parametrize(
     ("training", "message"),
     [

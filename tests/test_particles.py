@@ -361,6 +361,15 @@ def test_systematic_resampling_keeps_every_particle_about_as_often_as_it_weighs(
     torch.testing.assert_close(counts[:, :3], 6 * share[:, :3], rtol=0, atol=0.06)
 
 
+@pytest.mark.parametrize("far", [1e4, -1e6])
+def test_the_effective_size_depends_on_differences_of_log_weights_alone(far):
+    """In float32; the differences are multiples of 1/8, which it holds at a million."""
+    log_weights = (8 * torch.randn(16, 40)).round() / 8
+    expected = effective_size(log_weights.double())
+    assert expected.std() > 1
+    torch.testing.assert_close(effective_size(log_weights + far).double(), expected, rtol=1e-5, atol=0)
+
+
 def test_the_effective_size_is_between_one_and_all():
     assert effective_size(torch.zeros(5, 2)).tolist() == pytest.approx([5.0, 5.0])
     one = torch.full((5, 1), -math.inf)
