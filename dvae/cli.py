@@ -1116,8 +1116,10 @@ def _forecasts(
         for part in past.split(64):
             once = loaded.model.forecast({"x": part}, whole, 1) if fix else {}
             held = {"fix": {name: once[name][0] for name in fix}} if fix else {}
-            parts.append(loaded.model.forecast({"x": part}, whole, samples, **held)["x"][:, :, :horizon])
-    positions = [windows.positions(frames).numpy() for frames in (torch.cat(parts, dim=1), past, future)]
+            made = loaded.model.forecast({"x": part}, whole, samples, **held)["x"][:, :, :horizon]
+            parts.append(windows.positions(made).numpy())
+            del made  # with many samples the largest thing here
+    positions = [np.concatenate(parts, axis=1), *(windows.positions(frames).numpy() for frames in (past, future))]
     return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], *positions)
 
 

@@ -35,6 +35,8 @@ from .units import Units
 _COUNT = itertools.count()
 WHOLE = "x"
 """Name of the array that the parts of a model with parts are coordinates of."""
+CHUNK = 2048
+"""Sequences times samples that a forecast holds at once."""
 
 Batch = Tensor | Mapping[str, Tensor]
 MaskFunction = Callable[[int], Any]
@@ -378,6 +380,7 @@ class DynamicalVAE(nn.Module):
         *,
         draw_emission: bool | None = None,
         fix: Mapping[str, Tensor] | None = None,
+        chunk: int = CHUNK,
     ) -> dict[str, Tensor]:
         """Continues observed sequences: latents of the past from the guide, then the model runs free.
 
@@ -391,6 +394,7 @@ class DynamicalVAE(nn.Module):
             fix: what is the same in all samples: the future (B, H, D) of a data variable, or the value (B, D) of a
                 static latent, such as one sample of an earlier forecast. Later variables read it; latents are not
                 inferred from it.
+            chunk: sequences times samples to hold at once, beside the result; draws come chunk by chunk.
 
         Returns:
             Name to (S, B, H, D) for the data, (S, B, O + H, D) for local and (S, B, D) for static latents; with parts,
@@ -406,24 +410,29 @@ class DynamicalVAE(nn.Module):
             )
         if horizon < 1 or samples < 1:
             raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
-        past = data[self.history or self.observed[0]].shape[1]
+        size, past = data[self.history or self.observed[0]].shape[:2]
         fixed = self._fixed(fix or {}, data, horizon)
         drawn = {n: self.generator[n].discrete if draw_emission is None else draw_emission for n in self.observed}
         means = [name for name in self.observed if not drawn[name]]
-        data, fixed = ({name: repeat(value, samples) for name, value in each.items()} for each in (data, fixed))
         seen = {
             name: value[:, :past] if name in self.context and value.dim() == 3 else value
             for name, value in data.items()
         }
-        with self._evaluating():
-            latents = poutine.condition(self.guide, {n: v for n, v in fixed.items() if n in self.latents})(seen)
+        self._rollout(self.inference, self.encoder, seen, None, 1)  # refuses what cannot be read, of all sequences
+
+        def futures(part: slice, count: int) -> dict[str, Tensor]:
+            known, held, observed = (repeat(rows(each, part), count) for each in (data, fixed, seen))
+            latents = poutine.condition(self.guide, {n: v for n, v in held.items() if n in self.latents})(observed)
             statics = {name: value for name, value in latents.items() if not self.generative.local(name)}
             program = poutine.condition(self.model, data=statics) if statics else self.model
             prefix = {name: value for name, value in latents.items() if name not in statics}
-            data |= {name: value for name, value in fixed.items() if name in self.observed}
-            out = program(data, length=past + horizon, prefix=prefix, mean_emission=means)
-        out = {name: out[name].unflatten(0, (samples, -1)) for name in (*self.observed, *self.latents)}
-        return self._with_whole({n: v[:, :, past:] if n in self.observed else v for n, v in out.items()})
+            known |= {name: value for name, value in held.items() if name in self.observed}
+            out = program(known, length=past + horizon, prefix=prefix, mean_emission=means)
+            made = {name: out[name].unflatten(0, (count, -1)) for name in (*self.observed, *self.latents)}
+            return self._with_whole({n: v[:, :, past:] if n in self.observed else v for n, v in made.items()})
+
+        with self._evaluating():
+            return in_chunks(futures, size, samples, chunk)
 
     def _fixed(self, fix: Mapping[str, Tensor], data: Mapping[str, Tensor], horizon: int) -> dict[str, Tensor]:
         """The values of `forecast(fix=...)`, those of data over past and future."""
@@ -454,24 +463,35 @@ class DynamicalVAE(nn.Module):
 
     @alone
     @torch.no_grad()
-    def reconstruct(self, batch: Batch, samples: int = 1) -> dict[str, Tensor]:
+    def reconstruct(self, batch: Batch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
         """Means of the data given latents from the guide, teacher-forced; missing entries are filled in so.
+
+        Args:
+            batch: see `model`.
+            samples: S, draws of the latents for each sequence.
+            chunk: sequences times samples to hold at once, beside the result.
 
         Returns:
             Name to (S, B, T, D) for every data variable, and the whole where these are parts.
         """
-        data = {name: repeat(value, samples) for name, value in self._mapping(batch).items()}
-        with self._evaluating():
-            latents = self.guide(data)
-            rollout = self._rollout(self.generative, self.generator, data, None, 1)
+        data = self._mapping(batch)
+        whole = self._rollout(self.inference, self.encoder, data, None, 1)  # refuses what cannot be read
+
+        def means(part: slice, count: int) -> dict[str, Tensor]:
+            some = repeat(rows(data, part), count)
+            latents = self.guide(some)
+            rollout = self._rollout(self.generative, self.generator, some, None, 1)
             rollout.values.update(latents)
-            means = {}
+            found = {}
             for name in self.generative.variables:
                 if name in self.observed and name not in rollout.values:  # a function of its parents
                     rollout.know(name, rollout.draw(name))
                 if name in self.observed:
-                    means[name] = rollout.evaluate(name, rollout.values[name]).mean
-        return self._with_whole({name: mean.unflatten(0, (samples, -1)) for name, mean in means.items()})
+                    found[name] = rollout.evaluate(name, rollout.values[name]).mean
+            return self._with_whole({name: mean.unflatten(0, (count, -1)) for name, mean in found.items()})
+
+        with self._evaluating():
+            return in_chunks(means, whole.batch, samples, chunk)
 
     @alone
     @torch.no_grad()
@@ -692,6 +712,39 @@ def repeat(value: Any, samples: int) -> Any:
     if isinstance(value, Mapping):
         return {name: repeat(v, samples) for name, v in value.items()}
     return value.repeat(samples, *[1] * (value.dim() - 1))
+
+
+def rows(value: Any, part: slice) -> Any:
+    """Some of the sequences of a batch, or of a tensor (B, ...)."""
+    return {name: rows(v, part) for name, v in value.items()} if isinstance(value, Mapping) else value[part]
+
+
+def in_chunks(
+    make: Callable[[slice, int], Mapping[str, Tensor]], size: int, samples: int, chunk: int
+) -> dict[str, Tensor]:
+    """What is made of all sequences and samples, (S, B, ...), with no more than a chunk of them at once beside it.
+
+    Args:
+        make: values (n, b, ...) by name, from a slice of b sequences and n samples.
+        size: B.
+        samples: S.
+        chunk: the most sequences times samples.
+
+    Raises:
+        ValueError: no samples, or a chunk that holds nothing.
+    """
+    if samples < 1 or chunk < 1:
+        raise ValueError(f"samples and chunk are at least 1, got {samples} and {chunk}")
+    found: dict[str, Tensor] = {}
+    for first in range(0, max(size, 1), chunk):  # of no sequences too, which `make` refuses
+        part = slice(first, min(first + chunk, size))
+        at_once = chunk // max(part.stop - first, 1)
+        for start in range(0, samples, at_once):
+            for name, value in make(part, min(at_once, samples - start)).items():
+                if name not in found:
+                    found[name] = value.new_empty(samples, size, *value.shape[2:])
+                found[name][start : start + at_once, part] = value
+    return found
 
 
 def _shapes(values: Mapping[str, Tensor]) -> str:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from .. import energies
 from ..inference.batches import Source
-from ..model import WHOLE, Batch, DynamicalVAE
+from ..model import CHUNK, WHOLE, Batch, DynamicalVAE
 from ..motion import Skeleton, Windows, face_forward, rotate_about_up
 from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
 from ..motion.truths import PseudoTruths, WithPseudoTruths
@@ -225,8 +225,11 @@ class EnergyModel(DynamicalVAE):
         return face_forward(x, self.skeleton, min(self.frames, x.shape[-2]) - 1)
 
     def _back(self, values: dict[str, Tensor], heading: Tensor | None) -> dict[str, Tensor]:
-        """Motion as the networks make it, turned back."""
-        return {n: self._rotated(v, heading) if n in (WHOLE, *self.parts) else v for n, v in values.items()}
+        """Motion as the networks make it, turned back: in place, sample by sample, as there may be many."""
+        for name in values.keys() & {WHOLE, *self.parts} if heading is not None else ():
+            for sample in values[name].view(-1, *values[name].shape[-3:]):  # (B, T, D)
+                sample.copy_(self._rotated(sample, heading))
+        return values
 
     def _rotated(self, x: Tensor, angle: Tensor | None) -> Tensor:
         """(..., B, T, D) turned about the up axis by (B,)."""
@@ -236,9 +239,9 @@ class EnergyModel(DynamicalVAE):
         return joints.flatten(-2)
 
     @torch.no_grad()
-    def reconstruct(self, batch: Batch, samples: int = 1) -> dict[str, Tensor]:
+    def reconstruct(self, batch: Batch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
         """See `DynamicalVAE.reconstruct`."""
-        return self._back(super().reconstruct(batch, samples), self._heading(batch))
+        return self._back(super().reconstruct(batch, samples, chunk=chunk), self._heading(batch))
 
 
 def _without_futures(batch: Any) -> Any:

@@ -34,7 +34,7 @@ from torch import Tensor
 from .. import energies
 from ..heads import Delta
 from ..inference.objectives import Evidence, Objective
-from ..model import WHOLE, Batch, DynamicalVAE
+from ..model import CHUNK, WHOLE, Batch, DynamicalVAE
 from ..motion import Skeleton, Windows
 from ..motion.body import body_parts
 from ..networks import GraphConv
@@ -295,6 +295,7 @@ class GSPSModel(EnergyModel):
         *,
         draw_emission: bool | None = None,
         fix: Mapping[str, Tensor] | None = None,
+        chunk: int = CHUNK,
     ) -> dict[str, Tensor]:
         """See `DynamicalVAE.forecast`; at most as far as the networks' T frames.
 
@@ -318,10 +319,11 @@ class GSPSModel(EnergyModel):
         heading = self.turned(x)[1]
         back = None if heading is None else -heading
         held = {name: self._rotated(v, back) if name in self.parts else v for name, v in given.items()}
-        out = self._back(super().forecast(batch, most, samples, fix=held), heading)
+        out = self._back(super().forecast(batch, most, samples, fix=held, chunk=chunk), heading)
         for name, value in given.items():  # turning there and back rounds
             out[name] = value.expand_as(out[name])
-        out = self._with_whole(out)
+            if name in self.parts:
+                out[WHOLE][..., list(self.parts[name])] = value
         return {name: value[:, :, :horizon] if name in (WHOLE, *self.parts) else value for name, value in out.items()}
 
     @torch.no_grad()

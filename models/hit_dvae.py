@@ -46,7 +46,7 @@ from ..inference.batches import Source
 from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.schedules import Linear, Schedule
-from ..model import WHOLE, Batch, DynamicalVAE
+from ..model import CHUNK, WHOLE, Batch, DynamicalVAE
 from ..motion import Skeleton, Windows
 from ..motion.body import body_parts
 from ..networks import Attention, FrameGraph, NetworkSpec, PoseGraph, Recurrent, SelfAttention
@@ -361,7 +361,8 @@ class HiTModel(EnergyModel):
         *,
         draw_emission: bool | None = None,
         fix: Mapping[str, Tensor] | None = None,
+        chunk: int = CHUNK,
     ) -> dict[str, Tensor]:
         """See `DynamicalVAE.forecast`."""
-        out = super().forecast(batch, horizon, samples, draw_emission=draw_emission, fix=fix)
+        out = super().forecast(batch, horizon, samples, draw_emission=draw_emission, fix=fix, chunk=chunk)
         return self._back(out, self._heading(batch))

@@ -25,7 +25,7 @@ from torch import Tensor
 from ..heads import FixedNormal, HeadSpec
 from ..inference.control import bend
 from ..inference.objectives import Evidence, Objective
-from ..model import WHOLE, Batch, DynamicalVAE, repeat
+from ..model import CHUNK, WHOLE, Batch, DynamicalVAE, in_chunks, repeat, rows
 from ..motion import HUMAN36M, PROTOCOLS, Clip, Skeleton, Windows, rotate_about_up
 from ..motion.data import defect
 from ..options import Amount, Share
@@ -249,6 +249,7 @@ class TrajectoryModel(DynamicalVAE):
         draw_emission: bool | None = None,
         fix: Mapping[str, Tensor] | None = None,
         temperature: float = 1.0,
+        chunk: int = CHUNK,
     ) -> dict[str, Tensor]:
         """Goes on from a pose, along the given trajectories if there are any.
 
@@ -261,7 +262,8 @@ class TrajectoryModel(DynamicalVAE):
             samples: S, motions for each pose.
             draw_emission: see `DynamicalVAE.forecast`.
             fix: nothing can be fixed; give trajectories.
-            temperature: of the latent's scale: 0 for the motion of the prior's mean.
+            temperature: of the latent's scale: 0 for the motion of the prior's mean, in all samples the same.
+            chunk: see `DynamicalVAE.forecast`.
 
         Returns:
             "x" (S, B, H, D) and the latents.
@@ -286,18 +288,28 @@ class TrajectoryModel(DynamicalVAE):
                 "fewer, or fit it under a protocol that predicts so many",
                 stacklevel=3,  # torch.no_grad is between
             )
-        first, length = data[FIRST], data[GIVEN].shape[1]
-        with self._evaluating():
-            latents = {}
+        length = data[GIVEN].shape[1]
+        heading = self._heading(self._apart(batch)) if self.method.heading else None
+        distinct = samples if temperature or draw_emission else 1
+
+        def futures(part: slice, count: int) -> dict[str, Tensor]:
+            some, latents = rows(data, part), {}
             for name in self.latents:  # the prior is evaluated once for all samples
-                loc, scale = self.generator[name](data, len(first), length)
-                noise = torch.randn(samples, *loc.shape, dtype=loc.dtype, device=loc.device)
+                loc, scale = self.generator[name](some, len(some[FIRST]), length)
+                noise = torch.randn(count, *loc.shape, dtype=loc.dtype, device=loc.device)
                 latents[name] = torch.addcmul(loc, scale, noise, value=temperature).flatten(0, 1)
-            many = {name: repeat(value, samples) for name, value in data.items()}
-            out = poutine.condition(self.model, data=latents)(many, length=length, mean_emission=not draw_emission)
-        found = {name: out[name].unflatten(0, (samples, -1)) for name in (WHOLE, *self.latents)}
-        found[WHOLE] = found[WHOLE][:, :, :horizon]
-        return self._back(found, batch)
+            program = poutine.condition(self.model, data=latents)
+            out = program(repeat(some, count), length=length, mean_emission=not draw_emission)
+            made = {name: out[name].unflatten(0, (count, -1)) for name in (WHOLE, *self.latents)}
+            made[WHOLE] = made[WHOLE][:, :, :horizon]
+            if heading is not None:
+                made[WHOLE] = self._turned(made[WHOLE], heading[part])
+            return made
+
+        with self._evaluating():
+            out = in_chunks(futures, len(data[FIRST]), distinct, chunk)
+        # Samples that are all the same are one: rows of one product may differ in their last bits.
+        return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
 
     def _whole(self, data: Mapping[str, Tensor], horizon: int) -> dict[str, Tensor]:
         """The first pose, and trajectories over all frames that the networks are to make for a horizon.
@@ -328,9 +340,9 @@ class TrajectoryModel(DynamicalVAE):
         return out if batch is None else self._back(out, batch)
 
     @torch.no_grad()
-    def reconstruct(self, batch: Batch, samples: int = 1) -> dict[str, Tensor]:
+    def reconstruct(self, batch: Batch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
         """See `DynamicalVAE.reconstruct`."""
-        return self._back(super().reconstruct(batch, samples), batch)
+        return self._back(super().reconstruct(batch, samples, chunk=chunk), batch)
 
     @alone
     def complete(

@@ -1,6 +1,7 @@
 """The Pyro program: one declaration of a factorization, and every way of running it agrees with every other."""
 
 import copy
+import itertools
 from functools import partial
 
 import pyro
@@ -14,6 +15,7 @@ from pyro.infer import Predictive, Trace_ELBO
 
 from dvae import DynamicalVAE, heads, priors
 from dvae.inference.bounds import SequenceELBO
+from dvae.model import in_chunks, rows
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.rollout import SelfFeeding
 from dvae.testing.strategies import factorizations
@@ -269,14 +271,15 @@ def means(model, values):
     }
 
 
+@pytest.mark.parametrize("chunk", [2, 2048])  # less than the sequences, and more than all there is
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("pair", [pair for pair in PAIRS if pair != "rvae"])
-def test_a_forecast_continues_the_past_by_the_models_own_means(pair, network):
+def test_a_forecast_continues_the_past_by_the_models_own_means(pair, network, chunk):
     model = build(pair, network)
     past, horizon, samples = 3, 4, 2
     data = draw(model, B, past + horizon)
     observed = {n: v[:, :past] if n in model.observed else v for n, v in data.items()}
-    out = model.forecast(observed, horizon, samples)
+    out = model.forecast(observed, horizon, samples, chunk=chunk)
     for name in model.latents:
         steps = [past + horizon] if model.generative.local(name) else []
         assert out[name].shape == (samples, B, *steps, model.sizes[name])
@@ -394,6 +397,46 @@ def test_reconstruction_is_the_mean_given_the_guides_latents():
     torch.testing.assert_close(out["x"].flatten(0, 1), expected)
     holes = {"x": x.clone().fill_(float("nan")), "mask": torch.zeros_like(x, dtype=torch.bool)}
     assert torch.isfinite(model.reconstruct(holes)["x"]).all()
+
+
+@given(size=st.integers(1, 7), samples=st.integers(1, 7), chunk=st.integers(1, 50))
+def test_chunks_make_every_sample_of_every_sequence_once_and_no_more_at_once(size, samples, chunk):
+    made = itertools.count()
+
+    def make(part, count):
+        sequences = torch.arange(size)[part].expand(count, -1)
+        assert 1 <= sequences.numel() <= chunk
+        calls = torch.tensor([next(made) for _ in range(count)])[:, None].expand_as(sequences)
+        return {"sequence": sequences, "draw": torch.stack([calls, -calls], -1)}
+
+    found = in_chunks(make, size, samples, chunk)
+    assert torch.equal(found["sequence"], torch.arange(size).expand(samples, -1))
+    assert torch.equal(found["draw"][..., 0], -found["draw"][..., 1])
+    assert all(len(set(draws.tolist())) == samples for draws in found["draw"][..., 0].T)
+
+
+@pytest.mark.parametrize("what", ["forecast", "reconstruct"])
+@pytest.mark.parametrize("pair", PAIRS)
+def test_a_chunk_is_a_run_of_its_own(pair, what):
+    """Of these sequences and samples alone, with the draws that come next: so chunks have the law of the whole."""
+    model, past = build(pair), 3
+    data = draw(model)
+    mask = {n: torch.rand_like(data[n]) < 0.8 for n in model.observed}
+    fix = {n: torch.randn(B, model.sizes[n]) for n in model.latents if not model.generative.local(n)}
+
+    def run(part, samples, **options):
+        some = rows(data, part)
+        if what == "reconstruct":
+            return model.reconstruct({**some, "mask": rows(mask, part)}, samples, **options)
+        some |= {n: some[n][:, :past] for n in model.observed}
+        return model.forecast(some, T - past, samples, fix=rows(fix, part), draw_emission=True, **options)
+
+    torch.manual_seed(0)
+    whole = run(slice(None), 2, chunk=2)
+    torch.manual_seed(0)
+    first, again, last = run(slice(2), 1), run(slice(2), 1), run(slice(2, None), 2)
+    for name, value in whole.items():
+        assert torch.equal(value, torch.cat([torch.cat([first[name], again[name]]), last[name]], 1))  # the same runs
 
 
 @pytest.mark.parametrize("pair", PAIRS)

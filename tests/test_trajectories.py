@@ -392,6 +392,16 @@ def test_forecasts_are_draws_of_the_program(windows):
     assert torch.allclose(still, loc, atol=1e-12, rtol=0)
 
 
+def test_at_temperature_zero_all_samples_are_one(windows):
+    """The very same, whatever the machine makes of rows of one product."""
+    model, x = build(windows).float(), windows.all()["x"][:3, :1]
+    one, many = (model.forecast(x, 20, samples, temperature=0) for samples in (1, 9))
+    assert all(torch.equal(many[name], one[name].expand_as(many[name])) for name in ("x", "z"))
+    drawn = model.forecast(x, 20, 2, temperature=0, draw_emission=True)
+    assert torch.equal(drawn["z"], many["z"][:2])
+    assert not torch.equal(drawn["x"][0], drawn["x"][1])
+
+
 def test_the_prior_is_evaluated_once_for_all_samples(windows, monkeypatch):
     model, seen = build(windows), []
     prior = model.generator["z"].network
