@@ -16,10 +16,13 @@ clips has
 
 (Cameron, Gelbach and Miller, 2011, have this as two-way clustering.) A difference of two models is paired over
 sequences, and its seeds are independent: V_seeds and V_rest are sums of both models'. With one seed V_seeds and V_total
-are unknown, and what is left speaks of these weights only. With few seeds, V_seeds itself is uncertain: S give it S - 1
-degrees of freedom, and a difference of two rows has between S - 1 and 2 (S - 1) (Welch), the fewer the more the rows'
-variances differ. Where seeds rule the error, an interval of 95 % then reaches 2.8 to 4.3 standard errors to each side
-with three seeds a row, and 4.3 to 12.7 with two.
+are unknown, and what is left speaks of these weights only.
+
+Intervals and p-values are Student's, since few seeds tell little of V_seeds. V_sequences has C - 1 degrees of freedom,
+V_seeds of a row S - 1, and sums of independent variances V_i with f_i have (sum V_i)^2 / sum (V_i^2 / f_i), as in the
+tests of Satterthwaite (1946) and Welch (1947): V_seeds of a difference between S - 1 and 2 (S - 1), and
+
+    f_total = V_total^2 / (V_sequences^2 / (C - 1) + sum over rows V_seeds^2 / (S - 1))
 
 References: Burda et al., 2016, arXiv 1509.00519 (importance-weighted bound, active units); Vehtari et al., 2024, arXiv
 1507.02646 (k-hat); Hoffman and Johnson, 2016, "ELBO surgery", and Poole et al., 2019, arXiv 1905.06922 (information).
@@ -45,6 +48,7 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
+from scipy import special
 from torch import Tensor, nn
 
 from .. import distributions
@@ -64,6 +68,7 @@ from .evaluate import (
     on_device_of,
     plain,
     refuse_non_finite,
+    student_interval,
 )
 from .result import Result, progress_bar
 
@@ -78,6 +83,7 @@ KHAT = 0.7
 SHOWN = ("ADE", "FDE", "MMADE", "MMFDE", "energy score")
 """Free-running scores of the table."""
 
+_ERRORS = ("sequences", "seeds", "total")
 _GUIDE_DRAWS = 8  # over which posterior means are averaged; the noise that this leaves is taken out
 _PAIRS = 4096  # sequences times contrasts to hold at once
 _LOO_DRAWS = 25  # arviz_stats fits a Pareto tail to a fifth of the draws, and needs five
@@ -92,12 +98,38 @@ class Estimate:
         sequences: standard error over sequences, clustered by clip.
         seeds: standard error over training seeds.
         total: standard error from both.
+        freedom: degrees of freedom of each of the three, in this order.
     """
 
     mean: float
     sequences: float
     seeds: float
     total: float
+    freedom: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+
+    def interval(self, level: float = 0.95, error: str = "total") -> tuple[float, float]:
+        """Where the mean lies at this level by Student's t, from one of the errors; NaN where that is unknown.
+
+        Raises:
+            ValueError: a level that is not between 0 and 1, or an error that is none of the three.
+        """
+        return student_interval(self.mean, *self._error(error), level)
+
+    def p_value(self, error: str = "total") -> float:
+        """Of a mean of zero, two-sided, by Student's t from one of the errors; NaN where that is unknown.
+
+        Raises:
+            ValueError: an error that is none of the three.
+        """
+        scale, freedom = self._error(error)
+        if scale == 0:
+            return float(self.mean == 0)
+        return float(2 * special.stdtr(freedom, -abs(self.mean) / scale))
+
+    def _error(self, name: str) -> tuple[float, float]:
+        if name not in _ERRORS:
+            raise ValueError(f"errors are over {', '.join(_ERRORS)}, not {name!r}")
+        return getattr(self, name), self.freedom[_ERRORS.index(name)]
 
     def __str__(self) -> str:
         known = [error for error in (self.sequences, self.seeds) if error > 0]
@@ -239,13 +271,17 @@ class Comparison(Result):
         differences = {name: self.difference(name, ranking[0]) for name in ranking}
         for panel, estimates in zip(panels, (bounds, differences), strict=False):
             for place, (name, estimate) in enumerate(estimates.items()):
-                for error, width in ((estimate.sequences, 3), (estimate.total, 1)):
-                    if error > 0:
-                        panel.errorbar(estimate.mean, place, xerr=error, color=colours[name], elinewidth=width)
+                for error, width in (("sequences", 3), ("total", 1)):
+                    reach = estimate.interval(error=error)[1] - estimate.mean
+                    if reach > 0:
+                        panel.errorbar(estimate.mean, place, xerr=reach, color=colours[name], elinewidth=width)
+                if estimate.freedom[-1] > 0:
+                    freedom = f"{estimate.freedom[-1]:.2g} df"
+                    panel.annotate(freedom, (1, place), xycoords=("axes fraction", "data"), ha="right", fontsize=7)
                 panel.plot(estimate.mean, place, "o", markersize=5, color=colours[name], label=labels[name])
             panel.set_ylim(len(ranking) - 0.5, -0.5)
             panel.set_yticks(range(len(ranking)), labels.values())
-            panel.set_xlabel("nats a frame (bars: ± error over sequences, thin: total)", fontsize=9)
+            panel.set_xlabel("nats a frame (95 %, thick: over sequences, thin: over seeds too)", fontsize=9)
             panel.grid(axis="x", alpha=0.3)
         panels[0].set_title(f"importance-weighted bound (K = {self.particles})")
         panels[1].set_title(f"difference to {ranking[0]}")
@@ -339,8 +375,8 @@ class Comparison(Result):
         document["rows"] = {
             name: {
                 **{field.name: getattr(row, field.name) for field in dataclasses.fields(row)},
-                "scores": {metric: dataclasses.asdict(estimate) for metric, estimate in self[name].items()},
-                "difference_to_best": dataclasses.asdict(self.difference(name, ranking[0])),
+                "scores": {metric: _scored(estimate) for metric, estimate in self[name].items()},
+                "difference_to_best": _scored(self.difference(name, ranking[0])),
                 "khat_above_0.7": row.unreliable,
                 "active_units": row.active_units,
             }
@@ -403,12 +439,20 @@ class Comparison(Result):
     @staticmethod
     def _estimate(first: "_Parts", second: "_Parts | None" = None) -> Estimate:
         mean, deviations, between, rest = first.mean, first.deviations, first.seeds, first.rest
+        of_seeds = [(first.seeds, first.count - 1)]
         if second is not None:
             mean, deviations = mean - second.mean, deviations - second.deviations
             between, rest = between + second.seeds, rest + second.rest
+            of_seeds.append((second.seeds, second.count - 1))
         over = clustered_variance(deviations)
         total = max(over + between - rest, over, between) if not math.isnan(over + between) else math.nan
-        return Estimate(mean, math.sqrt(over), math.sqrt(between), math.sqrt(total))
+        of_sequences = (over, len(deviations) - 1)
+        freedom = (
+            _freedom(over, of_sequences),
+            _freedom(between, *of_seeds),
+            _freedom(total, of_sequences, *of_seeds),
+        )
+        return Estimate(mean, math.sqrt(over), math.sqrt(between), math.sqrt(total), freedom)
 
     # Tables
 
@@ -422,14 +466,15 @@ class Comparison(Result):
     def _bound_table(self) -> Table:
         table = Table(
             title=f"{self._title()}\nteacher-forced, nats a frame",
-            caption="mean ± standard error over sequences (clustered by clip) ± over seeds",
+            caption="mean ± standard error over sequences (clustered by clip) ± over seeds\n"
+            "95 %: from both, by Student's t, in brackets its degrees of freedom",
         )
         table.add_column("", overflow="fold")  # a long name takes no room from the numbers
         for column in (
             "seeds",
             f"importance bound ↑\nK = {self.particles}",
             "difference to the best",
-            "± total",
+            "95 % (df)",
             "ELBO ↑",
             f"k-hat\n> {KHAT}",
         ):
@@ -438,7 +483,7 @@ class Comparison(Result):
         for name in ranking:
             row, scores = self.rows[name], self[name]
             difference = self.difference(name, ranking[0])
-            behind = ["–", "–"] if name == ranking[0] else [str(difference), _number(difference.total)]
+            behind = ["–", "–"] if name == ranking[0] else [str(difference), _interval(difference)]
             share = "–" if math.isnan(row.unreliable) else f"{100 * row.unreliable:.1f} %"
             bounds = (str(scores["importance bound"]), *behind, str(scores["ELBO"]))
             table.add_row(Text(name), str(row.seeds), *bounds, share)
@@ -490,14 +535,21 @@ class Comparison(Result):
         return table
 
 
+def _freedom(total: float, *parts: tuple[float, float]) -> float:
+    """Satterthwaite's degrees of freedom of a variance made of parts, each with its own; NaN where one is unknown."""
+    uncertainty = sum(part**2 / freedom if freedom else math.nan for part, freedom in parts)
+    return total**2 / uncertainty if uncertainty else math.nan
+
+
 @dataclass(frozen=True)
 class _Parts:
-    """A model's mean, what each clip adds to its error (C,), and the variances of its seeds and of the rest."""
+    """A model's mean, what each clip adds to its error (C,), the variances of its seeds and of the rest, and S."""
 
     mean: float
     deviations: np.ndarray
     seeds: float
     rest: float
+    count: int
 
     @classmethod
     def of(cls, means: np.ndarray, weights: np.ndarray) -> "_Parts":
@@ -506,10 +558,10 @@ class _Parts:
         common = deviations.mean(0)
         count = len(means)
         if count < 2:
-            return cls(float(by_seed.mean()), common, math.nan, math.nan)
+            return cls(float(by_seed.mean()), common, math.nan, math.nan, count)
         # As `clustered_variance`, of the seeds' own deviations from what they have in common.
         rest = sum(clustered_variance(own) for own in deviations - common) / (count * (count - 1))
-        return cls(float(by_seed.mean()), common, float(by_seed.var(ddof=1)) / count, rest)
+        return cls(float(by_seed.mean()), common, float(by_seed.var(ddof=1)) / count, rest, count)
 
 
 @alone
@@ -826,6 +878,16 @@ def _stack(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def _number(value: float, decimals: int = 3) -> str:
     return "–" if math.isnan(value) else f"{round(value, decimals) + 0.0:.{decimals}f}"  # no minus before a zero
+
+
+def _interval(estimate: Estimate) -> str:
+    """The interval of 95 % and its degrees of freedom."""
+    low, high = map(_number, estimate.interval())
+    return low if low == "–" else f"{low} to {high} ({estimate.freedom[-1]:.3g})"
+
+
+def _scored(estimate: Estimate) -> dict[str, Any]:
+    return {**dataclasses.asdict(estimate), "interval": estimate.interval(), "p_value": estimate.p_value()}
 
 
 def _lists(value: Any) -> Any:

@@ -41,6 +41,7 @@ import numpy as np
 import torch
 from rich.markup import escape
 from rich.table import Table
+from scipy import special
 from torch import Tensor, nn
 
 from ..energies import pose_prior_energy
@@ -114,10 +115,21 @@ _MULTIMODAL = {
 
 @dataclass(frozen=True)
 class Score:
-    """Mean over windows, or FID, and its standard error, clustered by clip (NaN where there is a single clip)."""
+    """Mean over windows, or FID, and its standard error, clustered by clip (NaN where there is a single clip).
+
+    Args:
+        mean: the mean.
+        standard_error: its standard error.
+        freedom: degrees of freedom of that, one less than there are clips.
+    """
 
     mean: float
     standard_error: float
+    freedom: float = field(default=math.nan, compare=False)
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Where the mean lies at this level, by Student's t; NaN where the error is unknown."""
+        return student_interval(self.mean, self.standard_error, self.freedom, level)
 
     def __str__(self) -> str:
         # Three decimals as in the papers, a fourth where the error needs it.
@@ -283,7 +295,7 @@ class Evaluation(Result):
     def _score(self, metric: str, clip_means: np.ndarray) -> Score:
         scored = ~np.isnan(clip_means) if _kind(metric) == "ACC" else slice(None)
         mean, deviations = linearised(clip_means[scored], np.array(list(self.clips.values()))[scored])
-        return Score(float(mean), math.sqrt(clustered_variance(deviations)))
+        return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
 
     def _document(self, method: str) -> dict[str, Any]:
         row = dataclasses.asdict(self.rows[method])
@@ -301,7 +313,11 @@ class Evaluation(Result):
     def _caption(self) -> str:
         closer = f"all windows whose last poses are closer than {self.multimodal['threshold']:g} m, itself included"
         alone = f"{self.multimodal['alone']} of {self.data['windows']} have no other"
-        lines = ["mean ± standard error over windows, clustered by clip", f"MM: over the futures of {closer}; {alone}"]
+        freedom = f"{len(self.clips) - 1} degrees of freedom"
+        lines = [
+            f"mean ± standard error over windows, clustered by clip ({freedom})",
+            f"MM: over the futures of {closer}; {alone}",
+        ]
         for name, used in self.classifiers.items():
             unknown = f"; {used['unknown']} of {self.data['windows']} windows are of no class it knows"
             lines.append(
@@ -406,6 +422,18 @@ def clustered_variance(deviations: np.ndarray) -> float:
     """Variance of a mean over windows from what each clip adds to its error, (C,); NaN where there is one clip."""
     clips = len(deviations)
     return clips / (clips - 1) * float((deviations**2).sum()) if clips > 1 else math.nan
+
+
+def student_interval(mean: float, error: float, freedom: float, level: float = 0.95) -> tuple[float, float]:
+    """Two-sided interval of Student's t for a mean with a standard error of so many degrees of freedom.
+
+    Raises:
+        ValueError: a level that is not between 0 and 1.
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
+    reach = error * float(special.stdtrit(freedom, (1 + level) / 2)) if error else 0.0
+    return mean - reach, mean + reach
 
 
 _FOUND: dict[tuple[str, int, float, bool], list[Tensor]] = {}
