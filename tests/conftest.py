@@ -1,5 +1,6 @@
 """What every test starts from: the same seeds, an empty parameter store; and what it must leave as it was."""
 
+import signal
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -8,6 +9,9 @@ import pyro
 import pytest
 import torch
 from hypothesis import settings
+
+# A shell has what it starts in the background ignore Ctrl-C, and so would all that is started from there.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Examples are the same in every run, so that a failure is one for everybody.
 settings.register_profile("dvae", derandomize=True, deadline=None)

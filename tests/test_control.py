@@ -99,4 +99,5 @@ def test_motions_are_bent_one_by_one():
     def bent(z):
         return bend(lambda z: (z @ weight.T).unflatten(-1, (4, 6)), z, one, paths, known, POINT, bones, steps=5)[0]
 
-    assert torch.equal(bent(drawn)[1:2], bent(drawn[1:2]))
+    # In one product of three rows or of one, sums may round otherwise; five steps hardly spread that.
+    torch.testing.assert_close(bent(drawn)[1:2], bent(drawn[1:2]), rtol=0, atol=1e-9)
