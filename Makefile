@@ -1,5 +1,5 @@
 # make demo    simulated people: fit two methods, print the table, save demo/futures.png
-# make test    lint, types, tests
+# make test    lint, types, tests, and some of these once more as on another processor
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
 # make bench   the benchmarks
 # Each makes the environment in .venv when it is missing or out of date.
@@ -9,6 +9,9 @@ BIN := .venv/bin
 
 # One thread: the models are small, and on cores that others use too, two threads wait for each other many times longer.
 export OMP_NUM_THREADS := 1
+
+# Numerical tests that take little time, for the second run: other instructions round otherwise.
+NUMERICAL := control energies forecasts graphconv metrics networks trajectories
 
 .PHONY: venv demo test fuzz bench clean
 
@@ -32,6 +35,7 @@ test: venv
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p dvae
 	$(BIN)/pytest -n 2
+	ATEN_CPU_CAPABILITY=default $(BIN)/pytest -n 2 $(NUMERICAL:%=tests/test_%.py)
 
 SECONDS := 600
 SEED := $(shell date +%s)
