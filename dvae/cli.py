@@ -22,8 +22,6 @@ import numpy as np
 import torch
 import tyro
 from joblib import parallel_config
-from rich.console import Console
-from rich.table import Table
 
 from . import files, motion
 from .graph import audit
@@ -32,6 +30,7 @@ from .inference.compare import compare as compare_models
 from .inference.criticism import Calibration, PredictiveChecks, calibrate, predictive_checks
 from .inference.evaluate import evaluate as evaluate_models
 from .inference.fit import Fit, Interrupted, Training, reason
+from .inference.result import Plain, Table
 from .inference.trackers import TensorBoard
 from .models import method as method_by_name
 from .models import methods, runs
@@ -79,8 +78,8 @@ else:
     )
 
 # Both keep to the width of the terminal; a file or a pipe gets lines as long as they need to be.
-OUT = Console(width=None if sys.stdout.isatty() else 200)
-ERROR = Console(stderr=True, soft_wrap=True, highlight=False)
+OUT = Plain(width=None if sys.stdout.isatty() else 200)
+ERROR = Plain(stderr=True, soft_wrap=True, highlight=False)
 
 
 class UsageError(ValueError):
@@ -829,8 +828,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         expected = isinstance(error, ValueError | OSError | RuntimeError | FloatingPointError)
         hint = "" if expected or debug else " (this looks like a bug: --debug shows the traceback)"
-        ERROR.print("[bold red]error:[/bold red] ", end="")
-        ERROR.print((reason(error) or type(error).__name__) + hint, markup=False)
+        ERROR.print("error: ", style="bold red", end="")
+        ERROR.print((reason(error) or type(error).__name__) + hint)
         return 2 if isinstance(error, UsageError) else 1
 
 
@@ -1157,7 +1156,7 @@ def _save_futures(futures: motion.Forecasts, path: Path, paths: Mapping[str, Any
     drawing = Figure(figsize=(9, 2.6), layout="constrained")
     window = futures.observed[0], futures.forecasts[:, 0], futures.truth[0]
     axes = draw(futures.skeleton, *window, ax=drawing.subplots(), paths=paths)
-    axes.set_title(_title(futures), fontsize=9)
+    axes.set_title(_title(futures), fontsize=9, parse_math=False)
     _save_figure(drawing, path)
 
 

@@ -187,7 +187,7 @@ class Audit:
         for name in HEADER:
             table.add_column(name)
         for factor, missing, redundant in self.rows:
-            table.add_row(factor, Text(missing, style="" if missing == "-" else "red"), redundant)
+            table.add_row(Text(factor), Text(missing, style="" if missing == "-" else "red"), Text(redundant))
         return table
 
     def __str__(self) -> str:

@@ -45,9 +45,6 @@ import numpy as np
 import torch
 from pyro import poutine
 from rich.console import Group
-from rich.markup import escape
-from rich.table import Table
-from rich.text import Text
 from scipy import special
 from torch import Tensor, nn
 
@@ -70,7 +67,7 @@ from .evaluate import (
     refuse_non_finite,
     student_interval,
 )
-from .result import Result, progress_bar
+from .result import Result, Table, as_they_are, progress_bar
 
 __all__ = ["Comparison", "Contender", "Estimate", "compare"]
 
@@ -280,11 +277,11 @@ class Comparison(Result):
                     panel.annotate(freedom, (1, place), xycoords=("axes fraction", "data"), ha="right", fontsize=7)
                 panel.plot(estimate.mean, place, "o", markersize=5, color=colours[name], label=labels[name])
             panel.set_ylim(len(ranking) - 0.5, -0.5)
-            panel.set_yticks(range(len(ranking)), labels.values())
+            panel.set_yticks(range(len(ranking)), labels.values(), parse_math=False)
             panel.set_xlabel("nats a frame (95 %, thick: over sequences, thin: over seeds too)", fontsize=9)
             panel.grid(axis="x", alpha=0.3)
-        panels[0].set_title(f"importance-weighted bound (K = {self.particles})")
-        panels[1].set_title(f"difference to {ranking[0]}")
+        panels[0].set_title(f"importance-weighted bound ↑ (K = {self.particles})")
+        panels[1].set_title(f"difference to {ranking[0]}", parse_math=False)
         panels[1].axvline(0, color="grey", linewidth=0.8)
         panels[1].set_yticklabels([])
         self._khat_panel(panels[2], colours)
@@ -297,7 +294,9 @@ class Comparison(Result):
         for panel in panels[3 + len(latents) :]:
             panel.set_axis_off()
         columns = min(5, 100 // (widest + 5))
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=columns, fontsize=9)
+        handles = panels[0].get_legend_handles_labels()
+        legend = figure.legend(*handles, loc="outside lower center", ncols=columns, fontsize=9)
+        as_they_are(legend.get_texts())
         return figure
 
     def _khat_panel(self, panel: matplotlib.axes.Axes, colours: Mapping[str, str]) -> None:
@@ -458,7 +457,7 @@ class Comparison(Result):
 
     def _title(self) -> str:
         clips = len(set(self._clips))
-        parts = [escape(str(self.protocol.get("name", ""))), f"{len(self.keys)} sequences of {clips} clips"]
+        parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} sequences of {clips} clips"]
         parts += [f"seed {self.seed}"]
         parts += [f"data {self.data['fingerprint'][:12]}"] if "fingerprint" in self.data else []
         return " · ".join(part for part in parts if part)
@@ -486,7 +485,7 @@ class Comparison(Result):
             behind = ["–", "–"] if name == ranking[0] else [str(difference), _interval(difference)]
             share = "–" if math.isnan(row.unreliable) else f"{100 * row.unreliable:.1f} %"
             bounds = (str(scores["importance bound"]), *behind, str(scores["ELBO"]))
-            table.add_row(Text(name), str(row.seeds), *bounds, share)
+            table.add_row(name, str(row.seeds), *bounds, share)
         return table
 
     def _latent_table(self) -> Table:
@@ -504,7 +503,7 @@ class Comparison(Result):
                 active = row.active_units[latent].mean()
                 units = f"{active:g}" if active.is_integer() else f"{active:.1f}"
                 table.add_row(
-                    Text(name if latent == row.latents[0] else ""),
+                    name if latent == row.latents[0] else "",
                     latent,
                     str(scores[f"KL {latent}"]),
                     "–" if math.isnan(active) else f"{units} of {row.variances[latent].shape[-1]}",
@@ -531,7 +530,7 @@ class Comparison(Result):
         for metric in SHOWN:
             table.add_column(f"{metric} ↓ ({METRICS[metric].unit})", justify="right", overflow="fold")
         for name in self.ranking:
-            table.add_row(Text(name), *(str(self[name][metric]) for metric in SHOWN))
+            table.add_row(name, *(str(self[name][metric]) for metric in SHOWN))
         return table
 
 
@@ -660,7 +659,7 @@ def compare(
         for label, model in labelled.items():
 
             def parts(what: str, count: int, size: int, label: str = label) -> Iterator[slice]:
-                for start in bar.track(range(0, count, size), description=f"{escape(label)}, {what}"):
+                for start in bar.track(range(0, count, size), description=f"{label}, {what}"):
                     yield slice(start, start + size)
 
             with evaluating(model, seed):

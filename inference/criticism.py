@@ -22,8 +22,7 @@ import matplotlib.figure
 import numpy as np
 import torch
 from pyro import poutine
-from rich.markup import escape
-from rich.table import Table
+from rich.text import Text
 from scipy import fft, special
 from torch import Tensor
 
@@ -32,7 +31,7 @@ from ..motion import Skeleton
 from ..turns import alone
 from .bounds import require_likelihood
 from .evaluate import evaluating, hold, on_device_of, plain
-from .result import Result, progress_bar
+from .result import Result, Table, as_they_are, progress_bar
 
 __all__ = [
     "Calibration",
@@ -146,12 +145,12 @@ class Calibration(Result):
     def table(self, worst: int = 20) -> Table:
         """The quantities with the smallest p-values first."""
         order = np.argsort(self.p_values, kind="stable")[:worst]
-        table = Table(title=escape(self._title), caption=self.verdict)
+        table = Table(title=self._title, caption=self.verdict)
         for column in ("quantity", "p", "p (Bonferroni)", "bias", "spread", "the guide"):
             table.add_column(column, justify="left" if column in ("quantity", "the guide") else "right", no_wrap=True)
         for q in order:
             numbers = f"{self.p_values[q]:.2g}", f"{self.adjusted[q]:.2g}", f"{self.bias[q]:+.3f}"
-            table.add_row(escape(self.names[q]), *numbers, f"{self.spread[q]:.2f}", self.readings[q])
+            table.add_row(self.names[q], *numbers, f"{self.spread[q]:.2f}", self.readings[q])
         if len(self.names) > worst:
             table.add_row(f"and {len(self.names) - worst} more", style="dim")
         return table
@@ -182,7 +181,7 @@ class Calibration(Result):
             top.stairs(share, edges / levels, color="C0")
             top.axhline(1, color="0.4", linewidth=0.8)
             reading = f"\n{self.readings[q]}" if self.readings[q] else ""
-            top.set_title(f"{self.names[q]}, p = {self.adjusted[q]:.2g}{reading}", fontsize=8)
+            top.set_title(f"{self.names[q]}, p = {self.adjusted[q]:.2g}{reading}", fontsize=8, parse_math=False)
             bottom.fill_between(points, low - points, high - points, color="0.88", step="mid", linewidth=0)
             below = self.counts[q].cumsum()[:-1] / count
             bottom.plot(points, below - points, color="C0", linewidth=1.2)
@@ -198,7 +197,7 @@ class Calibration(Result):
             panels[2 * row, column].set_axis_off()
             panels[2 * row + 1, column].set_axis_off()
         shown = "" if len(order) == len(self.names) else f" · worst {len(order)} of {len(self.names)}"
-        figure.suptitle(f"{self._title}{shown}", fontsize=9)
+        figure.suptitle(f"{self._title}{shown}", fontsize=9, parse_math=False)
         figure.supxlabel(f"rank among {self.draws} draws, scaled to [0, 1]", fontsize=8)
         return figure
 
@@ -580,21 +579,21 @@ class PredictiveChecks(Result):
             if self.emission == "drawn"
             else f"means lack the emission's noise: even a true model's need not have ½ and {expected:.1%}",
         ]
-        table = Table(title=escape(self._title), caption="\n".join(caption))
+        table = Table(title=self._title, caption="\n".join(caption))
         for column in ("", "", "5 %", "median", "95 %", "Wasserstein", "tail area", "outside"):
             table.add_column(column, justify="right" if column else "left", no_wrap=True)
         models, programs, names = (list(dict.fromkeys(keys)) for keys in zip(*self.checks, strict=True))
         for program in programs:
             table.add_section()
-            table.add_row(f"[bold]{program}[/bold]")
+            table.add_row(Text(program, "bold"))
             for name in names:
                 first = self.checks[models[0], program, name]
-                label = f"{escape(name)} [dim]({escape(first.unit)})[/dim]" if first.unit else escape(name)
+                label = Text.assemble(name, (f" ({first.unit})" if first.unit else "", "dim"))
                 table.add_row(label, "real", *_quantiles(first.real))
                 for model in models:
                     check = self.checks[model, program, name]
                     outcome = (f"{check.wasserstein:.3g}", f"{check.tail_areas.mean():.2f}", f"{check.outside:.0%}")
-                    table.add_row("", escape(model), *_quantiles(check.replicated), *outcome)
+                    table.add_row("", model, *_quantiles(check.replicated), *outcome)
         return table
 
     def plot(self) -> matplotlib.figure.Figure:
@@ -619,12 +618,14 @@ class PredictiveChecks(Result):
                 panel.set_yticks([])
                 panel.tick_params(labelsize=7)
             unit = checks[0].unit
-            panels[-1, column].set_xlabel(f"{name} ({unit})" if unit else name, fontsize=9)
+            panels[-1, column].set_xlabel(f"{name} ({unit})" if unit else name, fontsize=9, parse_math=False)
         for row, program in enumerate(programs):
             panels[row, 0].set_ylabel(program, fontsize=9)
         handles, labels = panels[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8, frameon=False)
-        figure.suptitle(self._title, fontsize=9)
+        below: dict[str, Any] = {"loc": "outside lower center", "ncols": len(labels), "frameon": False}
+        legend = figure.legend(handles, labels, fontsize=8, **below)
+        as_they_are(legend.get_texts())
+        figure.suptitle(self._title, fontsize=9, parse_math=False)
         return figure
 
     def document(self) -> dict[str, Any]:

@@ -39,8 +39,7 @@ from typing import Any, Protocol
 import matplotlib.figure
 import numpy as np
 import torch
-from rich.markup import escape
-from rich.table import Table
+from rich.text import Text
 from scipy import special
 from torch import Tensor, nn
 
@@ -50,7 +49,7 @@ from ..turns import alone
 from . import metrics
 from .batches import each
 from .bounds import SequenceELBO, importance_bound
-from .result import Result, progress_bar
+from .result import Result, Table, progress_bar
 
 __all__ = [
     "METRICS",
@@ -77,6 +76,9 @@ class Metric:
     program: str
     better: str = "lower"
 
+
+ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
+"""By the direction that is better."""
 
 METRICS: dict[str, Metric] = {
     "APD": Metric("m", "free-running", "higher"),
@@ -211,22 +213,21 @@ class Evaluation(Result):
 
     def table(self) -> Table:
         """Metrics down, methods across: mean ± standard error, the two programs apart."""
-        arrow = {"lower": " ↓", "higher": " ↑", "": ""}
         table = Table(title=self._title(), caption=self._caption())
         table.add_column("", no_wrap=True)  # on a narrow terminal the numbers wrap, never the names
         for method, row in self.rows.items():
-            table.add_column(f"{escape(method)}\nK = {row.samples}", justify="right")
+            table.add_column(f"{method}\nK = {row.samples}", justify="right")
         scores = {method: self[method] for method in self.rows}
         for program in ("free-running", "teacher-forced"):
             names = [name for name in self.metrics if _reading(name).program == program]
             if names:
                 table.add_section()
-                table.add_row(f"[bold]{program}[/bold]")
+                table.add_row(Text(program, "bold"))
             for name in names:
                 reading = _reading(name)
-                unit = f" [dim]({reading.unit})[/dim]" if reading.unit else ""
+                unit = f" ({reading.unit})" if reading.unit else ""
                 values = (str(row[name]) if name in row else "–" for row in scores.values())
-                table.add_row(name + arrow[reading.better] + unit, *values)
+                table.add_row(Text.assemble(name + ARROWS[reading.better], (unit, "dim")), *values)
         return table
 
     @property
@@ -237,7 +238,7 @@ class Evaluation(Result):
         return sorted(found, key=lambda name: (order.index(_kind(name)), name))
 
     def plot(self, metrics: Sequence[str] | None = None) -> matplotlib.figure.Figure:
-        """One panel per metric, one dot per method with a bar of one standard error to each side."""
+        """One panel per metric, with an arrow for what is better; a dot per method with a bar of one standard error."""
         names = self.metrics if metrics is None else list(metrics)
         columns = min(4, len(names))
         rows = math.ceil(len(names) / columns)
@@ -250,8 +251,10 @@ class Evaluation(Result):
                 if name in row:
                     error = np.nan_to_num(row[name].standard_error)
                     panel.errorbar(row[name].mean, place, xerr=error, fmt="o", markersize=4, color=f"C{place}")
-            panel.set_title(f"{name} ({_reading(name).unit})" if _reading(name).unit else name, fontsize=9)
-            panel.set_yticks(range(len(scores)), list(scores))
+            reading = _reading(name)
+            unit = f" ({reading.unit})" if reading.unit else ""
+            panel.set_title(name + ARROWS[reading.better] + unit, fontsize=9, parse_math=False)
+            panel.set_yticks(range(len(scores)), list(scores), parse_math=False)
             panel.set_ylim(len(scores) - 0.5, -0.5)
             panel.tick_params(labelsize=8)
             panel.locator_params(axis="x", nbins=4)  # more would overlap where values agree in many digits
@@ -320,16 +323,14 @@ class Evaluation(Result):
         ]
         for name, used in self.classifiers.items():
             unknown = f"; {used['unknown']} of {self.data['windows']} windows are of no class it knows"
-            lines.append(
-                f"ACC, FID {escape(name)}: classifier {used['weights'][:12]}" + (unknown if used["unknown"] else "")
-            )
+            lines.append(f"ACC, FID {name}: classifier {used['weights'][:12]}" + (unknown if used["unknown"] else ""))
         return "\n".join(lines)
 
     def _title(self) -> str:
-        name = escape(self.protocol.get("name", ""))
+        name = str(self.protocol.get("name", ""))
         parts = [name, f"{self.data['windows']} windows of {len(self.clips)} clips"]
         if (given := self.data.get("given")) is not None:
-            parts.append(f"given {escape(', '.join(given)) or 'no paths'}")
+            parts.append(f"given {', '.join(given) or 'no paths'}")
         if exchanged := self.data.get("exchanged"):
             parts.append(f"first poses of {exchanged['partners']} other windows")
         parts += [f"{name} {value}" for name, value in self.options.items()]
@@ -596,7 +597,7 @@ def evaluate(
             stack.enter_context(evaluating(judge.model, seed))
 
         def parts(label: str) -> Iterator[slice]:
-            for start in bar.track(range(0, len(held.keys), batch_size), description=escape(label)):
+            for start in bar.track(range(0, len(held.keys), batch_size), description=label):
                 yield slice(start, start + batch_size)
 
         for name, (count, forecaster) in baselines.items():

@@ -39,6 +39,7 @@ from .checkpoints import (
     weights,
 )
 from .objectives import Evidence, Objective
+from .result import as_they_are
 from .schedules import Piecewise, Schedule, clamp, levels, schedule, to_config
 from .trackers import JSONLines, Memory, Terminal, Tracker
 
@@ -227,7 +228,7 @@ class Fit:
         for name in names:
             if name.startswith(start):
                 terms.plot(*self.series(name), label=name.removeprefix(start))
-                terms.legend()
+                as_they_are(terms.legend().get_texts())
         terms.set(xlabel="step", ylabel="KL (nats per frame)" if likelihood else "energies (per frame)")
         if not likelihood:
             terms.set_yscale("log")  # their scales differ by orders of magnitude; weights make up for it

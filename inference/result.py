@@ -1,15 +1,65 @@
 """What every result is: a table on a terminal, in print and in a notebook, and a file. And the bar while one waits."""
 
 import io
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import rich.table
 from rich.console import Console, RenderableType
-from rich.progress import Progress
+from rich.progress import Progress, TextColumn
+from rich.text import Text
 
 from .. import files
 
+if TYPE_CHECKING:
+    import matplotlib.text
+
 LARGEST = 2**28
 """Bytes of a result."""
+
+
+class Table(rich.table.Table):
+    """A rich table that shows texts as they are: names of clips, labels and models hold no markup and no emoji."""
+
+    def __init__(self, *, title: str = "", caption: str = "", **options: Any) -> None:
+        super().__init__(**options)
+        self.title = Text(_shown(title), "table.title") if title else None
+        self.caption = Text(_shown(caption), "table.caption") if caption else None
+
+    def add_column(self, header: RenderableType = "", *arguments: Any, **options: Any) -> None:
+        """See rich."""
+        super().add_column(_as_it_is(header), *arguments, **options)
+
+    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
+        """See rich."""
+        super().add_row(*map(_as_it_is, cells), **options)
+
+
+class Plain(Console):
+    """A console that prints texts as they are: paths, names and messages hold no markup and no emoji."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """See rich."""
+        return super().render_str(_shown(text), **options)
+
+
+def _as_it_is(cell: Any) -> Any:
+    return Text(_shown(cell)) if isinstance(cell, str) else cell
+
+
+def _shown(text: str) -> str:
+    """The text, which cannot command the terminal: rich drops the other control characters."""
+    return text.replace("\x1b", r"\x1b")
+
+
+def as_they_are(texts: "Iterable[matplotlib.text.Text]") -> None:
+    """Have matplotlib draw texts as they are: dollar signs in a name enclose no formula."""
+    for text in texts:
+        text.set_parse_math(False)
 
 
 class Result:
@@ -65,5 +115,9 @@ def progress_bar(shown: bool) -> Progress:
     """A bar that goes when the work is done; hidden where nobody would see it move."""
     console = Console()
     return Progress(
-        transient=True, console=console, disable=not (shown and (console.is_terminal or console.is_jupyter))
+        TextColumn("{task.description}", "progress.description", markup=False),  # it may be the name of a model
+        *Progress.get_default_columns()[1:],
+        transient=True,
+        console=console,
+        disable=not (shown and (console.is_terminal or console.is_jupyter)),
     )

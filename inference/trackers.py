@@ -14,9 +14,11 @@ from typing import Any, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from .. import files
 from .checkpoints import CheckpointError
+from .result import Plain
 
 Row = Mapping[str, float]
 LARGEST_LOG = 2**28
@@ -157,7 +159,7 @@ class Terminal:
 
     def __init__(self, steps: int, console: Console | None = None) -> None:
         self.steps = steps
-        self.console = console or Console(stderr=True)
+        self.console = console or Plain(stderr=True)
         self._latest: dict[str, float] = {}
         self._bar: Progress | None = None
 
@@ -166,7 +168,7 @@ class Terminal:
         self._next_line = step + self.steps / 10
         if self.console.is_terminal and not self.console.is_jupyter:
             rate = TextColumn("{task.fields[rate]}")
-            text = TextColumn("{task.fields[terms]}")
+            text = TextColumn("{task.fields[terms]}", markup=False)
             columns = (BarColumn(20), MofNCompleteColumn(), rate, TimeRemainingColumn(compact=True), text)
             self._bar = Progress(*columns, console=self.console)
             self._task = self._bar.add_task("fit", total=self.steps, completed=step, terms="", rate="")
@@ -192,7 +194,8 @@ class Terminal:
             self._print()
 
     def _print(self) -> None:
-        self.console.print(f"step {self._step}/{self.steps}  {self._text()}", highlight=False, soft_wrap=True)
+        line = Text(f"step {self._step}/{self.steps}  {self._text()}")
+        self.console.print(line, soft_wrap=True)
 
     def _text(self) -> str:
         likelihood = not any(name.startswith("energy/") for name in self._latest) or any(

@@ -29,14 +29,13 @@ from uuid import uuid4
 
 import torch
 from joblib import Parallel, delayed
-from rich.console import Console
 from rich.live import Live
-from rich.table import Table
 
 from .. import files
 from ..inference import fit as loop
 from ..inference.checkpoints import Run
 from ..inference.fit import Fit, State, Training
+from ..inference.result import Plain, Table
 from ..inference.schedules import clamp
 from ..inference.trackers import LARGEST_LOG
 from ..motion import Protocol
@@ -401,7 +400,7 @@ class _Progress:
     """A line as each run ends. Meanwhile, a live table of the runs; away from a terminal, a line as each starts."""
 
     def __init__(self, runs: Sequence[_Run], training: Training) -> None:
-        self.console = Console(stderr=True, quiet=not training.progress)
+        self.console = Plain(stderr=True, quiet=not training.progress)
         self.steps, self.total = training.steps, len(runs)
         self.logs = {run.path: _Log(run.path) for run in runs}
         live = self.console.is_terminal and not self.console.is_jupyter
@@ -428,7 +427,7 @@ class _Progress:
             log = self.logs.pop(result.path, None)
             if result.status != "interrupted" or (log is not None and log.begin is not None):
                 style = "red" if result.status == "failed" else None
-                self.console.print(str(result), style=style, markup=False, highlight=False, soft_wrap=True)
+                self.console.print(str(result), style=style, highlight=False, soft_wrap=True)
             self._refresh()
 
     def _watch(self) -> None:
@@ -439,7 +438,7 @@ class _Progress:
     def _look(self) -> None:
         for log in self.logs.values():
             if log.look() and self._live is None:
-                self.console.print(f"{log.name} {log.begins}", markup=False, highlight=False, soft_wrap=True)
+                self.console.print(f"{log.name} {log.begins}", highlight=False, soft_wrap=True)
         self._refresh()
 
     def _refresh(self) -> None:

@@ -17,6 +17,7 @@ from dvae import motion
 from dvae.inference import metrics
 from dvae.inference.bounds import SequenceELBO
 from dvae.inference.evaluate import (
+    METRICS,
     ArrayWindows,
     Evaluation,
     Row,
@@ -354,7 +355,10 @@ def test_table_and_plot_show_every_method_and_metric(model):
         assert part in text
     assert str(result["dkf"]["ADE"]) in text
     panels = [axes.get_title() for axes in result.plot().axes if axes.axison]
-    assert [title.split(" (")[0] for title in panels] == result.metrics
+    arrows = {"lower": " ↓", "higher": " ↑", "": ""}
+    better = [arrows[METRICS.get(name, METRICS["KL"]).better] for name in result.metrics]
+    assert [title.split(" (")[0] for title in panels] == [n + b for n, b in zip(result.metrics, better, strict=True)]
+    assert all(title.split(" (")[0] in text for title in panels)
     assert len([axes for axes in result.plot(["ADE", "FDE"]).axes if axes.axison]) == 2
 
 

@@ -14,6 +14,7 @@ from dataclasses import InitVar, dataclass, field
 import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from .skeleton import Skeleton
 
@@ -185,12 +186,12 @@ class MotionSet:
 
     def info(self) -> RenderableType:
         """What `dvae data info` prints: splits, skeleton, how rigid the bones are, and the labels."""
-        splits = Table(title=self.name or None, title_justify="left")
+        splits = Table(title=_shown(self.name, "table.title") if self.name else None, title_justify="left")
         rows = self.summary()
         for column in rows[0]:
             splits.add_column(column, justify="left" if column == "split" else "right")
         for row in rows:
-            splits.add_row(*(f"{value:,}" if isinstance(value, int) else str(value) for value in row.values()))
+            splits.add_row(*(_shown(f"{value:,}" if isinstance(value, int) else str(value)) for value in row.values()))
 
         bones = [self.skeleton.bone_lengths(clip.positions.astype(np.float64)) for clip in self.clips]
         variation = [lengths.std(axis=0) / np.maximum(lengths.mean(axis=0), 1e-9) for lengths in bones]
@@ -199,19 +200,28 @@ class MotionSet:
         extent = np.median([np.median(np.ptp(clip.positions, axis=1)[:, self.skeleton.vertical]) for clip in self])
 
         facts = Table.grid(padding=(0, 2))
-        facts.add_row("skeleton", f"{self.skeleton.name}: {self.skeleton.joints} joints, {self.skeleton.up} up")
-        facts.add_row("frames per second", f"{self.skeleton.fps:g}")
-        facts.add_row("vertical extent", f"{extent:.2f} m (median)")
-        facts.add_row(
+
+        def fact(*cells: str) -> None:
+            facts.add_row(*map(_shown, cells))
+
+        fact("skeleton", f"{self.skeleton.name}: {self.skeleton.joints} joints, {self.skeleton.up} up")
+        fact("frames per second", f"{self.skeleton.fps:g}")
+        fact("vertical extent", f"{extent:.2f} m (median)")
+        fact(
             "bone lengths",
             f"vary by at most {variation[worst].max():.2%} within a clip (sd / mean; {bone} in "
             f"{'/'.join(self.clips[worst].key)})",
         )
-        facts.add_row("fingerprint", self.fingerprint()[:16])
+        fact("fingerprint", self.fingerprint()[:16])
         for label in dict.fromkeys(name for clip in self.clips for name in clip.labels):
             counts = Counter(clip.labels[label] for clip in self.clips if label in clip.labels)
             if len(counts) <= 24:
-                facts.add_row(label, ", ".join(f"{value} {count}" for value, count in counts.most_common()))
+                fact(label, ", ".join(f"{value} {count}" for value, count in counts.most_common()))
         for split, name, reason in self.skipped[:10]:
-            facts.add_row("skipped", f"{split}/{name}: {reason}")
+            fact("skipped", f"{split}/{name}: {reason}")
         return Group(splits, facts)
+
+
+def _shown(text: str, style: str = "") -> Text:
+    """What a file says, as it is: it holds no markup, and cannot command the terminal."""
+    return Text(text.replace("\x1b", r"\x1b"), style)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from html import escape
 from math import ceil, pi
 from os import PathLike
 from typing import Any
@@ -246,11 +247,11 @@ def animate(
 
     first = traces(shown[0])
     for trace, (k, _, _, width) in zip(first, drawn, strict=True):
-        trace |= {"mode": "lines", "name": people[k][0], "hoverinfo": "skip"}
+        trace |= {"mode": "lines", "name": _literal(people[k][0]), "hoverinfo": "skip"}
         trace["line"]["width"] = width
     floors = np.unique(places[:, 2]) + low[2]
     labels = [
-        {"text": name, "font": {"size": 14}, "showarrow": False, "x": x, "y": y, "z": z + high[2] + MARGIN}
+        {"text": _literal(name), "font": {"size": 14}, "showarrow": False, "x": x, "y": y, "z": z + high[2] + MARGIN}
         for (name, _, _), (x, y, z) in zip(people, places, strict=True)
     ]
     low, high = low + places.min(0) - MARGIN, high + places.max(0) + MARGIN
@@ -269,7 +270,7 @@ def animate(
         data=[*first, *(_floor(low[:2], high[:2], height) for height in floors)],
         frames=[go.Frame(name=str(f), data=traces(f), traces=list(range(len(drawn)))) for f in shown],
         layout={
-            "title": {"text": title, "x": 0.5, "font": {"size": 16}},
+            "title": {"text": _literal(title), "x": 0.5, "font": {"size": 16}},
             "template": "none",
             "showlegend": False,
             "margin": {"l": 0, "r": 0, "t": 40 if title else 0, "b": 110},
@@ -314,6 +315,11 @@ def _player(seconds: dict[str, float], spacing: float) -> dict[str, Any]:
         "updatemenus": [{"type": "buttons", "showactive": False, "buttons": buttons, "x": 0.01, **corner}],
         "sliders": [{"steps": steps, "currentvalue": {"suffix": " s"}, "x": 0.12, "len": 0.86, **corner}],
     }
+
+
+def _literal(text: str) -> str:
+    """A text for plotly, which takes tags for markup, links among them, and dollar signs for formulas."""
+    return escape(text, quote=False).replace("$", "&#36;")
 
 
 def _floor(low: np.ndarray, high: np.ndarray, height: float) -> dict[str, Any]:

@@ -1,0 +1,211 @@
+"""Names that files and users give are shown as they are: no markup, no tags, no formulas, whatever is in them."""
+
+import html
+import io
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import plotly.io
+import pytest
+import torch
+from rich.console import Console
+
+import dvae
+from dvae import motion
+from dvae.cli import main
+from dvae.inference.criticism import Calibration, Statistic, predictive_checks
+from dvae.inference.evaluate import ArrayWindows, evaluate
+from dvae.inference.fit import Fit
+from dvae.inference.result import progress_bar
+from dvae.inference.trackers import Terminal
+from dvae.motion.plot import animate
+from dvae.networks import Dense
+
+NAMES = (
+    "[/x]",
+    "[bold]b",
+    "\\[/x]",
+    "<a href=https://example.org>t</a>",
+    "<script>alert(1)</script>",
+    "$\\frac$",
+    "100 %s {0}",
+    ":smile:",
+    "a&lt;b",
+)
+LINES = "one\ntwo"
+COLOURED = "\x1b[31mred"
+
+
+@pytest.fixture(scope="module")
+def models():
+    torch.manual_seed(0)
+    sizes, network = {"z": 1, "x": 3}, Dense((4,))
+    model = dvae.DynamicalVAE("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", sizes, network).eval()
+    return dict.fromkeys((*NAMES, LINES), model)
+
+
+@pytest.fixture(scope="module")
+def windows():
+    clips = [f"[/{n}]" for n in range(6)]
+    return ArrayWindows(torch.randn(6, 5, 3, generator=torch.Generator().manual_seed(0)), 2, clips=clips)
+
+
+def printed(renderable):
+    """What a console prints that takes markup, as a user's own does."""
+    console = Console(file=io.StringIO(), width=1000, force_jupyter=False, no_color=True)
+    console.print(renderable)
+    return console.file.getvalue()
+
+
+def blank(text):
+    """Without white space: long names are wrapped."""
+    return "".join(text.split())
+
+
+def is_shown_as_it_is(result, names=NAMES):
+    text, page = printed(result), result._repr_html_()
+    for name in names:
+        assert blank(name) in blank(text), name
+        assert blank(html.escape(name)) in blank(re.sub("<[^>]*>", "", page)), name
+    assert "<script" not in page
+    assert "<a " not in page
+    assert "\x1b" not in text
+
+
+def is_drawn_as_it_is(figure, names=NAMES):
+    figure.savefig(io.BytesIO())  # mathtext refuses $\frac$
+    texts = [text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_parse_math"))]
+    for name in names:
+        assert any(blank(name) in blank(text) for text in texts), name
+
+
+def test_models_in_an_evaluation(models, windows):
+    result = evaluate(models, windows, samples=2, references=False, options={}, progress=True)
+    is_shown_as_it_is(result)
+    is_drawn_as_it_is(result.plot(["ADE", "ELBO"]))
+
+
+def test_classifiers_and_protocols_in_an_evaluation(models, windows):
+    result = evaluate(models[LINES], windows, samples=2, references=False, progress=False)
+    result.protocol["name"] = "[/p] <b>"
+    result.data["given"] = ["[/j]"]
+    result.options["[/o]"] = "[/v]"
+    result.classifiers.update({name: {"weights": "0" * 64, "unknown": 0} for name in NAMES})
+    is_shown_as_it_is(result, (*NAMES, "[/p] <b>", "[/j]", "[/o] [/v]"))
+
+
+def test_models_in_a_comparison(models, windows):
+    result = dvae.compare(models, windows, particles=4, samples=2, contrasts=0, progress=True)
+    is_shown_as_it_is(result)
+    is_drawn_as_it_is(result.plot())
+
+
+def test_models_and_statistics_in_predictive_checks(models, windows):
+    statistics = {name: Statistic(lambda x: x.mean((-1, -2, -3)), name) for name in NAMES[2:6]}
+    few = {name: models[name] for name in NAMES[:2]}
+    bodies = SimpleNamespace(**{name: getattr(windows, name) for name in ("protocol", "keys", "fingerprint", "all")})
+    bodies.positions = lambda x: x.unflatten(-1, (-1, 3))
+    checks = predictive_checks(few, bodies, statistics=statistics, samples=19)
+    is_shown_as_it_is(checks, NAMES[:6])
+    is_drawn_as_it_is(checks.plot(), NAMES[:6])
+
+
+def test_quantities_and_equations_in_a_calibration():
+    ranks = np.random.default_rng(0).integers(0, 4, (20, len(NAMES)))
+    calibration = Calibration(ranks, NAMES, 3, 5, 0, {"inference": "q(z_{[/x]$\\frac$})"})
+    is_shown_as_it_is(calibration, (*NAMES, "q(z_{[/x]$\\frac$})"))
+    is_drawn_as_it_is(calibration.plot(worst=1), ("q(z_{[/x]$\\frac$})",))
+
+
+def test_masks_in_an_audit():
+    masks = {"[/x]": lambda T: np.eye(T, dtype=bool)}
+    audit = dvae.audit(
+        dvae.Factorization.parse("p(z_t) p(x_t | z_t)"),
+        dvae.Factorization.parse("q(z_t | x_{[/x]})", masks=masks),
+    )
+    assert "x_{[/x]}" in printed(audit.table())
+
+
+def test_terms_in_learning_curves_and_on_the_terminal():
+    row = {f"energy/{name}": 1.0 for name in NAMES}
+    history = [{"step": step, "loss": 1.0, **row} for step in (1, 2)]
+    is_drawn_as_it_is(Fit(history, 2, None, None, "finished", None).plot())
+    for live in (True, False):
+        screen = io.StringIO()
+        terminal = Terminal(2, Console(file=screen, force_terminal=live, width=1000, no_color=True))
+        terminal.start(0)
+        terminal.log(1, {"loss": 1.0, **row})
+        terminal.close()
+        for name in NAMES:
+            assert name.replace("/", " ") in screen.getvalue().replace("/", " ")
+
+
+def test_models_beside_a_progress_bar():
+    bar = progress_bar(True)
+    for name in NAMES:
+        bar.add_task(name)
+    text = printed(bar.get_renderable())
+    for name in NAMES:
+        assert name in text
+
+
+def hostile(name):
+    """A clip of that name, with labels and in a skeleton of that name; in a file, a slash ends the split's name."""
+    split, _, own = name.rpartition("/")
+    clip = motion.simulate(clips=1, frames=20).clips[0]
+    labels = {name: name}
+    skeleton = motion.Skeleton(
+        names=tuple(f"{name}{j}" for j in range(clip.positions.shape[1])),
+        parents=motion.simulate(clips=1, frames=2).skeleton.parents,
+        fps=30.0,
+        name=name,
+    )
+    return motion.MotionSet([motion.Clip(split or "train", own, clip.positions, labels, {})], skeleton, name)
+
+
+@pytest.mark.parametrize("name", [*NAMES, LINES, COLOURED])
+def test_clips_labels_and_skeletons_in_what_a_file_holds(name):
+    text = printed(hostile(name).info())
+    assert "\x1b" not in text
+    for line in name.replace("\x1b", "\\x1b").split("\n"):
+        assert text.count(line) >= 5  # title, skeleton, clip, label and its value
+
+
+@pytest.mark.parametrize("name", [*NAMES, LINES, COLOURED])
+def test_files_are_described_and_played(name, tmp_path, capsys):
+    file, page, figure = (tmp_path / ending for ending in ("[/d].npz", "[/p].html", "[/f].png"))
+    clips = hostile(name)
+    motion.save(file, clips)
+    assert main(["data", "info", str(file)]) == 0
+    assert main(["animate", str(file), "--out", str(page)]) == 0
+    error = capsys.readouterr().err
+    assert "[/p].html" in error
+    for line in name.replace("\x1b", "\\x1b").split("\n"):
+        assert line in error
+
+    positions = clips.clips[0].positions[None]
+    future = motion.Forecasts(
+        clips.skeleton, [("test", name, 0)], positions[None, :, 5:], positions[:, :5], positions[:, 5:]
+    )
+    future.save(tmp_path / "futures.npz")
+    drawn = ["--figure", str(figure)] if name != COLOURED else []  # of which no font has the first character
+    assert main(["animate", str(tmp_path / "futures.npz"), "--out", str(page), *drawn]) == 0
+    own = page.read_text(encoding="utf-8")
+    own = own[own.rindex("Plotly.newPlot") :]
+    assert "<a " not in own
+    assert "<script>alert" not in own
+    assert main(["animate", str(file), "--out", str(page), "--clip", f"{name} else"]) == 1
+    assert "no clip" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_titles_and_names_of_an_animation_are_text(name):
+    clips = hostile("walker")
+    positions = clips.clips[0].positions
+    figure = animate(clips.skeleton, positions[:5], positions[None, 5:], names=[name], title=name)
+    texts = [figure.layout.title.text, figure.layout.scene.annotations[0].text, figure.data[0].name]
+    for text in texts:
+        assert not set(text) & set("<>$"), text  # what plotly takes for tags and formulas
+        assert html.unescape(text) == name
+    assert name not in plotly.io.to_json(figure) or not set(name) & set("<>$")
