@@ -290,7 +290,11 @@ class Comparison(Result):
                 if latent in self.rows[name].kl_steps:
                     steps = self.rows[name].kl_steps[latent].mean(0)
                     panel.plot(range(1, len(steps) + 1), steps, color=colours[name])
-            panel.set(title=f"KL of {latent} over time", xlabel="step", ylabel="nats a step", ylim=(0, None))
+            panel.set(title=f"KL of {latent} over time", xlabel="step", ylabel="nats a step")
+            drawn = np.concatenate([line.get_ydata() for line in panel.lines])
+            if (top := drawn.max()) > 0:  # the first step may take a hundred times what the others take
+                least = max(drawn[drawn > 0].min(), top / 1e5)
+                panel.set(yscale="log", ylim=(least / 1.5, top * 1.5))
         for panel in panels[3 + len(latents) :]:
             panel.set_axis_off()
         columns = min(5, 100 // (widest + 5))

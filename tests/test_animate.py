@@ -154,6 +154,32 @@ def test_many_samples_stand_in_rows(bodies):
     assert sum(trace.name == "floor" for trace in figure.data) == 2
 
 
+def test_everybody_is_as_large_as_the_window_lets_them_be(bodies):
+    observed, samples, _ = bodies
+    people = np.repeat(samples[:1], 6, 0)
+    for stretch in (0, 3):  # people on the spot, and people who walk away and need room
+        walk = np.linspace(0, stretch, HORIZON)[:, None, None] * np.array([1.0, 0.0, 0.0])
+        figure = animate(WALKER, observed, people + walk, every=1, view=0.0)
+        places = np.array([(label.x, label.z) for label in figure.layout.scene.annotations])
+        rows, columns = (len(np.unique(places[:, axis].round(3))) for axis in (1, 0))
+        assert rows * columns == 6
+        assert rows == (1 if stretch == 0 else 2)
+        ratio = figure.layout.scene.aspectratio
+        assert max(figure.layout.meta["high"], ratio.x / 2) == pytest.approx(1.9)
+
+
+def test_the_figure_has_a_key_of_what_it_shows(bodies):
+    observed, samples, truth = bodies
+
+    def key(*arguments, **options):
+        return [text.get_text() for text in futures(WALKER, *arguments, **options).get_legend().get_texts()]
+
+    assert key(observed, samples, truth) == ["observed", "what happened", "3 samples"]
+    assert key(observed, samples[:1]) == ["observed", "1 sample"]
+    paths = {"LWrist": np.zeros((HORIZON, 3))}
+    assert key(observed, samples, paths=paths) == ["observed", "3 samples", "given paths"]
+
+
 def test_what_does_not_fit_is_refused(bodies):
     observed, samples, truth = bodies
     for wrong in (

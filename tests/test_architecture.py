@@ -90,6 +90,12 @@ def test_nothing_is_tied_to_one_machine():
         assert not absolute.search(path.read_text(encoding="utf-8")), path
 
 
-def test_readme_example_runs():
+def test_readme_example_beats_zero_velocity():
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    exec(compile(re.sub(r"steps=\d+", "steps=4", example), "README.md", "exec"), {})
+    variables = {}
+    exec(compile(example, "README.md", "exec"), variables)
+    scores = variables["scores"]
+    for error in ("ADE", "FDE", "MMADE", "MMFDE"):
+        assert scores["model"][error].mean < 0.9 * scores["zero velocity"][error].mean
+        behind = scores.difference("model", "zero velocity", error)
+        assert behind.mean < -5 * behind.standard_error

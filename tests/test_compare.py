@@ -614,6 +614,23 @@ def test_every_model_with_a_khat_has_its_curve_in_view(fitted, khat, share):
     assert said == ([f"{100 * share:g} % beyond 3"] if share else [])
 
 
+@pytest.mark.parametrize("least", [1e-4, 0.0, -1e-6])
+def test_a_large_kl_at_the_first_step_hides_no_other(fitted, least):
+    models, x = fitted
+    result = run(models, x)
+    rows = {}
+    for name, row in result.rows.items():
+        steps = np.full(row.kl_steps["z"].shape, 0.01)
+        steps[:, 0], steps[:, -1] = 50, least
+        rows[name] = dataclasses.replace(row, kl_steps={"z": steps})
+    figure = dataclasses.replace(result, rows=rows).plot()
+    figure.savefig(io.BytesIO())
+    panel = next(axes for axes in figure.axes if "KL" in axes.get_title())
+    low, high = panel.transAxes.inverted().transform(panel.transData.transform([(1, 0.01), (1, 50)]))[:, 1]
+    assert 0.02 < low < high - 0.3
+    assert high < 1
+
+
 def test_infinite_khats_come_back_from_json_as_unreliable(fitted):
     models, x = fitted
     khat = np.r_[np.full(6, math.inf), np.zeros(18)]

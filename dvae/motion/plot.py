@@ -15,6 +15,8 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
+from matplotlib.legend_handler import HandlerTuple
+from matplotlib.lines import Line2D
 
 from .. import files
 from .skeleton import Skeleton, rotate_about_up
@@ -24,8 +26,8 @@ PAST, TRUTH, FIXED, GIVEN = "black", "#1a7f37", "#4a4f57", "#cf222e"
 SPACING = 1.15
 """Metres between the skeletons of a figure."""
 
-ABREAST, MARGIN = 6, 0.15
-"""Skeletons in a row of an animation, and metres around all of them."""
+MARGIN = 0.15
+"""Metres around all skeletons of an animation."""
 
 ELEVATION = 0.2
 """Radians by which the viewer of an animation looks down."""
@@ -33,8 +35,13 @@ ELEVATION = 0.2
 _PLAYER = """
 const figure = document.getElementById('{plot_id}'), scene = figure._fullLayout.scene._scene;
 const [place, update] = [scene.setViewport, scene.updateFx];
-const {w, h} = figure._fullLayout._size, narrow = w / h / 2, {x, y, z} = scene.fullSceneLayout.aspectratio;
-if (narrow < 1) Plotly.relayout(figure, {'scene.aspectratio': {x: x * narrow, y: y * narrow, z: z * narrow}});
+const {w, h} = figure._fullLayout._size, {x, y, z} = scene.fullSceneLayout.aspectratio, {high} = figure.layout.meta;
+const height = Math.min(h, w * high / x), fit = 1.9 * Math.min(w / height / x, 1 / high);
+document.body.style.margin = 0;
+Plotly.relayout(figure, {
+  'height': figure._fullLayout.height - h + height,
+  'scene.aspectratio': {x: x * fit, y: y * fit, z: z * fit},
+});
 let turning = false, drag = scene.fullSceneLayout.dragmode, due = 0;
 figure.addEventListener('pointerdown', () => { turning = true; }, true);
 for (const end of ['pointerup', 'pointercancel']) window.addEventListener(end, () => { turning = false; }, true);
@@ -48,8 +55,8 @@ figure.on('plotly_animatingframe', () => {
   due += (late + 1) * spacing;
 });
 """
-"""What plotly lacks: the scene fits a narrow window, can be turned while it plays, and keeps its speed on a slow
-machine by leaving frames out."""
+"""What plotly lacks: the scene fills the window, or is as high as the window's width lets it be; it can be turned while
+it plays, and keeps its speed on a slow machine by leaving frames out."""
 
 
 def pose(
@@ -149,6 +156,7 @@ def futures(
     ax.tick_params(length=0)
     for spine in ax.spines.values():
         spine.set_visible(False)
+    _key(ax, len(future), real is not None, len(crosses) > 0)
     return ax
 
 
@@ -218,9 +226,9 @@ def animate(
     if skeleton.up == "y":  # plotly turns a scene about z
         motion = motion[..., [0, 2, 1]] * [1, -1, 1]
     low, high = np.nanmin(motion, (0, 1, 2)), np.nanmax(motion, (0, 1, 2))
-    columns = ceil(len(people) / ceil(len(people) / ABREAST))
-    row, column = np.divmod(np.arange(len(people)), columns)
     step = np.maximum(high - low + 0.4, SPACING)
+    columns = _abreast(len(people), step[0] / step[2])
+    row, column = np.divmod(np.arange(len(people)), columns)
     places = np.stack([column * step[0], 0.0 * row, -row * step[2]], axis=-1)  # rows one above the other
     gap = np.full((*motion.shape[:2], 1, 3), np.nan)
     motion = np.concatenate([motion + places[:, None, None], gap], axis=2).astype(np.float32)
@@ -286,6 +294,7 @@ def animate(
                 },
             },
             **_player({str(f): (f - now) / skeleton.fps for f in shown}, 1000 * every / skeleton.fps),
+            "meta": {"milliseconds": 1000 * every / skeleton.fps, "high": 1.9 * height / max(height, size[0] / 2)},
         },
     )
 
@@ -295,6 +304,28 @@ def save_html(figure: go.Figure, path: str | PathLike[str]) -> None:
     page = figure.to_html(auto_play=False, post_script=_PLAYER, config={"displaylogo": False})
     with files.written(path) as file:
         file.write(page.encode())
+
+
+def _key(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
+    """What the colours of `futures` mean, below the times."""
+    sampled = tuple(Line2D([], [], color=colour) for colour in _colours(min(samples, 5)))
+    key: dict[str, Any] = {"observed": Line2D([], [], color=PAST)}
+    if truth:
+        key["what happened"] = Line2D([], [], color=TRUTH)
+    key[f"{samples} sample{'s' * (samples > 1)}"] = sampled
+    if paths:
+        key["given paths"] = Line2D([], [], color=GIVEN, marker="x", linestyle="")
+    ax.legend(
+        key.values(),
+        key.keys(),
+        handler_map={tuple: HandlerTuple(ndivide=None, pad=0)},
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0),
+        borderaxespad=2,  # the height of the times
+        ncols=len(key),
+        frameon=False,
+        fontsize="small",
+    )
 
 
 def _player(seconds: dict[str, float], spacing: float) -> dict[str, Any]:
@@ -311,10 +342,15 @@ def _player(seconds: dict[str, float], spacing: float) -> dict[str, Any]:
     buttons = [play, {"label": "Pause", **go_to([None])}]
     steps = [{"label": f"{time:.2f}", **go_to([name])} for name, time in seconds.items()]
     return {
-        "meta": {"milliseconds": spacing},
         "updatemenus": [{"type": "buttons", "showactive": False, "buttons": buttons, "x": 0.01, **corner}],
         "sliders": [{"steps": steps, "currentvalue": {"suffix": " s"}, "x": 0.12, "len": 0.86, **corner}],
     }
+
+
+def _abreast(people: int, wide: float) -> int:
+    """How many stand in a row, so that all are as large as can be in a window of 2:1; one is `wide` by 1."""
+    rows = min(range(1, people + 1), key=lambda rows: max(rows, ceil(people / rows) * wide / 2))
+    return ceil(people / rows)
 
 
 def _literal(text: str) -> str:
