@@ -54,6 +54,6 @@ for axes, (name, model) in zip(figure.subplots(len(models)), models.items(), str
     torch.manual_seed(0)
     samples = model.forecast({"x": x[:, : protocol.observed]}, horizon=protocol.predicted, samples=10)["x"]
     futures(test.skeleton, past[0], test.positions(samples)[:, 0], future[0], ax=axes)
-    axes.set_title(f"{name}: black observed, green what happened, colors ten forecasts", fontsize=9)
+    axes.set_title(name, fontsize=9)
 figure.savefig(OUT / "futures.png", dpi=150)
 print(f"saved {OUT / 'futures.png'} and {OUT / 'evaluation.json'}")

@@ -2,7 +2,7 @@
 
     python docs/overview.py
 
-That takes four minutes on one core. Below are ten futures of one test window, chosen by a rule that luck has no part
+That takes three minutes on one core. Below are ten futures of one test window, chosen by a rule that luck has no part
 in: of those windows in which a wrist is below its shoulder while the person is observed, and above the head at some
 time after, the one where the best of the ten is off by the median of all these windows.
 """
