@@ -2,6 +2,7 @@
 # make test    lint, types, tests, and some of these once more as on another processor
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
 # make bench   the benchmarks
+# make notebooks   runs the notebooks and stores them with what they show
 # Each makes the environment in .venv when it is missing or out of date.
 
 PYTHON := python3
@@ -13,7 +14,7 @@ export OMP_NUM_THREADS := 1
 # Numerical tests that take little time, for the second run: other instructions round otherwise.
 NUMERICAL := control energies forecasts graphconv metrics networks trajectories
 
-.PHONY: venv demo test fuzz bench clean
+.PHONY: venv demo test fuzz bench notebooks clean
 
 venv: .venv/installed
 
@@ -45,6 +46,9 @@ fuzz: venv
 
 bench: venv
 	set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file; done
+
+notebooks: venv
+	$(BIN)/python docs/notebooks.py notebooks/*.ipynb
 
 clean:
 	rm -rf .venv build dist *.egg-info demo runs .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,106 @@
+"""Runs notebooks and stores them with what they show; `make notebooks` does so for all.
+
+    python docs/notebooks.py notebooks/01_factorizations.ipynb ...
+
+What is stored depends on the run alone: no times, no versions, no progress. An animation is stored as a still of its
+last frame, as figures that move are large and hosts that show notebooks do not play them.
+"""
+
+import base64
+import html
+import io
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import numpy as np
+from matplotlib.figure import Figure
+from nbclient import NotebookClient
+
+ROOT = Path(__file__).parents[1]
+PLOTLY = "application/vnd.plotly.v1+json"
+TEXTS = ("text/plain", "text/html", "text/latex")
+
+
+def execute(path: Path) -> nbformat.NotebookNode:
+    """A notebook run from top to bottom in a kernel of its own, without what varies."""
+    notebook = nbformat.read(path, as_version=4)
+    options = {"timeout": 1200, "kernel_name": "python3", "record_timing": False}
+    client = NotebookClient(notebook, resources={"metadata": {"path": str(ROOT)}}, **options)
+    own = {"PYTHONPATH": str(ROOT), "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    client.execute(env={**os.environ, **own, "PYTHONWARNINGS": "ignore:IProgress not found"})  # tqdm misses ipywidgets
+    notebook.metadata.language_info = {"name": "python"}
+    for cell in notebook.cells:
+        if "outputs" in cell:
+            cell.outputs = _joined(cell.outputs)
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            if PLOTLY in data:
+                output["data"] = {"image/png": _still(data[PLOTLY]), "text/plain": "a still; run the cell to play it"}
+    return notebook
+
+
+def _joined(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
+    """Outputs with what was printed in one piece, however it came."""
+    whole: list[nbformat.NotebookNode] = []
+    for output in outputs:
+        if whole and output.output_type == "stream" and output.name == whole[-1].get("name"):
+            whole[-1].text += output.text
+        else:
+            whole.append(output)
+    return whole
+
+
+def _still(figure: Any) -> str:
+    """The last frame of an animation by `dvae.motion.plot.animate`, seen from the front, as a PNG in base64."""
+    scene = figure["layout"]["scene"]
+    width, height = (np.ptp(scene[axis]["range"]) for axis in ("xaxis", "zaxis"))
+    still = Figure(figsize=(9, min(9 * height / width, 6)), dpi=72, layout="constrained")
+    ax = still.subplots()
+    for trace in figure["frames"][-1]["data"]:
+        ax.plot(_numbers(trace["x"]), _numbers(trace["z"]), color=trace["line"]["color"], linewidth=1.8)
+    for label in scene["annotations"]:
+        ax.text(label["x"], label["z"], html.unescape(label["text"]), ha="center", parse_math=False)
+    ax.set_aspect("equal")
+    ax.axis("off")
+    file = io.BytesIO()
+    still.savefig(file, format="png", metadata={"Software": None})
+    return base64.encodebytes(file.getvalue()).decode()
+
+
+def _numbers(values: Any) -> np.ndarray:
+    """An array as plotly writes it, in base64 or as a list."""
+    if "bdata" in values:
+        return np.frombuffer(base64.b64decode(values["bdata"]), values["dtype"])
+    return np.array(values, float)
+
+
+def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
+    """What a cell shows, as any run of it must: kinds of output, and their texts without what arithmetic decides.
+
+    Figures are there or not. Texts have their words and whole numbers; of a table, which may order its rows by their
+    numbers, the words alone.
+    """
+    found = []
+    for output in cell.get("outputs", []):
+        data = dict(output.get("data", {}))
+        if "text" in output:
+            data["text/plain"] = output["text"]
+        texts = {kind: _stable(text) if kind in TEXTS else "" for kind, text in data.items()}
+        found.append((output.get("name") or output["output_type"], texts))
+    return found
+
+
+def _stable(text: str) -> str:
+    if "<pre" in text or "━" in text:
+        return " ".join(sorted(re.findall(r"[^\W\d_]{2,}", re.sub("<[^>]*>", "", text))))
+    return " ".join(re.sub(r"[-+]?(\d*\.\d+|\d+(?=e[-+]\d))(e[-+]?\d+)?", "#", text).split())
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:]:
+        nbformat.write(execute(Path(name)), name)
+        print(f"stored {name}, {Path(name).stat().st_size / 1000:.0f} kB")
