@@ -35,7 +35,7 @@ def execute(path: Path) -> nbformat.NotebookNode:
     notebook.metadata.language_info = {"name": "python"}
     for cell in notebook.cells:
         if "outputs" in cell:
-            cell.outputs = _joined(cell.outputs)
+            cell.outputs = _kept(cell.outputs)
         for output in cell.get("outputs", []):
             data = output.get("data", {})
             if PLOTLY in data:
@@ -43,10 +43,13 @@ def execute(path: Path) -> nbformat.NotebookNode:
     return notebook
 
 
-def _joined(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
-    """Outputs with what was printed in one piece, however it came."""
+def _kept(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
+    """Outputs without the script that plays animations, and with what was printed in one piece, however it came."""
     whole: list[nbformat.NotebookNode] = []
     for output in outputs:
+        data = output.get("data", {})
+        if "PlotlyConfig" in data.get("text/html", "") and PLOTLY not in data:
+            continue
         if whole and output.output_type == "stream" and output.name == whole[-1].get("name"):
             whole[-1].text += output.text
         else:
