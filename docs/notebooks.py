@@ -44,11 +44,12 @@ def execute(path: Path) -> nbformat.NotebookNode:
 
 
 def _kept(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
-    """Outputs without the script that plays animations, and with what was printed in one piece, however it came."""
+    """Outputs without progress and the script that plays animations; what was printed is one, however it came."""
     whole: list[nbformat.NotebookNode] = []
     for output in outputs:
         data = output.get("data", {})
-        if "PlotlyConfig" in data.get("text/html", "") and PLOTLY not in data:
+        script = "PlotlyConfig" in data.get("text/html", "") and PLOTLY not in data
+        if script or "application/vnd.jupyter.widget-view+json" in data:
             continue
         if whole and output.output_type == "stream" and output.name == whole[-1].get("name"):
             whole[-1].text += output.text
@@ -84,8 +85,8 @@ def _numbers(values: Any) -> np.ndarray:
 def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
     """What a cell shows, as any run of it must: kinds of output, and their texts without what arithmetic decides.
 
-    Figures are there or not. Texts have their words and whole numbers; of a table, which may order its rows by their
-    numbers, the words alone.
+    Figures are there or not. Texts have their words and whole numbers, but for shares; of a table, which may order its
+    rows by their numbers, the words alone.
     """
     found = []
     for output in cell.get("outputs", []):
@@ -100,7 +101,7 @@ def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
 def _stable(text: str) -> str:
     if "<pre" in text or "━" in text:
         return " ".join(sorted(re.findall(r"[^\W\d_]{2,}", re.sub("<[^>]*>", "", text))))
-    return " ".join(re.sub(r"[-+]?(\d*\.\d+|\d+(?=e[-+]\d))(e[-+]?\d+)?", "#", text).split())
+    return " ".join(re.sub(r"[-+]?(\d*\.\d+|\d+(?=e[-+]\d|%))(e[-+]?\d+)?", "#", text).split())
 
 
 if __name__ == "__main__":

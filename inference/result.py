@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -112,12 +113,13 @@ class Result:
 
 
 def progress_bar(shown: bool) -> Progress:
-    """A bar that goes when the work is done; hidden where nobody would see it move."""
+    """A bar that goes when the work is done; hidden where nobody would see it move (notebooks need ipywidgets)."""
     console = Console()
+    moves = find_spec("ipywidgets") is not None if console.is_jupyter else console.is_terminal
     return Progress(
         TextColumn("{task.description}", "progress.description", markup=False),  # it may be the name of a model
         *Progress.get_default_columns()[1:],
         transient=True,
         console=console,
-        disable=not (shown and (console.is_terminal or console.is_jupyter)),
+        disable=not (shown and moves),
     )

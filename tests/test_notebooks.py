@@ -6,6 +6,9 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from rich import console
+
+from dvae.inference import result
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -83,3 +86,11 @@ def test_words_of_a_table_are_held_in_any_order_of_its_rows():
     table = "<pre>┃ name ┃ bound ┃\n│ first │ 1.5 ± 0.1 │\n│ second │ 1 % │</pre>"
     assert stable(table) == stable("<pre>┃ name ┃ bound ┃\n│ second │ 2 % │\n│ first │ 11.5 ± 0.1 │</pre>")
     assert stable(table) != stable(table.replace("second", "third"))
+
+
+@pytest.mark.parametrize("widgets", [None, "installed"])
+def test_a_notebook_has_a_bar_only_where_there_are_widgets(monkeypatch, widgets):
+    monkeypatch.setattr(console, "_is_jupyter", lambda: True)
+    monkeypatch.setattr(result, "find_spec", {"ipywidgets": widgets}.get)
+    assert result.progress_bar(True).disable == (widgets is None)
+    assert result.progress_bar(False).disable
