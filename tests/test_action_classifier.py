@@ -323,7 +323,7 @@ def test_the_record_says_which_classifier_and_older_records_are_read(fitted):
     score = document["rows"]["zero velocity"]["scores"]["FID b"]
     assert (score["program"], score["better"]) == ("free-running", "lower")
     assert f"ACC, FID b: classifier {document['classifiers']['b']['weights'][:12]}" in str(result)
-    assert "FID a" in [axes.get_title() for axes in result.plot().axes]
+    assert "FID a ↓" in [axes.get_title() for axes in result.plot().axes]
     del document["classifiers"]
     older = Evaluation.from_json(json.dumps(document))
     assert older["zero velocity"] == result["zero velocity"]

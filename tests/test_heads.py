@@ -100,7 +100,7 @@ def test_a_share_of_the_previous_value_is_one():
     for share in (-0.1, 1.1):
         with pytest.raises(ValueError, match="it is a share of the previous value, from 0 to 1"):
             heads.Normal(residual=share).build(D, D)
-    with pytest.raises(ValueError, match="residual is 2; it must be a share, between 0 and 1"):
+    with pytest.raises(ValueError, match="residual is 2; it must be between 0 and 1"):
         dvae.method("srnn", residual=2)
 
 

@@ -75,7 +75,8 @@ def _damage() -> Iterator[None]:
     except (Refused, MemoryError, FileNotFoundError, PermissionError):
         raise
     except Exception as error:
-        raise Refused(f"damaged, truncated or not an npz archive ({error or type(error).__name__})") from error
+        what = str(error)[:200] or type(error).__name__
+        raise Refused(f"damaged, truncated or not an npz archive ({what})") from error
 
 
 def _members(file: zipfile.ZipFile, size: int) -> dict[str, Member]:

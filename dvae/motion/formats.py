@@ -67,9 +67,9 @@ def load(
     if skeleton is None:
         skeleton, kept = _skeleton_of(path, found)
         joints = kept if joints is None else joints
-    known = _read_labels(path, Path(labels) if labels else None)
+    known = _read_labels(path, labels)
     if known and not any((split, name) in known or (None, name) in known for split, name, _ in found):
-        raise ValueError(f"{path}: no row of its labels file names a clip of the archive by (split, clip)")
+        raise ValueError(f"{_labels_of(path, labels)}: no row names a clip of {path} by (split, clip)")
     found.reverse()
 
     def clips() -> Iterator[Clip]:
@@ -89,9 +89,11 @@ def save(path: str | Path, motion: MotionSet) -> None:
     """Write a plain npz, and beside it skeleton.json and (where there are labels) labels.csv, for `load`.
 
     Raises:
-        ValueError: a clip's name has a slash, which would be read as part of the split.
+        ValueError: a clip's name has a slash, which would be read as part of the split, or is one that `load` refuses.
     """
     path = Path(path)
+    if unnamed := [name for clip in motion for name in (clip.split, clip.name) if not is_name(name)]:
+        raise ValueError(f"{brief(unnamed[0])} is no name for a split and a clip: expected text that can be printed")
     slashed = [clip.name for clip in motion if "/" in clip.name]
     if slashed:
         raise ValueError(f"clip name {slashed[0]!r} has a slash, which separates split and clip in the file")
@@ -125,9 +127,14 @@ def _skeleton_of(path: Path, clips: Sequence[tuple[str, str, np.ndarray]]) -> tu
     )
 
 
-def _read_labels(path: Path, labels: Path | None) -> dict[tuple[str | None, str], dict[str, str]]:
+def _labels_of(path: Path, labels: str | Path | None) -> Path:
+    """The file of labels that is given, or that stands beside the clips."""
+    return Path(labels) if labels else path.with_name("labels.csv")
+
+
+def _read_labels(path: Path, labels: str | Path | None) -> dict[tuple[str | None, str], dict[str, str]]:
     """Rows by (split, clip); by (None, clip) where the file has no split column."""
-    file = labels or path.with_name("labels.csv")
+    file = _labels_of(path, labels)
     if not file.is_file():
         if labels:
             raise FileNotFoundError(f"{labels}: no such labels file")

@@ -125,7 +125,7 @@ def futures(
     ahead = np.unique(np.linspace(0, horizon, frames + 1)[1:].round().clip(1)).astype(int)
     shown = [*sorted({0, now}), *(now + ahead)]
     if ax is None:
-        ax = plt.subplots(figsize=(1.15 * len(shown), 2.3), layout="constrained")[1]
+        ax = plt.subplots(figsize=(max(1.15 * len(shown), 4.6), 2.3), layout="constrained")[1]
 
     middle = future[:, :, skeleton.root].mean(0)
 
