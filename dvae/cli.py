@@ -998,7 +998,7 @@ def _rows(loaded: Sequence[runs.Loaded]) -> dict[str, list[runs.Loaded]]:
     seeds: dict[tuple[str, int], Path] = {}
     for run in loaded:
         key = json.dumps(_config_without_seed(run), sort_keys=True)
-        seed = Run(run.path).config["training"]["seed"]
+        seed = runs.read_config(run.path).training.seed
         if (key, seed) in seeds:
             raise UsageError(f"{run.path} and {seeds[key, seed]} are the same fit with the same seed; give one of them")
         seeds[key, seed] = run.path
@@ -1033,7 +1033,7 @@ def _unfinished(loaded: Sequence[runs.Loaded]) -> list[str]:
     """A sentence on every run that has not ended."""
     sentences = []
     for run in loaded:
-        state, steps = Run(run.path).state, Run(run.path).config["training"]["steps"]
+        state, steps = Run(run.path).state, runs.read_config(run.path).training.steps
         if (status := state["status"]) not in ENDED:
             where = f"{status} at step {state['step']} of {steps}"
             sentences.append(f"{run.path} has not ended ({where}); dvae resume {run.path} goes on")

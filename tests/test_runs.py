@@ -233,6 +233,15 @@ def test_a_config_out_of_range_is_refused_by_file_key_and_value(run, keys, value
     assert len(str(caught.value)) < 2000
 
 
+@pytest.mark.parametrize("key", ["steps", "seed", "devices"])
+def test_an_option_that_a_run_does_not_tell_is_at_its_default(run, capsys, key):
+    config = json.loads((run / CONFIG).read_text())
+    del config["training"][key]
+    (run / CONFIG).write_text(json.dumps(config))
+    fast = ["--no-forecasts", "--particles", "2", "--contrasts", "0", "--stride", "60"]
+    assert main(["compare", str(run), *fast]) == 0, capsys.readouterr().err
+
+
 def test_nesting_is_bounded(run):
     for depth in (40, 100_000):
         (run / CONFIG).write_text('{"a": ' * depth + "1" + "}" * depth)
