@@ -274,7 +274,8 @@ class Comparison(Result):
                         panel.errorbar(estimate.mean, place, xerr=reach, color=colours[name], elinewidth=width)
                 if estimate.freedom[-1] > 0:
                     freedom = f"{estimate.freedom[-1]:.2g} df"
-                    panel.annotate(freedom, (1, place), xycoords=("axes fraction", "data"), ha="right", fontsize=7)
+                    above = {"xytext": (-2, 4), "textcoords": "offset points", "ha": "right", "fontsize": 7}
+                    panel.annotate(freedom, (1, place), xycoords=("axes fraction", "data"), **above)
                 panel.plot(estimate.mean, place, "o", markersize=5, color=colours[name], label=labels[name])
             panel.set_ylim(len(ranking) - 0.5, -0.5)
             panel.set_yticks(range(len(ranking)), labels.values(), parse_math=False)

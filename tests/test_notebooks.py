@@ -23,9 +23,9 @@ def shown(notebook):
 @each_notebook
 # The kernel's transport warns of its own affairs.
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.timeout(1200)  # the longest computes for a minute, on a core of its own
+@pytest.mark.timeout(1200)
 def test_a_run_shows_what_is_stored(path):
-    stored, run = nbformat.read(path, as_version=4), TOOL["execute"](path)
+    stored, run = nbformat.read(path, as_version=4), TOOL["execute"](path, share=0.1)
     for cell, before, now in zip(
         (cell for cell in run.cells if cell.cell_type == "code"), shown(stored), shown(run), strict=True
     ):
