@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from .distributions.chain import DERIVATIVES, gaussian_chain
 from .heads import Head, HeadSpec, NormalHead, Parameters, StandardNormal
 from .networks.base import Input, Network, NetworkSpec, at, shift
 from .networks.rows import Rows
-from .notation import PROBED, Factor
+from .notation import Factor
 from .units import Units
 
 CONSTANT = "1"
@@ -55,11 +56,10 @@ class Conditional(nn.Module):
         self.parents = [parent.name for parent in factor.parents]
         self.units: dict[str, Units] = {}  # not registered here: they are the model's
         self.discrete, self.reparameterised = self._try_head()
-        for length in PROBED:
+        for length in range(2, 9):
             self.check(length)
 
     @torch.inference_mode(False)
-    @torch.enable_grad()
     def _try_head(self) -> tuple[bool, bool]:
         """Whether the head's values are discrete, and whether its draws have a gradient.
 
@@ -67,12 +67,16 @@ class Conditional(nn.Module):
             ValueError: a distribution of which several coordinates are one event.
         """
         rows = (1, 1) if self.factor.local else (1,)
-        with torch.random.fork_rng(devices=[]):
-            features = torch.randn(*rows, 1 if self.network is None else self.network.features, requires_grad=True)
+        training, own = self.head.training, list(self.head.parameters())
+        self.head.eval()  # statistics of what it normalises are of data
+        with torch.random.fork_rng(devices=[]), torch.set_grad_enabled(not any(p.is_inference() for p in own)):
+            features = torch.randn(*rows, 1 if self.network is None else self.network.features)
+            features.requires_grad_(torch.is_grad_enabled())
             previous = torch.randn(*rows, self.size) if self.head.residual else None
             parameters = self.head(features, previous)
             law = self.head.distribution(parameters)
             value = self.head.draw(parameters, self.head.noise((*rows, self.size), features))
+        self.head.train(training)
         if law.event_shape or law.batch_shape != (*rows, self.size):
             raise ValueError(
                 f"the head of {self.factor} makes a {type(law).__name__} of batch {tuple(law.batch_shape)} and event "
@@ -80,7 +84,9 @@ class Conditional(nn.Module):
                 f"{(*rows, self.size)} and no event, so that masks and bounds by step mean something; let latents "
                 "carry what the coordinates have in common"
             )
-        discrete = law.support is not None and law.support.is_discrete
+        discrete = False
+        with suppress(NotImplementedError):  # a distribution that says nothing of its support
+            discrete = law.support is not None and law.support.is_discrete
         learns = value.requires_grad or not any(parameter.requires_grad for parameter in parameters)
         return discrete, learns and not discrete  # torch.bernoulli has a gradient, of zero
 

@@ -13,6 +13,8 @@ import math
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
+from functools import reduce
+from operator import or_
 from typing import TYPE_CHECKING, Any
 
 import networkx as nx
@@ -92,22 +94,16 @@ def analytic_kl(
         T = 3 + (reach**2 if hidden else reach)  # lags that add up again and again meet within their product
         T = min(T, steps or T)
     model, guide = generative.dag(T), inference.dag(T)
+    bits = {node: 1 << place for place, node in enumerate({**model.nodes, **guide.nodes})}
+    reads: dict[Node, int] = {}  # sets of nodes, as the bits of a number
+    for node in nx.topological_sort(model):
+        parents = model.pred[node]
+        reads[node] = reduce(or_, (bits[p] | (reads[p] if p[0] in hidden else 0) for p in parents), 0)
+    moves: dict[Node, int] = {}
+    for node in reversed(list(nx.topological_sort(guide))):
+        moves[node] = reduce(or_, (bits[child] | moves[child] for child in guide.succ[node]), 0)
     latents = [name for block in inference.blocks for name in block.names]
-
-    def reads(node: Node) -> set[Node]:
-        found: set[Node] = set()
-        frontier = list(model.predecessors(node))
-        while frontier:
-            parent = frontier.pop()
-            if parent not in found:
-                found.add(parent)
-                frontier.extend(model.predecessors(parent) if parent[0] in hidden else ())
-        return found
-
-    return {
-        latent: all(nx.descendants(guide, node).isdisjoint(reads(node)) for node in guide if node[0] == latent)
-        for latent in latents
-    }
+    return {latent: not any(moves[n] & reads[n] for n in guide if n[0] == latent) for latent in latents}
 
 
 def _relations(*factorizations: Factorization) -> list[Relation]:

@@ -70,6 +70,7 @@ class DynamicalVAE(nn.Module):
         torch.Size([5, 10, 3])
     """
 
+    @alone
     def __init__(
         self,
         generative: str | Factorization,
@@ -142,7 +143,7 @@ class DynamicalVAE(nn.Module):
     def _check_latents(self) -> None:
         for name in self.latents:
             for conditional in (self.generator[name], self.encoder[name]):
-                if conditional.discrete or not (conditional.reparameterised or conditional.factor.kind == "p"):
+                if conditional.discrete or (conditional is self.encoder[name] and not conditional.reparameterised):
                     what = "are discrete" if conditional.discrete else "are not reparameterised"
                     raise ValueError(
                         f"the draws of the latent {name} {what} by the head of {conditional.factor}, so that no "
@@ -554,7 +555,8 @@ class DynamicalVAE(nn.Module):
             if mask is not None:
                 values["mask"] = {name: mask[..., list(places)] for name, places in self.parts.items()}
         if whole is not None and self.history is not None:
-            seen = whole if mask is None or mask.shape != whole.shape else whole.masked_fill(~mask, 0)
+            fill = self.units[self.history].mean if self.history in self.units else whole.new_zeros(())
+            seen = whole if mask is None or mask.shape != whole.shape else torch.where(mask, whole, fill)
             values.setdefault(self.history, seen)
         return values
 

@@ -21,6 +21,7 @@ import html
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
@@ -43,8 +44,8 @@ RESERVED = {
     "mask": "the batch's entry for which entries are observed",
     "sequences": "the name of the plate over the batch",
 }
-PROBED = (*range(2, 9), 16, 32, 64)
-"""Lengths at which the direction of a custom mask is looked up; every run checks it at its own."""
+FARTHER = (16, 32, 64)
+"""Lengths at which the direction of a custom mask is looked up, after 2 to 8; every run checks it at its own."""
 FONT = r"\\(?:math(?:bf|rm|it|sf)|boldsymbol|bm)(?![a-z])\s*"
 
 
@@ -146,11 +147,13 @@ class Relation:
 
     @property
     def directions(self) -> frozenset[int]:
-        """Where it reads: -1 the past, 0 the same step, +1 the future; for custom masks, at the lengths `PROBED`."""
+        """Where it reads: -1 the past, 0 the same step, +1 the future; custom masks are tried at some lengths."""
         if self.intervals is not None:
             reads = {-1: (-math.inf, -1), 0: (0, 0), 1: (1, math.inf)}
             return frozenset(k for k, side in reads.items() if (self & Relation.of([side])).intervals)
-        offsets = [np.subtract(*np.nonzero(self.mask(T).T)) for T in PROBED]
+        offsets = [np.subtract(*np.nonzero(self.mask(T).T)) for T in range(2, 9)]
+        with suppress(Exception):  # a mask may be made for short sequences alone
+            offsets += [np.subtract(*np.nonzero(self.mask(T).T)) for T in FARTHER]
         return frozenset(int(sign) for sign in np.sign(np.concatenate(offsets)))
 
     def reads(self, offset: int, T: int) -> bool:

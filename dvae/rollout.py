@@ -198,7 +198,7 @@ class Rollout:
         """
         if not self.hidden:
             return {}
-        gradient = any(hidden.detached is None or other in self.observed for other, hidden in self.hidden.items())
+        gradient = any(hidden.detached is not hidden.entries for hidden in self.hidden.values())
         with torch.set_grad_enabled(gradient and torch.is_grad_enabled()):
             while self._block[name] in self._unfed:  # blocks read themselves and earlier ones
                 self._fed.update(self._feed(self._unfed.pop(0)))
@@ -225,15 +225,16 @@ class Rollout:
     def _feed(self, block: Block) -> dict[str, Tensor]:
         """The data of a block with own means at the hidden entries."""
         names = [name for name in block.names if name in self.hidden]
-        if not names or self.feeding is None or self.feeding.passes is None:
-            return self._run(block, self._fed, self.hidden) if names else {}
-        fed: dict[str, Tensor] = {}
+        if not names:
+            return {}
+        if self.feeding is None or self.feeding.passes is None or not self.feeding.probability:
+            return self._run(block, self._fed, self.hidden)
+        known = {**self.values, **self._fed}
         for _ in range(self.feeding.passes):
-            known = {**self.values, **self._fed, **fed}
             for name in names:
                 mean = self.conditionals[name](known, self.batch, self.length, self.lengths)[0]
-                fed[name] = self._hide(self.hidden[name].fill(self.values[name], mean))
-        return fed
+                known[name] = self._hide(self.hidden[name].fill(self.values[name], mean))
+        return {name: known[name] for name in names}
 
     def _run(
         self, block: Block, fed: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Hidden] | None = None

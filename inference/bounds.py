@@ -102,6 +102,7 @@ class SequenceELBO(ELBO):
         draws = [self._terms(model, guide, (batch,), options) for _ in range(self.num_particles)]
         return draws[0] if len(draws) == 1 else _mean(draws)
 
+    @alone
     def differentiable_loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> Tensor:
         """Minus the bound plus the energies, summed over the batch."""
         draws = [self._terms(model, guide, args, kwargs) for _ in range(self.num_particles)]
@@ -194,12 +195,14 @@ def _closed_forms(model_sites: Mapping[str, Any], guide_sites: Mapping[str, Any]
     """The latents whose KL term may be analytic; none for programs whose factorizations are not known."""
     # In a replayed model the latents' sites carry the guide's notes; those of the data carry its own.
     sites = ([site for site in model_sites.values() if site["is_observed"]], guide_sites.values())
-    notes = [s["infer"] for group in sites for s in [s for s in group if "program" in s["infer"]][:1]]
-    if len(notes) < 2:
+    notes = [next((s["infer"] for s in group if "program" in s["infer"]), None) for group in sites]
+    if None in notes:
         return set()
-    pair, run = [note["program"] for note in notes], notes[0]["run"]
-    depends = run.hidden or any(equations.masks for equations in pair)  # on the length; else any length has one answer
-    right = _analytic(*pair, frozenset(run.hidden), run.length if depends else None)
+    pair, run = [note["program"] for note in notes], notes[0]["run"]  # type: ignore[index]
+    # Data that are missing, fed, or a function of their parents are read as what these make of them.
+    hidden = frozenset(run.hidden) | {name for name, s in model_sites.items() if s["infer"].get("_deterministic")}
+    depends = hidden or any(equations.masks for equations in pair)  # on the length
+    right = _analytic(*pair, hidden, run.length if depends else None)
     return {name for name, analytic in right.items() if analytic}
 
 

@@ -542,7 +542,8 @@ class Comparison(Result):
 def _freedom(total: float, *parts: tuple[float, float]) -> float:
     """Satterthwaite's degrees of freedom of a variance made of parts, each with its own; NaN where one is unknown."""
     uncertainty = sum(part**2 / freedom if freedom else math.nan for part, freedom in parts)
-    return total**2 / uncertainty if uncertainty else math.nan
+    least = min(freedom for _, freedom in parts)  # the total is at most the sum of the parts
+    return max(total**2 / uncertainty, least) if uncertainty else math.nan
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from pyro.infer.autoguide.initialization import InitMessenger, init_to_value
 
 from dvae import DynamicalVAE, Oracle, SequenceELBO, heads, importance_bound, twin
 from dvae.distributions import Sequence
-from dvae.inference.bounds import _khat
-from dvae.networks import Attention, Recurrent
+from dvae.inference.bounds import _closed_forms, _khat, _traces, sites_of
+from dvae.networks import Attention, Linear, Recurrent
 from dvae.rollout import SelfFeeding
 
 B, T = 3, 5
@@ -332,6 +332,19 @@ def test_a_backward_guide_has_no_analytic_kl_where_the_model_reads_its_own_means
     x = torch.randn(1, 4, 1, dtype=torch.float64)
     exact = exact_bound(model, x[0], **{name: value[0] for name, value in run.items() if name != "feeding"})
     torch.testing.assert_close(library_bound(model, x, **run)[0], exact, rtol=0, atol=1e-9)
+
+
+def test_nor_where_data_are_functions_of_latents():
+    """p(z_t | x_{t-1}) reads z_{t-1} then, whatever is missing."""
+    equations = "p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | z_{t+1}, c_t)"
+    own = {"p(x)": heads.Delta(), "q(z)": heads.FixedNormal(0.7), "p(z)": heads.FixedNormal(0.7)}
+    networks = {"p(x)": Linear(3, 1.0), "p(z)": Recurrent(4, hidden=(5,)), "q": Recurrent(4, hidden=(5,))}
+    model = DynamicalVAE(*equations, {"z": 1, "x": 1, "c": 1}, networks, own).double()
+    batch = {"c": torch.randn(2, 3, 1, dtype=torch.float64)}
+    model_sites, guide_sites = (sites_of(t) for t in _traces(model, model.guide, (batch,), {}))
+    assert _closed_forms(model_sites, guide_sites) == set()
+    forward = DynamicalVAE(equations[0], "q(z_t | z_{t-1}, c_t)", {"z": 1, "x": 1, "c": 1}, networks, own).double()
+    assert _closed_forms(*(sites_of(t) for t in _traces(forward, forward.guide, (batch,), {}))) == {"z"}
 
 
 def test_a_static_variable_of_the_data_may_have_missing_entries():

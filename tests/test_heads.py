@@ -244,6 +244,8 @@ def test_latents_whose_draws_have_no_gradient_are_refused():
         model(qz=Stuck)
     with torch.no_grad():  # the family is what counts, not where the model is made
         model(pz=Stuck)
+    with pytest.raises(ValueError, match="latent z are not reparameterised"):  # the prior is the guide
+        dvae.DynamicalVAE("p(z_t | c_t) p(x_t | z_t)", None, {"z": 1, "x": 1, "c": 1}, heads={"p(z)": Own(Stuck)})
 
 
 @pytest.mark.parametrize(
@@ -252,6 +254,36 @@ def test_latents_whose_draws_have_no_gradient_are_refused():
 def test_heads_with_events_are_refused(place, head):
     with pytest.raises(ValueError, match=r"one density for each coordinate, here batch \(1, 1, 2\) and no event"):
         model(**{place: head})
+
+
+class Unsaid(dist.Normal):
+    """A distribution that says nothing of its support."""
+
+    @property
+    def support(self):
+        raise NotImplementedError
+
+
+class Normalising(heads.NormalHead):
+    """It takes statistics of a batch."""
+
+    def __init__(self, features, size):
+        super().__init__(heads.Normal(), features, size)
+        self.norm = nn.BatchNorm1d(features)
+
+    def forward(self, features, previous=None, t=None):
+        return super().forward(self.norm(features.flatten(0, -2)).unflatten(0, features.shape[:-1]))
+
+    def distribution(self, parameters):
+        return Unsaid(*parameters)
+
+
+def test_a_head_is_tried_without_changing_it():
+    built = model(qz=Normalising)
+    assert built.encoder["z"].head.training
+    assert not built.encoder["z"].head.norm.num_batches_tracked
+    with torch.inference_mode():
+        assert model().sample(2, length=3)["x"].shape == (2, 3, 2)
 
 
 def test_discrete_data_have_a_head_of_their_own():

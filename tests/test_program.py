@@ -1,5 +1,7 @@
 """What the program does with what is not there, not in order, or not a tensor."""
 
+import threading
+import time
 from typing import Any
 
 import numpy as np
@@ -9,10 +11,11 @@ import torch
 from pyro.infer import SVI, Trace_ELBO
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO, heads
+from dvae import DynamicalVAE, SequenceELBO, heads, twin
 from dvae.inference.particles import Filter
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.testing import FactorizationContract
+from dvae.turns import alone
 
 SRNN = ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})")
 
@@ -175,6 +178,79 @@ def test_a_residual_head_is_held_to_a_custom_mask_at_every_length():
     model.sample(2, length=11)
     with pytest.raises(ValueError, match=r"residual head, which adds x_{t-1}, but it does not read that at 12 steps"):
         model.sample(2, length=12)
+
+
+def test_a_custom_mask_may_be_made_for_short_sequences_alone():
+    band = np.tri(20, k=-1, dtype=bool)
+    masks = {"band": lambda length: band[:length, :length]}
+    model = DynamicalVAE(
+        "p(z_t | z_{band}) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 1}, Attention(8, 2), masks=masks
+    )
+    assert model.sample(2, length=10)["x"].shape == (2, 10, 1)
+    with pytest.raises(ValueError, match=r"the mask {band} at T=21 is bool"):
+        model.sample(2, length=21)
+
+
+# ------------------------------------------------------------------------------------------------------ self-feeding
+
+
+@pytest.mark.parametrize("order", ["p(x_t | z_t, y_{<t}) p(y_t | x_{<=t})", "p(y_t | z_t, x_{<t}) p(x_t | y_{<=t})"])
+def test_as_many_passes_as_steps_are_exact_where_data_read_each_other(order):
+    steps = 4
+    sizes = {"z": 1, "x": 1, "y": 1}
+    model = twin(f"p(z_t | x_{{t-1}}) {order}", "q(z_t | x_{1:T})", sizes, steps, observed=("x", "y"))
+    batch = {name: torch.randn(3, steps, 1).double() for name in "xy"}
+    z = {"z": torch.randn(3, steps, 1).double()}
+
+    def log_joint(**options: Any) -> torch.Tensor:
+        program = pyro.poutine.condition(model.model, data=z)
+        return pyro.poutine.trace(program).get_trace(batch, **options).log_prob_sum()
+
+    exact = log_joint(self_feeding=dvae.SelfFeeding(1.0))
+    torch.testing.assert_close(log_joint(self_feeding=dvae.SelfFeeding(1.0, passes=steps)), exact)
+
+    batch["mask"] = {name: torch.rand(3, steps, 1) < 0.5 for name in "xy"}
+    missing = log_joint()
+    torch.testing.assert_close(log_joint(self_feeding=dvae.SelfFeeding(0.0, passes=1)), missing)
+
+
+def test_the_past_as_context_is_filled_in_its_units():
+    masks = {"1:O": lambda length: np.arange(length)[None] < 2}
+    model = DynamicalVAE(
+        "p(z) p(x_t | z, h_{1:O})",
+        "q(z | x_{1:T})",
+        {"z": 1, "x": 1, "h": 1},
+        Attention(8, 2),
+        history="h",
+        masks=masks,
+    )
+    model.standardise("h").fit(10 + torch.randn(50, 1))
+    x = 10 + torch.randn(2, 4, 1)
+    read = model._mapping({"x": x, "mask": torch.zeros(2, 4, 1, dtype=torch.bool)})["h"]
+    assert torch.equal(read, model.units["h"].mean.expand_as(read))
+
+
+# ------------------------------------------------------------------------------------------------------------ threads
+
+
+def test_a_bound_and_the_building_of_a_model_wait_for_their_turn():
+    model, x = srnn(), torch.randn(4, 6, 3).double()
+    done: list[float] = []
+
+    def work() -> None:
+        done.append(SequenceELBO().loss_and_grads(model, model.guide, x))
+        srnn()
+        done.append(0.0)
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    with alone:
+        for thread in threads:
+            thread.start()
+        time.sleep(0.2)
+        assert not done
+    for thread in threads:
+        thread.join()
+    assert len(done) == 8
 
 
 # ---------------------------------------------------------------------------------------------------------- engines
