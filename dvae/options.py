@@ -1,6 +1,6 @@
 """Options are fields of frozen dataclasses, whose types say what they can be: `check` holds every value to its type.
 
-    width: Size = 64                                       at least 1 and at most 4096
+    width: Size = 64                                       at least 1 and at most 16384
     keep: Share = 0.15                                     between 0 and 1
     noise: Annotated[float, Range(0, 1, below=True)] = 0   at least 0 and below 1
     loss: Literal["evidence", "best-of-many"] = ...        one of these
@@ -59,9 +59,9 @@ Count = Annotated[int, Range(1, 10**9)]
 """Of steps, draws or frames."""
 Delay = Annotated[int, Range(0, 10**9)]
 """Steps, possibly none."""
-Size = Annotated[int, Range(1, 4096)]
+Size = Annotated[int, Range(1, 16384)]
 """Of a variable, a layer or a state."""
-Extra = Annotated[int, Range(0, 4096)]
+Extra = Annotated[int, Range(0, 16384)]
 """Of a variable or layer that may be left out."""
 Layers = Annotated[int, Range(1, DEEPEST)]
 Share = Annotated[float, Range(0, 1)]

@@ -72,7 +72,7 @@ class Training:
         patience: validations without a better bound after which the run stops; None to run all steps.
         log_every: steps from one row of the log to the next.
         seed: seed of batches and latent draws; each process adds its rank.
-        accelerator: where to run: "auto", "cpu", "cuda" or "mps".
+        accelerator: where to run: "auto", "cpu", "gpu", "cuda" or "mps".
         devices: number of devices, with one process each.
         precision: precision of the computation; "32-true" leaves the model's own.
         progress: whether to show the terms on the terminal.
@@ -94,12 +94,14 @@ class Training:
     patience: Count | None = None
     log_every: Count = 10
     seed: int = 0
-    accelerator: str = "auto"
-    devices: Annotated[int, Range(1, 16)] = 1
+    accelerator: Literal["auto", "cpu", "gpu", "cuda", "mps"] = "auto"
+    devices: Annotated[int, Range(1, 32)] = 1
     precision: Literal["32-true", "64-true", "bf16-mixed", "bf16-true"] = "32-true"
     progress: bool = True
 
     def __post_init__(self) -> None:
+        if self.gradient_clip == math.inf:
+            object.__setattr__(self, "gradient_clip", None)
         check(self)
         for name, allowed in (("learning_rate", Range(0)), ("self_feeding", Range(0, 1))):
             for value in levels(getattr(self, name)):

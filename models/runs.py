@@ -290,9 +290,10 @@ def reading_config(path: str | os.PathLike[str]) -> Iterator[None]:
     except (CheckpointError, OSError):
         raise
     except Exception as error:  # a method of somebody else's may fail in any way at options that are not its own
+        what = f"it lacks {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
         raise CheckpointError(
-            f"{Path(path) / CONFIG} does not tell method, data, protocol and training ({_shortened(repr(error))}); it "
-            "is damaged, or was not written by `dvae fit` with these methods"
+            f"{Path(path) / CONFIG} does not tell method, data, protocol and training of a run on its data "
+            f"({_shortened(what)}); it is damaged, or was not written by `dvae fit` with these methods"
         ) from error
 
 

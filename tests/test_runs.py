@@ -3,6 +3,7 @@
 import errno
 import io
 import json
+import math
 import os
 import shutil
 import signal
@@ -196,7 +197,7 @@ def test_an_archive_that_would_grow_or_hang_is_refused(run):
 @pytest.mark.parametrize(
     ("keys", "value", "message"),
     [
-        (("method", "width"), 20_000, "width is 20000; it must be at least 1 and at most 4096"),
+        (("method", "width"), 20_000, "width is 20000; it must be at least 1 and at most 16384"),
         (("method", "width"), -3, "width is -3; it must be at least 1"),
         (("method", "width"), 10**400, "width is .*; it must be at least"),
         (("method", "hidden"), [8] * 100_000, "hidden has 100000 entries; it must have 64 at most"),
@@ -204,7 +205,7 @@ def test_an_archive_that_would_grow_or_hang_is_refused(run):
         (("method", "residual"), float("nan"), "residual is nan; it must be"),
         (("method", "emission"), "fixd", r"unknown emission .*did you mean .*fixed"),
         (("method", "latent"), 4096, "asks for a model that is larger than its weights|weights of another model"),
-        (("training", "devices"), 40, "devices is 40; it must be at least 1 and at most 16"),
+        (("training", "devices"), 40, "devices is 40; it must be at least 1 and at most 32"),
         (("training", "steps"), True, "steps is True; it must be a whole number"),
         (("training", "batch_size"), 10**6, "batch_size is 1000000; it must be at least 1 and at most 16384"),
         (("training", "precision"), "8", "unknown precision '8'"),
@@ -531,3 +532,11 @@ def test_threads_take_turns(people, fitted, tmp_path):
     assert found["forecast"] == forecast().shape
     for name in ("a", "b"):
         assert (tmp_path / name / LAST).read_bytes() == (fitted / LAST).read_bytes()
+
+
+def test_what_was_valid_stays_valid():
+    """A limit of the gradient that is none, and layers as wide as a user of a large machine has them."""
+    assert dvae.Training(gradient_clip=math.inf).gradient_clip is None
+    assert dvae.method("vae", hidden=(8192,)).hidden == (8192,)
+    with pytest.raises(ValueError, match="unknown accelerator 'tpu' .*known: auto, cpu"):
+        dvae.Training(accelerator="tpu")
