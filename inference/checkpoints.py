@@ -373,10 +373,18 @@ _STORAGES = {f"torch {kind}Storage" for kind in ("Float", "Double", "BFloat16", 
 _KNOWN = _STORAGES | {"torch._utils _rebuild_tensor_v2", "collections OrderedDict"}
 
 
+# all that torch says of such a state: what puts a plain value on the stack, and what takes values from it
+_PLAIN = {"EMPTY_DICT", "EMPTY_LIST", "NONE", "NEWTRUE", "NEWFALSE", "BINUNICODE", "BINFLOAT"}
+_PLAIN |= {"BININT", "BININT1", "BININT2", "LONG1"}
+_TAKEN = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "REDUCE": 2, "BINPERSID": 1, "APPEND": 1, "SETITEM": 2}
+_INSTRUCTIONS = 2**20
+"""Of a state's pickle, which has about a hundred and fifty for each parameter."""
+_DEEPEST = 8
+"""Tuples in one another; those of a tensor are two."""
+
+
 def _check_archive(content: bytes) -> None:
     """Refuse an archive that would grow when it is read, or whose pickle asks for more than tensors in dicts.
-
-    Pickles share objects by name, so that forty tuples, each of two of the one before, are hashed for years.
 
     Raises:
         ValueError: saying why.
@@ -388,16 +396,55 @@ def _check_archive(content: bytes) -> None:
         if sum(each.file_size for each in members) > len(content):
             raise ValueError("its members are larger than itself")
         (pickled,) = [each for each in members if each.filename.endswith("/data.pkl")]
-        operations = [(code.name, argument) for code, argument, _ in pickletools.genops(archive.read(pickled))]
-    tuples, before = set(), ""
-    for name, argument in operations:
+        _check_pickle(archive.read(pickled))
+
+
+def _check_pickle(content: bytes) -> None:
+    """Follow a pickle without making what it says, and refuse what torch would not have written.
+
+    Whatever is a key is hashed, tuples with all that they hold: a hundred thousand of them in one another overflow the
+    stack of C, and forty, each of two times the one before, which a pickle shares by name, take years.
+
+    Raises:
+        ValueError: saying why.
+    """
+    stack: list[int] = []  # of each value, how deep tuples nest in it; 0 for whatever is no tuple
+    below: list[list[int]] = []  # the stacks under the marks
+    memo: dict[Any, int] = {}
+    for count, (code, argument, _) in enumerate(pickletools.genops(content)):
+        name = code.name
+        if count == _INSTRUCTIONS:
+            raise ValueError(f"its pickle has more than {_INSTRUCTIONS:,} instructions")
         if name in ("GLOBAL", "STACK_GLOBAL", "INST") and argument not in _KNOWN:
             raise ValueError(f"it asks for {str(argument)[:80]!r}")
-        if name in ("BINPUT", "LONG_BINPUT") and before.startswith("TUPLE"):
-            tuples.add(argument)
-        if name == "DUP" or (name in ("BINGET", "LONG_BINGET") and argument in tuples):
-            raise ValueError("it shares a tuple")
-        before = name
+        if isinstance(argument, int) and argument.bit_length() > 64:  # of these, many could have one hash
+            raise ValueError(f"it has a number of {argument.bit_length():,} bits")
+        try:
+            if name in ("TUPLE", "APPENDS", "SETITEMS"):
+                values, stack = stack, below.pop()
+            elif number := _TAKEN.get(name):
+                values = [stack.pop() for _ in range(number)]
+            else:
+                values = []
+            if name.startswith("TUPLE") or name == "EMPTY_TUPLE":
+                stack.append(1 + max(values, default=0))
+                if stack[-1] > _DEEPEST:
+                    raise ValueError(f"its tuples nest deeper than {_DEEPEST}")
+            elif name in _PLAIN or name in ("GLOBAL", "REDUCE", "BINPERSID"):
+                stack.append(0)
+            elif name == "MARK":
+                below.append(stack)
+                stack = []
+            elif name in ("BINPUT", "LONG_BINPUT"):
+                memo[argument] = stack[-1]
+            elif name in ("BINGET", "LONG_BINGET"):
+                stack.append(memo[argument])
+                if stack[-1]:
+                    raise ValueError("it shares a tuple")
+            elif name not in ("PROTO", "STOP", "APPEND", "SETITEM", "APPENDS", "SETITEMS"):
+                raise ValueError(f"it uses the instruction {name}")
+        except LookupError as error:
+            raise ValueError(f"its pickle is damaged, it uses {name} on what is not there") from error
 
 
 def _count(value: Any) -> bool:

@@ -191,6 +191,50 @@ def test_an_archive_that_would_grow_or_hang_is_refused(run):
         Run(run).optimiser_state()
 
 
+NESTED = b"\x80\x02})" + b"\x85" * 200_000 + b"Ns."
+COLLIDING = b"\x80\x02}\x8a\x0a" + b"\x01" * 10 + b"Ns."
+HOSTILE = {
+    "a key of tuples in tuples": (NESTED, "its tuples nest deeper than 8"),
+    "a key in an ordered dict": (
+        b"\x80\x02ccollections\nOrderedDict\n]" + NESTED[3:-3] + b"N\x86a\x85R.",
+        "its tuples nest deeper than 8",
+    ),
+    "a tuple by two names": (b"\x80\x02})\x85\x80\x02q\x00h\x00s.", "it shares a tuple"),
+    "a number of many bits": (COLLIDING, "it has a number of 73 bits"),
+    "an instruction of others": (b"\x80\x02}N2s.", "it uses the instruction DUP"),
+    "without end": (b"\x80\x02}" + b"NNs" * 400_000 + b".", "more than 1,048,576 instructions"),
+    "nothing below": (b"\x80\x02}\x85\x85\x86.", "its pickle is damaged"),
+}
+
+
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_a_pickle_that_torch_would_not_write_is_refused_before_torch_reads_it(hostile, run, monkeypatch):
+    pickled, message = HOSTILE[hostile]
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as new:
+        new.writestr("archive/data.pkl", pickled)
+        new.writestr("archive/version", "3\n")
+    recommit(run, OPTIMISER, archive.getvalue())
+    monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("torch reads it"))  # which may end the process
+    with pytest.raises(CheckpointError, match=message):
+        Run(run).optimiser_state()
+
+
+@pytest.mark.parametrize("optimiser", [torch.optim.Adam, torch.optim.AdamW, torch.optim.SGD])
+def test_the_state_of_each_optimiser_is_read(optimiser, run):
+    model = torch.nn.Sequential(*(torch.nn.Linear(2, 2) for _ in range(100)))  # of more than 256 names
+    used = optimiser(model.parameters(), lr=1e-3, **({"momentum": 0.9} if optimiser is torch.optim.SGD else {}))
+    model(torch.ones(3, 2)).sum().backward()
+    used.step()
+    content = io.BytesIO()
+    random = {"torch": torch.get_rng_state(), "cuda": torch.get_rng_state()}
+    torch.save({"name": "adam", "optimizer": used.state_dict(), "random": random, "large": 2**40}, content)
+    recommit(run, OPTIMISER, content.getvalue())
+    read = Run(run).optimiser_state()
+    assert read["optimizer"]["param_groups"] == used.state_dict()["param_groups"]
+    assert torch.equal(read["random"]["cuda"], random["cuda"])
+
+
 # Values --------------------
 
 
