@@ -6,6 +6,7 @@ under `validation/` those of the validation data, in nats per frame; `loss`, `gr
 `self_feeding` are of the step.
 """
 
+import io
 import json
 import os
 from collections.abc import Mapping
@@ -21,8 +22,10 @@ from .checkpoints import CheckpointError
 from .result import Plain
 
 Row = Mapping[str, float]
-LARGEST_LOG = 2**28
+LARGEST_LOG = 2**25
 """Bytes of a file of JSON lines."""
+MOST_ROWS = 200_000
+"""In a file of JSON lines; in memory, a row takes many times its bytes."""
 
 
 class Tracker(Protocol):
@@ -90,21 +93,24 @@ class JSONLines:
         """Return the rows of the file, without a last line that was cut off; none if there is no file.
 
         Raises:
-            CheckpointError: a line that is no row of numbers, or a path that is no plain file.
+            CheckpointError: a line that is no row of numbers, too many rows or bytes, or a path that is no plain file.
         """
         try:
-            lines = files.read(self.path, LARGEST_LOG).split(b"\n")
+            content = files.read(self.path, LARGEST_LOG)
         except FileNotFoundError:
             return []
         except files.FileRefused as error:
             raise CheckpointError(f"{error}; move it away to go on without the history of the run") from error
         rows: list[dict[str, Any]] = []
-        for number, line in enumerate(lines[:-1], 1):  # the last one has no end
-            try:
-                row = json.loads(line)
-            except (ValueError, RecursionError):
-                row = None
-            if not _is_row(row):
+        for number, line in enumerate(io.BytesIO(content), 1):
+            if not line.endswith(b"\n"):
+                break
+            if number > MOST_ROWS:
+                raise CheckpointError(
+                    f"{self.path} has more than {MOST_ROWS:,} rows; take some out, or move the file away to go on "
+                    "without the history of the run"
+                )
+            if (row := row_of(line)) is None:
                 raise CheckpointError(
                     f"{self.path} is damaged: line {number} is no row of numbers with a step; take the line out, or "
                     "move the file away to go on without the history of the run"
@@ -113,11 +119,16 @@ class JSONLines:
         return rows
 
 
-def _is_row(row: Any) -> bool:
-    """Whether it maps "step" to a count and every name to a number."""
+def row_of(line: bytes) -> dict[str, Any] | None:
+    """The row of a line, if that maps "step" to a count and every name to a number."""
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
     if not isinstance(row, dict) or type(row.get("step")) is not int or not 0 <= row["step"] <= 10**9:
-        return False
-    return all(isinstance(value, int | float) for value in row.values())
+        return None
+    numbers = all(isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**63) for value in row.values())
+    return row if numbers else None
 
 
 class TensorBoard:

@@ -10,7 +10,6 @@ backend.
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import re
@@ -37,7 +36,7 @@ from ..inference.checkpoints import Run
 from ..inference.fit import Fit, State, Training
 from ..inference.result import Plain, Table
 from ..inference.schedules import clamp
-from ..inference.trackers import LARGEST_LOG
+from ..inference.trackers import LARGEST_LOG, row_of
 from ..motion import Protocol
 from ..turns import alone
 from .method import Method
@@ -384,7 +383,9 @@ class _Log:
                 file.seek(self._read)
                 whole, end, _ = file.read(LARGEST_LOG).rpartition(b"\n")
                 self._read += len(whole + end)
-                for row in map(json.loads, whole.splitlines()):
+                for row in map(row_of, whole.split(b"\n")):
+                    if row is None:  # whoever reads the log for its rows says what is wrong with it
+                        continue
                     self.step = row["step"]
                     self.bound = row.get("validation/self_fed/bound", row.get("validation/bound", self.bound))
         return began

@@ -414,6 +414,20 @@ def test_a_damaged_log_is_refused_by_its_line(run, line):
         runs.resume(run, steps=6, progress=False)
 
 
+def test_a_log_of_more_rows_than_a_run_writes_is_refused_at_the_first_beyond(tmp_path, monkeypatch):
+    path = tmp_path / "log.jsonl"
+    row = b'{"step": 1}\n'
+    path.write_bytes(row * trackers.MOST_ROWS)
+    assert len(JSONLines(path).read()) == trackers.MOST_ROWS
+    path.write_bytes(row * trackers.MOST_ROWS + b"no row\n")  # is not come to
+    with pytest.raises(CheckpointError, match=f"{path} has more than 200,000 rows; take some out, or move the file"):
+        JSONLines(path).read()
+    path.write_bytes(row * (2**25 // len(row) + 1))
+    monkeypatch.setattr(trackers, "row_of", lambda line: pytest.fail("a row is made"))
+    with pytest.raises(CheckpointError, match=f"{path} has .* bytes, and can rightly have 33554432 at most; move it"):
+        JSONLines(path).read()
+
+
 def test_a_forecast_that_is_not_finite_is_refused_by_its_clip(run, capsys):
     huge = {name: value * 0 + 3e38 for name, value in load_file(run / BEST).items()}
     recommit(run, BEST, save(huge))

@@ -205,6 +205,11 @@ def test_the_table_is_read_from_the_logs(tmp_path):
         more.write('0, "validation/bound": 2.0, "validation/self_fed/bound": 1.5}\n')
     assert not log.look()
     assert (log.step, log.bound) == (60, 1.5)  # as the best weights of such a run are chosen
+    damaged = ["{", "[]", "7", '{"bound": 1}', '{"step": "7"}', "[" * 100_000, '{"step": 7, "validation/bound": 1%s}']
+    with file.open("a") as more:
+        more.write("\n".join(damaged) % ("0" * 400) + '\n\xff\n{"step": 70}\n')
+    assert not log.look()  # a damaged line is nobody's progress, and does not end the thread that looks
+    assert (log.step, log.bound) == (70, 1.5)
 
 
 def test_the_callers_backend_is_used_and_threads_take_turns(swept, data, tmp_path, monkeypatch):
