@@ -1,4 +1,5 @@
 import csv
+import errno
 import io
 import os
 import pickle
@@ -340,6 +341,34 @@ class TestPlain:
         assert read.skeleton == made().skeleton
         for old, new in zip(made(), read, strict=True):
             assert {**new.labels, **old.labels} == new.labels
+
+    def test_links_are_replaced_and_not_followed(self, tmp_path):
+        victim = tmp_path / "mine.txt"
+        victim.write_text("mine")
+        links = [tmp_path / name for name in ("a.npz", "skeleton.json", "labels.csv")]
+        for link in links:
+            link.symlink_to(victim)
+        save(links[0], simulate(5, 20))
+        assert victim.read_text() == "mine"
+        assert not any(link.is_symlink() for link in links)
+        assert load(links[0]).fingerprint() == simulate(5, 20).fingerprint()
+
+    @pytest.mark.parametrize("name", ["a.npz", "skeleton.json", "labels.csv"])
+    def test_a_full_disk_leaves_the_older_file_and_is_named(self, name, tmp_path, monkeypatch):
+        save(tmp_path / "a.npz", simulate(5, 20))
+        old = (tmp_path / name).read_bytes()
+        replace_file = os.replace
+
+        def full(new, path):
+            if Path(path).name == name:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            replace_file(new, path)
+
+        monkeypatch.setattr(os, "replace", full)
+        with pytest.raises(OSError, match=f"No space left on device: '{tmp_path / name}'"):
+            save(tmp_path / "a.npz", simulate(5, 21))
+        assert (tmp_path / name).read_bytes() == old
+        assert len(list(tmp_path.iterdir())) == 3
 
     def test_fortran_order_other_numbers_and_keys_without_a_split(self, tmp_path):
         positions = people((9,))[0].positions

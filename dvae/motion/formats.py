@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import files
 from .archive import archive
 from .data import Clip, MotionSet
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, read_text
@@ -88,7 +89,10 @@ def load(
 def save(path: str | Path, motion: MotionSet) -> None:
     """Write a plain npz, and beside it skeleton.json and (where there are labels) labels.csv, for `load`.
 
+    Each takes the place of an older file, or of a link, once it is whole.
+
     Raises:
+        OSError: one cannot be written; the error names it.
         ValueError: a clip's name has a slash, which would be read as part of the split, or is one that `load` refuses.
     """
     path = Path(path)
@@ -98,16 +102,17 @@ def save(path: str | Path, motion: MotionSet) -> None:
     if slashed:
         raise ValueError(f"clip name {slashed[0]!r} has a slash, which separates split and clip in the file")
     arrays: dict[str, Any] = {f"{clip.split}/{clip.name}": clip.positions for clip in motion}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("wb") as file:  # an open file: savez would append .npz to a name
+    with files.written(path) as file:
         np.savez_compressed(file, **arrays)
     motion.skeleton.to_json(path.with_name("skeleton.json"))
     columns = list(dict.fromkeys(name for clip in motion for name in clip.labels))
     if columns:
-        with path.with_name("labels.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, ["split", "clip", *(c for c in columns if c not in ("split", "clip"))])
-            writer.writeheader()
-            writer.writerows({**clip.labels, "split": clip.split, "clip": clip.name} for clip in motion)
+        table = io.StringIO(newline="")
+        writer = csv.DictWriter(table, ["split", "clip", *(c for c in columns if c not in ("split", "clip"))])
+        writer.writeheader()
+        writer.writerows({**clip.labels, "split": clip.split, "clip": clip.name} for clip in motion)
+        with files.written(path.with_name("labels.csv")) as file:
+            file.write(table.getvalue().encode())
 
 
 def _skeleton_of(path: Path, clips: Sequence[tuple[str, str, np.ndarray]]) -> tuple[Skeleton, tuple[int, ...] | None]:

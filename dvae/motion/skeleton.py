@@ -24,6 +24,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import files
+
 MOST_JOINTS = 1000
 """A body scanner's suit has two hundred markers; matrices here grow with the square of the number."""
 
@@ -312,7 +314,7 @@ class Skeleton:
             raise ValueError(f"{path}: {error}") from error
 
     def to_json(self, path: str | Path) -> None:
-        """Write the skeleton as a JSON file that people can read."""
+        """Write the skeleton as a JSON file that people can read; it replaces an older one once it is whole."""
         fields: dict[str, object] = {
             "name": self.name,
             "joint_names": self.names,
@@ -326,7 +328,8 @@ class Skeleton:
         if self.lengths:
             lengths = iter(self.lengths)
             fields["bone_lengths_m"] = [0.0 if parent == -1 else next(lengths) for parent in self.parents]
-        Path(path).write_text(json.dumps(fields, indent=2) + "\n", encoding="utf-8")
+        with files.written(path) as file:
+            file.write((json.dumps(fields, indent=2) + "\n").encode())
 
 
 SHORTEST = 1e-6
