@@ -21,6 +21,7 @@ from dvae.motion import (
     PROTOCOLS,
     WALKER,
     Clip,
+    Forecasts,
     MotionSet,
     Protocol,
     Skeleton,
@@ -369,6 +370,19 @@ class TestPlain:
             save(tmp_path / "a.npz", simulate(5, 21))
         assert (tmp_path / name).read_bytes() == old
         assert len(list(tmp_path.iterdir())) == 3
+
+    def test_a_body_at_rest_is_read_again(self, tmp_path):
+        frames = 80 * 10**6 // (WALKER.joints * 3 * 4)  # packs to less than a hundredth
+        rest = np.repeat(people()[0].positions[:1].astype(np.float32), frames, 0)
+        save(tmp_path / "a.npz", MotionSet([Clip("train", "rest", rest)], WALKER))
+        assert load(tmp_path / "a.npz").clips[0].positions.shape == rest.shape
+
+    def test_a_forecast_of_a_body_at_rest_is_read_again(self, tmp_path):
+        future = np.zeros((80 * 10**6 // (10 * WALKER.joints * 3 * 4), 1, 10, WALKER.joints, 3), np.float32)
+        Forecasts(WALKER, [("test", "rest", 0)], future, future[0], future[0]).save(tmp_path / "a.npz")
+        assert Forecasts.load(tmp_path / "a.npz").forecasts.shape == future.shape
+        Forecasts(WALKER, [("test", "rest", 0)], future[:9], future[0], future[0]).save(tmp_path / "a.npz")
+        assert (tmp_path / "a.npz").stat().st_size < future[:9].nbytes  # compressed where that is read
 
     def test_fortran_order_other_numbers_and_keys_without_a_split(self, tmp_path):
         positions = people((9,))[0].positions

@@ -11,12 +11,12 @@ import io
 import pickletools
 import re
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -79,10 +79,31 @@ def _damage() -> Iterator[None]:
         raise Refused(f"damaged, truncated or not an npz archive ({what})") from error
 
 
+def _limit(size: int) -> int:
+    """Bytes that a file of this size may unpack to."""
+    return min(LARGEST, max(SMALL, DENSEST * size))
+
+
+def write(file: BinaryIO, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write an npz that `archive` reads, compressed where that may be: motion that hardly moves packs too well.
+
+    Args:
+        file: a new one, open for writing and reading.
+        arrays: the members by name.
+    """
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    size = file.seek(0, io.SEEK_END)
+    with zipfile.ZipFile(file) as written:
+        unpacked = sum(info.file_size for info in written.infolist())
+    if unpacked > _limit(size):
+        file.seek(0)
+        file.truncate()
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
 def _members(file: zipfile.ZipFile, size: int) -> dict[str, Member]:
     infos = [info for info in file.infolist() if not info.is_dir()]
-    unpacked = sum(info.file_size for info in infos)
-    limit = min(LARGEST, max(SMALL, DENSEST * size))
+    unpacked, limit = sum(info.file_size for info in infos), _limit(size)
     if unpacked > limit:
         raise Refused(f"it would unpack to {unpacked:,} bytes, at most {limit:,} are read from {size:,}")
     if sum(info.compress_size for info in infos) > size:

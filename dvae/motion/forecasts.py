@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
-from .archive import archive
+from .archive import archive, write
 from .formats import read_arrays
 from .skeleton import Skeleton
 
@@ -75,23 +75,23 @@ class Forecasts:
         `fps`.
         """
         split, clip, start = zip(*self.keys, strict=True)
-        with files.written(path) as file:  # an open file: numpy would append .npz to a name
-            np.savez_compressed(
-                file,
-                forecasts=self.forecasts,
-                observed=self.observed,
-                truth=self.truth,
-                split=np.array(split),
-                clip=np.array(clip),
-                start=np.array(start),
-                name=np.array(self.skeleton.name),
-                joint_names=np.array(self.skeleton.names),
-                parents=np.array(self.skeleton.parents),
-                joints_left=np.array(self.skeleton.left, int),
-                joints_right=np.array(self.skeleton.right, int),
-                up_axis=np.array(self.skeleton.up),
-                fps=np.array(self.skeleton.fps),
-            )
+        arrays = {
+            "forecasts": self.forecasts,
+            "observed": self.observed,
+            "truth": self.truth,
+            "split": np.array(split),
+            "clip": np.array(clip),
+            "start": np.array(start),
+            "name": np.array(self.skeleton.name),
+            "joint_names": np.array(self.skeleton.names),
+            "parents": np.array(self.skeleton.parents),
+            "joints_left": np.array(self.skeleton.left, int),
+            "joints_right": np.array(self.skeleton.right, int),
+            "up_axis": np.array(self.skeleton.up),
+            "fps": np.array(self.skeleton.fps),
+        }
+        with files.written(path) as file:
+            write(file, arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Forecasts:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .. import files
-from .archive import archive
+from .archive import archive, write
 from .data import Clip, MotionSet
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, read_text
 
@@ -103,7 +103,7 @@ def save(path: str | Path, motion: MotionSet) -> None:
         raise ValueError(f"clip name {slashed[0]!r} has a slash, which separates split and clip in the file")
     arrays: dict[str, Any] = {f"{clip.split}/{clip.name}": clip.positions for clip in motion}
     with files.written(path) as file:
-        np.savez_compressed(file, **arrays)
+        write(file, arrays)
     motion.skeleton.to_json(path.with_name("skeleton.json"))
     columns = list(dict.fromkeys(name for clip in motion for name in clip.labels))
     if columns:
