@@ -11,8 +11,8 @@ BIN := .venv/bin
 # One thread: the models are small, and on cores that others use too, two threads wait for each other many times longer.
 export OMP_NUM_THREADS := 1
 
-# Numerical tests that take little time, for the second run: other instructions round otherwise.
-NUMERICAL := control energies forecasts graphconv metrics networks trajectories
+# Numerical tests, for the second run: other instructions round otherwise.
+NUMERICAL := bounds compare control forecasts graphconv heads metrics model networks oracle particles trajectories
 
 .PHONY: venv demo test fuzz bench notebooks clean
 

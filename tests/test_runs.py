@@ -596,5 +596,5 @@ def test_what_was_valid_stays_valid():
     """A limit of the gradient that is none, and layers as wide as a user of a large machine has them."""
     assert dvae.Training(gradient_clip=math.inf).gradient_clip is None
     assert dvae.method("vae", hidden=(8192,)).hidden == (8192,)
-    with pytest.raises(ValueError, match="unknown accelerator 'tpu' .*known: auto, cpu"):
+    with pytest.raises(ValueError, match=r"unknown accelerator 'tpu' .*known: auto, cpu"):
         dvae.Training(accelerator="tpu")
