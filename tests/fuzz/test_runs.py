@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import pickle
 import shutil
 import warnings
 from pathlib import Path
@@ -30,6 +31,7 @@ FILES = (CONFIG, STATE, BEST, LAST, OPTIMISER, "log.jsonl", "evaluation.json", "
 FILES += (f"{STATE}.new", f"{LAST}.new", f"{OPTIMISER}.new", f"{CONFIG}.new")
 NOTHING_LEFT = (
     SafetensorError,
+    pickle.UnpicklingError,
     OSError,
     ValueError,
     LookupError,
