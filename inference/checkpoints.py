@@ -146,21 +146,21 @@ class Run:
         """
         content = json.dumps(config, indent=2).encode()
         self.path.mkdir(parents=True, exist_ok=True)
-        _write(self.path / f"{CONFIG}.new", content)
+        files.write(self.path / f"{CONFIG}.new", content)
         os.replace(self.path / f"{CONFIG}.new", self.path / CONFIG)
 
-    def commit(self, state: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
-        """Replace `files` and `state.json` together; files of earlier commits that are not given stay."""
+    def commit(self, state: Mapping[str, Any], contents: Mapping[str, bytes]) -> None:
+        """Replace files by `contents`, and `state.json` with them; files of earlier commits that are not given stay."""
         self.path.mkdir(parents=True, exist_ok=True)
         fingerprints = self.state["fingerprints"] if self.exists else {}
         for name in fingerprints:
             self._settle(name, fingerprints[name])
-        for name, content in files.items():
-            _write(self.path / f"{name}.new", content)
-        fingerprints |= {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
-        _write(self.path / f"{STATE}.new", json.dumps({**state, "fingerprints": fingerprints}, indent=2).encode())
+        for name, content in contents.items():
+            files.write(self.path / f"{name}.new", content)
+        fingerprints |= {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+        files.write(self.path / f"{STATE}.new", json.dumps({**state, "fingerprints": fingerprints}, indent=2).encode())
         os.replace(self.path / f"{STATE}.new", self.path / STATE)
-        for name in files:
+        for name in contents:
             os.replace(self.path / f"{name}.new", self.path / name)
 
     def read(self, name: str, most: int = LARGEST_WEIGHTS) -> bytes:
@@ -250,8 +250,6 @@ def weights(model: nn.Module) -> dict[str, Tensor]:
 
 def save_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
     """Write a model's weights to a safetensors file, which replaces an older one only when it is complete."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with files.written(path) as file:
         file.write(save_tensors(weights(model)))
 
@@ -476,8 +474,3 @@ def _refusing() -> Iterator[None]:
         yield
     except files.FileRefused as error:
         raise CheckpointError(f"{error}; a run directory holds plain files, as fit writes them") from error
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write and force to the disk, so that a later rename never reveals a half-written file."""
-    files.write(path, content)

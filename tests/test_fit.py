@@ -674,7 +674,7 @@ def test_a_process_killed_at_any_moment_leaves_a_whole_checkpoint(tmp_path_facto
         return call
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(checkpoints, "_write", mortal(checkpoints._write))
+        patch.setattr(checkpoints.files, "write", mortal(checkpoints.files.write))
         patch.setattr(checkpoints.os, "replace", mortal(checkpoints.os.replace))
         with contextlib.suppress(Killed):
             Run(path).commit(STATE | {"step": 2}, {name: b"2" + content for name, content in files.items()})

@@ -22,7 +22,7 @@ def check(example):
     pair, steps, seed, share, probability, gradient = example
     rng = np.random.default_rng(seed)
     pair = [masked(text, rng, share) for text in pair]
-    names = {f"{name}" for equations in pair for name in equations.variables}
+    names = {name for equations in pair for name in equations.variables}
     model = twin(*pair, {name: size for name, size in SIZES.items() if name in names}, steps, seed)
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(B, steps, SIZES["x"], generator=generator, dtype=torch.float64)
