@@ -21,7 +21,7 @@ from pathlib import Path
 import torch
 
 import dvae
-from dvae.models import runs
+from dvae.runs import directory as runs
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 FILES = (DATA / "bandai" / "bandai2.npz", DATA / "cmu" / "cmu8.npz")

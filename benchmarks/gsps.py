@@ -21,7 +21,7 @@ from speed import report, seconds, start, training_step
 
 import dvae
 from dvae import motion
-from dvae.distributions.flow import QRFlow
+from dvae.laws.flow import QRFlow
 from dvae.models.gsps import PRESETS, GSPSModel
 
 TARGETS = {"step": ("at most", 28.0), "prior": ("at least", 3.0), "memory": ("at most", 6.7)}

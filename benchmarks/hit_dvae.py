@@ -22,7 +22,7 @@ from torch import Tensor
 
 import dvae
 from dvae import motion
-from dvae.rollout import SelfFeeding
+from dvae.program.rollout import SelfFeeding
 
 TARGETS = {"cache": ("at least", 10.0), "growth": ("at most", 5.0), "seconds": ("at most", 30.0)}
 

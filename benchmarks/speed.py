@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 import dvae
-from dvae.distributions.chain import gaussian_chain
+from dvae.laws.chain import gaussian_chain
 from dvae.networks.base import shift
 
 BATCH, STEPS, SIZE = 32, 125, 48

@@ -21,7 +21,7 @@ import pyro
 # Without it a second model silently receives the first one's parameters from Pyro's global store.
 pyro.settings.set(module_local_params=True)
 
-from . import energies, heads, motion, networks, priors  # noqa: E402
+from . import laws, motion, networks  # noqa: E402
 from .graph import Audit, audit  # noqa: E402
 from .inference.bounds import SequenceELBO, Terms, importance_bound  # noqa: E402
 from .inference.compare import Comparison, compare  # noqa: E402
@@ -30,12 +30,13 @@ from .inference.evaluate import Evaluation, evaluate  # noqa: E402
 from .inference.fit import Fit, Training, fit  # noqa: E402
 from .inference.objectives import Evidence  # noqa: E402
 from .inference.particles import particle_bound  # noqa: E402
-from .model import DynamicalVAE  # noqa: E402
 from .models import method, methods  # noqa: E402
-from .models.runs import load  # noqa: E402
+from .motion import energies  # noqa: E402
 from .notation import Factorization  # noqa: E402
 from .oracle import Oracle, price, twin  # noqa: E402
-from .rollout import SelfFeeding  # noqa: E402
+from .program.model import DynamicalVAE  # noqa: E402
+from .program.rollout import SelfFeeding  # noqa: E402
+from .runs.directory import load  # noqa: E402
 
 __all__ = [
     "Audit",
@@ -53,11 +54,10 @@ __all__ = [
     "audit",
     "calibrate",
     "compare",
-    "energies",
     "evaluate",
     "fit",
-    "heads",
     "importance_bound",
+    "laws",
     "load",
     "method",
     "methods",
@@ -66,7 +66,6 @@ __all__ = [
     "particle_bound",
     "predictive_checks",
     "price",
-    "priors",
     "traverse",
     "twin",
 ]

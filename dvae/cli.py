@@ -33,14 +33,15 @@ from .inference.fit import Fit, Interrupted, Training, reason
 from .inference.result import Plain, Table
 from .inference.trackers import TensorBoard
 from .models import method as method_by_name
-from .models import methods, runs
+from .models import methods
 from .models.method import Method
-from .models.sweep import ENDED
-from .models.sweep import Interrupted as SweepInterrupted
-from .models.sweep import sweep as sweep_methods
 from .models.trajectories import TrajectoryModel
 from .notation import Factorization
 from .options import nearest
+from .runs import directory as runs
+from .runs.sweep import ENDED
+from .runs.sweep import Interrupted as SweepInterrupted
+from .runs.sweep import sweep as sweep_methods
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -29,13 +29,15 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 import networkx as nx
 import numpy as np
 
+from .drawing import Node, draw_dag
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
 
 __all__ = ["Block", "Factor", "Factorization", "NotationError", "Parent", "Relation", "check_pair"]
 
 Interval = tuple[float, float]
-Node = tuple[str, int | None]
 MaskFunction = Callable[[int], np.ndarray]
 
 KNOWN_RELATIONS = "t, {t-1}, {t+1}, {t-k}, {t-a:t+b}, {<t}, {<=t}, {>t}, {>=t}, {1:t}, {t:T}, {1:T}"
@@ -569,8 +571,6 @@ class Factorization:
 
         Latents are open circles, data shaded, context squares. Returns the matplotlib axes.
         """
-        from dvae.graph import draw_dag
-
         return draw_dag(self.dag(T, observed), ax=ax)
 
 

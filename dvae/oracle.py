@@ -15,10 +15,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .heads import FixedNormal, FixedNormalHead, StandardNormal
-from .model import DynamicalVAE
+from .laws.families import FixedNormal, FixedNormalHead, StandardNormal
 from .networks.linear import Linear, LinearNetwork
 from .notation import Factorization
+from .program.model import DynamicalVAE
 from .turns import alone
 
 

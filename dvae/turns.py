@@ -2,7 +2,7 @@
 
 Two programs that ran at once would land on each other's stack, and draw from each other's random numbers. So whatever
 runs one for a user is decorated with `alone`: of several threads one goes on, and the others wait until it is done, a
-whole fit if need be. Processes run side by side (`dvae.models.sweep`).
+whole fit if need be. Processes run side by side (`dvae.runs.sweep`).
 """
 
 from __future__ import annotations

@@ -21,11 +21,10 @@ from pyro.infer import ELBO
 from torch import Tensor
 from torch.distributions import kl_divergence
 
-from ..distributions import Sequence
 from ..graph import analytic_kl
-from ..model import Batch, DynamicalVAE, repeat
 from ..networks.base import computing_once
-from ..rollout import Rollout
+from ..program.model import Batch, DynamicalVAE, repeat
+from ..program.rollout import Rollout, Sequence
 from ..turns import alone
 
 

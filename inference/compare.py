@@ -48,10 +48,10 @@ from rich.console import Group
 from scipy import special
 from torch import Tensor, nn
 
-from .. import distributions
-from ..model import repeat
 from ..networks.base import valid_steps
 from ..options import nearest
+from ..program.model import repeat
+from ..program.rollout import Sequence as SequenceLaw
 from ..turns import alone
 from .batches import Batch, each, leaves, sequences
 from .bounds import KHAT_PARTICLES, SequenceELBO, importance_bound, require_likelihood, site_log_prob, sites_of
@@ -782,7 +782,7 @@ def _posterior_means(model: Any, batch: Batch) -> dict[str, Tensor]:
     means = {}
     for name, site in sites_of(poutine.trace(model.guide).get_trace(batch)).items():
         fn, value = site["fn"], site["value"]
-        local = isinstance(fn, distributions.Sequence)
+        local = isinstance(fn, SequenceLaw)
         means[name] = fn.elementwise(value).mean if local else fn.mean[:, None]
     return means
 

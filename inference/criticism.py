@@ -26,8 +26,8 @@ from rich.text import Text
 from scipy import fft, special
 from torch import Tensor
 
-from ..model import Batch, DynamicalVAE, repeat
 from ..motion import Skeleton
+from ..program.model import Batch, DynamicalVAE, repeat
 from ..turns import alone
 from .bounds import require_likelihood
 from .evaluate import evaluating, hold, on_device_of, plain

@@ -43,7 +43,7 @@ from rich.text import Text
 from scipy import special
 from torch import Tensor, nn
 
-from ..energies import pose_prior_energy
+from ..motion.energies import pose_prior_energy
 from ..options import nearest
 from ..turns import alone
 from . import metrics

@@ -20,13 +20,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..conditional import Conditional
-from ..heads import Parameters
-from ..model import Batch, DynamicalVAE
+from ..laws.families import Parameters
 from ..networks.base import computing_once, valid_steps
 from ..networks.rows import Rows, pick, select
 from ..notation import Factor, Parent
-from ..rollout import Rollout, like
+from ..program.conditional import Conditional
+from ..program.model import Batch, DynamicalVAE
+from ..program.rollout import Rollout, like
 from ..turns import alone
 from .batches import each
 from .bounds import require_likelihood

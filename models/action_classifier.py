@@ -27,10 +27,10 @@ from torch import Tensor, nn
 
 from ..inference.batches import Batch
 from ..inference.objectives import Evidence, Objective
-from ..model import DynamicalVAE
 from ..motion import Protocol, Skeleton, Windows
 from ..notation import Factorization
 from ..options import Layers, Size
+from ..program.model import DynamicalVAE
 from .method import Method
 
 CLASS = "c"

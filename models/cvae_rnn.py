@@ -27,7 +27,7 @@ from ..networks import Input, Network, NetworkSpec
 from ..networks.base import once, perceptron, share_modules
 from ..networks.recurrent import gru_cell
 from ..options import Amount, Size
-from ..rollout import SelfFeeding
+from ..program.rollout import SelfFeeding
 from .trajectories import FIRST, GIVEN, REST, TrajectoryMethod
 
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..heads import Head, HeadSpec, Parameters
+from ..laws.families import Head, HeadSpec, Parameters
 from ..networks import Dense, Input, NetworkSpec, Recurrent
 from ..networks.base import Network, at, shift
 from ..options import Extra, Size

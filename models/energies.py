@@ -16,14 +16,13 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from .. import energies
 from ..inference.batches import Source
-from ..model import CHUNK, WHOLE, Batch, DynamicalVAE
-from ..motion import Skeleton, Windows, face_forward, rotate_about_up
+from ..laws.priors import VampPrior
+from ..motion import Skeleton, Windows, energies, face_forward, rotate_about_up
 from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
 from ..motion.truths import PseudoTruths, WithPseudoTruths
 from ..options import Amount, Count, Positive, Range, Size
-from ..priors import VampPrior
+from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE
 from .method import Method
 from .pose_prior import PosePrior, PosePriorModel, fit_pose_prior
 
@@ -102,7 +101,7 @@ class EnergyMethod(Method):
     def _fitted_prior(self, windows: Windows) -> nn.Module:
         if not self.pose_prior_run:
             return fit_pose_prior(windows, heading=bool(self.heading))
-        from .runs import load
+        from ..runs.directory import load
 
         loaded = load(self.pose_prior_run)
         method = loaded.method

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from ..model import DynamicalVAE
 from ..networks import Attention, Dense, Linear, NetworkSpec, Recurrent
 from ..notation import Factorization
 from ..options import Size, nearest
+from ..program.model import DynamicalVAE
 from .method import Method
 
 

@@ -31,16 +31,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .. import energies
-from ..heads import Delta
 from ..inference.objectives import Evidence, Objective
-from ..model import CHUNK, WHOLE, Batch, DynamicalVAE
-from ..motion import Skeleton, Windows
+from ..laws.families import Delta
+from ..motion import Skeleton, Windows, energies
 from ..motion.body import body_parts
 from ..networks import GraphConv
 from ..notation import Factorization
 from ..options import Amount, Layers, Size
-from ..rollout import Rollout
+from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE
+from ..program.rollout import Rollout
 from .energies import EnergyMethod, EnergyModel
 from .method import Method
 

@@ -41,19 +41,18 @@ from typing import Annotated, Any, ClassVar, Literal, cast
 import torch
 from torch import Tensor, nn
 
-from .. import energies
 from ..inference.batches import Source
 from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.schedules import Linear, Schedule
-from ..model import CHUNK, WHOLE, Batch, DynamicalVAE
-from ..motion import Skeleton, Windows
+from ..motion import Skeleton, Windows, energies
 from ..motion.body import body_parts
 from ..networks import Attention, FrameGraph, NetworkSpec, PoseGraph, Recurrent, SelfAttention
 from ..networks.extract import share
 from ..notation import Factorization
 from ..options import Amount, Delay, Extra, Layers, Range, Share, Size
-from ..rollout import Rollout, SelfFeeding
+from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE
+from ..program.rollout import Rollout, SelfFeeding
 from .energies import EnergyMethod, EnergyModel
 from .method import SHAPES
 

@@ -32,15 +32,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..distributions.kalman import LinearGaussianChain, update
-from ..distributions.triangular import InverseCholesky, TriangularNormal
-from ..heads import Head, HeadSpec, Parameters
 from ..inference.fit import Stage
-from ..model import Batch, DynamicalVAE, repeat
+from ..laws.families import Head, HeadSpec, Parameters
+from ..laws.kalman import LinearGaussianChain, update
+from ..laws.triangular import InverseCholesky, TriangularNormal
 from ..networks import Dense, Input, Network, NetworkSpec
 from ..networks.base import valid_steps
 from ..networks.recurrent import lstm_cell
 from ..options import Range, Size
+from ..program.model import Batch, DynamicalVAE, repeat
 from .method import Method
 
 

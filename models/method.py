@@ -11,18 +11,18 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import torch
 from torch import nn
 
-from ..heads import FixedNormal, HeadSpec, Normal, StudentT
 from ..inference.batches import Source
 from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.schedules import Cosine, Linear, Logistic, Schedule
-from ..model import DynamicalVAE
+from ..laws.families import FixedNormal, HeadSpec, Normal, StudentT
+from ..laws.priors import FlowPrior, MixturePrior, Prior, VampPrior
 from ..motion import Skeleton, Windows
 from ..networks import NetworkSpec
 from ..notation import Factor, Factorization
 from ..options import Amount, Delay, Range, Share, Size, check, nearest
-from ..priors import FlowPrior, MixturePrior, Prior, VampPrior
-from ..rollout import SelfFeeding
+from ..program.model import DynamicalVAE
+from ..program.rollout import SelfFeeding
 
 SHAPES: dict[str, type[Linear | Cosine | Logistic]] = {"linear": Linear, "cosine": Cosine, "logistic": Logistic}
 

@@ -5,7 +5,7 @@
 It has no latents and no time: every frame is a pose of its own, and the flow's density is exact, so that the bound is
 the log evidence. Others are trained with it: poses that it finds unlikely cost energy (`energies.pose_prior_energy`).
 
-Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the flow of its public code (see `distributions.flow`). Ours:
+Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the flow of its public code (see `dvae.laws.flow`). Ours:
 
 * Training poses get noise of 2 mm. Where a body part is rigid, as the hips are, its limbs' directions hardly vary, and
   the density rises without bound as a flow narrows down on them. In bandai2 eight of sixty dimensions have no more than
@@ -27,15 +27,15 @@ import pyro
 import torch
 from torch import Tensor, nn
 
-from ..distributions import QRFlow
 from ..inference.batches import Batch
 from ..inference.fit import fit
 from ..inference.objectives import Evidence, Objective
 from ..inference.result import progress_bar
-from ..model import DynamicalVAE
+from ..laws import QRFlow
 from ..motion import Skeleton, Windows, face_forward, rotate_about_up
 from ..notation import Factorization
 from ..options import Layers, Range
+from ..program.model import DynamicalVAE
 from ..turns import alone
 from .method import Method
 

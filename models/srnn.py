@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from ..model import DynamicalVAE
 from ..networks import NetworkSpec, Recurrent
 from ..networks.recurrent import tie
 from ..options import Extra, Size
+from ..program.model import DynamicalVAE
 from .method import Method
 
 

@@ -22,13 +22,13 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from ..heads import FixedNormal, HeadSpec
-from ..inference.control import bend
 from ..inference.objectives import Evidence, Objective
-from ..model import CHUNK, WHOLE, Batch, DynamicalVAE, in_chunks, repeat, rows
+from ..laws.families import FixedNormal, HeadSpec
 from ..motion import HUMAN36M, PROTOCOLS, Clip, Skeleton, Windows, rotate_about_up
+from ..motion.control import bend
 from ..motion.data import defect
 from ..options import Amount, Share
+from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE, in_chunks, repeat, rows
 from ..turns import alone
 from .method import Method
 

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..heads import Head, HeadSpec, Normal, NormalHead, Parameters
+from ..laws.families import Head, HeadSpec, Normal, NormalHead, Parameters
 from ..motion import Skeleton
 from ..networks import CosineEncoder, MotionDecoder, NetworkSpec
 from ..networks.base import share_modules

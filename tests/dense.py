@@ -13,10 +13,10 @@ import networkx as nx
 import numpy as np
 import torch
 
-from dvae.conditional import CONSTANT
-from dvae.heads import Head
 from dvae.inference.bounds import SequenceELBO
+from dvae.laws import Head
 from dvae.notation import Factorization, Relation
+from dvae.program.conditional import CONSTANT
 
 
 def exact_bound(model, x, *, length=None, seen=None, fed=None, detach=False):

@@ -13,8 +13,9 @@ from dvae import motion
 from dvae.cli import main
 from dvae.inference.evaluate import Evaluation, evaluate, frechet_pseudo_values
 from dvae.inference.metrics import frechet_distance
-from dvae.models import from_config, runs
+from dvae.models import from_config
 from dvae.models.action_classifier import ActionClassifier, ActionClassifierModel
+from dvae.runs import directory as runs
 
 SHORT = replace(motion.PROTOCOLS["simulated"], observed=4, predicted=6)
 SMALL = {"label": "way", "hidden": 8, "layers": 2, "features": 3}

@@ -11,11 +11,11 @@ from pyro import poutine
 from pyro.infer import Trace_ELBO, TraceMeanField_ELBO
 from pyro.infer.autoguide.initialization import InitMessenger, init_to_value
 
-from dvae import DynamicalVAE, Oracle, SequenceELBO, heads, importance_bound, twin
-from dvae.distributions import Sequence
+from dvae import DynamicalVAE, Oracle, SequenceELBO, importance_bound, twin
 from dvae.inference.bounds import _closed_forms, _khat, _traces, sites_of
+from dvae.laws import families as heads
 from dvae.networks import Attention, Linear, Recurrent
-from dvae.rollout import SelfFeeding
+from dvae.program.rollout import SelfFeeding, Sequence
 
 B, T = 3, 5
 EQUATIONS = (

@@ -19,7 +19,7 @@ import torch
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.models import runs
+from dvae.runs import directory as runs
 
 SMALL = ["--batch-size", "4", "--warm-up", "4", "--latent", "3", "--validate-every", "5"]
 EQUATIONS = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t)", "--inference", "q(z_t | x_{t:T}, z_{t-1})"]

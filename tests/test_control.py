@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from dvae.inference import control
-from dvae.inference.control import bend, smooth
-from dvae.motion import Skeleton
+from dvae.motion import Skeleton, control
+from dvae.motion.control import bend, smooth
 
 POINT = Skeleton(("root", "tip"), (-1, 0))
 LOOSE = torch.full((1,), 1e9, dtype=torch.float64)

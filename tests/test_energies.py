@@ -5,8 +5,10 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-import dvae.energies
-from dvae.energies import (
+import dvae.motion.energies
+from dvae.motion import HUMAN36M, HUMANEVA, WALKER, AngleLimits, Skeleton, estimate_angle_limits
+from dvae.motion.angles import cosines
+from dvae.motion.energies import (
     best_of_many,
     history_error,
     joint_angles,
@@ -15,8 +17,6 @@ from dvae.energies import (
     pairwise_diversity,
     pose_prior_energy,
 )
-from dvae.motion import HUMAN36M, HUMANEVA, WALKER, AngleLimits, Skeleton, estimate_angle_limits
-from dvae.motion.angles import cosines
 
 STICK = Skeleton(("hip", "knee", "foot"), (-1, 0, 1), name="stick")
 S, B, T, M = 5, 3, 4, 6
@@ -56,7 +56,7 @@ def gradient(value, samples):
 
 class TestEveryEnergy:
     def test_is_public(self):
-        assert set(ENERGIES) == set(dvae.energies.__all__)
+        assert set(ENERGIES) == set(dvae.motion.energies.__all__)
 
     @every_energy
     def test_is_one_number_a_sequence_in_the_precision_of_the_samples(self, energy):
@@ -100,7 +100,7 @@ class TestEveryEnergy:
         samples = normal(S, B, T, D).requires_grad_()
         found = []
         for block in (1, 10**9):
-            monkeypatch.setattr(dvae.energies, "BLOCK", block)
+            monkeypatch.setattr(dvae.motion.energies, "BLOCK", block)
             values = energy(samples, **SEQUENCES)
             found.append((values, torch.autograd.grad((values * torch.arange(1, B + 1)).sum(), samples)[0]))
         torch.testing.assert_close(*found)

@@ -27,7 +27,7 @@ from dvae.inference.evaluate import (
     nearest_neighbours,
     zero_velocity,
 )
-from dvae.model import DynamicalVAE
+from dvae.program.model import DynamicalVAE
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 OBSERVED, FRAMES, SIZE = 4, 9, 3

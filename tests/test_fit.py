@@ -27,8 +27,8 @@ from dvae.inference.fit import Callback, Interrupted, NonFiniteError, Stage, Tra
 from dvae.inference.objectives import Evidence
 from dvae.inference.schedules import Linear, Piecewise
 from dvae.inference.trackers import JSONLines, Memory, TensorBoard, Terminal
-from dvae.model import DynamicalVAE
 from dvae.networks import Dense
+from dvae.program.model import DynamicalVAE
 
 matplotlib.use("agg")
 
@@ -734,7 +734,7 @@ SCRIPT = """
 import sys
 import torch
 from dvae.inference.fit import fit
-from dvae.model import DynamicalVAE
+from dvae.program.model import DynamicalVAE
 from dvae.networks import Dense
 
 def run(name, steps, resume=False):

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy import stats
 
-from dvae.distributions import QRFlow
 from dvae.inference.checkpoints import CheckpointError, load_weights, save_weights
+from dvae.laws import QRFlow
 
 SIZES = [(1, 1), (1, 3), (2, 3), (5, 1), (5, 3)]
 

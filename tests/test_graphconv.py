@@ -6,9 +6,9 @@ import torch
 from scipy.fft import dct
 
 import dvae
-from dvae.distributions.dct import cosine_basis
 from dvae.networks import GraphConv
 from dvae.networks.base import Input
+from dvae.networks.dct import cosine_basis
 from dvae.notation import Relation
 
 OBSERVED, LENGTH, JOINTS = 4, 9, 5
@@ -145,9 +145,9 @@ def test_it_generates_in_a_model_of_ones_own():
         {"a": 2, "h": 15, "lower": 6, "upper": 9},
         {f"p({name})": GraphConv(EVERYTHING, name, LENGTH, 3, 6, 1) for name in ("lower", "upper")},
         {
-            "default": dvae.heads.Normal(),
-            "p(lower)": dvae.heads.FixedNormal(0.1),
-            "p(upper)": dvae.heads.FixedNormal(0.1),
+            "default": dvae.laws.Normal(),
+            "p(lower)": dvae.laws.FixedNormal(0.1),
+            "p(upper)": dvae.laws.FixedNormal(0.1),
         },
         parts={"lower": [0, 1, 2, 9, 10, 11], "upper": [3, 4, 5, 6, 7, 8, 12, 13, 14]},
         history="h",
@@ -169,7 +169,7 @@ def generator(**options):
         None,
         {"a": 2, "h": 15, "lower": 6, "upper": 9},
         {f"p({name})": GraphConv(EVERYTHING, name, LENGTH, 3, 6, 1) for name in ("lower", "upper")},
-        {f"p({name})": dvae.heads.FixedNormal(0.1) for name in ("lower", "upper")},
+        {f"p({name})": dvae.laws.FixedNormal(0.1) for name in ("lower", "upper")},
         parts={"lower": [0, 1, 2, 9, 10, 11], "upper": [3, 4, 5, 6, 7, 8, 12, 13, 14]},
         history="h",
         masks={"1:O": lambda T: np.arange(T)[None] < OBSERVED},

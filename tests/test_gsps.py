@@ -7,14 +7,16 @@ import torch
 from pyro import poutine
 
 import dvae
-from dvae import energies, motion
+from dvae import motion
 from dvae.inference.fit import fit
 from dvae.inference.metrics import average_pairwise_distance
-from dvae.models import from_config, runs
+from dvae.models import from_config
 from dvae.models.gsps import PRESETS, GSPSModel, part_by_part
 from dvae.models.pose_prior import PosePriorModel
+from dvae.motion import energies
 from dvae.motion.body import LIMBS, body_parts
 from dvae.networks import GraphConv
+from dvae.runs import directory as runs
 from dvae.testing import FactorizationContract
 
 SMALL = {"latent": 3, "coefficients": 4, "width": 6, "blocks": 1, "draws": (3, 2), "pose_prior": 0.0}
@@ -427,7 +429,7 @@ class TestTheFactorization(FactorizationContract):
             None,
             {"a": size, "b": size, "h": 9, "lower": 6, "upper": 3},
             {f"p({name})": GraphConv(joints, name, self.steps, 3, 5, 1) for name in ("lower", "upper")},
-            {f"p({name})": dvae.heads.FixedNormal(0.1, project=False) for name in ("lower", "upper")},
+            {f"p({name})": dvae.laws.FixedNormal(0.1, project=False) for name in ("lower", "upper")},
             observed=("lower", "upper"),
         )
 

@@ -10,10 +10,10 @@ import torch
 from torch import nn
 
 import dvae
-from dvae import heads
-from dvae.conditional import Conditional
+from dvae.laws import families as heads
 from dvae.networks import Dense, Recurrent
 from dvae.notation import Factorization
+from dvae.program.conditional import Conditional
 
 HEADS = {
     "normal": heads.Normal(),

@@ -8,11 +8,13 @@ import torch
 from pyro import poutine
 
 import dvae
-from dvae import energies, motion
-from dvae.models import from_config, runs
+from dvae import motion
+from dvae.models import from_config
 from dvae.models.hit_dvae import PRESETS, HiTModel
+from dvae.motion import energies
 from dvae.motion.body import body_parts
 from dvae.networks.posegraph import PoseFeatures
+from dvae.runs import directory as runs
 
 SMALL = {"latent": 3, "static": 2, "width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "samples": 3}
 QUICK = {**SMALL, "pose_prior": 0.0, "angles": 0.0, "multimodal": 0.0, "heading": False}

@@ -9,9 +9,9 @@ from torch.autograd import gradcheck
 from torch.distributions import MultivariateNormal, kl_divergence
 
 import dvae
-from dvae.distributions.kalman import LinearGaussianChain
-from dvae.distributions.triangular import InverseCholesky, TriangularNormal
 from dvae.inference.fit import Callback
+from dvae.laws.kalman import LinearGaussianChain
+from dvae.laws.triangular import InverseCholesky, TriangularNormal
 from dvae.models.kvae import KVAE, Kalman, KalmanNetwork, Triangular, smooth
 from dvae.networks import Input
 from dvae.notation import Relation

@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 from pyro import poutine
 from pyro.infer import Predictive, Trace_ELBO
 
-from dvae import DynamicalVAE, heads, priors
+from dvae import DynamicalVAE
 from dvae.inference.bounds import SequenceELBO
-from dvae.model import in_chunks, rows
+from dvae.laws import families as heads
+from dvae.laws import priors
 from dvae.networks import Attention, Dense, Linear, Recurrent
-from dvae.rollout import SelfFeeding
+from dvae.program.model import in_chunks, rows
+from dvae.program.rollout import SelfFeeding
 from dvae.testing.strategies import factorizations
 
 B, T = 3, 5

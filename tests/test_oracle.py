@@ -14,7 +14,7 @@ from pyro.infer import Trace_ELBO
 from torch.distributions.transforms import ReshapeTransform
 
 from dvae import DynamicalVAE, Oracle, SequenceELBO, audit, price, twin
-from dvae.heads import FixedNormal
+from dvae.laws import FixedNormal
 from dvae.networks import Linear
 from dvae.notation import Factorization
 from dvae.testing.strategies import factorizations
@@ -309,7 +309,7 @@ def test_models_that_the_oracle_does_not_know():
     driven = ("p(z_t | z_{t-1}, c_t) p(x_t | z_t)", "q(z_t | x_{1:T})")
     with pytest.raises(ValueError, match="no law of the context c"):
         Oracle(twin(*driven, {"z": 1, "x": 1, "c": 1}, T), T)
-    from dvae.priors import NormalPrior
+    from dvae.laws.priors import NormalPrior
 
     own = DynamicalVAE(
         "p(w) p(x_t | w)",

@@ -7,12 +7,14 @@ import pytest
 import torch
 from pyro import poutine
 
-from dvae import DynamicalVAE, Oracle, SequenceELBO, heads, importance_bound, particle_bound, priors, twin
+from dvae import DynamicalVAE, Oracle, SequenceELBO, importance_bound, particle_bound, twin
 from dvae.inference.particles import Filter, ancestors, effective_size
-from dvae.model import repeat
+from dvae.laws import families as heads
+from dvae.laws import priors
 from dvae.networks import Attention, Dense, Input, Linear, Recurrent
 from dvae.networks.rows import Rows, select
 from dvae.notation import Factorization, Relation
+from dvae.program.model import repeat
 
 T = 5
 PAIRS = {

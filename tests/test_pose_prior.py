@@ -12,8 +12,9 @@ from torch.distributions import MultivariateNormal
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.models import from_config, runs
+from dvae.models import from_config
 from dvae.models.pose_prior import PosePrior, PosePriorModel, fit_pose_prior
+from dvae.runs import directory as runs
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 CHAIN = motion.Skeleton(("root", "middle", "end"), (-1, 0, 1), name="chain")

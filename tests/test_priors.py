@@ -10,11 +10,12 @@ import torch
 from scipy import stats
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO, importance_bound, motion, priors
+from dvae import DynamicalVAE, SequenceELBO, importance_bound, motion
 from dvae.cli import main
 from dvae.inference.checkpoints import load_weights, save_weights
-from dvae.models import runs
+from dvae.laws import priors
 from dvae.networks import Dense, Recurrent
+from dvae.runs import directory as runs
 
 B, T = 3, 5
 PRIORS = {

@@ -11,8 +11,9 @@ import torch
 from pyro.infer import SVI, Trace_ELBO
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO, heads, twin
+from dvae import DynamicalVAE, SequenceELBO, twin
 from dvae.inference.particles import Filter
+from dvae.laws import families as heads
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.testing import FactorizationContract
 from dvae.turns import alone
@@ -49,7 +50,7 @@ def test_the_model_reads_its_own_mean_in_place_of_a_missing_entry():
 
 
 def test_a_gap_does_not_wreck_the_next_frame_of_a_residual_model():
-    model = srnn(heads={"p(x)": dvae.heads.FixedNormal(residual=True)})
+    model = srnn(heads={"p(x)": dvae.laws.FixedNormal(residual=True)})
     with torch.no_grad():
         for parameter in model.generator["x"].head.parameters():
             parameter.zero_()
@@ -62,7 +63,7 @@ def test_a_gap_does_not_wreck_the_next_frame_of_a_residual_model():
 
 def test_removing_frames_of_a_well_predicted_sequence_raises_no_alarm():
     """A missing frame takes its own log-likelihood along, and little of its neighbours'."""
-    model = srnn(heads={"p(x)": dvae.heads.FixedNormal(scale=0.05, residual=True)})
+    model = srnn(heads={"p(x)": dvae.laws.FixedNormal(scale=0.05, residual=True)})
     with torch.no_grad():
         for parameter in model.generator["x"].head.parameters():
             parameter.zero_()

@@ -27,9 +27,9 @@ from dvae.inference import trackers
 from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE, CheckpointError, Run, at_most
 from dvae.inference.fit import reason
 from dvae.inference.trackers import JSONLines
-from dvae.models import runs
-from dvae.models.sweep import sweep
 from dvae.options import Range
+from dvae.runs import directory as runs
+from dvae.runs.sweep import sweep
 
 ROOT = Path(__file__).parent.parent
 METHOD = dvae.method("vrnn", latent=2, width=4, embed=(4,), embed_latent=(4,), warm_up=1)

@@ -16,9 +16,9 @@ from joblib import parallel_config
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.models import runs
-from dvae.models import sweep as sweeps
-from dvae.models.sweep import Interrupted, Result, sweep
+from dvae.runs import directory as runs
+from dvae.runs import sweep as sweeps
+from dvae.runs.sweep import Interrupted, Result, sweep
 
 TRAINING = dvae.Training(steps=6, batch_size=4, validate_every=3)
 VAE = dvae.method("vae", latent=3, warm_up=4)

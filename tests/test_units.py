@@ -31,7 +31,7 @@ def test_units_come_from_values_that_vary(shape, fill):
 
 @pytest.mark.parametrize("network", [Attention(8, heads=2), Recurrent(4)])
 @pytest.mark.parametrize(
-    "head", [dvae.heads.Normal(residual=0.5), dvae.heads.FixedNormal(0.3, learned=True), dvae.heads.StudentT()]
+    "head", [dvae.laws.Normal(residual=0.5), dvae.laws.FixedNormal(0.3, learned=True), dvae.laws.StudentT()]
 )
 def test_a_standardised_model_is_the_same_model_of_standardised_data(network, head):
     """log p(x) = log p(u) - T D log s for u = (x - m) / s, with the guide's draws the same."""
@@ -66,7 +66,7 @@ def test_a_standardised_model_is_the_same_model_of_standardised_data(network, he
 
 
 def test_a_scale_that_is_given_is_in_the_variables_own_unit():
-    model = dvae.DynamicalVAE(*PAIR, SIZES, heads={"p(x)": dvae.heads.FixedNormal(0.3)})
+    model = dvae.DynamicalVAE(*PAIR, SIZES, heads={"p(x)": dvae.laws.FixedNormal(0.3)})
     x = 4 + 0.1 * torch.randn(5, 6, 3)
     model.standardise("x").fit(x)
     site = poutine.trace(model.model).get_trace(x).nodes["x"]

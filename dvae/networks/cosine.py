@@ -25,9 +25,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..distributions.dct import cosine_basis
 from ..notation import ALL
 from .base import AtOnce, Input, Network, once
+from .dct import cosine_basis
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from ..distributions.dct import cosine_basis
 from .base import AtOnce, Input
+from .dct import cosine_basis
 
 
 @dataclass(frozen=True)

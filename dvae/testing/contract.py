@@ -20,14 +20,14 @@ from pyro import poutine
 from pyro.infer import Trace_ELBO
 from torch import Tensor
 
-from ..conditional import Conditional
 from ..graph import audit
 from ..inference.bounds import SequenceELBO
 from ..inference.checkpoints import load_weights, save_weights
 from ..inference.fit import fit
-from ..model import Batch, DynamicalVAE
 from ..motion import PROTOCOLS, simulate, windows
 from ..oracle import Oracle, twin
+from ..program.conditional import Conditional
+from ..program.model import Batch, DynamicalVAE
 
 
 class FactorizationContract:

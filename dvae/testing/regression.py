@@ -39,7 +39,7 @@ from scipy import stats
 from torch import Tensor, nn
 
 from ..inference.bounds import SequenceELBO
-from ..model import _Evaluating
+from ..program.model import _Evaluating
 
 Array = NDArray[np.float64]
 

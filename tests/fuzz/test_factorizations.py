@@ -9,7 +9,7 @@ from dense import exact_bound, library_bound, masked
 from hypothesis import strategies as st
 
 from dvae.oracle import twin
-from dvae.rollout import SelfFeeding
+from dvae.program.rollout import SelfFeeding
 from dvae.testing.strategies import factorizations
 
 from .engine import fuzz, limited

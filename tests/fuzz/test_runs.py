@@ -22,7 +22,7 @@ from safetensors.torch import load, save
 import dvae
 from dvae import cli, motion
 from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE
-from dvae.models import runs
+from dvae.runs import directory as runs
 
 from .engine import Isolated, fuzz, limited
 

@@ -22,15 +22,15 @@ from pyro import poutine
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ..laws.families import HeadSpec, Normal
+from ..laws.priors import Prior
+from ..networks import NetworkSpec, Recurrent
+from ..networks.base import valid_steps
+from ..notation import Factorization, check_pair
+from ..turns import alone
+from ..units import Units
 from .conditional import Conditional
-from .heads import HeadSpec, Normal
-from .networks import NetworkSpec, Recurrent
-from .networks.base import valid_steps
-from .notation import Factorization, check_pair
-from .priors import Prior
 from .rollout import Rollout, SelfFeeding, like
-from .turns import alone
-from .units import Units
 
 _COUNT = itertools.count()
 WHOLE = "x"

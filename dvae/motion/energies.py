@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import Function, once_differentiable
 
-from .motion.angles import AngleLimits, angle_names, cosines
-from .motion.skeleton import Skeleton
+from .angles import AngleLimits, angle_names, cosines
+from .skeleton import Skeleton
 
 __all__ = [
     "best_of_many",

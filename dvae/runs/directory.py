@@ -25,7 +25,7 @@ from ..inference.trackers import Tracker
 from ..motion import PROTOCOLS, MotionSet, Protocol, Windows
 from ..options import check, nearest
 from ..turns import alone
-from .method import Method, from_config
+from ..models.method import Method, from_config
 
 SIMULATED = "simulated"
 

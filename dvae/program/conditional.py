@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .distributions.chain import DERIVATIVES, gaussian_chain
-from .heads import Head, HeadSpec, NormalHead, Parameters, StandardNormal
-from .networks.base import Input, Network, NetworkSpec, at, shift
-from .networks.rows import Rows
-from .notation import Factor
-from .units import Units
+from ..laws.chain import DERIVATIVES, gaussian_chain
+from ..laws.families import Head, HeadSpec, NormalHead, Parameters, StandardNormal
+from ..networks.base import Input, Network, NetworkSpec, at, shift
+from ..networks.rows import Rows
+from ..notation import Factor
+from ..units import Units
 
 CONSTANT = "1"
 """What the network of a guide's factor without parents reads."""

@@ -12,8 +12,7 @@ import torch
 from pyro.distributions import transforms
 from torch import Tensor, nn
 
-from .conditional import Conditional
-from .notation import Factor
+from ..notation import Factor
 
 
 class Prior(nn.Module):
@@ -41,7 +40,7 @@ class Prior(nn.Module):
         if self.size != sizes[guide.child]:
             raise ValueError(f"the prior of {guide.child} has size {self.size}, but {guide.child} {sizes[guide.child]}")
 
-    def forward(self, batch: int, guide: Conditional) -> dist.Distribution:
+    def forward(self, batch: int, guide: Any) -> dist.Distribution:
         """The prior of `batch` sequences: batch (B,), event (D,).
 
         Args:
@@ -63,7 +62,7 @@ class NormalPrior(Prior):
         self.loc = nn.Parameter(torch.zeros(size))
         self.log_scale = nn.Parameter(torch.zeros(size))
 
-    def forward(self, batch: int, guide: Conditional) -> dist.Distribution:
+    def forward(self, batch: int, guide: Any) -> dist.Distribution:
         """See `Prior.forward`."""
         return dist.Normal(self.loc, self.log_scale.exp()).expand((batch, self.size)).to_event(1)
 
@@ -82,7 +81,7 @@ class MixturePrior(Prior):
         self.loc = nn.Parameter(torch.randn(components, size) / math.sqrt(size))
         self.log_scale = nn.Parameter(torch.zeros(components, size))
 
-    def forward(self, batch: int, guide: Conditional) -> dist.Distribution:
+    def forward(self, batch: int, guide: Any) -> dist.Distribution:
         """See `Prior.forward`."""
         parts = dist.Normal(self.loc, self.log_scale.exp()).to_event(1)
         return dist.MixtureSameFamily(dist.Categorical(logits=self.logits), parts).expand((batch,))
@@ -136,7 +135,7 @@ class VampPrior(Prior):
                 )
             pseudo.copy_(data[name][:, : self.steps])
 
-    def forward(self, batch: int, guide: Conditional) -> dist.Distribution:
+    def forward(self, batch: int, guide: Any) -> dist.Distribution:
         """See `Prior.forward`."""
         parameters = guide(dict(self.pseudo.items()), self.components, self.steps)
         parts = guide.head.distribution(parameters).to_event(1)
@@ -174,7 +173,7 @@ class FlowPrior(Prior):
         self.loc = nn.Parameter(torch.zeros(size))
         self.log_scale = nn.Parameter(torch.zeros(size))
 
-    def forward(self, batch: int, guide: Conditional) -> dist.Distribution:
+    def forward(self, batch: int, guide: Any) -> dist.Distribution:
         """See `Prior.forward`.
 
         Raises:

@@ -39,8 +39,8 @@ from ..inference.schedules import clamp
 from ..inference.trackers import LARGEST_LOG, row_of
 from ..motion import Protocol
 from ..turns import alone
-from .method import Method
-from .runs import SIMULATED, Data, fit, read_config, resume
+from ..models.method import Method
+from .directory import SIMULATED, Data, fit, read_config, resume
 
 ENDED = ("finished", "stopped early")
 

@@ -20,9 +20,9 @@ from math import sqrt
 import torch
 from torch import Tensor
 
-from ..motion import Skeleton
-from ..motion.skeleton import SHORTEST
-from .result import progress_bar
+from ..inference.result import progress_bar
+from . import Skeleton
+from .skeleton import SHORTEST
 
 STRETCH = 0.02
 """Standard deviation of a bone's length, relative."""

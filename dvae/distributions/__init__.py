@@ -1,6 +1,0 @@
-"""Distributions of sequences."""
-
-from .flow import FlowDistribution, QRFlow
-from .sequence import Sequence
-
-__all__ = ["FlowDistribution", "QRFlow", "Sequence"]

@@ -1,0 +1,1 @@
+"""What runs: a batch read and checked, the factors of two equations, and the Pyro programs made of them."""
