@@ -21,6 +21,7 @@ from pathlib import Path
 import torch
 
 import dvae
+from dvae.motion.dataset import MotionData
 from dvae.runs import directory as runs
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -29,7 +30,7 @@ FILES = (DATA / "bandai" / "bandai2.npz", DATA / "cmu" / "cmu8.npz")
 
 def scores(file: Path, steps: int, batch_size: int) -> dict[str, tuple[float, str, bool]]:
     """Name to value, what is asked of it, and whether it holds."""
-    data = runs.Data.open(file)
+    data = MotionData.open(file)
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
         training = dvae.Training(steps=steps, batch_size=batch_size, decay=0.5, validate_every=max(steps // 12, 1))

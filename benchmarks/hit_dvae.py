@@ -46,8 +46,8 @@ def main() -> None:
     start(__doc__)
     windows = motion.windows(motion.simulate(), motion.PROTOCOLS["simulated"], "train")
     method = dvae.method("hit-dvae", pose_prior=0.0, decoder=256).suited(windows)  # the paper's width
-    model = method.build_for(windows)
-    method.prepare(model, windows)
+    model = method.build(windows)
+    method.train(windows).prepare(model)
     past = model.turned(windows.all()["x"][:100, : windows.protocol.observed])[0]
     found: dict[str, float] = {}
 
@@ -67,7 +67,7 @@ def main() -> None:
     found["seconds"] = time.perf_counter() - begun
 
     model.train()
-    source, objective, elbo = method.batches(windows), method.objective(), dvae.SequenceELBO()
+    source, objective, elbo = method.train(windows).batches, method.train(windows).objective, dvae.SequenceELBO()
     generator = torch.Generator().manual_seed(0)
 
     def step(feeding: SelfFeeding | None):

@@ -30,9 +30,9 @@ def main() -> None:
     windows = motion.windows(motion.simulate(), protocol, "train")
     method = dvae.method("trajevae")
     method = method.filled(method.preset(motion.HUMAN36M))
-    model = method.build_for(windows).train()
-    source, generator = method.batches(windows), torch.Generator().manual_seed(0)
-    elbo, objective, square = dvae.SequenceELBO(), method.objective(), torch.randn(2048, 2048)
+    model = method.build(windows).train()
+    source, generator = method.train(windows).batches, torch.Generator().manual_seed(0)
+    elbo, objective, square = dvae.SequenceELBO(), method.train(windows).objective, torch.randn(2048, 2048)
     step = training_step(model, lambda: objective(elbo.terms(model, source.sample(32, generator)), 0))
     batch = {name: value[:1] for name, value in windows.given(["RFoot", "LFoot"]).all().items()}
     past = {"x": batch["x"][:, :1], "y": batch["y"]}

@@ -26,19 +26,10 @@ for name, steps in STEPS.items():
     method = dvae.method(name, latent=8, self_feeding=1.0, warm_up=steps // 3, **loss)
     print(f"\n[bold]{name}[/bold]  {method.generative}   {method.inference}", method.source)
     torch.manual_seed(0)
-    models[name] = method.build_for(train)
-    method.prepare(models[name], train)
-    result = dvae.fit(
-        models[name],
-        train,
-        validation,
-        steps=steps,
-        batch_size=32,
-        learning_rate={"hit-dvae": 3e-3, "srnn": 1e-3}[name],
-        decay=0.5,
-        objective=method.objective(),
-        self_feeding=method.feeding(steps),
-    )
+    models[name] = method.build(train)
+    rate = {"hit-dvae": 3e-3, "srnn": 1e-3}[name]
+    recipe = method.train(train, validation, steps)
+    result = recipe.fit(models[name], batch_size=32, learning_rate=rate, decay=0.5)
     print(f"best validation bound: {result.best_bound:.2f} nats a frame at step {result.best_step}")
 
 training = dvae.motion.windows(people, protocol, "train+validation")

@@ -30,7 +30,7 @@ from .inference.evaluate import Evaluation, evaluate  # noqa: E402
 from .inference.fit import Fit, Training, fit  # noqa: E402
 from .inference.objectives import Evidence  # noqa: E402
 from .inference.particles import particle_bound  # noqa: E402
-from .models import method, methods  # noqa: E402
+from .models.registry import method, methods  # noqa: E402
 from .motion import energies  # noqa: E402
 from .notation import Factorization  # noqa: E402
 from .oracle import Oracle, price, twin  # noqa: E402

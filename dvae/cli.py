@@ -30,14 +30,17 @@ from .inference.compare import compare as compare_models
 from .inference.criticism import Calibration, PredictiveChecks, calibrate, predictive_checks
 from .inference.evaluate import evaluate as evaluate_models
 from .inference.fit import Fit, Interrupted, Training, reason
+from .inference.recipe import Trainable
 from .inference.result import Plain, Table
 from .inference.trackers import TensorBoard
-from .models import method as method_by_name
-from .models import methods
-from .models.method import Method
-from .models.trajectories import TrajectoryModel
+from .models.method import LatentMethod
+from .models.registry import judges, methods
+from .models.registry import method as method_by_name
+from .models.trajectories import TrajectoryMethod, TrajectoryModel
+from .motion.dataset import SIMULATED, MotionData
+from .motion.judges.pose_prior import PosePriorModel
 from .notation import Factorization
-from .options import nearest
+from .options import flat, nearest
 from .runs import directory as runs
 from .runs.sweep import ENDED
 from .runs.sweep import Interrupted as SweepInterrupted
@@ -46,35 +49,27 @@ from .runs.sweep import sweep as sweep_methods
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    MethodChoice = Method
+    MethodChoice = Trainable
     ProtocolName = str
     SweptMethod = str
     MethodOptions = Any
 else:
-    SweptMethod = tyro.extras.literal_type_from_choices(
-        [n for n, kind in methods().items() if kind.forecasts and "generative" not in {o.name for o in fields(kind)}]
-    )
+    FAMILY_OPTIONS = {option.name for option in fields(LatentMethod)} - {"latent"}
+    SweptMethod = tyro.extras.literal_type_from_choices([name for name in methods() if name != "equations"])
     MethodOptions = make_dataclass(
         "MethodOptions",
-        [(o.name, get_type_hints(Method)[o.name] | None, None) for o in fields(Method) if o.name != "latent"],
+        [
+            (o.name, get_type_hints(LatentMethod)[o.name] | None, None)
+            for o in fields(LatentMethod)
+            if o.name != "latent"
+        ],
         frozen=True,
-        namespace={"__doc__": Method.__doc__},
+        namespace={"__doc__": LatentMethod.__doc__},
     )
     ProtocolName = tyro.extras.literal_type_from_choices(motion.PROTOCOLS)
-
-    def shown(kind: type[Method]) -> type[Method]:
-        """The method, of whose options those are hidden that do not apply to it."""
-        hints = get_type_hints(kind)
-        hidden = [
-            (option.name, Annotated[hints[option.name], tyro.conf.Suppress], option.default)
-            for option in fields(kind)
-            if option.name in kind.unused
-        ]
-        return make_dataclass(kind.__name__, hidden, bases=(kind,), frozen=True, namespace={"__doc__": kind.__doc__})
-
     MethodChoice = tyro.extras.subcommand_type_from_defaults(
-        {name: shown(kind)() for name, kind in methods().items()},
-        descriptions={name: kind.source for name, kind in methods().items()},
+        {name: kind() for name, kind in {**methods(), **judges()}.items()},
+        descriptions={name: kind.source for name, kind in {**methods(), **judges()}.items()},
         prefix_names=False,
     )
 
@@ -165,7 +160,7 @@ def show(
 def fit(
     method: MethodChoice,
     out: Path,
-    data: str = runs.SIMULATED,
+    data: str = SIMULATED,
     protocol: ProtocolName | None = None,
     skip_bad: bool = False,
     steps: int = Training.steps,
@@ -223,7 +218,7 @@ def fit(
             devices=devices,
             precision=precision,
         )
-    opened = runs.Data.open(data, protocol, skip_bad)
+    opened = MotionData.open(data, protocol, skip_bad)
     _report(runs.fit(method, opened, out, training, trackers=[TensorBoard(out)] if tensorboard else []))
 
 
@@ -260,7 +255,7 @@ def sweep(
     options: MethodOptions,
     seeds: tuple[int, ...] = (0, 1, 2),
     latent: tuple[int, ...] = (),
-    data: str = runs.SIMULATED,
+    data: str = SIMULATED,
     protocol: ProtocolName | None = None,
     skip_bad: bool = False,
     steps: int = Training.steps,
@@ -322,7 +317,7 @@ def sweep(
             accelerator=accelerator,
             precision=precision,
         )
-    opened = runs.Data.open(data, protocol, skip_bad)
+    opened = MotionData.open(data, protocol, skip_bad)
     with _cluster(scheduler):
         results = sweep_methods(chosen, opened, out, seeds, training, jobs)
     if failed := [result for result in results if result.status == "failed"]:
@@ -330,7 +325,7 @@ def sweep(
             f"{len(failed)} of {len(results)} runs failed, the same command tries them again\n"
             + "\n".join(map(str, failed))
         )
-    how = "compare" if all(each.likelihood for each in chosen) else "evaluate"
+    how = "compare" if all(each.selects == "bound" for each in chosen) else "evaluate"
     OUT.print(f"all {len(results)} runs have ended; {how} them with: dvae {how} {out}/*", soft_wrap=True)
 
 
@@ -477,7 +472,7 @@ def criticise(
         {loaded.method.name: loaded.model},
         windows,
         samples=samples,
-        draw_emission=draw_emission and not loaded.method.control,
+        draw_emission=draw_emission and not isinstance(loaded.model, TrajectoryModel),
         seed=seed,
         batch_size=batch_size,
     )
@@ -723,7 +718,7 @@ def animate(
         raise UsageError(f"--fix is about the futures that a run draws; {source} is no run directory")
     elif data is not None:
         raise UsageError(f"--data tells where the data of a run lie; {source} is no run directory")
-    elif source != runs.SIMULATED and motion.is_forecasts(source):
+    elif source != SIMULATED and motion.is_forecasts(source):
         stored = motion.Forecasts.load(source)
         known = [n for n, key in enumerate(stored.keys) if clip in (None, key[1], f"{key[0]}/{key[1]}")]
         if not known:
@@ -735,7 +730,7 @@ def animate(
     elif window is not None or samples is not None or figure is not None:
         raise UsageError(f"--window, --samples and --figure are about futures; {source} has none")
     else:
-        clips = motion.simulate() if source == runs.SIMULATED else motion.load(source)
+        clips = motion.simulate() if source == SIMULATED else motion.load(source)
         shown = clips.clips[0] if clip is None else _clip(clips, clip)
         save_html(animation(clips.skeleton, shown.positions, every=every, title="/".join(shown.key)), out)
         ERROR.print(f"wrote {out}: {'/'.join(shown.key)}, {shown.frames} frames")
@@ -757,7 +752,7 @@ def animate(
 
 @data_app.command(name="info")
 def data_info(
-    file: Annotated[str, tyro.conf.Positional] = runs.SIMULATED,
+    file: Annotated[str, tyro.conf.Positional] = SIMULATED,
     skip_bad: bool = False,
 ) -> None:
     """Say what a motion file holds: splits, clips, skeleton, how rigid its bones are, labels.
@@ -766,7 +761,7 @@ def data_info(
         file: an npz file, or "simulated".
         skip_bad: leave out clips that cannot be used, and list them, instead of refusing the file.
     """
-    clips = motion.simulate() if file == runs.SIMULATED else motion.load(file, skip_bad=skip_bad)
+    clips = motion.simulate() if file == SIMULATED else motion.load(file, skip_bad=skip_bad)
     OUT.print(clips.info())
 
 
@@ -925,7 +920,7 @@ def _check_figure(path: Path | None, option: str) -> None:
             raise UsageError(f"--{option} {path}: the end of the name is the format, one of {', '.join(sorted(known))}")
 
 
-def _asks_for_equations(kind: Method | type[Method]) -> bool:
+def _asks_for_equations(kind: Any) -> bool:
     """Whether the equations of a method are options of it."""
     return "generative" in {option.name for option in fields(kind)}
 
@@ -934,14 +929,25 @@ def _report(result: Fit) -> None:
     found = ", ".join(filter(None, [f"{result.status} at step {result.step}", result.best]))
     OUT.print(found, highlight=False, soft_wrap=True)
     assert result.run is not None
-    use = methods()[Run(result.run).config["method"]["method"]].use
-    OUT.print(use.format(run=result.run), highlight=False, soft_wrap=True)
+    OUT.print(_use(Run(result.run).config["method"]["method"], result.run), highlight=False, soft_wrap=True)
+
+
+def _use(name: str, run: Path) -> str:
+    """What to do with a fitted run."""
+    if name in judges():
+        what = "the poses of forecasts" if name == "pose-prior" else "forecasts"
+        option = "--pose-prior" if name == "pose-prior" else "--classifier"
+        return f"score {what} with: dvae evaluate RUN {option} {run}"
+    if issubclass(methods()[name], TrajectoryMethod):
+        joints = f"{run} --joints JOINT …"
+        return f"score it with: dvae evaluate {joints}, move it with: dvae complete {joints}"
+    return f"score it with: dvae evaluate {run}"
 
 
 def _pose_prior(path: Path, data: str | None, skeleton: motion.Skeleton) -> Any:
     """The pose prior of a run, for poses of a skeleton."""
     model = runs.load(path, data).model
-    if not hasattr(model, "flow") or model.skeleton != skeleton:
+    if not isinstance(model, PosePriorModel) or model.skeleton != skeleton:
         raise UsageError(f"--pose-prior {path} is no run of a pose-prior of the skeleton {skeleton.name!r}")
     return model
 
@@ -956,9 +962,10 @@ def _classifiers(paths: Sequence[Path], data: str | None, windows: motion.Window
         if loaded.model.label in found:
             raise UsageError(f"--classifier {path} is the second of the label {loaded.model.label!r}; give one of them")
         if loaded.data.windows("test").fingerprint != windows.fingerprint:
+            where = loaded.config.data["path"]
             raise UsageError(
-                f"--classifier {path} was fitted on other data or under another protocol ({loaded.data.path}, "
-                f"{loaded.data.protocol.name}) than the runs ({windows.protocol.name}); it may have seen test clips"
+                f"--classifier {path} was fitted on other data or under another protocol ({where}, "
+                f"{loaded.schema.protocol.name}) than the runs ({windows.protocol.name}); it may have seen test clips"
             )
         _note_unfinished([loaded])
         found[loaded.model.label] = loaded.model
@@ -968,7 +975,7 @@ def _classifiers(paths: Sequence[Path], data: str | None, windows: motion.Window
 def _load(path: Path, data: str | None) -> runs.Loaded:
     """A run of a method that forecasts."""
     loaded = runs.load(path, data)
-    if not loaded.method.forecasts:
+    if loaded.method.name in judges():
         raise ValueError(
             f"{path} is a fitted {loaded.method.name}, which forecasts nothing; its bounds are in {path / 'log.jsonl'}"
         )
@@ -984,12 +991,13 @@ def _on_the_same_windows(paths: Sequence[Path], data: str | None) -> tuple[list[
     windows, loaded = first.data.windows("test"), [first]
     for path in paths[1:]:
         other = _load(path, data)
-        if other.data.windows("test").fingerprint != windows.fingerprint:
+        if not other.share(first):
+            there, here = (f"{run.config.data['path']}, {run.schema.protocol.name}" for run in (other, first))
             raise ValueError(
-                f"{other.path} has other test windows ({other.data.path}, {other.data.protocol.name}) than "
-                f"{first.path} ({first.data.path}, {first.data.protocol.name}); give runs of the same data and protocol"
+                f"{other.path} has other test windows ({there}) than {first.path} ({here}); give runs of the same data "
+                "and protocol"
             )
-        loaded.append(replace(other, data=first.data))
+        loaded.append(other)
     return loaded, windows
 
 
@@ -1027,7 +1035,7 @@ def _options(run: runs.Loaded) -> dict[str, Any]:
     """The options of method and training that were chosen; the training's self-feeding follows from the method's."""
     config = _config_without_seed(run)
     training = {key: value for key, value in config["training"].items() if key != "self_feeding"}
-    return dict(_flat({"method": config["method"], "training": training}))
+    return dict(flat({"method": config["method"], "training": training}))
 
 
 def _unfinished(loaded: Sequence[runs.Loaded]) -> list[str]:
@@ -1054,15 +1062,6 @@ def _config_without_seed(run: runs.Loaded) -> dict[str, Any]:
     return {**config, "training": training, "data": {k: v for k, v in config["data"].items() if k != "path"}}
 
 
-def _flat(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every option of a nested configuration, named with dots."""
-    for key, value in config.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
 def _names(loaded: Sequence[runs.Loaded]) -> list[str]:
     """Names of methods, of run directories where methods repeat, and whole paths where these repeat too."""
     candidates = ([run.method.name for run in loaded], [run.path.name for run in loaded])
@@ -1085,8 +1084,10 @@ def _windows_of(loaded: runs.Loaded, clip: str | None) -> motion.Windows:
     """The test windows of a run's data, or all windows of one clip, of any split."""
     if clip is None:
         return loaded.data.windows("test")
-    chosen = motion.MotionSet([_clip(loaded.data.motion, clip)], loaded.data.motion.skeleton, loaded.data.path)
-    anywhere = replace(loaded.data.protocol, split_by="split", test=tuple(chosen.splits), train=())
+    chosen = motion.MotionSet(
+        [_clip(loaded.data.motion, clip)], loaded.data.motion.skeleton, loaded.config.data["path"]
+    )
+    anywhere = replace(loaded.schema.protocol, split_by="split", test=tuple(chosen.splits), train=())
     return motion.windows(chosen, anywhere, "test")
 
 
@@ -1106,12 +1107,12 @@ def _forecasts(
             f"--fix {' '.join(unknown)}: {loaded.path} has "
             + (f"{', '.join(sorted(free))} to fix" if free else "nothing to fix, no parts and no static latents")
         )
-    observed, horizon = loaded.data.protocol.observed, horizon or loaded.data.protocol.predicted
+    observed, horizon = loaded.schema.protocol.observed, horizon or loaded.schema.protocol.predicted
     x, keys = windows.all()["x"][list(chosen)], windows.keys
     past, future = x[:, :observed], x[:, observed:][:, :horizon]
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        whole = max(horizon, loaded.data.protocol.predicted) if fix else horizon  # parts are fixed as a whole
+        whole = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # parts are fixed as a whole
         parts = []
         for part in past.split(64):
             once = loaded.model.forecast({"x": part}, whole, 1) if fix else {}

@@ -14,7 +14,7 @@ from __future__ import annotations
 import difflib
 import reprlib
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from math import inf
@@ -117,7 +117,7 @@ def problem(name: str, value: Any, hint: Any) -> Exception | None:
         whole = isinstance(value, Integral) and abs(int(value)) > sys.float_info.max
         return ValueError(f"{given}; it must be a number that a float holds") if whole or value != value else None
     kind = origin or hint
-    if isinstance(kind, type) and not isinstance(value, kind):
+    if isinstance(kind, type) and kind is not Any and not isinstance(value, kind):
         return TypeError(f"{given}; it must be {'true or false' if kind is bool else 'of type ' + kind.__name__}")
     if isinstance(value, str | Mapping) and len(value) > LONGEST:
         return ValueError(f"{given}, with {len(value)} characters or entries; it must have {LONGEST} at most")
@@ -126,6 +126,20 @@ def problem(name: str, value: Any, hint: Any) -> Exception | None:
         parts += [(f"{name}[{key!r}]", item, arguments[1]) for key, item in value.items()]
         return next((found for part in parts if (found := problem(*part)) is not None), None)
     return None
+
+
+def tuples(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as JSON gives them back, with tuples in place of its lists."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
+
+
+def flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every option of a nested configuration, named with dots."""
+    for name, value in options.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -2,7 +2,3 @@
 
 if __name__ != "dvae.models":
     raise ImportError(f"import this package as dvae.models, not as {__name__}: a second path loads a second copy")
-
-from .method import Method, from_config, method, methods
-
-__all__ = ["Method", "from_config", "method", "methods"]

@@ -15,7 +15,7 @@ summary of y before the decoder reads it, one to the decoder's first state, one 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -23,6 +23,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ..inference.recipe import Recipe
+from ..motion import Windows
 from ..networks import Input, Network, NetworkSpec
 from ..networks.base import once, perceptron, share_modules
 from ..networks.recurrent import gru_cell
@@ -47,7 +49,7 @@ class CVAERNN(TrajectoryMethod):
     generative: ClassVar[str] = "p(w) p(x_t | x_{<t}, y_{1:T}, w, s)"
     inference: ClassVar[str] = "q(w | r_{1:T}, y_{1:T}, s)"
 
-    latent: Size = 256
+    latent: Size | None = 256
     beta: Amount | None = 0.1
     summary: Size = 64
     width: Size = 128
@@ -60,7 +62,7 @@ class CVAERNN(TrajectoryMethod):
 
     def sizes(self) -> dict[str, int]:
         """Size of w."""
-        return {"w": self.latent}
+        return {"w": self.latent or 0}
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """Summaries, and the decoder; guide and decoder share that of y."""
@@ -75,9 +77,9 @@ class CVAERNN(TrajectoryMethod):
         model.feeding = SelfFeeding(1.0, gradient=True)
         return model
 
-    def feeding(self, steps: int) -> float:
-        """1: the model never reads what it has not made."""
-        return 1.0
+    def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
+        """As others, with self-feeding at 1: the model never reads what it has not made."""
+        return replace(super().train(train, validation, steps), feeding=1.0)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from ..laws.families import Head, HeadSpec, Parameters
 from ..networks import Dense, Input, NetworkSpec, Recurrent
 from ..networks.base import Network, at, shift
 from ..options import Extra, Size
-from .method import Method
+from .method import LatentMethod
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class GatedHead(Head):
 
 
 @dataclass(frozen=True)
-class DKF(Method):
+class DKF(LatentMethod):
     """See the file.
 
     Args:

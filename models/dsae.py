@@ -24,7 +24,7 @@ from ..networks.base import Network
 from ..networks.recurrent import Memory
 from ..notation import ALL
 from ..options import Size
-from .method import Method
+from .method import LatentMethod
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Recurrence(torch.autograd.Function):
 
 
 @dataclass(frozen=True)
-class DSAE(Method):
+class DSAE(LatentMethod):
     """See the file.
 
     Args:

@@ -14,22 +14,23 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..inference.batches import Source
 from ..laws.priors import VampPrior
 from ..motion import Skeleton, Windows, energies, face_forward, rotate_about_up
 from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
+from ..motion.judges.pose_prior import PosePriorModel, fit_pose_prior, load_pose_prior
+from ..motion.protocols import Poses
 from ..motion.truths import PseudoTruths, WithPseudoTruths
 from ..options import Amount, Count, Positive, Range, Size
 from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE
-from .method import Method
-from .pose_prior import PosePrior, PosePriorModel, fit_pose_prior
+from .poses import PoseMethod
 
 
 @dataclass(frozen=True)
-class EnergyMethod(Method):
-    """A method that learns from energies. Options that are None are chosen by the skeleton.
+class EnergyMethod(PoseMethod):
+    """A method that learns from energies.
 
     Args:
         reconstruction: weight of the squared error of the best sample.
@@ -67,27 +68,26 @@ class EnergyMethod(Method):
     pool_stride: Count | None = None
     heading: bool | None = None
 
-    def refuse_root(self, windows: Windows) -> None:
-        """Refuses windows with a root.
+    def poses(self, data: Any) -> Poses:
+        """The schema of data, of poses without a root.
 
         Raises:
-            ValueError: saying so.
+            ValueError: poses with a root, or no poses.
         """
-        if windows.protocol.root != "drop":
+        schema = Poses.of(data, self.name)
+        if schema.protocol.root != "drop":
             raise ValueError(
-                f"{self.name} makes poses relative to the pelvis, but the protocol {windows.protocol.name} has the "
-                f"root {windows.protocol.root!r}; use one with root='drop'"
+                f"{self.name} makes poses relative to the pelvis, but the protocol {schema.protocol.name} has the "
+                f"root {schema.protocol.root!r}; use one with root='drop'"
             )
+        return schema
 
-    def prepare(self, model: nn.Module, windows: Windows) -> None:
-        """See `Method.prepare`: the limits of the angles, and the pose prior.
+    def start(self, model: EnergyModel, windows: Windows) -> None:
+        """Has a model take the limits of the angles, the pose prior, and the starts of pseudo-sequences.
 
         Raises:
             ValueError: a pose prior of another skeleton.
         """
-        if not isinstance(model, EnergyModel):
-            super().prepare(model, windows)
-            return
         for prior in model.priors.values():
             if isinstance(prior, VampPrior):
                 prior.start_at({WHOLE: model.turned(windows.sample(prior.components, torch.default_generator)["x"])[0]})
@@ -96,27 +96,14 @@ class EnergyMethod(Method):
             model.angle_low.copy_(limits.low)
             model.angle_high.copy_(limits.high)
         if model.pose_prior is not None:
-            model.pose_prior.load_state_dict(model.method._fitted_prior(windows).state_dict())
+            heading = bool(model.method.heading)
+            run = self.pose_prior_run
+            prior = load_pose_prior(run, windows.skeleton, heading) if run else fit_pose_prior(windows, heading=heading)
+            model.pose_prior.load_state_dict(prior.state_dict())
 
-    def _fitted_prior(self, windows: Windows) -> nn.Module:
-        if not self.pose_prior_run:
-            return fit_pose_prior(windows, heading=bool(self.heading))
-        from ..runs.directory import load
-
-        loaded = load(self.pose_prior_run)
-        method = loaded.method
-        if not isinstance(method, PosePrior) or loaded.data.motion.skeleton.parents != windows.skeleton.parents:
-            raise ValueError(f"{self.pose_prior_run} holds no pose prior of the skeleton {windows.skeleton.name!r}")
-        if (method.heading, method.layers) != (self.heading, PosePrior.layers):
-            raise ValueError(
-                f"{self.pose_prior_run} was fitted with heading={method.heading} and layers={method.layers}, but this "
-                f"model sees poses with heading={self.heading}, and takes a prior of {PosePrior.layers} layers"
-            )
-        return loaded.model
-
-    def batches(self, windows: Windows) -> Source:
-        """See `Method.batches`: windows and their pseudo ground truths."""
-        method: Any = self.suited(windows)
+    def scored(self, windows: Windows) -> Source:
+        """Windows with their pseudo ground truths, if these count; of a method with no option left open."""
+        method: Any = self
         if not method.multimodal:
             return windows
         truths = PseudoTruths(

@@ -5,17 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ..networks import Attention, Dense, Linear, NetworkSpec, Recurrent
-from ..notation import Factorization
 from ..options import Size, nearest
 from ..program.model import DynamicalVAE
-from .method import Method
+from ..schema import Schema
+from .method import LatentMethod
 
 
 @dataclass(frozen=True)
-class Equations(Method):
+class Equations(LatentMethod):
     """A model of its own equations.
 
     Args:
@@ -58,9 +58,10 @@ class Equations(Method):
             )
         return {"default": kinds[self.network]}
 
-    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
+    def build(self, data: Any) -> DynamicalVAE:
         """The model; `residual` holds where p(x_t | ...) reads x_{t-1}."""
-        generative, inference = Factorization.parse(self.generative), Factorization.parse(self.inference)
-        latents = {name: self.latents.get(name, self.latent) for name in generative.variables if name not in data}
-        sizes = {**latents, **data}
+        given = Schema.of(data).sizes
+        generative, inference = self.equations()
+        latents = {name: self.latents.get(name, self.latent) for name in generative.variables if name not in given}
+        sizes = {**latents, **given}
         return DynamicalVAE(generative, inference, sizes, self.networks(), self.heads(), self.priors(sizes))

@@ -20,18 +20,21 @@ generator may see every window turned so that the last observed pose faces one w
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from itertools import accumulate
 from math import prod
 from operator import mul
 from string import ascii_lowercase
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
+from ..inference.recipe import Recipe
 from ..laws.families import Delta
 from ..motion import Skeleton, Windows, energies
 from ..motion.body import body_parts
@@ -41,7 +44,6 @@ from ..options import Amount, Layers, Size
 from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE
 from ..program.rollout import Rollout
 from .energies import EnergyMethod, EnergyModel
-from .method import Method
 
 PRESETS: dict[str, dict[str, Any]] = {
     "human36m": {
@@ -80,9 +82,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class GSPS(EnergyMethod):
-    """See the file. Without a likelihood, emission, residual, prior, warm-up, free bits and self-feeding do not apply.
+    """See the file. Options that are None are the paper's for Human3.6M and HumanEva-I, and smaller ones for others.
 
-    Options that are None are chosen by the skeleton: the paper's for Human3.6M and HumanEva-I, smaller ones for others.
     What is given once for each part may be given as one number for all.
 
     Args:
@@ -101,8 +102,6 @@ class GSPS(EnergyMethod):
     source: ClassVar[str] = "Mao, Liu and Salzmann, 2021, arXiv 2108.08422"
     generative: ClassVar[str] = "p(a) p(lower_t | h_{1:O}, a) p(b) p(upper_t | h_{1:O}, lower_{1:T}, b)"
     inference: ClassVar[str] = "q(a) q(b)"
-    unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method)) - {"latent"}
-    likelihood: ClassVar[bool] = False
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
     latent: Size = 64
     parts: tuple[str, ...] = ("lower", "upper")
@@ -119,12 +118,6 @@ class GSPS(EnergyMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for option in fields(self):
-            if option.name in self.unused and getattr(self, option.name) != option.default:
-                raise ValueError(
-                    f"gsps has no {option.name}, as it has no likelihood and no inference network; leave it at "
-                    f"{option.default!r}"
-                )
         if not self.parts:
             raise ValueError("gsps makes the body part by part; name at least one part")
         for name in ("draws", "diversity", "diversity_scale"):
@@ -144,10 +137,7 @@ class GSPS(EnergyMethod):
         """Names of the parts."""
         return [part.partition("=")[0] for part in self.parts]
 
-    def check(self) -> None:
-        """See `Method.check`; the rest needs the skeleton."""
-
-    def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
+    def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
         """See `Method.preset`; for these parts."""
         return {name: self._spread(name, value) for name, value in super().preset(skeleton).items()}
 
@@ -160,23 +150,25 @@ class GSPS(EnergyMethod):
             return (max(2, int(prod(value) ** (1 / count))),) * count
         return (sum(value) / count,) * count
 
-    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
-        """GSPS cannot be built from sizes alone.
+    def build(self, data: Any) -> GSPSModel:
+        """The model for such windows.
 
         Raises:
-            ValueError: always.
+            ValueError: poses with a root, or parts that are not those of the skeleton.
         """
-        raise self.needs("gsps needs to know the skeleton, its parts, and how many frames are observed")
+        schema = self.poses(data)
+        return GSPSModel(self.suited(schema), schema.skeleton, schema.protocol.observed, schema.frames)
 
-    def build_for(self, windows: Windows) -> GSPSModel:
-        """See `Method.build_for`.
+    def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
+        """One stage that minimises the weighted energies."""
+        method = self.suited(train)
+        stages = [Stage(steps, method.objective())]
+        return Recipe(method.scored(train), validation, stages, prepare=partial(method.start, windows=train))
 
-        Raises:
-            ValueError: windows with a root, or parts that are not those of the skeleton.
-        """
-        method = self.suited(windows)
-        self.refuse_root(windows)
-        return GSPSModel(method, windows.skeleton, windows.protocol.observed, windows.length)
+    @property
+    def selects(self) -> Literal["bound", "loss"]:
+        """There is no likelihood."""
+        return "loss"
 
     def objective(self) -> Objective:
         """The weighted energies, summed; in `Evidence`'s unit, per frame.

@@ -34,27 +34,30 @@ Bie et al., 2022, arXiv 2204.01565. There is no public code. Ours where the pape
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal, cast
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
-from ..inference.batches import Source
 from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
+from ..inference.recipe import Recipe
 from ..inference.schedules import Linear, Schedule
-from ..motion import Skeleton, Windows, energies
+from ..motion import Skeleton, energies
 from ..motion.body import body_parts
+from ..motion.protocols import Poses
 from ..networks import Attention, FrameGraph, NetworkSpec, PoseGraph, Recurrent, SelfAttention
 from ..networks.extract import share
 from ..notation import Factorization
 from ..options import Amount, Delay, Extra, Layers, Range, Share, Size
 from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE
 from ..program.rollout import Rollout, SelfFeeding
+from ..schema import Schema
 from .energies import EnergyMethod, EnergyModel
-from .method import SHAPES
+from .method import SHAPES, LatentMethod, start_priors
 
 HUMANEVA: dict[str, Any] = {
     "reconstruction": 10.0,
@@ -103,7 +106,7 @@ FRAMES = 15
 
 
 @dataclass(frozen=True)
-class HiTDVAE(EnergyMethod):
+class HiTDVAE(EnergyMethod, LatentMethod):
     """See the file. With loss="evidence" the energies do not apply.
 
     Args:
@@ -132,7 +135,7 @@ class HiTDVAE(EnergyMethod):
         feeding_passes: the means that are fed back, computed in so many parallel passes; 0 for exactly, step by step.
         feeding_gradient: whether gradients flow through these means.
         warm_up: steps over which the KL weights rise from 0; None for the first 4 % of the run, the paper's 20 epochs
-            of 500. `stages` knows how many these are; `objective` alone has no warm-up then.
+            of 500.
         self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over 16 %
             of training, after the first 4 %: the paper's 80 and 20 of 500 epochs.
     """
@@ -216,9 +219,26 @@ class HiTDVAE(EnergyMethod):
             found["q(w)"] = graph if self.summary == "graph" else pooled
         return found
 
-    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
-        """See `Method.build`; without a skeleton there are no energies, and x are numbers, not poses (`pose_width`)."""
-        return self._finished(super().build(data), self.frames or FRAMES)
+    def build(self, data: Any) -> DynamicalVAE:
+        """The model; without a skeleton there are no energies, and x are numbers, not poses (`pose_width`).
+
+        Raises:
+            ValueError: windows with a root, of which there are energies or headings.
+        """
+        schema = Schema.of(data)
+        if not isinstance(schema, Poses):
+            return self._finished(super().build(schema), self.frames or FRAMES)
+        method, observed = self.suited(schema), schema.protocol.observed
+        if method.loss == "evidence" and not method.heading:
+            return method._finished(super(HiTDVAE, method).build(schema), observed)
+        self.poses(schema)
+        sizes = {**method.sizes(), **schema.sizes}
+        heads: dict[str, Any] = dict(method.heads())
+        if method.selects == "loss":
+            heads["p(x)"] = replace(heads["p(x)"], fitted="scale")
+        parts = (sizes, method.networks(), heads, method.priors(sizes))
+        model = HiTModel(method, schema.skeleton, observed, *method.equations(), *parts)
+        return method._finished(model, observed)
 
     def _finished(self, model: Any, observed: int) -> Any:
         """The model, whose factors share their features of poses, and which feeds itself as the options say."""
@@ -232,57 +252,44 @@ class HiTDVAE(EnergyMethod):
         )
         return model
 
-    def suited(self, windows: Windows) -> HiTDVAE:
-        """See `Method.suited`; with loss="evidence" windows are turned only if `heading` says so, as bounds of turned
-        windows are of no other model.
+    def suited(self, data: Any) -> HiTDVAE:
+        """See `PoseMethod.suited`; with loss="evidence" windows are turned only if `heading` says so, as bounds of
+        turned windows are of no other model.
         """
-        suited = replace(self, frames=self.frames or windows.protocol.observed)
+        schema = Poses.of(data, self.name)
+        suited = replace(self, frames=self.frames or schema.protocol.observed)
         if self.loss == "evidence":
-            preset = self.preset(windows.skeleton)
+            preset = self.preset(schema.skeleton)
             open_ = {name: preset[name] for name in ("decoder", "pose_width") if getattr(self, name) is None}
             return replace(suited, heading=bool(self.heading), **open_)
-        return super(HiTDVAE, suited).suited(windows)
+        return super(HiTDVAE, suited).suited(schema)
 
-    def build_for(self, windows: Windows) -> DynamicalVAE:
-        """See `Method.build_for`.
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
+        """One stage of the paper's objective, or of the evidence, with warm-up and self-feeding over its shares."""
+        method = self.suited(train) if self.loss == "best-of-many" else self
+        if self.warm_up is None:
+            method = replace(method, warm_up=round(0.04 * steps))
+        batches = method.scored(train) if self.loss == "best-of-many" else train
+        stages = [Stage(steps, method.objective())]
+        return Recipe(batches, validation, stages, self._feeding(steps), partial(method.start, windows=train))
 
-        Raises:
-            ValueError: windows with a root, of which there are energies or headings.
-        """
-        method = self.suited(windows)
-        observed = windows.protocol.observed
-        if method.loss == "evidence" and not method.heading:
-            return method._finished(super(HiTDVAE, method).build({WHOLE: windows.size}), observed)
-        self.refuse_root(windows)
-        p, q = method.equations()
-        sizes = {**method.sizes(), WHOLE: windows.size}
-        heads: dict[str, Any] = dict(method.heads())
-        if method.selects == "loss":
-            heads["p(x)"] = replace(heads["p(x)"], fitted="scale")
-        networks, priors = method.networks(), method.priors(sizes)
-        model = HiTModel(method, windows.skeleton, observed, p, q, sizes, networks, heads, priors)
-        return method._finished(model, observed)
+    def _feeding(self, steps: int) -> Schedule | float:
+        """Over the paper's shares of the run."""
+        if not self.self_feeding:
+            return 0.0
+        return Linear(0.0, self.self_feeding, steps=max(round(0.16 * steps), 1), delay=round(0.04 * steps))
 
-    def prepare(self, model: nn.Module, windows: Windows) -> None:
-        """See `Method.prepare`: what `EnergyMethod` takes, and mean and spread of the poses of 1024 windows, where a
-        learned scale of x starts.
-        """
-        super().prepare(model, windows)
+    def start(self, model: Any, windows: Any) -> None:
+        """See `EnergyMethod.start`; and mean and spread of 1024 windows' poses, where a learned scale of x starts."""
+        if isinstance(model, EnergyModel):
+            super().start(model, windows)
+        else:
+            start_priors(model, windows)
         if self.standardise:
             x = windows.sample(1024, torch.default_generator)["x"]
-            units, generator = cast(Any, model.units), cast(Any, model.generator)
-            units[WHOLE].fit(model.turned(x)[0] if isinstance(model, EnergyModel) else x)
+            model.units[WHOLE].fit(model.turned(x)[0] if isinstance(model, EnergyModel) else x)
             if self.emission == "fixed":
-                nn.init.zeros_(generator[WHOLE].head.log_scale)
-
-    def batches(self, windows: Windows) -> Source:
-        """See `Method.batches`."""
-        return windows if self.loss == "evidence" else super().batches(windows)
-
-    def stages(self, steps: int) -> Sequence[Stage]:
-        """See `Method.stages`, and `warm_up`."""
-        method = replace(self, warm_up=round(0.04 * steps)) if self.warm_up is None else self
-        return super(HiTDVAE, method).stages(steps)
+                nn.init.zeros_(model.generator[WHOLE].head.log_scale)
 
     def objective(self) -> Objective:
         """See `Method.objective`.
@@ -309,12 +316,6 @@ class HiTDVAE(EnergyMethod):
             draws={"w" if self.static else "z": self.samples},
             select="loss",
         )
-
-    def feeding(self, steps: int) -> Schedule | float:
-        """See `Method.feeding`: over the paper's shares of the run."""
-        if not self.self_feeding:
-            return 0.0
-        return Linear(0.0, self.self_feeding, steps=max(round(0.16 * steps), 1), delay=round(0.04 * steps))
 
 
 class HiTModel(EnergyModel):

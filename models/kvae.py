@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar
 
@@ -33,6 +33,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ..inference.fit import Stage
+from ..inference.recipe import Recipe
 from ..laws.families import Head, HeadSpec, Parameters
 from ..laws.kalman import LinearGaussianChain, update
 from ..laws.triangular import InverseCholesky, TriangularNormal
@@ -41,11 +42,11 @@ from ..networks.base import valid_steps
 from ..networks.recurrent import lstm_cell
 from ..options import Range, Size
 from ..program.model import Batch, DynamicalVAE, repeat
-from .method import Method
+from .method import LatentMethod
 
 
 @dataclass(frozen=True)
-class KVAE(Method):
+class KVAE(LatentMethod):
     """See the file. `latent` is the size of z.
 
     Args:
@@ -88,14 +89,16 @@ class KVAE(Method):
         """The filter's prediction has a full covariance."""
         return {**super().heads(), "p(a)": Triangular()}
 
-    def stages(self, steps: int) -> Sequence[Stage]:
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """See `phases`. In a run of fewer than three steps there is one."""
+        recipe = super().train(train, validation, steps)
         if not self.phases or steps < 3:
-            return super().stages(steps)
+            return recipe
         ends = [0, max(steps // 10, 1), max(steps // 3, 2), steps]
         network = "generator.a.network."
         frozen = [(network,), tuple(network + name for name in ("memory.", "weights.", "first")), ()]
-        return [Stage(b - a, self.objective(), frozen=f) for (a, b), f in zip(pairwise(ends), frozen, strict=True)]
+        stages = [Stage(b - a, self.objective(), frozen=f) for (a, b), f in zip(pairwise(ends), frozen, strict=True)]
+        return replace(recipe, stages=stages)
 
 
 @dataclass(frozen=True)

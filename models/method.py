@@ -1,35 +1,52 @@
-"""What a method is: two equations, its networks and heads, and how it is trained. And the registry of them."""
+"""What a method is: two equations, a model built for data, and a recipe of how that is trained."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from functools import cache
-from importlib.metadata import entry_points
-from typing import Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from torch import nn
 
-from ..inference.batches import Source
 from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
+from ..inference.recipe import Recipe, Trainable
 from ..inference.schedules import Cosine, Linear, Logistic, Schedule
 from ..laws.families import FixedNormal, HeadSpec, Normal, StudentT
 from ..laws.priors import FlowPrior, MixturePrior, Prior, VampPrior
-from ..motion import Skeleton, Windows
 from ..networks import NetworkSpec
 from ..notation import Factor, Factorization
-from ..options import Amount, Delay, Range, Share, Size, check, nearest
+from ..options import Amount, Delay, Range, Share, Size
 from ..program.model import DynamicalVAE
 from ..program.rollout import SelfFeeding
+from ..schema import Schema
 
 SHAPES: dict[str, type[Linear | Cosine | Logistic]] = {"linear": Linear, "cosine": Cosine, "logistic": Logistic}
 
 
 @dataclass(frozen=True)
-class Method:
-    """A method of the literature. A subclass is one file of this package: its equations, networks and sizes.
+class Method(Trainable):
+    """A method of the literature; a subclass is one file of this package, and its fields are its options.
+
+    It has four hooks: `equations`, `suited` (options that are left open, chosen for the data), `build` (the model) and
+    `train` (the recipe).
+    """
+
+    generative: ClassVar[str]
+    inference: ClassVar[str]
+
+    def equations(self) -> tuple[Factorization, Factorization]:
+        """The generative model and the guide."""
+        return Factorization.parse(self.generative), Factorization.parse(self.inference)
+
+
+@dataclass(frozen=True)
+class LatentMethod(Method):
+    """A method with a likelihood whose model follows from its networks and laws, and is trained on the evidence.
+
+    A subclass gives `networks`, and `sizes` and `heads` where these are other ones.
 
     Args:
         latent: size of z.
@@ -47,21 +64,7 @@ class Method:
         self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over a
             third of training, after the first tenth, and carries no gradient. Nothing is fed to a model that reads no
             x.
-
-    Raises:
-        ValueError: when an option is out of range.
     """
-
-    name: ClassVar[str]
-    source: ClassVar[str]
-    generative: ClassVar[str]
-    inference: ClassVar[str]
-    unused: ClassVar[frozenset[str]] = frozenset()  # options that do not apply; the command line does not show them
-    likelihood: ClassVar[bool] = True  # without it, the best weights are by the objective in place of a bound
-    forecasts: ClassVar[bool] = True  # whether its models forecast motion, which evaluation and comparison ask for
-    control: ClassVar[bool] = False  # whether its models make motion from a pose along given paths
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"": {}}  # by the skeleton's name, and "" for any other
-    use: ClassVar[str] = "score it with: dvae evaluate {run}"  # what to do with a fitted run
 
     latent: Size = 16
     emission: Literal["fixed", "unit", "normal", "student"] = "fixed"
@@ -73,18 +76,6 @@ class Method:
     warm_up_shape: Literal["linear", "cosine", "logistic"] = "linear"
     free_bits: Amount = 0.0
     self_feeding: Share = 0.0
-
-    def __post_init__(self) -> None:
-        check(self)
-
-    @property
-    def selects(self) -> Literal["bound", "loss"]:
-        """What tells the best weights (see `Evidence`)."""
-        return "bound" if self.likelihood else "loss"
-
-    def equations(self) -> tuple[Factorization, Factorization]:
-        """The generative model and the guide."""
-        return Factorization.parse(self.generative), Factorization.parse(self.inference)
 
     def sizes(self) -> dict[str, int]:
         """Sizes of the latents."""
@@ -139,75 +130,28 @@ class Method:
         }
         return {name: kinds[self.prior](guide) for name, guide in guides.items()}
 
-    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
-        """The model for data of these sizes, such as {"x": 60}.
-
-        Raises:
-            ValueError: a method that needs to know more, which says so and points to `build_for`.
-        """
-        sizes = {**self.sizes(), **data}
+    def build(self, data: Any) -> DynamicalVAE:
+        """The model of these equations."""
+        sizes = {**self.sizes(), **Schema.of(data).sizes}
         model = DynamicalVAE(*self.equations(), sizes, self.networks(), self.heads(), self.priors(sizes))
         model.feeding = SelfFeeding(0.0, gradient=False)
         return model
 
-    def needs(self, what: str) -> ValueError:
-        """The error of a method that cannot be built from sizes alone, for lack of this."""
-        return ValueError(
-            f"{what}; use build_for(windows), with windows = dvae.motion.windows(motion, protocol, 'train')"
-        )
-
-    def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
-        """What options that are None stand for, with poses of this skeleton; see `presets`."""
-        return self.presets.get("" if skeleton is None else skeleton.name, self.presets[""])
-
-    def filled(self, preset: Mapping[str, Any]) -> Self:
-        """The method with options that are None taken from a preset."""
-        return replace(self, **{name: value for name, value in preset.items() if getattr(self, name) is None})
-
-    def suited(self, windows: Windows) -> Self:
-        """The method with what its options leave open chosen for these windows; itself, where nothing is open."""
-        return self.filled(self.preset(windows.skeleton))
-
-    def check(self) -> None:
-        """Refuses options that do not fit together, before any data are read.
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
+        """One stage that minimises the negative evidence, with warm-up, free bits and self-feeding as the options say.
 
         Raises:
-            ValueError: saying which.
+            ValueError: on preparing the model, the pseudo-sequences of a prior are longer than the windows.
         """
-        self.build({"x": 1})
-
-    def build_for(self, windows: Windows) -> nn.Module:
-        """The model for these windows; `build`, where it needs to know no more than their size."""
-        return self.build({"x": windows.size})
-
-    def prepare(self, model: nn.Module, windows: Windows) -> None:
-        """What a model takes from the training windows before it is fitted; its weights keep it.
-
-        Raises:
-            ValueError: the pseudo-sequences of a prior are longer than the windows.
-        """
-        for prior in getattr(model, "priors", {}).values():
-            if isinstance(prior, VampPrior):
-                prior.start_at(windows.sample(prior.components, torch.default_generator))
-
-    def batches(self, windows: Windows) -> Source:
-        """Where training draws its batches from: the windows, and what the objective needs beside them."""
-        return windows
-
-    def validation(self, windows: Windows) -> Windows:
-        """What the weights are judged by: the windows, with what the model needs beside them."""
-        return windows
+        stages = [Stage(steps, self.objective())]
+        return Recipe(train, validation, stages, self._feeding(steps), partial(start_priors, train=train))
 
     def objective(self) -> Objective:
         """What training minimises."""
         weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0
         return Evidence(kl_weight=weight, free_bits=self.free_bits)
 
-    def stages(self, steps: int) -> Sequence[Stage]:
-        """The stages of a run of `steps`; one, if the method does not train in phases."""
-        return [Stage(steps, self.objective())]
-
-    def feeding(self, steps: int) -> Schedule | float:
+    def _feeding(self, steps: int) -> Schedule | float:
         """Probability of self-feeding over a run of `steps`; 0 for a model that reads no data, where nothing is fed."""
         p, q = self.equations()
         reads = {parent.name for factor in p.factors for parent in factor.parents}
@@ -215,79 +159,9 @@ class Method:
             return 0.0
         return Linear(0.0, self.self_feeding, steps=max(steps // 3, 1), delay=steps // 10)
 
-    def config(self) -> dict[str, Any]:
-        """The method in JSON's types; `from_config` reads it."""
-        return {"method": self.name, **asdict(self)}
 
-
-@cache
-def methods() -> dict[str, type[Method]]:
-    """Every known method by name: those of this package and of installed packages (entry points "dvae.methods")."""
-    from . import (
-        action_classifier,
-        cvae_rnn,
-        dkf,
-        dsae,
-        equations,
-        gsps,
-        hit_dvae,
-        kvae,
-        pose_prior,
-        rvae,
-        srnn,
-        storn,
-        trajevae,
-        vae,
-        vrnn,
-    )
-
-    own: list[type[Method]] = [
-        vae.VAE,
-        dkf.DKF,
-        storn.STORN,
-        vrnn.VRNN,
-        srnn.SRNN,
-        rvae.CausalRVAE,
-        rvae.NonCausalRVAE,
-        dsae.DSAE,
-        kvae.KVAE,
-        hit_dvae.HiTDVAE,
-        gsps.GSPS,
-        trajevae.TrajeVAE,
-        cvae_rnn.CVAERNN,
-        pose_prior.PosePrior,
-        action_classifier.ActionClassifier,
-        equations.Equations,
-    ]
-    table = {method.name: method for method in own}
-    for entry in entry_points(group="dvae.methods"):
-        if entry.name in table:
-            raise ValueError(f"the entry point {entry.value} has the name of a method that exists: {entry.name}")
-        table[entry.name] = entry.load()
-    return table
-
-
-def method(name: str, **options: Any) -> Method:
-    """A method by its name, with options in place of its defaults.
-
-    Raises:
-        ValueError: an unknown name or option, with the nearest known one.
-    """
-    table = methods()
-    if name not in table:
-        raise ValueError(f"unknown method {name!r}{nearest(name, table)}; known: {', '.join(table)}")
-    known = {field.name for field in fields(table[name])}
-    for option in options:
-        if option not in known:
-            raise ValueError(
-                f"{name} has no option {option!r}{nearest(option, known)}; it has {', '.join(sorted(known))}"
-            )
-    return table[name](**options)
-
-
-def from_config(config: Mapping[str, Any]) -> Method:
-    """The method that `Method.config` wrote."""
-    options = {key: tuple(v) if isinstance(v, list) else v for key, v in config.items() if key != "method"}
-    if "method" not in config:
-        raise ValueError(f"the configuration names no method: it holds {', '.join(config) or 'nothing'}")
-    return method(config["method"], **options)
+def start_priors(model: nn.Module, train: Any) -> None:
+    """Has the pseudo-sequences of VampPriors start at windows of the training data."""
+    for prior in getattr(model, "priors", {}).values():
+        if isinstance(prior, VampPrior):
+            prior.start_at(train.sample(prior.components, torch.default_generator))

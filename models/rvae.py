@@ -16,11 +16,11 @@ from typing import ClassVar
 
 from ..networks import NetworkSpec, Recurrent
 from ..options import Size
-from .method import Method
+from .method import LatentMethod
 
 
 @dataclass(frozen=True)
-class CausalRVAE(Method):
+class CausalRVAE(LatentMethod):
     """See the file.
 
     Args:

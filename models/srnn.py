@@ -11,17 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ..networks import NetworkSpec, Recurrent
 from ..networks.recurrent import tie
 from ..options import Extra, Size
 from ..program.model import DynamicalVAE
-from .method import Method
+from .method import LatentMethod
 
 
 @dataclass(frozen=True)
-class SRNN(Method):
+class SRNN(LatentMethod):
     """See the file.
 
     Args:
@@ -50,7 +50,7 @@ class SRNN(Method):
             "q(z)": replace(around, stack=True),
         }
 
-    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
+    def build(self, data: Any) -> DynamicalVAE:
         """The model, with one h_t for its three factors."""
         model = super().build(data)
         tie(model.generator["z"].network, model.generator["x"].network, model.encoder["z"].network)

@@ -16,11 +16,11 @@ from typing import ClassVar
 
 from ..networks import NetworkSpec, Recurrent
 from ..options import Extra, Size
-from .method import Method
+from .method import LatentMethod
 
 
 @dataclass(frozen=True)
-class STORN(Method):
+class STORN(LatentMethod):
     """See the file.
 
     Args:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from math import inf, sqrt
 from typing import Any, ClassVar, Literal
 
@@ -22,15 +22,20 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from ..inference.objectives import Evidence, Objective
+from ..inference.fit import Stage
+from ..inference.objectives import Evidence
+from ..inference.recipe import Recipe
 from ..laws.families import FixedNormal, HeadSpec
 from ..motion import HUMAN36M, PROTOCOLS, Clip, Skeleton, Windows, rotate_about_up
 from ..motion.control import bend
 from ..motion.data import defect
-from ..options import Amount, Share
+from ..motion.protocols import Poses
+from ..networks import NetworkSpec
+from ..options import Amount, Share, Size
 from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE, in_chunks, repeat, rows
+from ..schema import Schema
 from ..turns import alone
-from .method import Method
+from .poses import PoseMethod
 
 FIRST, GIVEN, REST = "s", "y", "r"
 NEEDED = "relative", 1
@@ -38,10 +43,11 @@ NEEDED = "relative", 1
 
 
 @dataclass(frozen=True)
-class TrajectoryMethod(Method):
-    """A method that completes motion. The likelihood is the paper's squared error, whatever else methods offer.
+class TrajectoryMethod(PoseMethod):
+    """A method that completes motion. The likelihood is the paper's squared error.
 
     Args:
+        latent: size of the latent.
         beta: weight of the KL, beside squared errors in square metres.
         keep: probability with which a joint is given, in training.
         complement: the guide sees the joints that are not given, and not the others.
@@ -51,31 +57,27 @@ class TrajectoryMethod(Method):
             paper, where that is left to learn, and for so with others whose left and right are known.
     """
 
-    projected: ClassVar[bool] = True
-    """Whether a linear layer makes poses of the features; else these are poses."""
-    control: ClassVar[bool] = True
-    use: ClassVar[str] = (
-        "score it with: dvae evaluate {run} --joints JOINT …, move it with: dvae complete {run} --joints JOINT …"
-    )
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
-    unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method)) - {"latent"}
 
+    latent: Size | None = None
     beta: Amount | None = None
     keep: Share = 0.15
     complement: bool = True
     rotate: bool = True
     heading: bool | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for option in fields(self):
-            if option.name in self.unused and getattr(self, option.name) != option.default:
-                raise ValueError(f"{self.name} has no {option.name}; leave it at {option.default!r}")
+    def sizes(self) -> dict[str, int]:
+        """Size of the latent."""
+        return {"z": self.latent or 0}
 
-    def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
-        """See `Method.preset`; where left and right are unknown, so are headings."""
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        """Networks by factor."""
+        raise NotImplementedError(f"{type(self).__name__} says nothing of its networks")
+
+    def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
+        """See `PoseMethod.preset`; where left and right are unknown, so are headings."""
         found = super().preset(skeleton)
-        return found if skeleton is None or (skeleton.left and skeleton.right) else {**found, "heading": False}
+        return found if skeleton.left and skeleton.right else {**found, "heading": False}
 
     @property
     def selects(self) -> Literal["bound", "loss"]:
@@ -84,34 +86,31 @@ class TrajectoryMethod(Method):
 
     def heads(self) -> Mapping[str, HeadSpec]:
         """x is normal with variance 1/2, minus whose log-density is the squared error."""
-        return {"p(x)": FixedNormal(scale=sqrt(0.5), project=self.projected)}
+        return {"p(x)": FixedNormal(scale=sqrt(0.5))}
 
-    def build_for(self, windows: Windows) -> TrajectoryModel:
-        """See `Method.build_for`.
+    def build(self, data: Any) -> DynamicalVAE:
+        """The model for windows with a root and one observed frame.
+
+        Of sizes alone it is one with the paper's options whose batches hold y, r and s, of the size of x, beside x.
 
         Raises:
-            ValueError: windows without a root, or with more than one observed frame.
+            ValueError: windows without a root, or with more than one observed frame; no size of x.
         """
-        protocol = windows.protocol
+        schema = Schema.of(data)
+        if not isinstance(schema, Poses):
+            if WHOLE not in schema.sizes:
+                raise ValueError(
+                    f"sizes missing for {WHOLE}, 3 J of a pose; given are {', '.join(schema.sizes) or 'none'}"
+                )
+            return self.filled(self.presets[HUMAN36M.name])._built(DynamicalVAE, schema.sizes[WHOLE])
+        protocol = schema.protocol
         if (protocol.root, protocol.observed) != NEEDED:
             raise ValueError(
                 f"{self.name} moves a body through space from one pose on, but the protocol {protocol.name} has "
                 f"root={protocol.root!r} and {protocol.observed} observed frames; use one with root='relative' and "
                 f"observed=1, such as {', '.join(n for n, p in PROTOCOLS.items() if (p.root, p.observed) == NEEDED)}"
             )
-        return self.build_on(windows.skeleton, windows.length - 1)
-
-    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
-        """See `Method.build`; y, r and s are of the size of x, and options left open are the paper's.
-
-        Batches of this model hold y, r and s beside x; that of `build_for` makes them of windows itself.
-
-        Raises:
-            ValueError: no size of x.
-        """
-        if WHOLE not in data:
-            raise ValueError(f"sizes missing for {WHOLE}, 3 J of a pose; given are {', '.join(data) or 'none'}")
-        return self.filled(self.presets[HUMAN36M.name])._built(DynamicalVAE, data[WHOLE])
+        return self.build_on(schema.skeleton, schema.frames - 1)
 
     def build_on(self, skeleton: Skeleton, frames: int | None = None) -> TrajectoryModel:
         """The model for poses of this skeleton, to be fitted to motions of T frames after the first pose."""
@@ -124,27 +123,13 @@ class TrajectoryMethod(Method):
         sizes = {**self.sizes(), **dict.fromkeys((WHOLE, FIRST, GIVEN, REST), size)}
         return kind(*arguments, *self.equations(), sizes, self.networks(), self.heads())
 
-    def batches(self, windows: Windows) -> Windows:
-        """See `Method.batches`: windows with the trajectories that are given, turned anyhow."""
-        return windows.with_protocol(replace(windows.protocol, rotate=self.rotate)).given(self.keep)
-
-    def validation(self, windows: Windows) -> Windows:
-        """See `Method.validation`."""
-        return windows.given(self.keep)
-
-    def objective(self) -> Objective:
-        """Squared errors and the weighted KL.
-
-        Raises:
-            ValueError: a weight that is still open, which the skeleton decides.
-        """
-        if self.beta is None:
-            raise ValueError("beta depends on the skeleton; take the objective of method.suited(windows), or give beta")
-        return Evidence(kl_weight=self.beta, select="loss")
-
-    def feeding(self, steps: int) -> float:
-        """0: x is no parent of x."""
-        return 0.0
+    def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
+        """Minimises squared errors and the weighted KL, on windows that are turned anyhow, with some paths given."""
+        beta = self.suited(train).beta
+        assert beta is not None
+        turned = train.with_protocol(replace(train.protocol, rotate=self.rotate))
+        stages = [Stage(steps, Evidence(kl_weight=beta, select="loss"))]
+        return Recipe(turned.given(self.keep), validation and validation.given(self.keep), stages)
 
 
 class TrajectoryModel(DynamicalVAE):

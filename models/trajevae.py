@@ -20,13 +20,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from math import sqrt
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..laws.families import Head, HeadSpec, Normal, NormalHead, Parameters
+from ..laws.families import FixedNormal, Head, HeadSpec, Normal, NormalHead, Parameters
 from ..motion import Skeleton
 from ..networks import CosineEncoder, MotionDecoder, NetworkSpec
 from ..networks.base import share_modules
@@ -81,9 +82,7 @@ class TrajeVAE(TrajectoryMethod):
     inference: ClassVar[str] = "q(z_t | r_{1:T}, s)"
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
-    projected: ClassVar[bool] = False
 
-    latent: Size | None = None  # type: ignore[assignment]  # chosen by the skeleton, as the next ones
     components: Extra | None = None
     width: Size | None = None
     feedforward: Size | None = None
@@ -103,8 +102,8 @@ class TrajeVAE(TrajectoryMethod):
         if self.components and not self.cosine:
             raise ValueError("components are of the cosine transform; leave them at 0 without it")
 
-    def preset(self, skeleton: Skeleton | None = None) -> Mapping[str, Any]:
-        """See `Method.preset`; without the cosine transform there are no coefficients."""
+    def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
+        """See `PoseMethod.preset`; without the cosine transform there are no coefficients."""
         return {**super().preset(skeleton), **({} if self.cosine else {"components": 0})}
 
     def equations(self) -> tuple[Factorization, Factorization]:
@@ -136,9 +135,10 @@ class TrajeVAE(TrajectoryMethod):
         return {**found, "p(x)": MotionDecoder(hidden=2 * shape["width"], **shape)}
 
     def heads(self) -> Mapping[str, HeadSpec]:
-        """Normal latents, of which those beyond `components` are noise that nothing reads."""
+        """The decoder makes poses; normal latents, of which those beyond `components` are noise that nothing reads."""
         latent: HeadSpec = SlowNormal(steps=self.components) if self.components else Normal()
-        return {**super().heads(), "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
+        emission = FixedNormal(scale=sqrt(0.5), project=False)
+        return {"p(x)": emission, "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         model = super()._built(kind, size, *arguments)

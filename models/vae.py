@@ -15,11 +15,11 @@ from typing import ClassVar
 
 from ..networks import Dense, NetworkSpec
 from ..options import Size
-from .method import Method
+from .method import LatentMethod
 
 
 @dataclass(frozen=True)
-class VAE(Method):
+class VAE(LatentMethod):
     """See the file.
 
     Args:

@@ -12,17 +12,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ..networks import NetworkSpec, Recurrent
 from ..networks.recurrent import tie
 from ..options import Size
 from ..program.model import DynamicalVAE
-from .method import Method
+from .method import LatentMethod
 
 
 @dataclass(frozen=True)
-class VRNN(Method):
+class VRNN(LatentMethod):
     """See the file.
 
     Args:
@@ -47,7 +47,7 @@ class VRNN(Method):
         extract = {"x": self.embed, "z": self.embed_latent}
         return {"default": Recurrent(self.width, extract=extract, hidden=self.hidden, apart=True)}
 
-    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
+    def build(self, data: Any) -> DynamicalVAE:
         """The model, with one h_t for its three factors."""
         model = super().build(data)
         tie(model.generator["z"].network, model.generator["x"].network, model.encoder["z"].network)

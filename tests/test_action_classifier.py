@@ -13,8 +13,9 @@ from dvae import motion
 from dvae.cli import main
 from dvae.inference.evaluate import Evaluation, evaluate, frechet_pseudo_values
 from dvae.inference.metrics import frechet_distance
-from dvae.models import from_config
-from dvae.models.action_classifier import ActionClassifier, ActionClassifierModel
+from dvae.models.registry import from_config, judge
+from dvae.motion.dataset import MotionData
+from dvae.motion.judges.action_classifier import ActionClassifier, ActionClassifierModel
 from dvae.runs import directory as runs
 
 SHORT = replace(motion.PROTOCOLS["simulated"], observed=4, predicted=6)
@@ -47,7 +48,7 @@ def classifier(train=None, **options):
     train = windows("train") if train is None else train
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return ActionClassifier(**{**SMALL, **options}).build_for(train).double().eval()
+        return ActionClassifier(**{**SMALL, **options}).build(train).double().eval()
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,13 @@ def fitted():
     train, method = windows("train"), ActionClassifier(**SMALL)
     model = classifier(train)
     dvae.fit(
-        model, method.batches(train), steps=60, batch_size=16, learning_rate=0.02, accelerator="cpu", progress=False
+        model,
+        method.train(train).batches,
+        steps=60,
+        batch_size=16,
+        learning_rate=0.02,
+        accelerator="cpu",
+        progress=False,
     )
     return model
 
@@ -95,7 +102,7 @@ def test_windows_come_with_the_class_of_their_clip():
 
 def test_its_bound_is_the_log_likelihood_of_the_class_from_the_predicted_frames():
     test, model = windows("test"), classifier()
-    batch = ActionClassifier(**SMALL, classes=model.classes).batches(test).all()
+    batch = ActionClassifier(**SMALL, classes=model.classes).train(test).batches.all()
     x, c = batch["x"].double(), batch["c"]
     log_softmax = model.logits(model.features(x[:, 4:])).log_softmax(-1)
     terms = dvae.SequenceELBO().terms(model, {"x": x, "c": c})
@@ -138,7 +145,8 @@ def test_the_classes_are_those_of_the_training_clips_and_kept():
     assert from_config(json.loads(json.dumps(method.config()))) == method
     assert method.suited(windows("test", people(ways=("left", "right")))) == method
     assert method.equations()[0].text == "p(c | x_{1:T})"
-    assert (method.objective(), method.feeding(100)) == (dvae.Evidence(), 0)
+    recipe = method.train(train)
+    assert (recipe.objective, recipe.feeding) == (dvae.Evidence(), 0)
 
 
 def test_a_fitted_classifier_is_read_back_and_goes_on(run, file, tmp_path, capsys):
@@ -147,14 +155,14 @@ def test_a_fitted_classifier_is_read_back_and_goes_on(run, file, tmp_path, capsy
     assert loaded.model.classes == ("down", "up")
     training = dvae.Training(steps=20, batch_size=16, validate_every=10, decay=0.5, progress=False)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    method = dvae.method("action-classifier", **SMALL)
-    result = runs.fit(method, runs.Data.open(file), whole, training)
+    method = judge("action-classifier", **SMALL)
+    result = runs.fit(method, MotionData.open(file), whole, training)
     assert "nats a window" in result.best
     x = loaded.data.windows("test").all()["x"][:, 15:]
     logits = loaded.model.logits(loaded.model.features(x))
     other = dvae.load(whole).model
     assert torch.equal(other.logits(other.features(x)), logits)
-    runs.fit(method, runs.Data.open(file), parts, replace(training, steps=10))
+    runs.fit(method, MotionData.open(file), parts, replace(training, steps=10))
     assert main(["resume", str(parts), "--steps", "20"]) == 0
     assert f"score forecasts with: dvae evaluate RUN --classifier {parts}" in " ".join(capsys.readouterr().out.split())
     rows = [json.loads(line) for line in (parts / "log.jsonl").read_text().splitlines()]

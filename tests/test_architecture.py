@@ -34,7 +34,12 @@ PENDING = {
     "dvae.testing.contract",
     "dvae.runs.directory",
 }
-PENDING |= {"dvae.runs.sweep", "dvae.models.energies", "dvae.models.pose_prior", "dvae.models.action_classifier"}
+PENDING |= {
+    "dvae.runs.sweep",
+    "dvae.models.energies",
+    "dvae.motion.judges.pose_prior",
+    "dvae.motion.judges.action_classifier",
+}
 
 
 def sources():

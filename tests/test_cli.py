@@ -19,6 +19,7 @@ import torch
 import dvae
 from dvae import motion
 from dvae.cli import main
+from dvae.motion.dataset import MotionData
 from dvae.runs import directory as runs
 
 SMALL = ["--batch-size", "4", "--warm-up", "4", "--latent", "3", "--validate-every", "5"]
@@ -319,7 +320,7 @@ def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
 
 
 def test_a_loaded_run_forecasts_as_the_fitted_model_does(people, tmp_path):
-    data = runs.Data.open(people)
+    data = MotionData.open(people)
     training = dvae.Training(steps=5, batch_size=4, validate_every=5, progress=False)
     runs.fit(dvae.method("vrnn", latent=3, width=8, warm_up=4), data, tmp_path / "a", training)
     loaded = dvae.load(tmp_path / "a")
@@ -347,7 +348,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(people, tmp_path, capsys):
 
     method = dvae.method("vrnn", latent=3, width=8, warm_up=8, self_feeding=0.5)
     training = dvae.Training(steps=12, batch_size=4, validate_every=5, decay=0.5, progress=False)
-    data = runs.Data.open(people)
+    data = MotionData.open(people)
     runs.fit(method, data, tmp_path / "whole", training)
     with pytest.raises(KeyboardInterrupt, match="interrupted after step 7"):
         runs.fit(method, data, tmp_path / "parts", training, callbacks=[Stop()])
@@ -371,7 +372,7 @@ def test_a_longer_run_is_laid_out_anew(people, tmp_path):
     assert main(["resume", str(out), "--steps", "60"]) == 0
     rates = [row["learning_rate"] for row in log(out)]
     assert rates[2:] == pytest.approx([0.01, 0.01 * 21 / 30, 0.01 * 11 / 30, 0.01 / 30])
-    feeding = dvae.load(out).method.feeding(60)
+    feeding = dvae.load(out).method.train({}, steps=60).feeding
     assert [row["self_feeding"] for row in log(out)][2:] == pytest.approx([feeding(s - 1) for s in (30, 40, 50, 60)])
     assert main(["resume", str(out), "--steps", "70", "--learning-rate", "0.02"]) == 0
     assert log(out)[-1]["learning_rate"] == pytest.approx(0.02 / 35)
@@ -397,14 +398,14 @@ def test_a_method_with_an_objective_of_its_own_resumes(people, tmp_path, monkeyp
 
     monkeypatch.setitem(dvae.methods(), "plain", Plain)
     training = dvae.Training(steps=3, batch_size=4, progress=False)
-    runs.fit(Plain(latent=3), runs.Data.open(people), tmp_path / "run", training)
+    runs.fit(Plain(latent=3), MotionData.open(people), tmp_path / "run", training)
     runs.resume(tmp_path / "run", steps=5)
     assert seen == [0, 1, 2, 3, 4]
 
 
 def test_self_feeding_is_told_by_the_method_alone(people, tmp_path):
     with pytest.raises(ValueError, match=r"instead of Training\(self_feeding=0.5\) write dvae.method\('vrnn', self_"):
-        runs.fit(dvae.method("vrnn"), runs.Data.open(people), tmp_path / "run", dvae.Training(self_feeding=0.5))
+        runs.fit(dvae.method("vrnn"), MotionData.open(people), tmp_path / "run", dvae.Training(self_feeding=0.5))
 
 
 def test_a_run_is_neither_overwritten_nor_invented(capsys, run, people, tmp_path):

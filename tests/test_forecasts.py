@@ -33,7 +33,7 @@ def forecaster(request, people):
     protocol = protocol if paths else replace(protocol, observed=5)
     windows = motion.windows(people, protocol, "train")
     torch.manual_seed(0)
-    model = dvae.method(request.param, **METHODS[request.param]).build_for(windows).double().eval()
+    model = dvae.method(request.param, **METHODS[request.param]).build(windows).double().eval()
     past = windows.all()["x"][:WINDOWS, : protocol.observed]
     return lambda part, samples, **options: model.forecast(past[part], 20, samples, **options)
 

@@ -8,13 +8,13 @@ from pyro import poutine
 
 import dvae
 from dvae import motion
-from dvae.inference.fit import fit
 from dvae.inference.metrics import average_pairwise_distance
-from dvae.models import from_config
 from dvae.models.gsps import PRESETS, GSPSModel, part_by_part
-from dvae.models.pose_prior import PosePriorModel
+from dvae.models.registry import from_config, judge
 from dvae.motion import energies
 from dvae.motion.body import LIMBS, body_parts
+from dvae.motion.dataset import MotionData
+from dvae.motion.judges.pose_prior import PosePriorModel
 from dvae.networks import GraphConv
 from dvae.runs import directory as runs
 from dvae.testing import FactorizationContract
@@ -26,14 +26,14 @@ FIVE = ("torso", "right_leg", "left_leg", "right_arm", "left_arm")
 
 @pytest.fixture(scope="module")
 def people():
-    return runs.Data.open()
+    return MotionData.open()
 
 
 @pytest.fixture(scope="module")
 def prior_run(people, tmp_path_factory):
     """A run of a pose prior, of two steps."""
     out = tmp_path_factory.mktemp("prior") / "run"
-    method = dvae.method("pose-prior", heading=True)
+    method = judge("pose-prior", heading=True)
     runs.fit(method, people, out, dvae.Training(steps=2, progress=False, accelerator="cpu"))
     return str(out)
 
@@ -45,12 +45,12 @@ def windows(people):
 
 def build(windows, **options):
     method = dvae.method("gsps", **{**SMALL, **options}).suited(windows)
-    return method.build_for(windows).double()
+    return method.build(windows).double()
 
 
 def batch(windows, size=4):
     method = dvae.method("gsps", **SMALL)
-    drawn = method.batches(windows).sample(size, torch.Generator().manual_seed(0))
+    drawn = method.train(windows).batches.sample(size, torch.Generator().manual_seed(0))
     return {name: v.double() if v.is_floating_point() else v for name, v in drawn.items()}
 
 
@@ -380,13 +380,13 @@ def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, people, prior_run):
 
 def test_a_fitted_pose_prior_is_taken_along(windows, prior_run):
     method = dvae.method("gsps", **{**SMALL, "pose_prior": 1.0, "pose_prior_run": prior_run}).suited(windows)
-    model = method.build_for(windows)
-    method.prepare(model, windows)
+    model = method.build(windows)
+    method.train(windows).prepare(model)
     fitted, poses = runs.load(prior_run).model, windows.poses()[:5]
     assert isinstance(fitted, PosePriorModel)
     assert torch.equal(model.pose_prior.log_prob(poses), fitted.log_prob(poses))
     with pytest.raises(ValueError, match=r"fitted with heading=True .* sees poses with heading=False"):
-        method.prepare(replace(method, heading=False).build_for(windows), windows)
+        method.prepare(replace(method, heading=False).build(windows), windows)
 
 
 def test_a_model_without_a_likelihood_is_not_compared_by_bounds(windows):
@@ -409,7 +409,7 @@ def test_training_brings_the_best_future_nearer(windows):
     model = build(windows, width=16, coefficients=12, diversity=(0.0,)).float()
     method = model.method
     options = {"steps": 80, "batch_size": 8, "learning_rate": 5e-3, "progress": False}
-    result = fit(model, method.batches(windows), objective=method.objective(), **options)
+    result = method.train(windows, steps=options.pop("steps")).fit(model, **options)
     errors = result.series("energy/reconstruction")[1]
     assert errors[-1] < 0.75 * errors[0]
 

@@ -9,10 +9,11 @@ from pyro import poutine
 
 import dvae
 from dvae import motion
-from dvae.models import from_config
 from dvae.models.hit_dvae import PRESETS, HiTModel
+from dvae.models.registry import from_config
 from dvae.motion import energies
 from dvae.motion.body import body_parts
+from dvae.motion.dataset import MotionData
 from dvae.networks.posegraph import PoseFeatures
 from dvae.runs import directory as runs
 
@@ -36,7 +37,7 @@ ENERGIES = {"samples": None, "pose_prior": None, "angles": None, "multimodal": N
 
 @pytest.fixture(scope="module")
 def people():
-    return runs.Data.open()
+    return MotionData.open()
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +47,7 @@ def windows(people):
 
 def build(windows, **options):
     torch.manual_seed(0)
-    return small(**options).suited(windows).build_for(windows).double()
+    return small(**options).suited(windows).build(windows).double()
 
 
 def small(**options):
@@ -56,7 +57,7 @@ def small(**options):
 
 def drawn(windows, size=3, **options):
     method = small(**options)
-    batch = method.batches(windows).sample(size, torch.Generator().manual_seed(0))
+    batch = method.train(windows).batches.sample(size, torch.Generator().manual_seed(0))
     return {name: v.double() if v.is_floating_point() else v for name, v in batch.items()}
 
 
@@ -224,11 +225,12 @@ def test_the_presets_are_the_papers_weights(skeleton):
 def test_schedules_have_the_papers_shares_of_500_epochs(windows):
     """KL weights rise over 20 epochs, self-feeding over the next 80."""
     method = dvae.method("hit-dvae").suited(windows)
-    feeding, (stage,) = method.feeding(500), method.stages(500)
+    recipe = method.train(windows, steps=500)
+    feeding, (stage,) = recipe.feeding, recipe.stages
     assert [feeding(epoch) for epoch in (0, 20, 60, 100, 499)] == [0, 0, 0.5, 1, 1]
     weight = stage.objective.kl_weight["z"]
     assert [weight(epoch) / method.kl_local for epoch in (0, 10, 20, 499)] == pytest.approx([0, 0.5, 1, 1])
-    assert replace(method, warm_up=0).stages(500)[0].objective.kl_weight["z"] == method.kl_local
+    assert replace(method, warm_up=0).train(windows).objective.kl_weight["z"] == method.kl_local
 
 
 def test_options_reach_the_model(windows):
@@ -245,8 +247,8 @@ def test_options_reach_the_model(windows):
 
 def test_a_prepared_model_starts_at_the_spread_of_poses(windows):
     method = small().suited(windows)
-    model = method.build_for(windows)
-    method.prepare(model, windows)
+    model = method.build(windows)
+    method.train(windows).prepare(model)
     x = windows.all()["x"][:2]
     scale = poutine.trace(model.model).get_trace(x).nodes["x"]["fn"].elementwise(x).scale
     assert scale.mean().item() == pytest.approx(windows.poses().var(0).mean().sqrt().item(), rel=0.05)
@@ -359,10 +361,10 @@ def test_only_poses_go_through_pose_graphs(windows, loss):
 
     method = dvae.method("hit-dvae", loss=loss)
     assert not graphs(method.build({"x": windows.size}))  # numbers that nobody called joints
-    assert graphs(method.build_for(windows))
+    assert graphs(method.build(windows))
     assert method.suited(windows).pose_width == 8
     assert graphs(replace(method, pose_width=2).build({"x": 12}))
-    assert not graphs(replace(method, pose_width=0).build_for(windows))
+    assert not graphs(replace(method, pose_width=0).build(windows))
 
 
 @pytest.mark.parametrize(
@@ -388,5 +390,5 @@ def test_weights_are_asked_for_where_they_are_known(windows):
         dvae.method("hit-dvae").objective()
     rooted = motion.windows(motion.simulate(clips=4), replace(windows.protocol, root="relative"), "train")
     with pytest.raises(ValueError, match="use one with root='drop'"):
-        dvae.method("hit-dvae").build_for(rooted)
-    assert dvae.method("hit-dvae", loss="evidence").build_for(rooted).sizes["x"] == 51
+        dvae.method("hit-dvae").build(rooted)
+    assert dvae.method("hit-dvae", loss="evidence").build(rooted).sizes["x"] == 51

@@ -385,12 +385,12 @@ def test_phases_free_the_matrices_and_then_what_mixes_them():
             moved = {name.removeprefix("generator.a.network.") for name in now if not now[name].equal(start[name])}
             seen[state.step] = {name.split(".")[0] for name in moved}
 
-    dvae.fit(model, torch.randn(8, 5, 4), stages=method.stages(30), callbacks=[Watch()], progress=False)
+    dvae.fit(model, torch.randn(8, 5, 4), stages=method.train({}, steps=30).stages, callbacks=[Watch()], progress=False)
     assert seen[3] == {"encoder", "generator"}
     assert seen[4] == seen[10] == {"encoder", "generator", "A", "B", "C"}
     assert seen[11] == {"encoder", "generator", "A", "B", "C", "first", "memory", "weights"}
-    assert [stage.steps for stage in method.stages(3)] == [1, 1, 1]
-    assert [stage.steps for stage in method.stages(2)] == [2]
+    assert [stage.steps for stage in method.train({}, steps=3).stages] == [1, 1, 1]
+    assert [stage.steps for stage in method.train({}, steps=2).stages] == [2]
 
 
 def test_half_precision_is_left_at_the_filter():

@@ -12,8 +12,9 @@ from torch.distributions import MultivariateNormal
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.models import from_config
-from dvae.models.pose_prior import PosePrior, PosePriorModel, fit_pose_prior
+from dvae.models.registry import from_config, judge
+from dvae.motion.dataset import MotionData
+from dvae.motion.judges.pose_prior import PosePrior, PosePriorModel, fit_pose_prior
 from dvae.runs import directory as runs
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -110,13 +111,13 @@ def test_draws_are_of_its_density(train):
 
 def test_training_poses_are_turned_and_get_noise(train):
     x = train.sample(200, torch.Generator().manual_seed(3))["x"].unflatten(-1, (-1, 3))
-    plain = PosePrior(noise=0.0).batches(train).sample(200, torch.Generator().manual_seed(3))["x"]
+    plain = PosePrior(noise=0.0).train(train).batches.sample(200, torch.Generator().manual_seed(3))["x"]
     assert torch.equal(plain, x.flatten(-2))
-    noisy = PosePrior(noise=0.004).batches(train).sample(200, torch.Generator().manual_seed(3))["x"]
+    noisy = PosePrior(noise=0.004).train(train).batches.sample(200, torch.Generator().manual_seed(3))["x"]
     error = noisy - plain
     assert error.std().item() == pytest.approx(0.004, rel=0.02)
     assert abs(error.mean()) < 5 * 0.004 / error.numel() ** 0.5
-    turned = PosePrior(noise=0.0, turned=True).batches(train).sample(200, torch.Generator().manual_seed(3))["x"]
+    turned = PosePrior(noise=0.0, turned=True).train(train).batches.sample(200, torch.Generator().manual_seed(3))["x"]
     old, new = (torch.complex(poses[..., 2], poses[..., 0]) for poses in (x, turned.unflatten(-1, (-1, 3))))
     angles = (new * old.conj()).sum((1, 2)).angle()  # of whole windows, about y
     again = motion.rotate_about_up(x, angles[:, None, None], "y").flatten(-2)
@@ -129,7 +130,7 @@ def test_with_a_fixed_heading_it_does_not_mind_which_way_people_face(train):
     angle = torch.linspace(0, 6, 5, dtype=torch.float64)[:, None, None]
     turned = motion.rotate_about_up(x.unflatten(-1, (-1, 3)), angle, "y").flatten(-2)
     for heading in (False, True):
-        prior = PosePrior(heading=heading).build_for(train).double()
+        prior = PosePrior(heading=heading).build(train).double()
         plain, other = (dvae.SequenceELBO().terms(prior, {"x": each}).bound for each in (x, turned))
         assert torch.allclose(plain, other, rtol=0, atol=1e-8) == heading
 
@@ -137,13 +138,13 @@ def test_with_a_fixed_heading_it_does_not_mind_which_way_people_face(train):
 def test_a_fitted_prior_is_read_back_and_goes_on(run, people, tmp_path):
     loaded = dvae.load(run)
     assert isinstance(loaded.model, PosePriorModel)
-    assert loaded.method == dvae.method("pose-prior", noise=0.005)
+    assert loaded.method == judge("pose-prior", noise=0.005)
     assert not torch.equal(loaded.model.flow.whitening, torch.eye(48))
     x = loaded.data.windows("test").all()["x"]
     assert torch.isfinite(loaded.model.log_prob(x)).all()
     training = dvae.Training(steps=12, batch_size=4, validate_every=4, decay=0.5, progress=False)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    method, data = dvae.method("pose-prior", noise=0.005), runs.Data.open(people)
+    method, data = judge("pose-prior", noise=0.005), MotionData.open(people)
     runs.fit(method, data, whole, training)
     assert torch.equal(dvae.load(whole).model.log_prob(x), loaded.model.log_prob(x))
     runs.fit(method, data, parts, replace(training, steps=8))
@@ -173,8 +174,9 @@ def test_it_forecasts_nothing(command, run, tmp_path, capsys):
 def test_it_survives_its_configuration():
     method = PosePrior(layers=2, noise=0.0, turned=True, whiten=False)
     assert from_config(json.loads(json.dumps(method.config()))) == method
-    assert method.feeding(100) == 0
-    assert method.objective() == dvae.Evidence()
+    recipe = method.train({})
+    assert recipe.feeding == 0
+    assert recipe.objective == dvae.Evidence()
 
 
 @pytest.mark.parametrize(
@@ -204,7 +206,7 @@ def test_a_quick_fit_repeats_and_leaves_the_random_state(train):
 def gain(windows, steps):
     """Nats by which a fitted prior exceeds the normal with mean and covariance of such poses, on other draws."""
     prior = fit_pose_prior(windows, steps=steps)
-    batches = PosePrior().batches(windows)
+    batches = PosePrior().train(windows).batches
     first, second = (
         prior.skeleton.directions(batches.sample(1024, torch.Generator().manual_seed(seed))["x"].double()).flatten(0, 1)
         for seed in (1, 2)

@@ -14,6 +14,7 @@ from dvae import DynamicalVAE, SequenceELBO, importance_bound, motion
 from dvae.cli import main
 from dvae.inference.checkpoints import load_weights, save_weights
 from dvae.laws import priors
+from dvae.motion.dataset import MotionData
 from dvae.networks import Dense, Recurrent
 from dvae.runs import directory as runs
 
@@ -211,7 +212,7 @@ def weights(run: Path):
 
 def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
     """By the run's seed; and a resumed run goes on from where they have come."""
-    data, method = runs.Data.open(people), dvae.method("hit-dvae", **VAMP)
+    data, method = MotionData.open(people), dvae.method("hit-dvae", **VAMP)
     still = dvae.Training(steps=1, batch_size=2, learning_rate=0.0, progress=False, validate_every=2)
     starts = []
     for seed, name in ((0, "a"), (0, "b"), (1, "c")):
@@ -233,7 +234,7 @@ def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
 def test_pseudo_sequences_longer_than_the_windows(people, tmp_path):
     method = dvae.method("hit-dvae", **{**VAMP, "prior_steps": 400})
     with pytest.raises(ValueError, match=r"pseudo-sequences of 400 steps, but those of x that it is to start at have"):
-        runs.fit(method, runs.Data.open(people), tmp_path / "run", dvae.Training(steps=1, progress=False))
+        runs.fit(method, MotionData.open(people), tmp_path / "run", dvae.Training(steps=1, progress=False))
 
 
 @pytest.mark.parametrize("prior", ["mixture", "vamp", "flow"])

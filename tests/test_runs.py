@@ -27,6 +27,7 @@ from dvae.inference import trackers
 from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE, CheckpointError, Run, at_most
 from dvae.inference.fit import reason
 from dvae.inference.trackers import JSONLines
+from dvae.motion.dataset import MotionData
 from dvae.options import Range
 from dvae.runs import directory as runs
 from dvae.runs.sweep import sweep
@@ -46,7 +47,7 @@ def people(tmp_path_factory):
 @pytest.fixture(scope="module")
 def fitted(people, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "fitted"
-    runs.fit(METHOD, runs.Data.open(people), out, TRAINING)
+    runs.fit(METHOD, MotionData.open(people), out, TRAINING)
     return out
 
 
@@ -154,7 +155,7 @@ def test_a_run_of_a_sweep_is_no_link(fitted, people, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "vrnn-seed0").symlink_to(elsewhere)
     with pytest.raises(ValueError, match="vrnn-seed0 is a link"):
-        sweep([METHOD], runs.Data.open(people), tmp_path / "out", [0], TRAINING, jobs=1)
+        sweep([METHOD], MotionData.open(people), tmp_path / "out", [0], TRAINING, jobs=1)
     assert not list(elsewhere.iterdir())
 
 
@@ -564,7 +565,7 @@ def test_without_docstrings_pyro_is_missed_in_a_sentence():
 
 def test_threads_take_turns(people, fitted, tmp_path):
     """Two fits, and a forecast amid them, give what they give one after the other."""
-    data = runs.Data.open(people)
+    data = MotionData.open(people)
     model, x = dvae.load(fitted).model, data.windows("test").all()["x"][:2, :15]
 
     def forecast():

@@ -16,6 +16,7 @@ from joblib import parallel_config
 import dvae
 from dvae import motion
 from dvae.cli import main
+from dvae.motion.dataset import MotionData
 from dvae.runs import directory as runs
 from dvae.runs import sweep as sweeps
 from dvae.runs.sweep import Interrupted, Result, sweep
@@ -34,7 +35,7 @@ def people(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def data(people):
-    return runs.Data.open(people)
+    return MotionData.open(people)
 
 
 @pytest.fixture(scope="module")

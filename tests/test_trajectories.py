@@ -14,7 +14,7 @@ from scipy.stats import binomtest
 
 import dvae
 from dvae import motion
-from dvae.models import from_config
+from dvae.models.registry import from_config
 from dvae.motion import PROTOCOLS
 from dvae.motion.skeleton import HUMAN36M
 from dvae.testing import FactorizationContract
@@ -53,7 +53,7 @@ def small(name="trajevae", **options):
 
 def build(windows, name="trajevae", **options):
     torch.manual_seed(0)
-    return small(name, **options).build_for(windows).double().eval()
+    return small(name, **options).build(windows).double().eval()
 
 
 def double(batch):
@@ -111,7 +111,7 @@ def test_ablations_are_options(windows, options):
     method = small(**options)
     assert from_config(method.config()) == method
     model = build(windows, **options)
-    batch = double(method.batches(windows).sample(3, torch.Generator().manual_seed(0)))
+    batch = double(method.train(windows).batches.sample(3, torch.Generator().manual_seed(0)))
     terms = dvae.SequenceELBO().terms(model, batch)
     assert torch.isfinite(terms.bound).all()
     assert model.forecast({"x": batch["x"][:, :1]}, 20, 2)["x"].shape == (2, 3, 20, windows.size)
@@ -131,7 +131,7 @@ def test_prior_guide_and_decoder_share_what_the_paper_shares(windows):
 
 def test_components_beyond_those_of_the_model_are_noise_that_costs_nothing(windows):
     model = build(windows, components=3)
-    batch = double(small().batches(windows).sample(3, torch.Generator().manual_seed(0)))
+    batch = double(small().train(windows).batches.sample(3, torch.Generator().manual_seed(0)))
     steps = dvae.SequenceELBO().terms(model, batch).steps["z"]
     assert (steps[:, :3] > 0).all()
     assert (steps[:, 3:] == 0).all()
@@ -153,10 +153,10 @@ def test_methods_and_models_can_be_copied_to_other_processes(windows):
 
 def test_the_loss_is_squared_errors_and_the_weighted_divergence(windows):
     method, model = small(), build(windows)
-    batch = double(method.batches(windows).sample(3, torch.Generator().manual_seed(0)))
+    batch = double(method.train(windows).batches.sample(3, torch.Generator().manual_seed(0)))
     torch.manual_seed(1)
     terms = dvae.SequenceELBO().terms(model, batch)
-    loss = method.objective()(terms, 0)
+    loss = method.train(windows).objective(terms, 0)
     torch.manual_seed(1)
     s, x, y = batch["x"][:, 0], batch["x"][:, 1:], batch["y"][:, 1:]
     r = x * (y == 0)
@@ -174,14 +174,14 @@ def test_the_loss_is_squared_errors_and_the_weighted_divergence(windows):
 
 def test_cvae_rnn_reads_its_own_means_alone(windows):
     method, model = small("cvae-rnn"), build(windows, "cvae-rnn")
-    batch = double(method.batches(windows).sample(2, torch.Generator().manual_seed(0)))
+    batch = double(method.train(windows).batches.sample(2, torch.Generator().manual_seed(0)))
     latents = model.guide(batch)
     told = {**model._mapping(batch), "r": torch.zeros_like(batch["x"][:, 1:])}
     other = {**told, "x": told["x"] + 1}
     means = []
     for data in (told, other):
         fed = model._rollout(model.generative, model.generator, data, None, 1)
-        fed.feeding = replace(model.feeding, probability=method.feeding(100))
+        fed.feeding = replace(model.feeding, probability=method.train(windows).feeding)
         fed.values.update(latents)
         means.append(fed.parameters("x", data["x"])[0])
     assert torch.equal(*means)
@@ -214,14 +214,14 @@ def test_windows_that_do_not_suit(people):
     for change in ({"root": "drop"}, {"observed": 5}):
         windows = motion.windows(people, replace(PROTOCOL, **change), "train")
         with pytest.raises(ValueError, match="use one with root='relative' and observed=1"):
-            small().build_for(windows)
+            small().build(windows)
 
 
 # ---------------------------------------------------------------------------------------------------- what is given
 
 
 def test_every_joint_is_given_over_a_whole_window_or_not_at_all(windows):
-    x, y = small().batches(windows).sample(400, torch.Generator().manual_seed(0)).values()
+    x, y = small().train(windows).batches.sample(400, torch.Generator().manual_seed(0)).values()
     joints, given = x.unflatten(-1, (-1, 3)), y.unflatten(-1, (-1, 3))
     shown = (given != 0).any(-1).any(1)
     assert torch.equal(given, joints * shown[:, None, :, None])
@@ -233,7 +233,7 @@ def test_every_joint_is_given_over_a_whole_window_or_not_at_all(windows):
 
 def test_the_model_tells_windows_apart_into_what_is_given_and_the_rest(windows):
     method = small()
-    batch = double(method.batches(windows).sample(4, torch.Generator().manual_seed(0)))
+    batch = double(method.train(windows).batches.sample(4, torch.Generator().manual_seed(0)))
     found = build(windows)._mapping(batch)
     x, y = batch["x"], batch["y"]
     assert torch.equal(found["s"], x[:, 0])
@@ -295,12 +295,12 @@ def test_joints_are_found_by_their_usual_names(windows):
 
 
 def test_training_windows_are_turned_and_validation_windows_are_not(windows):
-    still = small(rotate=False).batches(windows)
+    still = small(rotate=False).train(windows).batches
     turned = small().batches(motion.Windows.with_protocol(windows, replace(PROTOCOL, rotate=False)))
     first, second = (w.sample(5, torch.Generator().manual_seed(3))["x"] for w in (still, turned))
     assert torch.allclose(first[..., 1], second[..., 1], atol=1e-6)  # heights of the pelvis
     assert not torch.allclose(first, second, atol=1e-3)
-    listed = small().validation(windows).all()
+    listed = small().train(windows, windows).validation.all()
     assert torch.equal(listed["x"], windows.all()["x"])
     assert (listed["y"] != 0).any()
 
@@ -371,8 +371,6 @@ def test_options_that_are_open_are_chosen_by_the_skeleton(windows):
     assert (ours.latent, ours.heading, published.latent, published.heading) == (7, True, 7, False)
     assert (published.width, published.components, published.beta) == (256, 0, 0.01)
     assert ours.width < 256
-    with pytest.raises(ValueError, match=r"objective of method.suited\(windows\)"):
-        method.objective()
 
 
 def test_forecasts_are_draws_of_the_program(windows):
@@ -533,9 +531,9 @@ def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
     """After some training, so that there is something that the latents move."""
     torch.manual_seed(0)
     method = small(width=32, feedforward=32, latent=16, dropout=0.0)
-    model = method.build_for(windows)
+    model = method.build(windows)
     options = {"steps": 400, "batch_size": 16, "learning_rate": 1e-3, "progress": False, "accelerator": "cpu"}
-    dvae.fit(model, method.batches(windows), objective=method.objective(), **options)
+    method.train(windows, steps=options.pop("steps")).fit(model, **options)
     walk = Straight(windows)
     paths = {joint: walk.path(joint) for joint in ("LWrist", "RFoot")}
     paths["LWrist"][8:11] = np.nan
@@ -561,9 +559,9 @@ def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
 def test_a_recurrent_decoder_is_bent_through_its_loop(windows):
     torch.manual_seed(0)
     method = small("cvae-rnn", latent=16, width=16)
-    model, walk = method.build_for(windows), Straight(windows)
+    model, walk = method.build(windows), Straight(windows)
     options = {"steps": 60, "batch_size": 16, "learning_rate": 5e-3, "progress": False, "accelerator": "cpu"}
-    dvae.fit(model, method.batches(windows), objective=method.objective(), self_feeding=method.feeding(60), **options)
+    method.train(windows, steps=options.pop("steps")).fit(model, **options)
     done = []
     for options in ({}, {"exact": True}, {"exact": True, "steps": 1}):
         torch.manual_seed(0)

@@ -2,10 +2,11 @@
 
 from .angles import AngleLimits, estimate_angle_limits
 from .data import Clip, MotionSet
+from .dataset import MotionData
 from .exchange import Exchanged
 from .forecasts import Forecasts, is_forecasts
 from .formats import load, read_paths, save
-from .protocols import PROTOCOLS, Protocol, Windows, windows
+from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
 from .simulate import simulate
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, face_forward, rotate_about_up
 from .truths import PseudoTruths, WithPseudoTruths
@@ -20,7 +21,9 @@ __all__ = [
     "Clip",
     "Exchanged",
     "Forecasts",
+    "MotionData",
     "MotionSet",
+    "Poses",
     "Protocol",
     "PseudoTruths",
     "Skeleton",

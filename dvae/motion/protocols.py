@@ -19,18 +19,19 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, field
 from math import pi
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
 
-from ..options import Amount, Range, check
+from ..options import Amount, Range, check, nearest, tuples
+from ..schema import Schema
 from .data import Clip, MotionSet
-from .skeleton import rotate_about_up
+from .skeleton import Skeleton, rotate_about_up
 
 Frames = Annotated[int, Range(1, 100_000)]
 
@@ -123,6 +124,52 @@ PROTOCOLS = {
 }
 """The presets by name. In `bandai2-by-style` all clips of groups A and B train, all of C test, whatever the
 file's own split; this reading gives the reference figures of the data's README."""
+
+
+def named_protocol(name: str) -> Protocol:
+    """A preset protocol.
+
+    Raises:
+        ValueError: an unknown name, with the nearest known one.
+    """
+    if name not in PROTOCOLS:
+        raise ValueError(f"unknown protocol {name!r}{nearest(name, PROTOCOLS)}; known: {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]
+
+
+@dataclass(frozen=True)
+class Poses(Schema):
+    """The schema of windows of motion, x (B, T, D) in metres.
+
+    Args:
+        skeleton: of the poses.
+        protocol: under which windows are cut.
+    """
+
+    kind: ClassVar[str] = "poses"
+
+    skeleton: Skeleton = field(kw_only=True)
+    protocol: Protocol = field(kw_only=True)
+
+    @classmethod
+    def under(cls, protocol: Protocol, skeleton: Skeleton, length: int | None = None) -> Self:
+        """The schema of windows that a protocol cuts, or of others of this length."""
+        size = 3 * (skeleton.joints - (protocol.root == "drop"))
+        return cls({"x": size}, length or protocol.length, protocol.observed, skeleton=skeleton, protocol=protocol)
+
+    @property
+    def frames(self) -> int:
+        """T, of a window."""
+        return self.length or self.protocol.length
+
+    def config(self) -> dict[str, Any]:
+        """The schema in JSON's types; `from_config` reads it."""
+        return {"skeleton": asdict(self.skeleton), "protocol": asdict(self.protocol), "length": self.length}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """The schema that `config` wrote."""
+        return cls.under(Protocol(**tuples(config["protocol"])), Skeleton(**config["skeleton"]), config["length"])
 
 
 def windows(motion: MotionSet, protocol: Protocol, split: str, length: int | None = None) -> Windows:
@@ -250,9 +297,14 @@ class Windows:
         )
 
     @property
+    def schema(self) -> Poses:
+        """What is known of these windows without their data."""
+        return Poses.under(self.protocol, self.skeleton, self.length)
+
+    @property
     def size(self) -> int:
         """Numbers per frame, D."""
-        return 3 * (self.skeleton.joints - (self.protocol.root == "drop"))
+        return self.schema.sizes["x"]
 
     def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw windows with replacement, as the protocol's `sampling` says: {"x": (B, T, D)} float32.

@@ -1,137 +1,129 @@
-"""Runs of methods on motion data: fit, resume and load a run directory that says all it takes to do so.
+"""Runs of methods on data: fit, resume and load a run directory that says all it takes to do so.
 
-`config.json` of such a run holds the method with its options, the data file as it was given with the
-fingerprint of its content, and every field of the protocol. A relative path stays relative, so that a project
-folder can be moved.
+`config.json` of such a run (format 2) holds the method with its options; the schema of the data, from which the model
+is built again without them; where the data were, with the fingerprint of their content; and the options of training. A
+relative path stays relative, so that a project folder can be moved. Runs of format 1 are read too (`migrations`).
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from .. import motion
 from ..inference.checkpoints import CONFIG, CheckpointError, Run, at_most, load_weights
 from ..inference.fit import Callback, Fit, Training
-from ..inference.fit import fit as fit_model
+from ..inference.recipe import Trainable
 from ..inference.schedules import from_config as option_from_config
 from ..inference.trackers import Tracker
-from ..motion import PROTOCOLS, MotionSet, Protocol, Windows
-from ..options import check, nearest
+from ..models.registry import from_config
+from ..options import check
+from ..schema import Schema
 from ..turns import alone
-from ..models.method import Method, from_config
-
-SIMULATED = "simulated"
-
-DEFAULT_PROTOCOLS = {
-    "bandai21": "bandai2-by-style",
-    "cmu21": "cmu8",
-    "human36m": "h36m",
-    "humaneva": "humaneva",
-    "walker": "simulated",
-}
-"""Protocols by the name of the skeleton, where none is named."""
-
+from .kinds import SCHEMAS, DATA, Data, opened
+from .migrations import FORMAT, upgraded
 
 @dataclass(frozen=True)
-class Data:
-    """Motion data under a protocol.
+class Config:
+    """What `config.json` of a run says.
 
     Args:
-        path: the file as it was given, or "simulated".
-        motion: its clips.
-        protocol: how windows are cut from them.
-        skip_bad: whether unusable clips were left out.
+        method: with its options.
+        schema: of the data.
+        data: where they were, with their kind.
+        training: how it was fitted.
     """
 
-    path: str
-    motion: MotionSet
-    protocol: Protocol
-    skip_bad: bool = False
+    method: Trainable
+    schema: Schema
+    data: dict[str, Any]
+    training: Training
 
-    @classmethod
-    def open(
-        cls,
-        path: str | os.PathLike[str] = SIMULATED,
-        protocol: str | Protocol | None = None,
-        skip_bad: bool = False,
-    ) -> Data:
-        """Reads a motion file, or simulates.
+    def __post_init__(self) -> None:
+        check(self)
+        if not isinstance(self.data["path"], str) or not isinstance(self.fingerprint, str):
+            raise TypeError("path and fingerprint of the data are text")
 
-        Args:
-            path: of a file that `dvae.motion.load` reads, or "simulated" for `dvae.motion.simulate()`.
-            protocol: one of `dvae.motion.PROTOCOLS` or its name; by default the one of the skeleton.
-            skip_bad: leave out unusable clips instead of refusing the file.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: a file that cannot be read, an unknown protocol, or none for the skeleton.
-        """
-        name = os.fspath(path)
-        clips = motion.simulate() if name == SIMULATED else motion.load(name, skip_bad=skip_bad)
-        if protocol is None:
-            if clips.skeleton.name not in DEFAULT_PROTOCOLS:
-                raise ValueError(
-                    f"{name}: which protocol? The skeleton {clips.skeleton.name!r} has none of its own; "
-                    f"choose one of {', '.join(PROTOCOLS)}"
-                )
-            protocol = DEFAULT_PROTOCOLS[clips.skeleton.name]
-        return cls(name, clips, named_protocol(protocol) if isinstance(protocol, str) else protocol, skip_bad)
-
-    def windows(self, split: str) -> Windows:
-        """The windows of "train", "validation", "test" or "train+validation"."""
-        return motion.windows(self.motion, self.protocol, split)
-
-    def config(self) -> dict[str, Any]:
-        """The data and the protocol in JSON's types."""
-        source = {"path": self.path, "fingerprint": self.motion.fingerprint(), "skip_bad": self.skip_bad}
-        return {"data": source, "protocol": asdict(self.protocol)}
+    @property
+    def fingerprint(self) -> str:
+        """Of the data."""
+        return self.data["fingerprint"]  # type: ignore[no-any-return]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Loaded:
     """A run, read back: `loaded.model.forecast(...)`, `loaded.data.windows("test")`.
 
     Args:
         path: the run directory.
-        method: the method with its options.
+        config: what it says.
         model: the model with the run's best weights, in evaluation mode.
-        data: the data and protocol that it was fitted on.
+        where: path of the data, if the one in the run no longer leads there.
     """
 
     path: Path
-    method: Method
+    config: Config
     model: Any
-    data: Data
+    where: str | None = None
+    _data: Data | None = field(default=None, repr=False)
 
+    @property
+    def method(self) -> Any:
+        """The method with its options."""
+        return self.config.method
 
-def named_protocol(name: str) -> Protocol:
-    """A preset protocol.
+    @property
+    def schema(self) -> Any:
+        """Of the data that it was fitted on."""
+        return self.config.schema
 
-    Raises:
-        ValueError: an unknown name, with the nearest known one.
-    """
-    if name not in PROTOCOLS:
-        raise ValueError(f"unknown protocol {name!r}{nearest(name, PROTOCOLS)}; known: {', '.join(PROTOCOLS)}")
-    return PROTOCOLS[name]
+    @property
+    def data(self) -> Any:
+        """The data that it was fitted on, opened when they are first asked for.
+
+        Raises:
+            CheckpointError: they are not here, or have changed.
+        """
+        if self._data is None:
+            self._data = opened(self.path, self.config.data, self.schema, self.where)
+        return self._data
+
+    def share(self, other: Loaded) -> bool:
+        """Takes over the data of another run, in place of opening them again, and says whether they are the same."""
+        same = (self.config.fingerprint, self.schema) == (other.config.fingerprint, other.schema)
+        if same:
+            self._data = other.data
+        return same
+
+    def on(self, path: str | os.PathLike[str]) -> Any:
+        """Other data of the same kind, under the run's schema.
+
+        Raises:
+            ValueError: data with another schema, such as other joints.
+        """
+        other = DATA[self.config.data["kind"]].reopened(self.config.data, self.schema, path)
+        if other.schema != self.schema:
+            raise ValueError(
+                f"{path} holds other variables than {self.path} was fitted on: {other.schema} in place of {self.schema}"
+            )
+        return other
 
 
 @alone
 def fit(
-    method: Method,
+    method: Trainable,
     data: Data,
     out: str | os.PathLike[str],
     training: Training | None = None,
     callbacks: Sequence[Callback] = (),
     trackers: Sequence[Tracker] = (),
 ) -> Fit:
-    """Fits a method to motion data, in a run directory that `load` and `resume` read.
+    """Fits a method to data, in a run directory that `load` and `resume` read.
 
     Args:
         method: such as `dvae.method("hit-dvae", latent=8)`; it tells objective and self-feeding.
@@ -151,23 +143,16 @@ def fit(
             f"self-feeding is an option of the method here; instead of Training(self_feeding={training.self_feeding}) "
             f"write dvae.method({method.name!r}, self_feeding=…)"
         )
-    train, validation = data.windows("train"), data.windows("validation")
+    train = data.windows("train")
     method = method.suited(train)
+    recipe = method.train(train, data.windows("validation"), training.steps)
+    schema = {"kind": data.schema.kind, **data.schema.config()}
+    config = {"format": FORMAT, "method": method.config(), "schema": schema}
+    config["data"] = {"kind": data.kind, **data.config()}
     with torch.random.fork_rng():
         torch.manual_seed(training.seed)
-        model = method.build_for(train)
-        method.prepare(model, train)
-    return fit_model(
-        model,
-        method.batches(train),
-        method.validation(validation),
-        stages=method.stages(training.steps),
-        out=out,
-        config={"method": method.config(), **data.config()},
-        callbacks=callbacks,
-        trackers=trackers,
-        **vars(replace(training, self_feeding=method.feeding(training.steps))),
-    )
+        model = method.build(data.schema)
+        return recipe.fit(model, out=out, config=config, callbacks=callbacks, trackers=trackers, **vars(training))
 
 
 @alone
@@ -193,91 +178,49 @@ def resume(
     Raises:
         CheckpointError: no run, a damaged one, or one whose data have changed.
     """
-    run, training = load(path, data), read_config(path).training
-    steps = options.get("steps", training.steps)
-    return fit_model(
-        run.model,
-        run.method.batches(run.data.windows("train")),
-        run.method.validation(run.data.windows("validation")),
-        stages=run.method.stages(steps),
-        out=path,
-        resume=True,
-        trackers=trackers,
-        callbacks=callbacks,
-        **{**vars(training), "self_feeding": run.method.feeding(steps), **options},
-    )
+    run = load(path, data)
+    training = replace(run.config.training, self_feeding=0.0, **options)
+    train, validation = run.data.windows("train"), run.data.windows("validation")
+    recipe = run.method.train(train, validation, training.steps)
+    more: dict[str, Any] = {"out": path, "trackers": trackers, "callbacks": callbacks, **vars(training)}
+    return recipe.fit(run.model, resume=True, **more)
 
 
 @alone
 def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> Loaded:
-    """Reads a run back: method, model with its best weights, data and protocol.
+    """Reads a run back: method, and model with its best weights; its data when they are asked for.
 
     Args:
         path: the run directory, as `dvae fit` writes it.
         data: where the data lie now, if the path in the run no longer leads there.
 
     Raises:
-        CheckpointError: no run, a damaged one, or one whose data have changed.
+        CheckpointError: no run, or a damaged one.
     """
-    config, size = read_config(path), Run(path).size()
-    recorded, expected = config.source, config.fingerprint
-    where = os.fspath(data or recorded)
-    try:
-        opened = Data.open(where, config.protocol, config.skip_bad)
-    except FileNotFoundError as error:
-        raise CheckpointError(
-            f"{path} was fitted on {recorded}, but {where} is not here; relative paths count from the "
-            "working directory, so change to where it was fitted, or tell where the data lie now (--data)"
-        ) from error
-    if (found := opened.motion.fingerprint()) != expected:
-        raise CheckpointError(
-            f"{where} has changed since {path} was fitted on it: its fingerprint is {found[:12]}…, the run's "
-            f"{expected[:12]}…; restore the file, or fit again"
-        )
-    # the data are those of the run: if they do not fit, the config is not
+    config, size = read_config(path, data), Run(path).size()
     with reading_config(path), at_most(size, f"{Path(path) / CONFIG}"):
-        model = config.method.build_for(opened.windows("train"))
+        model = config.method.build(config.schema)
     load_weights(model, path)
-    return Loaded(Path(path), config.method, model.eval(), opened)
+    return Loaded(Path(path), config, model.eval(), None if data is None else os.fspath(data))
 
 
-@dataclass(frozen=True)
-class Config:
-    """What `config.json` of a run says.
+def read_config(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> Config:
+    """Reads and checks the config of a run.
 
     Args:
-        method: with its options.
-        source, fingerprint, skip_bad: of the data, see `Data`.
-        protocol: how windows are cut from them.
-        training: how it was fitted.
-    """
-
-    method: Method
-    source: str
-    fingerprint: str
-    skip_bad: bool
-    protocol: Protocol
-    training: Training
-
-    def __post_init__(self) -> None:
-        check(self)
-
-
-def read_config(path: str | os.PathLike[str]) -> Config:
-    """Reads and checks the config of a run.
+        path: the run directory.
+        data: where the data lie now; a run of format 1 needs them to know the skeleton.
 
     Raises:
         CheckpointError: no run, or a damaged one.
     """
     with reading_config(path):
-        config = Run(path).config
-        data, training = config["data"], config["training"]
+        config = upgraded(Run(path).config, Path(path), data)
+        schema, training = dict(config["schema"]), config["training"]
         return Config(
             from_config(config["method"]),
-            data["path"],
-            data["fingerprint"],
-            data["skip_bad"],
-            Protocol(**tuples(config["protocol"])),
+            SCHEMAS[schema.pop("kind")].from_config(schema),
+            config["data"],
             Training(**{name: option_from_config(value) for name, value in training.items()}),
         )
 
@@ -299,8 +242,3 @@ def reading_config(path: str | os.PathLike[str]) -> Iterator[None]:
 
 def _shortened(text: str) -> str:
     return text if len(text) <= 400 else f"{text[:400]}…"
-
-
-def tuples(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options as JSON gives them back, with tuples in place of its lists."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}

@@ -37,10 +37,13 @@ from ..inference.fit import Fit, State, Training
 from ..inference.result import Plain, Table
 from ..inference.schedules import clamp
 from ..inference.trackers import LARGEST_LOG, row_of
-from ..motion import Protocol
 from ..turns import alone
+from ..inference.recipe import Trainable
 from ..models.method import Method
-from .directory import SIMULATED, Data, fit, read_config, resume
+from ..options import flat
+from ..schema import Schema
+from .directory import fit, read_config, resume
+from .kinds import Data
 
 ENDED = ("finished", "stopped early")
 
@@ -135,7 +138,7 @@ def sweep(
     if training.devices != 1:
         raise ValueError(f"devices is {training.devices}; a run of a sweep has one device, fit it alone for more")
     lease = out.absolute() / f".sweep-{uuid4().hex}"
-    source = data.path if data.path == SIMULATED else os.path.abspath(data.path)
+    source = data.location
     runs = [
         _Run(out.absolute() / f"{name}-seed{seed}", method, data, source, replace(training, seed=seed), lease)
         for seed in seeds
@@ -333,11 +336,11 @@ def _earlier(run: _Run) -> Result | None:
             raise ValueError(f"{run.path} is a file, where a run is to go; choose another directory for the sweep")
         return None
     config, state = read_config(run.path), earlier.state
-    there = _options(config.method, config.protocol, config.training, config.fingerprint)
+    there = _options(config.method, config.schema, config.training, config.fingerprint)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run itself tells which schedules it makes shorter
         training = clamp(run.training, run.training.steps)
-    here = _options(run.method, run.data.protocol, training, run.data.motion.fingerprint())
+    here = _options(run.method, run.data.schema, training, run.data.fingerprint)
     if changed := [name for name in {**there, **here} if there.get(name) != here.get(name)]:
         name = changed[0]
         others = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
@@ -350,12 +353,12 @@ def _earlier(run: _Run) -> Result | None:
     return Result(run.path, run.method, run.training.seed, state["status"], state["step"], state["best_bound"])
 
 
-def _options(method: Method, protocol: Protocol, training: Training, fingerprint: str) -> dict[str, Any]:
+def _options(method: Trainable, schema: Schema, training: Training, fingerprint: str) -> dict[str, Any]:
     """All that makes a run what it is, by what to call it. The method tells the self-feeding of the training."""
     same = replace(training, self_feeding=0.0, progress=True)
     return {
         **method.config(),
-        **{f"protocol's {name}": value for name, value in asdict(protocol).items()},
+        **dict(flat(schema.config(), "data's ")),
         **{option.name: getattr(same, option.name) for option in fields(same) if option.name != "self_feeding"},
         "data's fingerprint": fingerprint,
     }

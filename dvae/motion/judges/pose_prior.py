@@ -19,30 +19,31 @@ Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the flow of its public code 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from math import pi
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import pyro
 import torch
 from torch import Tensor, nn
 
-from ..inference.batches import Batch
-from ..inference.fit import fit
-from ..inference.objectives import Evidence, Objective
-from ..inference.result import progress_bar
-from ..laws import QRFlow
-from ..motion import Skeleton, Windows, face_forward, rotate_about_up
-from ..notation import Factorization
-from ..options import Layers, Range
-from ..program.model import DynamicalVAE
-from ..turns import alone
-from .method import Method
+from ...inference.batches import Batch
+from ...inference.checkpoints import Run, load_weights
+from ...inference.fit import Stage
+from ...inference.recipe import Recipe, Trainable
+from ...inference.result import progress_bar
+from ...laws import QRFlow
+from ...options import Layers, Range
+from ...turns import alone
+from ..protocols import Poses, Windows
+from ..skeleton import Skeleton, face_forward, rotate_about_up
 
 
 @dataclass(frozen=True)
-class PosePrior(Method):
-    """See the file. Options of every method that say something of latents, emissions or motion have no effect.
+class PosePrior(Trainable):
+    """See the file.
 
     Args:
         layers: of the flow.
@@ -57,11 +58,6 @@ class PosePrior(Method):
 
     name: ClassVar[str] = "pose-prior"
     source: ClassVar[str] = "Mao, Liu and Salzmann, 2021, arXiv 2108.08422"
-    generative: ClassVar[str] = "p(d_t)"
-    inference: ClassVar[str] = ""
-    unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method))
-    forecasts: ClassVar[bool] = False
-    use: ClassVar[str] = "score the poses of forecasts with: dvae evaluate RUN --pose-prior {run}"
 
     layers: Layers = 3
     noise: Annotated[float, Range(0, 1, below=True)] = 0.002
@@ -74,47 +70,25 @@ class PosePrior(Method):
         if self.turned and self.heading:
             raise ValueError("heading fixes the direction that turned would draw; choose one")
 
-    def equations(self) -> tuple[Factorization, Factorization]:
-        """See `Method.equations`; the guide has no factor."""
-        return Factorization.parse(self.generative), Factorization("q", ())
+    def build(self, data: Any) -> PosePriorModel:
+        """The model for poses of the data's skeleton."""
+        schema = Poses.of(data, "a pose prior")
+        return PosePriorModel(schema.skeleton, self.layers, schema.protocol.observed - 1 if self.heading else None)
 
-    def check(self) -> None:
-        """See `Method.check`; all its options were checked when they were given."""
+    def train(self, train: Windows, validation: Windows | None = None, steps: int = 1000) -> Recipe:
+        """Minimises minus the log density, in nats per pose, of poses that are turned and have noise."""
+        varied = VariedPoses(train, self.noise, self.turned)
+        return Recipe(varied, validation, [Stage(steps)], prepare=partial(self._whiten, poses=varied))
 
-    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
-        """A pose prior cannot be built from sizes alone.
-
-        Raises:
-            ValueError: always.
-        """
-        raise self.needs("a pose prior needs to know the skeleton")
-
-    def build_for(self, windows: Windows) -> PosePriorModel:
-        """The model for poses of the windows' skeleton."""
-        return PosePriorModel(windows.skeleton, self.layers, windows.protocol.observed - 1 if self.heading else None)
-
-    def prepare(self, model: nn.Module, windows: Windows) -> None:
-        """See `Method.prepare`: takes mean and covariance of the directions from the poses of 1024 windows."""
+    def _whiten(self, model: PosePriorModel, poses: VariedPoses) -> None:
+        """Has the flow take mean and covariance of the directions from the poses of 1024 windows."""
         if self.whiten:
-            assert isinstance(model, PosePriorModel)
-            x = self.batches(windows).sample(1024, torch.default_generator)["x"]
+            x = poses.sample(1024, torch.default_generator)["x"]
             model.flow.whiten(model.skeleton.directions(model.facing(x).double()))
-
-    def batches(self, windows: Windows) -> Poses:
-        """See `Method.batches`: windows, turned and with noise."""
-        return Poses(windows, self.noise, self.turned)
-
-    def objective(self) -> Objective:
-        """Minus the log density, in nats per pose."""
-        return Evidence()
-
-    def feeding(self, steps: int) -> float:
-        """0: nothing is fed to a model without time."""
-        return 0.0
 
 
 @dataclass(frozen=True)
-class Poses:
+class VariedPoses:
     """Training windows whose poses are varied.
 
     Args:
@@ -217,20 +191,43 @@ def fit_pose_prior(
     method = PosePrior(**options)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        model = method.build_for(windows)
-        method.prepare(model, windows)
-    fit(
-        model,
-        method.batches(windows),
-        steps=steps,
-        seed=seed,
-        learning_rate=1e-2,
-        decay=0.8,
-        weight_decay=1e-3,
-        accelerator="cpu",
-        progress=False,
-        trackers=[_Bar(steps, progress)],
-    )
+        model = method.build(windows)
+        method.train(windows, steps=steps).fit(
+            model,
+            seed=seed,
+            learning_rate=1e-2,
+            decay=0.8,
+            weight_decay=1e-3,
+            accelerator="cpu",
+            progress=False,
+            trackers=[_Bar(steps, progress)],
+        )
+    return model
+
+
+def load_pose_prior(path: str | Path, skeleton: Skeleton, heading: bool) -> PosePriorModel:
+    """The pose prior of a run, for a model of such poses.
+
+    Args:
+        path: the run directory of a pose prior.
+        skeleton: of the poses.
+        heading: whether the model sees windows turned to one heading.
+
+    Raises:
+        ValueError: a run of something else, of another skeleton, or of other options.
+    """
+    config = Run(path).config
+    options = config.get("method", {})
+    known = config.get("schema", {}).get("skeleton", {}).get("parents", skeleton.parents)
+    if options.get("method") != PosePrior.name or tuple(known) != skeleton.parents:
+        raise ValueError(f"{path} holds no pose prior of the skeleton {skeleton.name!r}")
+    if (options["heading"], options["layers"]) != (heading, PosePrior.layers):
+        raise ValueError(
+            f"{path} was fitted with heading={options['heading']} and layers={options['layers']}, but this model sees "
+            f"poses with heading={heading}, and takes a prior of {PosePrior.layers} layers"
+        )
+    model = PosePriorModel(skeleton)
+    load_weights(model, path)
     return model
 
 

@@ -16,8 +16,7 @@ noise at every call, so that its scores are random; here the first state is zero
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import pyro
@@ -25,20 +24,20 @@ import torch
 from pyro import distributions
 from torch import Tensor, nn
 
-from ..inference.batches import Batch
-from ..inference.objectives import Evidence, Objective
-from ..motion import Protocol, Skeleton, Windows
-from ..notation import Factorization
-from ..options import Layers, Size
-from ..program.model import DynamicalVAE
-from .method import Method
+from ...inference.batches import Batch
+from ...inference.fit import Stage
+from ...inference.recipe import Recipe, Trainable
+from ...options import Layers, Size
+from ...schema import SchemaError
+from ..protocols import Poses, Protocol, Windows
+from ..skeleton import Skeleton
 
 CLASS = "c"
 
 
 @dataclass(frozen=True)
-class ActionClassifier(Method):
-    """See the file. Options of every method that say something of latents, emissions or motion have no effect.
+class ActionClassifier(Trainable):
+    """See the file.
 
     Args:
         label: the label of the clips that is the class.
@@ -50,33 +49,22 @@ class ActionClassifier(Method):
 
     name: ClassVar[str] = "action-classifier"
     source: ClassVar[str] = "Bie et al., 2022, arXiv 2204.01565"
-    generative: ClassVar[str] = "p(c | x_{1:T})"
-    inference: ClassVar[str] = ""
-    unused: ClassVar[frozenset[str]] = frozenset(option.name for option in fields(Method))
-    forecasts: ClassVar[bool] = False
-    use: ClassVar[str] = "score forecasts with: dvae evaluate RUN --classifier {run}"
-
     label: str = "content"
     hidden: Size = 128
     layers: Layers = 2
     features: Size = 30
     classes: tuple[str, ...] = ()
 
-    def equations(self) -> tuple[Factorization, Factorization]:
-        """See `Method.equations`; the guide has no factor."""
-        return Factorization.parse(self.generative), Factorization("q", ())
-
-    def check(self) -> None:
-        """See `Method.check`; all its options were checked when they were given."""
-
     def suited(self, windows: Windows) -> ActionClassifier:
-        """See `Method.suited`: the classes, those of the clips that have a window.
+        """With the classes, those of the clips that have a window.
 
         Raises:
             ValueError: fewer than two classes.
         """
         if self.classes:
             return self
+        if not isinstance(windows, Windows):
+            raise SchemaError("an action classifier needs to know the classes; give windows whose clips have them")
         classes = sorted({clip.labels[self.label] for clip in windows.clips if self.label in clip.labels})
         if len(classes) < 2:
             known = sorted({label for clip in windows.clips for label in clip.labels})
@@ -86,35 +74,21 @@ class ActionClassifier(Method):
             )
         return replace(self, classes=tuple(classes))
 
-    def build(self, data: Mapping[str, int]) -> DynamicalVAE:
-        """A classifier cannot be built from sizes alone.
+    def build(self, data: Any) -> ActionClassifierModel:
+        """The model for such windows; a schema alone does not tell the classes."""
+        schema = Poses.of(data, "an action classifier")
+        method = self if self.classes else self.suited(data)
+        return ActionClassifierModel(method, schema.skeleton, schema.sizes["x"], schema.protocol)
 
-        Raises:
-            ValueError: always.
-        """
-        raise self.needs("an action classifier needs to know the classes")
-
-    def build_for(self, windows: Windows) -> ActionClassifierModel:
-        """The model for such windows."""
-        return ActionClassifierModel(self.suited(windows), windows.skeleton, windows.size, windows.protocol)
-
-    def batches(self, windows: Windows) -> Windows:
-        """See `Method.batches`: windows with their class.
+    def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
+        """Minimises minus the log-likelihood of the windows' classes, in nats per window.
 
         Raises:
             ValueError: a clip without the label, or of none of the classes.
         """
-        return windows.classified(CLASS, self.label, self.suited(windows).classes)
-
-    validation = batches
-
-    def objective(self) -> Objective:
-        """Minus the log-likelihood, in nats per window."""
-        return Evidence()
-
-    def feeding(self, steps: int) -> float:
-        """0: nothing is fed to a model that draws no motion."""
-        return 0.0
+        classes = self.suited(train).classes
+        held_out = validation and validation.classified(CLASS, self.label, classes)
+        return Recipe(train.classified(CLASS, self.label, classes), held_out, [Stage(steps)])
 
 
 class ActionClassifierModel(nn.Module):

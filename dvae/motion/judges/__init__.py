@@ -1,0 +1,1 @@
+"""Judges: models that are fitted to real motion, and say what they find of motion that a method makes."""

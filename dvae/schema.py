@@ -1,0 +1,57 @@
+"""Schemas: what a model must know of data to be built for them, without the data themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+
+class SchemaError(ValueError):
+    """Data of which less is known than a method needs to know."""
+
+
+@dataclass(frozen=True)
+class Schema:
+    """Sequences of numbers. What is known of other kinds of data is added by a subclass.
+
+    Args:
+        sizes: dimension of every variable of the data, context included, such as {"x": 48}.
+        length: T, steps of a sequence; None where they differ, or nobody knows.
+        observed: O, the steps that forecasts start from; None likewise.
+    """
+
+    kind: ClassVar[str] = "sequences"
+
+    sizes: Mapping[str, int]
+    length: int | None = None
+    observed: int | None = None
+
+    @classmethod
+    def of(cls, data: Any, who: str = "this method") -> Self:
+        """The schema of data.
+
+        Args:
+            data: a schema, windows that have one, or sizes by name.
+            who: needs to know this kind of schema.
+
+        Raises:
+            SchemaError: nothing of which this kind of schema is known.
+        """
+        found = Schema(dict(data)) if isinstance(data, Mapping) else getattr(data, "schema", data)
+        if not isinstance(found, cls):
+            known = found.kind if isinstance(found, Schema) else type(data).__name__
+            raise SchemaError(
+                f"{who} needs to know what {cls.kind} are, and was given {known}; give the windows that it is to be "
+                "trained on, or their schema"
+            )
+        return found
+
+    def config(self) -> dict[str, Any]:
+        """The schema in JSON's types; `from_config` of its kind reads it."""
+        return {"sizes": dict(self.sizes), "length": self.length, "observed": self.observed}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """The schema that `config` wrote."""
+        return cls(**config)

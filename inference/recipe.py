@@ -1,0 +1,110 @@
+"""Recipes: how a model is trained on some data, and what builds and trains one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar, Literal, Self
+
+from torch import nn
+
+from ..options import check
+from ..schema import Schema, SchemaError
+from .batches import Source
+from .fit import Fit, Stage, fit
+from .objectives import Objective
+from .schedules import Schedule
+
+
+def _as_it_is(model: nn.Module) -> None:
+    """Nothing is taken from the data beforehand."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a model is trained: what `fit` is told beside the options of a run.
+
+    Args:
+        batches: where training draws from: the data, and what the objective needs beside them.
+        validation: what the weights are judged by, or None.
+        stages: what is minimised, one after the other.
+        feeding: probability of self-feeding over the run.
+        prepare: has the model take from the training data what its weights keep, before it is fitted.
+    """
+
+    batches: Source
+    validation: Any
+    stages: Sequence[Stage]
+    feeding: Schedule | float = 0.0
+    prepare: Callable[[Any], None] = _as_it_is
+
+    @property
+    def objective(self) -> Objective:
+        """What the last stage minimises."""
+        return self.stages[-1].objective
+
+    def fit(self, model: nn.Module, *, resume: bool = False, **options: Any) -> Fit:
+        """Fits a model so, prepared first unless a run is resumed.
+
+        Args:
+            model: as the method has built it.
+            resume: continue the run in `out`.
+            **options: of `dvae.inference.fit.fit`: out, config, trackers, callbacks, and those of `Training`; the
+                steps are the recipe's.
+        """
+        if not resume:
+            self.prepare(model)
+        options |= {"steps": sum(stage.steps for stage in self.stages), "self_feeding": self.feeding}
+        return fit(model, self.batches, self.validation, stages=self.stages, resume=resume, **options)
+
+
+@dataclass(frozen=True)
+class Trainable:
+    """What builds a model for data and says how it is trained; its fields are its options.
+
+    A subclass gives `build` and `train`, and `suited` where options may be left open.
+
+    Raises:
+        ValueError: when an option is out of range.
+    """
+
+    name: ClassVar[str]
+    source: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    def suited(self, data: Any) -> Self:
+        """With what its options leave open chosen for these data; itself, where nothing is open."""
+        return self
+
+    def build(self, data: Any) -> nn.Module:
+        """The model for data: their windows, their `Schema`, or sizes by name such as {"x": 60}.
+
+        Raises:
+            SchemaError: more has to be known of the data.
+        """
+        raise NotImplementedError
+
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
+        """How the model is trained on these data, in so many steps."""
+        raise NotImplementedError
+
+    @property
+    def selects(self) -> Literal["bound", "loss"]:
+        """What tells the best weights (see `Evidence`)."""
+        return "bound"
+
+    def check(self) -> None:
+        """Refuses options that do not fit together, before any data are read.
+
+        Raises:
+            ValueError: saying which.
+        """
+        with suppress(SchemaError):
+            self.build(Schema({"x": 1}))
+
+    def config(self) -> dict[str, Any]:
+        """Name and options in JSON's types."""
+        return {"method": self.name, **asdict(self)}

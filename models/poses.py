@@ -1,0 +1,31 @@
+"""What methods for poses have in common: options that are left open are chosen by the skeleton."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+from ..motion import Skeleton
+from ..motion.protocols import Poses
+from .method import Method
+
+
+@dataclass(frozen=True)
+class PoseMethod(Method):
+    """A method for poses. Options that are None are chosen by the skeleton."""
+
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"": {}}
+    """What they stand for, by the skeleton's name, and "" for any other."""
+
+    def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
+        """What options that are None stand for, with poses of this skeleton."""
+        return self.presets.get(skeleton.name, self.presets[""])
+
+    def suited(self, data: Any) -> Self:
+        """With the options that are left open chosen for the skeleton of these data."""
+        return self.filled(self.preset(Poses.of(data, self.name).skeleton))
+
+    def filled(self, preset: Mapping[str, Any]) -> Self:
+        """With options that are None taken from a preset."""
+        return replace(self, **{name: value for name, value in preset.items() if getattr(self, name) is None})

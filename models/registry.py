@@ -1,0 +1,114 @@
+"""Methods by name, of this package and of installed ones; the file of a method loads when it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any
+
+from ..inference.recipe import Trainable
+from ..options import nearest, tuples
+from .method import Method
+
+METHODS = {
+    "vae": "dvae.models.vae:VAE",
+    "dkf": "dvae.models.dkf:DKF",
+    "storn": "dvae.models.storn:STORN",
+    "vrnn": "dvae.models.vrnn:VRNN",
+    "srnn": "dvae.models.srnn:SRNN",
+    "rvae-causal": "dvae.models.rvae:CausalRVAE",
+    "rvae-noncausal": "dvae.models.rvae:NonCausalRVAE",
+    "dsae": "dvae.models.dsae:DSAE",
+    "kvae": "dvae.models.kvae:KVAE",
+    "hit-dvae": "dvae.models.hit_dvae:HiTDVAE",
+    "gsps": "dvae.models.gsps:GSPS",
+    "trajevae": "dvae.models.trajevae:TrajeVAE",
+    "cvae-rnn": "dvae.models.cvae_rnn:CVAERNN",
+    "equations": "dvae.models.equations:Equations",
+}
+JUDGES = {
+    "pose-prior": "dvae.motion.judges.pose_prior:PosePrior",
+    "action-classifier": "dvae.motion.judges.action_classifier:ActionClassifier",
+}
+"""What is fitted as methods are, and judges what they make."""
+
+
+class Registry(Mapping[str, type[Any]]):
+    """Names to classes, each imported when it is asked for.
+
+    Args:
+        own: name to "module:class".
+        group: entry points of installed packages that add to them.
+
+    Raises:
+        ValueError: an entry point with a name that exists.
+    """
+
+    def __init__(self, own: Mapping[str, str], group: str) -> None:
+        self._own, self._others = dict(own), {entry.name: entry for entry in entry_points(group=group)}
+        if twice := self._own.keys() & self._others.keys():
+            name = twice.pop()
+            raise ValueError(f"the entry point {self._others[name].value} has the name of a method that exists: {name}")
+
+    def __getitem__(self, name: str) -> type[Any]:
+        if name in self._others:
+            return self._others[name].load()  # type: ignore[no-any-return]
+        module, _, kind = self._own[name].partition(":")
+        return getattr(import_module(module), kind)  # type: ignore[no-any-return]
+
+    def __iter__(self) -> Iterator[str]:
+        yield from (*self._own, *self._others)
+
+    def __len__(self) -> int:
+        return len(self._own) + len(self._others)
+
+
+@cache
+def methods() -> Mapping[str, type[Method]]:
+    """Every known method by name: those of this package and of installed packages (entry points "dvae.methods")."""
+    return Registry(METHODS, "dvae.methods")
+
+
+@cache
+def judges() -> Mapping[str, type[Trainable]]:
+    """Every known judge by name (and by entry points "dvae.judges")."""
+    return Registry(JUDGES, "dvae.judges")
+
+
+def method(name: str, **options: Any) -> Method:
+    """A method by its name, with options in place of its defaults.
+
+    Raises:
+        ValueError: an unknown name or option, with the nearest known one.
+    """
+    return _chosen(methods(), "method", name, options)  # type: ignore[no-any-return]
+
+
+def judge(name: str, **options: Any) -> Trainable:
+    """A judge by its name, likewise."""
+    return _chosen(judges(), "judge", name, options)  # type: ignore[no-any-return]
+
+
+def _chosen(table: Mapping[str, type[Any]], what: str, name: str, options: Mapping[str, Any]) -> Any:
+    if name not in table:
+        raise ValueError(f"unknown {what} {name!r}{nearest(name, table)}; known: {', '.join(table)}")
+    kind = table[name]
+    known = {field.name for field in fields(kind)}
+    for option in options:
+        if option not in known:
+            raise ValueError(
+                f"{name} has no option {option!r}{nearest(option, known)}; it has {', '.join(sorted(known))}"
+            )
+    return kind(**options)
+
+
+def from_config(config: Mapping[str, Any]) -> Trainable:
+    """The method or judge that `Trainable.config` wrote."""
+    if "method" not in config:
+        raise ValueError(f"the configuration names no method: it holds {', '.join(config) or 'nothing'}")
+    options = tuples(config)
+    name = options.pop("method")
+    return judge(name, **options) if name in judges() else method(name, **options)
