@@ -25,8 +25,9 @@ from ..models.registry import from_config
 from ..options import check
 from ..schema import Schema
 from ..turns import alone
-from .kinds import SCHEMAS, DATA, Data, opened
+from .kinds import DATA, SCHEMAS, Data, opened
 from .migrations import FORMAT, upgraded
+
 
 @dataclass(frozen=True)
 class Config:

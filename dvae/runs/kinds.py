@@ -43,7 +43,12 @@ class Data(Protocol):
         """The data that `config` describes, from there or from another path, whatever they are now."""
 
 
-def opened(run: str | os.PathLike[str], data: Mapping[str, Any], schema: Schema | None, where: str | os.PathLike[str] | None = None) -> Any:
+def opened(
+    run: str | os.PathLike[str],
+    data: Mapping[str, Any],
+    schema: Schema | None,
+    where: str | os.PathLike[str] | None = None,
+) -> Any:
     """The data of a run.
 
     Args:

@@ -20,9 +20,7 @@ from .kinds import opened
 FORMAT = 2
 
 
-def upgraded(
-    config: Mapping[str, Any], run: Path, data: str | os.PathLike[str] | None = None
-) -> Mapping[str, Any]:
+def upgraded(config: Mapping[str, Any], run: Path, data: str | os.PathLike[str] | None = None) -> Mapping[str, Any]:
     """The config in the present format.
 
     Args:

@@ -19,7 +19,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import timedelta
 from pathlib import Path
 from types import FrameType
@@ -34,14 +34,14 @@ from .. import files
 from ..inference import fit as loop
 from ..inference.checkpoints import Run
 from ..inference.fit import Fit, State, Training
+from ..inference.recipe import Trainable
 from ..inference.result import Plain, Table
 from ..inference.schedules import clamp
 from ..inference.trackers import LARGEST_LOG, row_of
-from ..turns import alone
-from ..inference.recipe import Trainable
 from ..models.method import Method
 from ..options import flat
 from ..schema import Schema
+from ..turns import alone
 from .directory import fit, read_config, resume
 from .kinds import Data
 
