@@ -23,7 +23,8 @@ from torch.distributions import kl_divergence
 
 from ..graph import analytic_kl
 from ..networks.base import computing_once
-from ..program.model import Batch, DynamicalVAE, repeat
+from ..program.batch import Batch, repeat
+from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, Sequence
 from ..turns import alone
 

@@ -50,7 +50,7 @@ from torch import Tensor, nn
 
 from ..networks.base import valid_steps
 from ..options import nearest
-from ..program.model import repeat
+from ..program.batch import repeat
 from ..program.rollout import Sequence as SequenceLaw
 from ..turns import alone
 from .batches import Batch, each, leaves, sequences

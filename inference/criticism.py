@@ -27,7 +27,8 @@ from scipy import fft, special
 from torch import Tensor
 
 from ..motion import Skeleton
-from ..program.model import Batch, DynamicalVAE, repeat
+from ..program.batch import Batch, repeat
+from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import require_likelihood
 from .evaluate import evaluating, hold, on_device_of, plain

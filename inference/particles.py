@@ -24,8 +24,9 @@ from ..laws.families import Parameters
 from ..networks.base import computing_once, valid_steps
 from ..networks.rows import Rows, pick, select
 from ..notation import Factor, Parent
+from ..program.batch import Batch
 from ..program.conditional import Conditional
-from ..program.model import Batch, DynamicalVAE
+from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, like
 from ..turns import alone
 from .batches import each

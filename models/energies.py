@@ -24,7 +24,8 @@ from ..motion.judges.pose_prior import PosePriorModel, fit_pose_prior, load_pose
 from ..motion.protocols import Poses
 from ..motion.truths import PseudoTruths, WithPseudoTruths
 from ..options import Amount, Count, Positive, Range, Size
-from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE
+from ..program.batch import CHUNK, WHOLE, Batch
+from ..program.model import DynamicalVAE
 from .poses import PoseMethod
 
 

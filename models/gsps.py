@@ -41,7 +41,8 @@ from ..motion.body import body_parts
 from ..networks import GraphConv
 from ..notation import Factorization
 from ..options import Amount, Layers, Size
-from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE
+from ..program.batch import CHUNK, WHOLE, Batch
+from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout
 from .energies import EnergyMethod, EnergyModel
 

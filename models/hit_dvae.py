@@ -53,7 +53,8 @@ from ..networks import Attention, FrameGraph, NetworkSpec, PoseGraph, Recurrent,
 from ..networks.extract import share
 from ..notation import Factorization
 from ..options import Amount, Delay, Extra, Layers, Range, Share, Size
-from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE
+from ..program.batch import CHUNK, WHOLE, Batch
+from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, SelfFeeding
 from ..schema import Schema
 from .energies import EnergyMethod, EnergyModel

@@ -41,7 +41,8 @@ from ..networks import Dense, Input, Network, NetworkSpec
 from ..networks.base import valid_steps
 from ..networks.recurrent import lstm_cell
 from ..options import Range, Size
-from ..program.model import Batch, DynamicalVAE, repeat
+from ..program.batch import Batch, repeat
+from ..program.model import DynamicalVAE
 from .method import LatentMethod
 
 

@@ -32,7 +32,8 @@ from ..motion.data import defect
 from ..motion.protocols import Poses
 from ..networks import NetworkSpec
 from ..options import Amount, Share, Size
-from ..program.model import CHUNK, WHOLE, Batch, DynamicalVAE, in_chunks, repeat, rows
+from ..program.batch import CHUNK, WHOLE, Batch, in_chunks, repeat, rows
+from ..program.model import DynamicalVAE
 from ..schema import Schema
 from ..turns import alone
 from .poses import PoseMethod

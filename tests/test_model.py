@@ -18,7 +18,8 @@ from dvae.inference.bounds import SequenceELBO
 from dvae.laws import families as heads
 from dvae.laws import priors
 from dvae.networks import Attention, Dense, Linear, Recurrent
-from dvae.program.model import in_chunks, rows
+from dvae.program.batch import in_chunks, rows
+from dvae.program.reference import reference
 from dvae.program.rollout import SelfFeeding
 from dvae.testing.strategies import factorizations
 
@@ -167,7 +168,7 @@ def per_step(model, data, latents):
     locals_ = {n: v for n, v in latents.items() if v.dim() == 3}
     given_values = {n: v for n, v in latents.items() if v.dim() == 2}
     given_values |= {f"{n}_{t + 1}": v[:, t] for n, v in locals_.items() for t in range(v.shape[1])}
-    _, logs = log_probs(poutine.condition(model.reference, data=given_values), data)
+    _, logs = log_probs(poutine.condition(partial(reference, model), data=given_values), data)
     out = {}
     for name in model.generative.variables:
         parts = [value for site, value in logs.items() if site == name or site.rsplit("_", 1)[0] == name]

@@ -14,7 +14,7 @@ from dvae.laws import priors
 from dvae.networks import Attention, Dense, Input, Linear, Recurrent
 from dvae.networks.rows import Rows, select
 from dvae.notation import Factorization, Relation
-from dvae.program.model import repeat
+from dvae.program.batch import repeat
 
 T = 5
 PAIRS = {

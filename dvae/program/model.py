@@ -20,25 +20,18 @@ import pyro.distributions as dist
 import torch
 from pyro import poutine
 from torch import Tensor, nn
-from torch.nn import functional
 
 from ..laws.families import HeadSpec, Normal
 from ..laws.priors import Prior
 from ..networks import NetworkSpec, Recurrent
-from ..networks.base import valid_steps
 from ..notation import Factorization, check_pair
 from ..turns import alone
 from ..units import Units
+from .batch import CHUNK, WHOLE, Batch, Reader, in_chunks, repeat, rows
 from .conditional import Conditional
 from .rollout import Rollout, SelfFeeding, like
 
 _COUNT = itertools.count()
-WHOLE = "x"
-"""Name of the array that the parts of a model with parts are coordinates of."""
-CHUNK = 2048
-"""Sequences times samples that a forecast holds at once."""
-
-Batch = Tensor | Mapping[str, Tensor]
 MaskFunction = Callable[[int], Any]
 
 
@@ -113,6 +106,15 @@ class DynamicalVAE(nn.Module):
         else:
             self.encoder: Any = self._conditionals(self.inference)
         self._check_latents()
+        self.reader = Reader(
+            self.sizes,
+            {**_locality(self.inference), **_locality(self.generative)},
+            self.observed,
+            self.context,
+            self.parts,
+            self.history,
+            [name for name in self.parts if not self.generator[name].head.deterministic],
+        )
         self.units: Any = nn.ModuleDict()
         self.priors = nn.ModuleDict(dict(priors or {}))
         for name, prior in (priors or {}).items():
@@ -234,7 +236,7 @@ class DynamicalVAE(nn.Module):
                     f"the prefix of {name} has shape {tuple(value.shape)}; expected the first values (B, O, D) of one "
                     f"of the latents {', '.join(self.latents)}, O at most {rollout.length}"
                 )
-            self._check(name, value)
+            self.reader.check(name, value)
         rollout.prefix = {**rollout.prefix, **(prefix or {})}
         names = self.observed if mean_emission else ()
         rollout.mean_emission = names if isinstance(mean_emission, bool) else mean_emission
@@ -304,43 +306,6 @@ class DynamicalVAE(nn.Module):
     def forward(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
         """`model`, so that the module itself is the Pyro model of `elbo(model, model.guide)`."""
         return self.model(batch, **options)
-
-    def reference(self, batch: Batch) -> None:
-        """The generative program as one reads it: a loop over time with one site per variable and step.
-
-        Sites are "z_1", "x_1", "z_2", ... as in the equations. Each factor is given noise in place of every value that
-        is not drawn yet, so that a network that reads what it should not changes the result. Slow; for tests.
-        """
-        rollout = self._rollout(self.generative, self.generator, batch, None, 1)
-        known = {name: value for name, value in rollout.values.items() if name not in self.observed}
-        size, length = rollout.batch, rollout.length
-
-        def law(name: str, sofar: Mapping[str, list[Tensor]]) -> Any:
-            conditional = self.generator[name]
-            parents = dict(known)
-            for other, values in sofar.items():
-                later = torch.randn(size, length - len(values), self.sizes[other]).to(like(self))
-                parents[other] = torch.cat([torch.stack(values, 1), later], 1) if values else later
-            return conditional.head, conditional(parents, size, length)
-
-        with pyro.plate("sequences", size, dim=-1):
-            for block in self.generative.blocks:
-                if not self.generative.local(block.names[0]):
-                    (name,) = block.names
-                    head, parameters = law(name, {})
-                    prior = (
-                        self._prior(name, size) if name in self.priors else head.distribution(parameters).to_event(1)
-                    )
-                    known[name] = pyro.sample(name, prior)
-                    continue
-                sofar: dict[str, list[Tensor]] = {name: [] for name in block.names}
-                for t in pyro.markov(range(length), history=length):
-                    for name in block.names:
-                        head, parameters = law(name, sofar)
-                        at_t = head.distribution(tuple(p[:, t] for p in parameters)).to_event(1)
-                        data = rollout.values[name][:, t] if name in self.observed else None
-                        sofar[name].append(pyro.sample(f"{name}_{t + 1}", at_t, obs=data))
-                known |= {name: torch.stack(values, 1) for name, values in sofar.items()}
 
     def _check_draws(self, draws: Mapping[str, int]) -> None:
         ours = [name for block in self.generative.blocks for name in block.names if name in self.latents]
@@ -505,7 +470,7 @@ class DynamicalVAE(nn.Module):
         if missing := [name for name in self.latents if name not in latents]:
             raise ValueError(f"the log joint needs a value of every latent; missing are {', '.join(missing)}")
         for name, value in latents.items():
-            self._check(name, value)
+            self.reader.check(name, value)
         trace = poutine.trace(poutine.condition(self.model, data=dict(latents))).get_trace(batch)
         trace.compute_log_prob(site_filter=lambda name, site: name in self.generative.variables)
         return {name: trace.nodes[name]["log_prob"] for name in self.generative.variables}
@@ -524,157 +489,18 @@ class DynamicalVAE(nn.Module):
     def _evaluating(self) -> Any:
         return _Evaluating(self) if self.training else nullcontext()
 
+    @property
+    def _fills(self) -> dict[str, Tensor]:
+        """What stands for missing entries of variables with units."""
+        return {name: units.mean for name, units in self.units.items()}
+
     def _mapping(self, batch: Batch | None) -> dict[str, Any]:
-        if batch is None:
-            return {}
-        if not isinstance(batch, Mapping):
-            if len(self.observed) > 1 and not self.parts:
-                raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
-            batch = {WHOLE if self.parts else self.observed[0]: batch}
-        names = (*([WHOLE] if self.parts else []), *self.sizes)
-        unknown = [name for name in batch if name not in (*names, "lengths", "mask")]
-        if unknown:
-            raise ValueError(
-                f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
-            )
-        dtype = like(self).dtype
-
-        def tensors(value: Any) -> Any:
-            if isinstance(value, Mapping):
-                return {name: tensors(v) for name, v in value.items()}
-            tensor = torch.as_tensor(value)
-            return tensor.to(dtype) if tensor.is_floating_point() else tensor
-
-        values = tensors(batch)
-        whole = values.pop(WHOLE, None) if self.parts else values.get(self.observed[0])
-        mask = values.get("mask")
-        if isinstance(mask, Mapping):
-            mask = mask.get(WHOLE if self.parts else self.observed[0])
-        if whole is not None and self.parts:
-            values = {**self._apart(whole), **values}
-            if mask is not None:
-                values["mask"] = {name: mask[..., list(places)] for name, places in self.parts.items()}
-        if whole is not None and self.history is not None:
-            fill = self.units[self.history].mean if self.history in self.units else whole.new_zeros(())
-            seen = whole if mask is None or mask.shape != whole.shape else torch.where(mask, whole, fill)
-            values.setdefault(self.history, seen)
-        return values
-
-    def _apart(self, whole: Tensor) -> dict[str, Tensor]:
-        """The parts of the data that a program can be given: those with a density."""
-        size = sum(map(len, self.parts.values()))
-        if whole.dim() != 3 or whole.shape[-1] != size:
-            raise ValueError(f"{WHOLE} has shape {tuple(whole.shape)}, expected (B, T, {size})")
-        return {
-            name: whole[..., list(places)]
-            for name, places in self.parts.items()
-            if not self.generator[name].head.deterministic
-        }
+        return self.reader.mapping(batch, like(self).dtype, self._fills)
 
     def _rollout(
-        self,
-        factorization: Factorization,
-        conditionals: Any,
-        batch: Batch | None,
-        length: int | None,
-        size: int,
+        self, factorization: Factorization, conditionals: Any, batch: Batch | None, length: int | None, size: int
     ) -> Rollout:
-        values = self._mapping(batch)
-        lengths, mask = values.pop("lengths", None), values.pop("mask", None)
-        masks = mask if isinstance(mask, Mapping) else {} if mask is None else {self.observed[0]: mask}
-        for name, value in values.items():
-            self._check(name, value)
-        local = {name: v for name, v in values.items() if v.dim() == 3}
-        sizes = {v.shape[0] for v in values.values()} or {size}
-        if len(sizes) > 1:
-            raise ValueError(f"the batch holds different numbers of sequences: {_shapes(values)}")
-        if sizes == {0}:
-            raise ValueError(f"the batch holds no sequences: {_shapes(values)}")
-        steps = {v.shape[1] for v in local.values()}
-        if length is None:
-            if not steps:
-                raise ValueError("neither a batch nor length= tells how many steps to run; pass length=")
-            length = max(steps)
-            if len(steps) > 1:
-                raise ValueError(f"the batch holds different numbers of steps: {_shapes(local)}")
-        if length < 1:
-            raise ValueError(f"length is at least 1, got {length}")
-        if self.history in local and local[self.history].shape[1] < length:  # the mask hides what is not there yet
-            past = local[self.history].shape[1]
-            gap = length - past
-            for factor in factorization.factors:
-                if factor.parent(self.history) is not None and factor.mask(self.history, length)[:, past:].any():
-                    raise ValueError(
-                        f"{factor} reads more than the first {past} frames of {self.history}, which are all there are"
-                    )
-            values[self.history] = local[self.history] = functional.pad(local[self.history], (0, 0, 0, gap))
-            steps = {v.shape[1] for v in local.values()}
-        prefix = {name: v for name, v in local.items() if v.shape[1] < length}
-        if not steps <= set(range(1, length + 1)) or not set(prefix) <= set(self.observed):
-            raise ValueError(
-                f"expected {length} steps (fewer of data to continue), but the batch holds {_shapes(local)}"
-            )
-        for name, seen in masks.items():
-            if name not in self.observed or name not in values:
-                raise ValueError(
-                    f"there is a mask of {name}, but the batch holds no data of that name: {_shapes(values)}"
-                )
-            if seen.shape != values[name].shape or seen.dtype != torch.bool:
-                raise ValueError(
-                    f"the mask of {name} is {seen.dtype} {tuple(seen.shape)}; expected bool "
-                    f"{tuple(values[name].shape)}, True where an entry was observed"
-                )
-            fill = self.units[name].mean if name in self.units else values[name].new_zeros(())
-            values[name] = torch.where(seen, values[name], fill)
-        if lengths is not None:
-            if (
-                lengths.is_floating_point()
-                or lengths.shape != (next(iter(sizes)),)
-                or lengths.min() < 1
-                or lengths.max() > length
-            ):
-                raise ValueError(f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}")
-            valid = valid_steps(lengths, length)[..., None]
-            values |= {name: v.masked_fill(~valid, 0) for name, v in values.items() if v.dim() == 3}
-        for name, value in values.items():
-            if not torch.isfinite(value.sum()):  # one pass; a NaN or infinity survives the sum
-                raise ValueError(
-                    f"{name} holds values that are not finite; where entries are missing, set 'mask' False in the batch"
-                )
-        self._check_context(factorization, values)
-        return Rollout(
-            factorization=factorization,
-            conditionals=conditionals,
-            batch=next(iter(sizes)),
-            length=length,
-            values={name: v for name, v in values.items() if name not in prefix},
-            data=frozenset(self.observed),
-            lengths=lengths,
-            observed=masks,
-            prefix=prefix,
-        )
-
-    def _check_context(self, factorization: Factorization, values: Mapping[str, Tensor]) -> None:
-        for factor in factorization.factors:
-            if lacking := [p for p in factor.parents if p.name in self.context and p.name not in values]:
-                shapes = ", ".join(f"{p.name} (B, {'T, ' * p.local}{self.sizes[p.name]})" for p in lacking)
-                raise ValueError(
-                    f"{factor} reads {shapes}, context that the batch has to give; it holds "
-                    f"{_shapes(values) or 'nothing'}"
-                )
-
-    def _check(self, name: str, value: Tensor) -> None:
-        local = self.generative.local(name) if name not in self.context else None
-        if local is None:
-            factorization = self.generative if name in self.generative.context else self.inference
-            local = factorization.local(name)
-        expected = f"(B, {'T, ' if local else ''}{self.sizes[name]})"
-        if value.dim() != (3 if local else 2) or value.shape[-1] != self.sizes[name]:
-            raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {expected}")
-        if value.dim() == 3 and value.shape[1] == 0:
-            raise ValueError(f"{name} has no steps: shape {tuple(value.shape)}")
-        if not value.is_floating_point():
-            raise ValueError(f"{name} is {value.dtype}, expected floating point {expected}")
+        return self.reader.rollout(factorization, conditionals, self._mapping(batch), length, size, self._fills)
 
 
 class _Evaluating:
@@ -696,6 +522,10 @@ def _factorization(equations: str | Factorization, masks: Mapping[str, MaskFunct
     return equations if isinstance(equations, Factorization) else Factorization.parse(equations, masks=masks or {})
 
 
+def _locality(factorization: Factorization) -> dict[str, bool]:
+    return {n: factorization.local(n) for n in (*factorization.variables, *factorization.context)}
+
+
 def _note(factorization: Factorization, rollout: Rollout) -> Any:
     """What a site says of its program: bounds decide from it where a KL term may be analytic, and average draws."""
     return {"program": factorization, "run": rollout}
@@ -707,47 +537,3 @@ def _by_factor(given: Any, default: Any, what: str) -> dict[str, Any]:
         if not hasattr(spec, "build"):
             raise ValueError(f"the {what} of {key!r} is {spec!r}; expected a description such as {default!r}")
     return {"default": default, **table}
-
-
-def repeat(value: Any, samples: int) -> Any:
-    """A batch, or a tensor (B, ...), `samples` times over: (samples * B, ...), sample by sample."""
-    if isinstance(value, Mapping):
-        return {name: repeat(v, samples) for name, v in value.items()}
-    return value.repeat(samples, *[1] * (value.dim() - 1))
-
-
-def rows(value: Any, part: slice) -> Any:
-    """Some of the sequences of a batch, or of a tensor (B, ...)."""
-    return {name: rows(v, part) for name, v in value.items()} if isinstance(value, Mapping) else value[part]
-
-
-def in_chunks(
-    make: Callable[[slice, int], Mapping[str, Tensor]], size: int, samples: int, chunk: int
-) -> dict[str, Tensor]:
-    """What is made of all sequences and samples, (S, B, ...), with no more than a chunk of them at once beside it.
-
-    Args:
-        make: values (n, b, ...) by name, from a slice of b sequences and n samples.
-        size: B.
-        samples: S.
-        chunk: the most sequences times samples.
-
-    Raises:
-        ValueError: no samples, or a chunk that holds nothing.
-    """
-    if samples < 1 or chunk < 1:
-        raise ValueError(f"samples and chunk are at least 1, got {samples} and {chunk}")
-    found: dict[str, Tensor] = {}
-    for first in range(0, max(size, 1), chunk):  # of no sequences too, which `make` refuses
-        part = slice(first, min(first + chunk, size))
-        at_once = chunk // max(part.stop - first, 1)
-        for start in range(0, samples, at_once):
-            for name, value in make(part, min(at_once, samples - start)).items():
-                if name not in found:
-                    found[name] = value.new_empty(samples, size, *value.shape[2:])
-                found[name][start : start + at_once, part] = value
-    return found
-
-
-def _shapes(values: Mapping[str, Tensor]) -> str:
-    return ", ".join(f"{name} {tuple(value.shape)}" for name, value in values.items())

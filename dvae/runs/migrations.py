@@ -37,7 +37,8 @@ def upgraded(config: Mapping[str, Any], run: Path, data: str | os.PathLike[str] 
         return _from_1(config, run, data)
     if version != FORMAT:
         raise CheckpointError(
-            f"{run} is a run of format {version!r}, and this version of dvae reads {FORMAT} and earlier; install a newer one"
+            f"{run} is a run of format {version!r}, and this version of dvae reads formats up to {FORMAT}; install a "
+            "newer one"
         )
     return config
 

@@ -11,6 +11,7 @@ last, which trains it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,10 @@ from ..inference.checkpoints import load_weights, save_weights
 from ..inference.fit import fit
 from ..motion import PROTOCOLS, simulate, windows
 from ..oracle import Oracle, twin
+from ..program.batch import Batch
 from ..program.conditional import Conditional
-from ..program.model import Batch, DynamicalVAE
+from ..program.model import DynamicalVAE
+from ..program.reference import reference
 
 
 class FactorizationContract:
@@ -110,7 +113,7 @@ class FactorizationContract:
             if value.dim() == 3
             for t in range(self.steps)
         }
-        _, logs = _run(poutine.condition(model.reference, data=sites), data)
+        _, logs = _run(poutine.condition(partial(reference, model), data=sites), data)
         vectorised = torch.stack(list(model.log_joint(data, latents).values())).sum(0)
         self._close({"joint": torch.stack(list(logs.values())).sum(0)}, {"joint": vectorised})
 

@@ -1,0 +1,266 @@
+"""Reading a batch: values by name, in a model's precision, checked before anything runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ..networks.base import valid_steps
+from ..notation import Factorization
+from .rollout import Rollout
+
+WHOLE = "x"
+"""Name of the array that the parts of a model with parts are coordinates of."""
+CHUNK = 2048
+"""Sequences times samples that a forecast holds at once."""
+
+Batch = Tensor | Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Reads batches of a model.
+
+    Args:
+        sizes: dimension of every variable.
+        local: whether a variable has a value for every step.
+        observed, context: names of the data variables, and of those that a batch has to give.
+        parts, history: of `DynamicalVAE`.
+        given: those of the parts that a program can be given, as they have a density.
+    """
+
+    sizes: Mapping[str, int]
+    local: Mapping[str, bool]
+    observed: tuple[str, ...]
+    context: tuple[str, ...]
+    parts: Mapping[str, tuple[int, ...]]
+    history: str | None
+    given: Collection[str]
+
+    def mapping(self, batch: Batch | None, dtype: torch.dtype, means: Mapping[str, Tensor]) -> dict[str, Any]:
+        """The batch by name, in this precision, with the parts of the whole.
+
+        Args:
+            batch: see `DynamicalVAE.model`.
+            dtype: of floating-point values.
+            means: name to what stands for missing entries of a variable, where that is not 0.
+
+        Raises:
+            ValueError: names that the model does not have.
+        """
+        if batch is None:
+            return {}
+        whole_name = WHOLE if self.parts else self.observed[0]
+        if not isinstance(batch, Mapping):
+            if len(self.observed) > 1 and not self.parts:
+                raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
+            batch = {whole_name: batch}
+        names = (*([WHOLE] if self.parts else []), *self.sizes)
+        if unknown := [name for name in batch if name not in (*names, "lengths", "mask")]:
+            raise ValueError(
+                f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
+            )
+        values = _tensors(batch, dtype)
+        whole = values.pop(WHOLE, None) if self.parts else values.get(whole_name)
+        mask = values.get("mask")
+        if isinstance(mask, Mapping):
+            mask = mask.get(whole_name)
+        if whole is not None and self.parts:
+            values = {**self._apart(whole), **values}
+            if mask is not None:
+                values["mask"] = {name: mask[..., list(places)] for name, places in self.parts.items()}
+        if whole is not None and self.history is not None:
+            fill = means.get(self.history, whole.new_zeros(()))
+            seen = whole if mask is None or mask.shape != whole.shape else torch.where(mask, whole, fill)
+            values.setdefault(self.history, seen)
+        return values
+
+    def _apart(self, whole: Tensor) -> dict[str, Tensor]:
+        """The parts of the data that a program can be given: those with a density."""
+        size = sum(map(len, self.parts.values()))
+        if whole.dim() != 3 or whole.shape[-1] != size:
+            raise ValueError(f"{WHOLE} has shape {tuple(whole.shape)}, expected (B, T, {size})")
+        return {name: whole[..., list(places)] for name, places in self.parts.items() if name in self.given}
+
+    def rollout(
+        self,
+        factorization: Factorization,
+        conditionals: Any,
+        values: dict[str, Any],
+        length: int | None,
+        size: int,
+        means: Mapping[str, Tensor],
+    ) -> Rollout:
+        """A run of the factorization over a batch.
+
+        Args:
+            factorization, conditionals: what is run.
+            values: of `mapping`.
+            length: T; None for the batch's.
+            size: B, where the batch does not tell.
+            means: see `mapping`.
+
+        Raises:
+            ValueError: a batch that cannot be read.
+        """
+        values = dict(values)
+        lengths, mask = values.pop("lengths", None), values.pop("mask", None)
+        masks = mask if isinstance(mask, Mapping) else {} if mask is None else {self.observed[0]: mask}
+        for name, value in values.items():
+            self.check(name, value)
+        size, length = _extent(values, length, size)
+        self._extend_history(factorization, values, length)
+        local = {name: v for name, v in values.items() if v.dim() == 3}
+        prefix = {name: v for name, v in local.items() if v.shape[1] < length}
+        if max((v.shape[1] for v in local.values()), default=0) > length or not set(prefix) <= set(self.observed):
+            raise ValueError(
+                f"expected {length} steps (fewer of data to continue), but the batch holds {shapes(local)}"
+            )
+        self._fill(values, masks, means)
+        if lengths is not None:
+            if lengths.is_floating_point() or lengths.shape != (size,) or lengths.min() < 1 or lengths.max() > length:
+                raise ValueError(f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}")
+            valid = valid_steps(lengths, length)[..., None]
+            values |= {name: v.masked_fill(~valid, 0) for name, v in values.items() if v.dim() == 3}
+        for name, value in values.items():
+            if not torch.isfinite(value.sum()):  # one pass; a NaN or infinity survives the sum
+                raise ValueError(
+                    f"{name} holds values that are not finite; where entries are missing, set 'mask' False in the batch"
+                )
+        self._check_context(factorization, values)
+        return Rollout(
+            factorization=factorization,
+            conditionals=conditionals,
+            batch=size,
+            length=length,
+            values={name: v for name, v in values.items() if name not in prefix},
+            data=frozenset(self.observed),
+            lengths=lengths,
+            observed=masks,
+            prefix={name: values[name] for name in prefix},
+        )
+
+    def _extend_history(self, factorization: Factorization, values: dict[str, Any], length: int) -> None:
+        """Lengthens the history to all steps: its mask hides what is not there yet."""
+        name = self.history
+        if name is None or name not in values or (past := values[name].shape[1]) >= length:
+            return
+        for factor in factorization.factors:
+            if factor.parent(name) is not None and factor.mask(name, length)[:, past:].any():
+                raise ValueError(f"{factor} reads more than the first {past} frames of {name}, which are all there are")
+        values[name] = functional.pad(values[name], (0, 0, 0, length - past))
+
+    def _fill(self, values: dict[str, Any], masks: Mapping[str, Tensor], means: Mapping[str, Tensor]) -> None:
+        """Puts what networks read in place of missing entries."""
+        for name, seen in masks.items():
+            if name not in self.observed or name not in values:
+                raise ValueError(
+                    f"there is a mask of {name}, but the batch holds no data of that name: {shapes(values)}"
+                )
+            if seen.shape != values[name].shape or seen.dtype != torch.bool:
+                raise ValueError(
+                    f"the mask of {name} is {seen.dtype} {tuple(seen.shape)}; expected bool "
+                    f"{tuple(values[name].shape)}, True where an entry was observed"
+                )
+            values[name] = torch.where(seen, values[name], means.get(name, values[name].new_zeros(())))
+
+    def _check_context(self, factorization: Factorization, values: Mapping[str, Tensor]) -> None:
+        for factor in factorization.factors:
+            if lacking := [p for p in factor.parents if p.name in self.context and p.name not in values]:
+                given = ", ".join(f"{p.name} (B, {'T, ' * p.local}{self.sizes[p.name]})" for p in lacking)
+                raise ValueError(
+                    f"{factor} reads {given}, context that the batch has to give; it holds "
+                    f"{shapes(values) or 'nothing'}"
+                )
+
+    def check(self, name: str, value: Tensor) -> None:
+        """Refuses a value (B, T, D), or (B, D), of another shape or of whole numbers.
+
+        Raises:
+            ValueError: saying what was expected.
+        """
+        local = self.local[name]
+        expected = f"(B, {'T, ' if local else ''}{self.sizes[name]})"
+        if value.dim() != (3 if local else 2) or value.shape[-1] != self.sizes[name]:
+            raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {expected}")
+        if value.dim() == 3 and value.shape[1] == 0:
+            raise ValueError(f"{name} has no steps: shape {tuple(value.shape)}")
+        if not value.is_floating_point():
+            raise ValueError(f"{name} is {value.dtype}, expected floating point {expected}")
+
+
+def _tensors(value: Any, dtype: torch.dtype) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _tensors(v, dtype) for name, v in value.items()}
+    tensor = torch.as_tensor(value)
+    return tensor.to(dtype) if tensor.is_floating_point() else tensor
+
+
+def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tuple[int, int]:
+    """B and T, of the values where these tell."""
+    sizes = {value.shape[0] for value in values.values()} or {size}
+    if len(sizes) > 1:
+        raise ValueError(f"the batch holds different numbers of sequences: {shapes(values)}")
+    if sizes == {0}:
+        raise ValueError(f"the batch holds no sequences: {shapes(values)}")
+    local = {name: value for name, value in values.items() if value.dim() == 3}
+    steps = {value.shape[1] for value in local.values()}
+    if length is None:
+        if not steps:
+            raise ValueError("neither a batch nor length= tells how many steps to run; pass length=")
+        if len(steps) > 1:
+            raise ValueError(f"the batch holds different numbers of steps: {shapes(local)}")
+        length = max(steps)
+    if length < 1:
+        raise ValueError(f"length is at least 1, got {length}")
+    return sizes.pop(), length
+
+
+def shapes(values: Mapping[str, Tensor]) -> str:
+    """The values' names and shapes, in words."""
+    return ", ".join(f"{name} {tuple(value.shape)}" for name, value in values.items())
+
+
+def repeat(value: Any, samples: int) -> Any:
+    """A batch, or a tensor (B, ...), `samples` times over: (samples * B, ...), sample by sample."""
+    if isinstance(value, Mapping):
+        return {name: repeat(v, samples) for name, v in value.items()}
+    return value.repeat(samples, *[1] * (value.dim() - 1))
+
+
+def rows(value: Any, part: slice) -> Any:
+    """Some of the sequences of a batch, or of a tensor (B, ...)."""
+    return {name: rows(v, part) for name, v in value.items()} if isinstance(value, Mapping) else value[part]
+
+
+def in_chunks(
+    make: Callable[[slice, int], Mapping[str, Tensor]], size: int, samples: int, chunk: int
+) -> dict[str, Tensor]:
+    """What is made of all sequences and samples, (S, B, ...), with no more than a chunk of them at once beside it.
+
+    Args:
+        make: values (n, b, ...) by name, from a slice of b sequences and n samples.
+        size: B.
+        samples: S.
+        chunk: the most sequences times samples.
+
+    Raises:
+        ValueError: no samples, or a chunk that holds nothing.
+    """
+    if samples < 1 or chunk < 1:
+        raise ValueError(f"samples and chunk are at least 1, got {samples} and {chunk}")
+    found: dict[str, Tensor] = {}
+    for first in range(0, max(size, 1), chunk):  # of no sequences too, which `make` refuses
+        part = slice(first, min(first + chunk, size))
+        at_once = chunk // max(part.stop - first, 1)
+        for start in range(0, samples, at_once):
+            for name, value in make(part, min(at_once, samples - start)).items():
+                if name not in found:
+                    found[name] = value.new_empty(samples, size, *value.shape[2:])
+                found[name][start : start + at_once, part] = value
+    return found

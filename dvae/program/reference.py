@@ -1,0 +1,50 @@
+"""The generative program as one reads it, step by step; in tests the program that runs is compared with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pyro
+import torch
+from torch import Tensor
+
+from .batch import Batch
+from .rollout import like
+
+
+def reference(model: Any, batch: Batch) -> None:
+    """The generative program of a `DynamicalVAE` as a loop over time with one site per variable and step.
+
+    Sites are "z_1", "x_1", "z_2", ... as in the equations. Each factor is given noise in place of every value that is
+    not drawn yet, so that a network that reads what it should not changes the result. Slow.
+    """
+    rollout = model._rollout(model.generative, model.generator, batch, None, 1)
+    known = {name: value for name, value in rollout.values.items() if name not in model.observed}
+    size, length = rollout.batch, rollout.length
+
+    def law(name: str, sofar: Mapping[str, list[Tensor]]) -> Any:
+        conditional = model.generator[name]
+        parents = dict(known)
+        for other, values in sofar.items():
+            later = torch.randn(size, length - len(values), model.sizes[other]).to(like(model))
+            parents[other] = torch.cat([torch.stack(values, 1), later], 1) if values else later
+        return conditional.head, conditional(parents, size, length)
+
+    with pyro.plate("sequences", size, dim=-1):
+        for block in model.generative.blocks:
+            if not model.generative.local(block.names[0]):
+                (name,) = block.names
+                head, parameters = law(name, {})
+                own = name in model.priors
+                prior = model._prior(name, size) if own else head.distribution(parameters).to_event(1)
+                known[name] = pyro.sample(name, prior)
+                continue
+            sofar: dict[str, list[Tensor]] = {name: [] for name in block.names}
+            for t in pyro.markov(range(length), history=length):
+                for name in block.names:
+                    head, parameters = law(name, sofar)
+                    at_t = head.distribution(tuple(p[:, t] for p in parameters)).to_event(1)
+                    data = rollout.values[name][:, t] if name in model.observed else None
+                    sofar[name].append(pyro.sample(f"{name}_{t + 1}", at_t, obs=data))
+            known |= {name: torch.stack(values, 1) for name, values in sofar.items()}
