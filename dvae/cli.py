@@ -962,7 +962,7 @@ def _classifiers(paths: Sequence[Path], data: str | None, windows: motion.Window
         if loaded.model.label in found:
             raise UsageError(f"--classifier {path} is the second of the label {loaded.model.label!r}; give one of them")
         if loaded.data.windows("test").fingerprint != windows.fingerprint:
-            where = loaded.config.data["path"]
+            where = loaded.config.data.path
             raise UsageError(
                 f"--classifier {path} was fitted on other data or under another protocol ({where}, "
                 f"{loaded.schema.protocol.name}) than the runs ({windows.protocol.name}); it may have seen test clips"
@@ -992,7 +992,7 @@ def _on_the_same_windows(paths: Sequence[Path], data: str | None) -> tuple[list[
     for path in paths[1:]:
         other = _load(path, data)
         if not other.share(first):
-            there, here = (f"{run.config.data['path']}, {run.schema.protocol.name}" for run in (other, first))
+            there, here = (f"{run.config.data.path}, {run.schema.protocol.name}" for run in (other, first))
             raise ValueError(
                 f"{other.path} has other test windows ({there}) than {first.path} ({here}); give runs of the same data "
                 "and protocol"
@@ -1084,9 +1084,7 @@ def _windows_of(loaded: runs.Loaded, clip: str | None) -> motion.Windows:
     """The test windows of a run's data, or all windows of one clip, of any split."""
     if clip is None:
         return loaded.data.windows("test")
-    chosen = motion.MotionSet(
-        [_clip(loaded.data.motion, clip)], loaded.data.motion.skeleton, loaded.config.data["path"]
-    )
+    chosen = motion.MotionSet([_clip(loaded.data.motion, clip)], loaded.data.motion.skeleton, loaded.config.data.path)
     anywhere = replace(loaded.schema.protocol, split_by="split", test=tuple(chosen.splits), train=())
     return motion.windows(chosen, anywhere, "test")
 

@@ -260,15 +260,15 @@ def test_the_state_of_each_optimiser_is_read(optimiser, run):
             {"schedule": "Linear", "start": 0, "end": float("inf"), "steps": 3},
             "end is inf",
         ),
-        (("protocol", "fps"), 0, "fps is 0; it must be at least 0.001"),
-        (("protocol", "observed"), 10**9, "observed is 1000000000; it must be"),
+        (("schema", "protocol", "fps"), 0, "fps is 0; it must be at least 0.001"),
+        (("schema", "protocol", "observed"), 10**9, "observed is 1000000000; it must be"),
         (
             ("method",),
             {"method": "equations", "generative": "p(z_t | z_{t-99999999:t-1}) p(x_t | z_t)"},
             "99999999 steps",
         ),
         (("data", "skip_bad"), "yes", "skip_bad is 'yes'; it must be true or false"),
-        (("data", "path"), ["people.npz"], "source is .*; it must be of type str"),
+        (("data", "path"), ["people.npz"], "path is .*; it must be of type str"),
     ],
 )
 def test_a_config_out_of_range_is_refused_by_file_key_and_value(run, keys, value, message):

@@ -25,6 +25,24 @@ DEFAULT_PROTOCOLS = {
 
 
 @dataclass(frozen=True)
+class Recordings:
+    """Where motion data were, as a run keeps it.
+
+    Args:
+        path: the file as it was given, or "simulated".
+        fingerprint: SHA-256 of the clips.
+        skip_bad: whether unusable clips were left out.
+    """
+
+    path: str
+    fingerprint: str
+    skip_bad: bool = False
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True)
 class MotionData:
     """Motion data under a protocol.
 
@@ -36,14 +54,12 @@ class MotionData:
     """
 
     kind: ClassVar[str] = "motion"
+    source: ClassVar[type[Recordings]] = Recordings
 
     path: str
     motion: MotionSet
     protocol: Protocol
     skip_bad: bool = False
-
-    def __post_init__(self) -> None:
-        check(self)
 
     @classmethod
     def open(
@@ -93,23 +109,23 @@ class MotionData:
         """What is known of the windows without the clips."""
         return Poses.under(self.protocol, self.motion.skeleton)
 
-    def config(self) -> dict[str, Any]:
-        """Where the clips are, in JSON's types; `reopened` reads it."""
-        return {"path": self.path, "fingerprint": self.fingerprint, "skip_bad": self.skip_bad}
+    def recorded(self) -> Recordings:
+        """Where the clips are; `reopened` reads it."""
+        return Recordings(self.path, self.fingerprint, self.skip_bad)
 
     @classmethod
     def reopened(
-        cls, config: Mapping[str, Any], schema: Poses | None, path: str | os.PathLike[str] | None = None
+        cls, source: Recordings, schema: Poses | Mapping[str, Any], path: str | os.PathLike[str] | None = None
     ) -> Self:
-        """The data that `config` describes, from there or from another path, whatever they are now.
+        """The data that were recorded, from there or from another path, whatever they are now.
 
         Args:
-            config: as `config` has it.
-            schema: of the windows; None where, as in runs of format 1, the config has the fields of the protocol.
+            source: as `recorded` gave it.
+            schema: of the windows; of runs of format 1, the fields of the protocol.
             path: where they lie now.
 
         Raises:
             FileNotFoundError, ValueError: see `open`.
         """
-        protocol = Protocol(**tuples(config["protocol"])) if schema is None else schema.protocol
-        return cls.open(path or config["path"], protocol, config["skip_bad"])
+        protocol = Protocol(**tuples(schema)) if isinstance(schema, Mapping) else schema.protocol
+        return cls.open(path or source.path, protocol, source.skip_bad)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from ..inference.recipe import Trainable
 from ..inference.schedules import from_config as option_from_config
 from ..inference.trackers import Tracker
 from ..models.registry import from_config
-from ..options import check
 from ..schema import Schema
 from ..turns import alone
 from .kinds import DATA, SCHEMAS, Data, opened
@@ -36,24 +35,16 @@ class Config:
     Args:
         method: with its options.
         schema: of the data.
-        data: where they were, with their kind.
+        kind: of the data.
+        data: where they were (`Recorded`).
         training: how it was fitted.
     """
 
     method: Trainable
     schema: Schema
-    data: dict[str, Any]
+    kind: str
+    data: Any
     training: Training
-
-    def __post_init__(self) -> None:
-        check(self)
-        if not isinstance(self.data["path"], str) or not isinstance(self.fingerprint, str):
-            raise TypeError("path and fingerprint of the data are text")
-
-    @property
-    def fingerprint(self) -> str:
-        """Of the data."""
-        return self.data["fingerprint"]  # type: ignore[no-any-return]
 
 
 @dataclass
@@ -91,12 +82,12 @@ class Loaded:
             CheckpointError: they are not here, or have changed.
         """
         if self._data is None:
-            self._data = opened(self.path, self.config.data, self.schema, self.where)
+            self._data = opened(self.path, self.config.kind, self.config.data, self.schema, self.where)
         return self._data
 
     def share(self, other: Loaded) -> bool:
         """Takes over the data of another run, in place of opening them again, and says whether they are the same."""
-        same = (self.config.fingerprint, self.schema) == (other.config.fingerprint, other.schema)
+        same = (self.config.data.fingerprint, self.schema) == (other.config.data.fingerprint, other.schema)
         if same:
             self._data = other.data
         return same
@@ -107,7 +98,7 @@ class Loaded:
         Raises:
             ValueError: data with another schema, such as other joints.
         """
-        other = DATA[self.config.data["kind"]].reopened(self.config.data, self.schema, path)
+        other = DATA[self.config.kind].reopened(self.config.data, self.schema, path)
         if other.schema != self.schema:
             raise ValueError(
                 f"{path} holds other variables than {self.path} was fitted on: {other.schema} in place of {self.schema}"
@@ -149,7 +140,7 @@ def fit(
     recipe = method.train(train, data.windows("validation"), training.steps)
     schema = {"kind": data.schema.kind, **data.schema.config()}
     config = {"format": FORMAT, "method": method.config(), "schema": schema}
-    config["data"] = {"kind": data.kind, **data.config()}
+    config["data"] = {"kind": data.kind, **asdict(data.recorded())}
     with torch.random.fork_rng():
         torch.manual_seed(training.seed)
         model = method.build(data.schema)
@@ -217,11 +208,13 @@ def read_config(path: str | os.PathLike[str], data: str | os.PathLike[str] | Non
     """
     with reading_config(path):
         config = upgraded(Run(path).config, Path(path), data)
-        schema, training = dict(config["schema"]), config["training"]
+        schema, source, training = dict(config["schema"]), dict(config["data"]), config["training"]
+        kind = source.pop("kind")
         return Config(
             from_config(config["method"]),
             SCHEMAS[schema.pop("kind")].from_config(schema),
-            config["data"],
+            kind,
+            DATA[kind].source(**source),
             Training(**{name: option_from_config(value) for name, value in training.items()}),
         )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol, Self
 
 from ..inference.checkpoints import CheckpointError
@@ -15,10 +14,19 @@ DATA = Registry({"motion": "dvae.motion.dataset:MotionData"}, "dvae.data")
 """Kinds of schemas and of data, by the name that a config gives them."""
 
 
+class Recorded(Protocol):
+    """Where data were: a dataclass of JSON's types, which a run keeps."""
+
+    path: str
+    fingerprint: str
+
+
 class Data(Protocol):
     """Data that runs are fitted on, such as `dvae.motion.MotionData`."""
 
     kind: ClassVar[str]
+    source: ClassVar[type[Any]]
+    """What `recorded` is."""
 
     @property
     def location(self) -> str:
@@ -35,42 +43,40 @@ class Data(Protocol):
     def windows(self, split: str) -> Any:
         """The sequences of "train", "validation" or "test"."""
 
-    def config(self) -> dict[str, Any]:
-        """Where they are, in JSON's types, with path and fingerprint."""
+    def recorded(self) -> Any:
+        """Where they are, as `Recorded`."""
 
     @classmethod
-    def reopened(cls, config: Mapping[str, Any], schema: Any, path: str | os.PathLike[str] | None = None) -> Self:
-        """The data that `config` describes, from there or from another path, whatever they are now."""
+    def reopened(cls, source: Any, schema: Any, path: str | os.PathLike[str] | None = None) -> Self:
+        """The data that were recorded, from there or from another path, whatever they are now."""
 
 
 def opened(
-    run: str | os.PathLike[str],
-    data: Mapping[str, Any],
-    schema: Schema | None,
-    where: str | os.PathLike[str] | None = None,
+    run: str | os.PathLike[str], kind: str, source: Any, schema: Any, where: str | os.PathLike[str] | None = None
 ) -> Any:
     """The data of a run.
 
     Args:
         run: its directory.
-        data: where they were, as its config says.
-        schema: of them; None where the config has none.
+        kind: of the data.
+        source: where they were, as `Recorded`.
+        schema: of them.
         where: they lie now.
 
     Raises:
         CheckpointError: they are not there, or have changed.
     """
-    where = os.fspath(where or data["path"])
+    where = os.fspath(where or source.path)
     try:
-        found = DATA[data["kind"]].reopened(data, schema, where)
+        found = DATA[kind].reopened(source, schema, where)
     except FileNotFoundError as error:
         raise CheckpointError(
-            f"{run} was fitted on {data['path']}, but {where} is not here; relative paths count from the "
+            f"{run} was fitted on {source.path}, but {where} is not here; relative paths count from the "
             "working directory, so change to where it was fitted, or tell where the data lie now (--data)"
         ) from error
-    if found.fingerprint != data["fingerprint"]:
+    if found.fingerprint != source.fingerprint:
         raise CheckpointError(
             f"{where} has changed since {run} was fitted on it: its fingerprint is {found.fingerprint[:12]}…, the "
-            f"run's {data['fingerprint'][:12]}…; restore the file, or fit again"
+            f"run's {source.fingerprint[:12]}…; restore the file, or fit again"
         )
     return found

@@ -15,7 +15,7 @@ from typing import Any
 from ..inference.checkpoints import CheckpointError
 from ..models.method import LatentMethod
 from ..models.registry import judges, methods
-from .kinds import opened
+from .kinds import DATA, opened
 
 FORMAT = 2
 
@@ -48,8 +48,8 @@ def _from_1(config: Mapping[str, Any], run: Path, data: str | os.PathLike[str] |
     kind = judges()[name] if name in judges() else methods()[name]
     aside = {option.name for option in fields(LatentMethod)} - {option.name for option in fields(kind)}
     method = {option: value for option, value in config["method"].items() if option not in aside}
-    source = {"kind": "motion", **config["data"], "protocol": config["protocol"]}
-    schema = opened(run, source, None, data).schema
+    source = DATA["motion"].source(**config["data"])
+    schema = opened(run, "motion", source, config["protocol"], data).schema
     described = {"kind": schema.kind, **schema.config()}
-    source.pop("protocol")
-    return {**config, "format": FORMAT, "method": method, "schema": described, "data": source}
+    now = {"method": method, "schema": described, "data": {"kind": "motion", **config["data"]}}
+    return {**config, **now, "format": FORMAT}

@@ -336,7 +336,7 @@ def _earlier(run: _Run) -> Result | None:
             raise ValueError(f"{run.path} is a file, where a run is to go; choose another directory for the sweep")
         return None
     config, state = read_config(run.path), earlier.state
-    there = _options(config.method, config.schema, config.training, config.fingerprint)
+    there = _options(config.method, config.schema, config.training, config.data.fingerprint)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run itself tells which schedules it makes shorter
         training = clamp(run.training, run.training.steps)
