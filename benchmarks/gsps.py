@@ -59,7 +59,7 @@ def main() -> None:
     drawn = {name: values[name].requires_grad_() for name in ("lower", "upper")}
 
     def scored() -> None:
-        futures = model._with_whole(dict(drawn))
+        futures = model.shown(dict(drawn))
         sum(energy.sum() for energy in model.energies(futures, batch["x"], batch).values()).backward()
 
     past = batch["x"][:, :25]

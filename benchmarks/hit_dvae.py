@@ -48,7 +48,7 @@ def main() -> None:
     method = dvae.method("hit-dvae", pose_prior=0.0, decoder=256).suited(windows)  # the paper's width
     model = method.build(windows)
     method.train(windows).prepare(model)
-    past = model.turned(windows.all()["x"][:100, : windows.protocol.observed])[0]
+    past = model.turned(windows.all()["x"][:100, : windows.protocol.observed])
     found: dict[str, float] = {}
 
     model.eval()

@@ -143,7 +143,7 @@ class Oracle:
 
     def evidence(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
         """log p(x), (B,), of data (B, T, D)."""
-        data = self._stack(self.model._mapping(x), self.model.observed)
+        data = self._stack(self.model.read(x), self.model.observed)
         mean, precision = self._joint()
         start = len(mean) - data.shape[1]
         covariance = torch.linalg.inv(precision)[start:, start:]
@@ -151,7 +151,7 @@ class Oracle:
 
     def posterior(self, x: Tensor | Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Mean (B, N) and covariance (N, N) of the latents, stacked in the guide's order, given data (B, T, D)."""
-        data = self._stack(self.model._mapping(x), self.model.observed)
+        data = self._stack(self.model.read(x), self.model.observed)
         mean, precision = self._joint()
         n = len(mean) - data.shape[1]
         gain = -torch.linalg.solve(precision[:n, :n], precision[:n, n:])
@@ -161,7 +161,7 @@ class Oracle:
         """The exact evidence lower bound of the model's guide, (B,): no draws are taken."""
         gain, offset, root = self._guide()
         mean, _ = self.posterior(x)
-        data = self._stack(self.model._mapping(x), self.model.observed)
+        data = self._stack(self.model.read(x), self.model.observed)
         n = len(mean.t())
         precision = self._joint()[1][:n, :n]
         difference = data @ gain.t() + offset - mean

@@ -2,6 +2,10 @@
 
 A network that must find them out first learns much more slowly: in metres, what varies between poses is a tenth of what
 they share. Densities and all that a program returns stay in the variable's own unit.
+
+Units are no view of the data (`dvae.views`), though they are a bijection with the same way back and its determinant.
+Latents and context have them too, of which nothing is handed out in another unit. And a law is put into the data's
+unit where it is made (`Head.in_units`, the push-forward), so that given scales and every density are in that.
 """
 
 from __future__ import annotations
@@ -49,6 +53,14 @@ class Units(nn.Module):
     def forward(self, values: Tensor) -> Tensor:
         """Values (..., D) without unit."""
         return (values - self.mean) / self.scale
+
+    def inverse(self, values: Tensor) -> Tensor:
+        """Values (..., D) in their unit again."""
+        return values * self.scale + self.mean
+
+    def log_det(self, values: Tensor) -> Tensor:
+        """(B,) log of the determinant of the Jacobian of `forward` at values (B, ..., D)."""
+        return -self.scale.log().expand(len(values)) * values[0].numel()
 
     def of(self, values: Tensor, lengths: Tensor | None) -> Tensor:
         """`forward` of (B, T, D) or (B, D), zero at padding; once for all that read the same values."""

@@ -309,7 +309,7 @@ def importance_bound(
     if particles < 1:
         raise ValueError(f"particles is at least 1, got {particles}")
     require_likelihood(model)
-    data = model._mapping(batch)
+    data = model.read(batch)
     size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
     weights: list[Tensor] = []
     at_once = max(1, min(particles, chunk // size))

@@ -760,7 +760,7 @@ def _decode(
 
     First frames that are context, as a pose from which motion starts, stay as they are.
     """
-    data = model._mapping(batch)
+    data = model.read(batch)
     known = {name: value for name, value in data.items() if name in model.context}
     length, size = data.get("x", batch["x"]).shape[1], len(batch["x"])
     x = model.model({**known, **latents}, length=length, size=size, mean_emission=mean_emission)["x"]
@@ -902,7 +902,7 @@ def traverse(
     if unit not in ("prior", "posterior"):
         raise ValueError(f"unit is 'prior' or 'posterior', got {unit!r}")
     _check_path(model, latent, free)
-    data = on_device_of(model, model._mapping(batch))
+    data = on_device_of(model, model.read(batch))
     if partial := {"lengths", "mask"} & data.keys():
         raise ValueError(f"a traversal needs complete sequences, but these have {', '.join(sorted(partial))}")
     with evaluating(model, seed):

@@ -84,7 +84,7 @@ def particle_bound(
     if not 0 <= resample_below <= 1:
         raise ValueError(f"resample_below is a share of the particles, between 0 and 1, got {resample_below}")
     require_likelihood(model)
-    data = model._mapping(batch)
+    data = model.read(batch)
     needed = (*model.observed, *model.context)
     if missing := [name for name in needed if name not in data]:
         raise ValueError(f"the bound needs {', '.join(needed)}; missing in the batch are {', '.join(missing)}")

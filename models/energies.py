@@ -9,7 +9,7 @@ Ours: a model may see every window turned so that the last observed pose faces o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -18,14 +18,14 @@ from torch import Tensor
 
 from ..inference.batches import Source
 from ..laws.priors import VampPrior
-from ..motion import Skeleton, Windows, energies, face_forward, rotate_about_up
+from ..motion import Heading, Skeleton, Windows, energies
 from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
 from ..motion.judges.pose_prior import PosePriorModel, fit_pose_prior, load_pose_prior
 from ..motion.protocols import Poses
 from ..motion.truths import PseudoTruths, WithPseudoTruths
 from ..options import Amount, Count, Positive, Range, Size
-from ..program.batch import CHUNK, WHOLE, Batch
 from ..program.model import DynamicalVAE
+from ..views import WHOLE, View, Views
 from .poses import PoseMethod
 
 
@@ -91,7 +91,7 @@ class EnergyMethod(PoseMethod):
         """
         for prior in model.priors.values():
             if isinstance(prior, VampPrior):
-                prior.start_at({WHOLE: model.turned(windows.sample(prior.components, torch.default_generator)["x"])[0]})
+                prior.start_at({WHOLE: model.turned(windows.sample(prior.components, torch.default_generator)["x"])})
         if model.limits is not None:
             limits = estimate_angle_limits(windows.poses(), windows.skeleton, self.angle_quantile)
             model.angle_low.copy_(limits.low)
@@ -127,15 +127,27 @@ class EnergyModel(DynamicalVAE):
         method: with no option left open.
         skeleton: of poses whose root was dropped, D = 3 (J - 1).
         observed: O, frames before the present.
+        views: of the windows, once these are turned.
         *arguments, **options: of `DynamicalVAE`.
     """
 
+    extras: ClassVar[tuple[str, ...]] = ("pseudo", "valid")
     angle_low: Tensor
     angle_high: Tensor
 
-    def __init__(self, method: Any, skeleton: Skeleton, observed: int, *arguments: Any, **options: Any):
-        super().__init__(*arguments, **options)
-        self.method, self.skeleton, self.frames = method, skeleton, observed
+    def __init__(
+        self,
+        method: Any,
+        skeleton: Skeleton,
+        observed: int,
+        *arguments: Any,
+        views: Sequence[View] = (),
+        **options: Any,
+    ):
+        turned = (WHOLE, *(name for view in views for name in view.parts))
+        heading = Heading(skeleton, observed, turned=turned) if method.heading else None
+        super().__init__(*arguments, view=Views(*([heading] if heading else []), *views), **options)
+        self.method, self.skeleton, self.frames, self.heading = method, skeleton, observed, heading
         self.limits: tuple[str, ...] | None = None
         if method.angles:
             self.limits = angle_names(skeleton)
@@ -158,7 +170,7 @@ class EnergyModel(DynamicalVAE):
         if self.method.multimodal:
             found["multimodal"] = truth.new_zeros(len(truth))
             if "pseudo" in batch:
-                others = self.turned(batch["pseudo"])[0][:, :, frames]
+                others = self.turned(batch["pseudo"])[:, :, frames]
                 found["multimodal"] = energies.multimodal_best_of_many(samples[:, :, frames], others, batch["valid"])
         return found
 
@@ -182,55 +194,6 @@ class EnergyModel(DynamicalVAE):
             found["pose_prior"] = energies.pose_prior_energy(judged[:, :, offset::3], self.pose_prior, self.skeleton)
         return found
 
-    def _mapping(self, batch: Batch | None) -> dict[str, Any]:
-        """The data as the networks see them, wherever a batch comes from."""
-        values = super()._mapping(_without_futures(batch))
-        name = self.history or WHOLE
-        if self.method.heading and batch is not None and (not isinstance(batch, Mapping) or WHOLE in batch):
-            if "mask" in values and self.history is None:
-                raise ValueError(
-                    "this model turns every window to one heading, which missing entries do not tell; fit with "
-                    "heading=False"
-                )
-            needed = min(self.frames, values[name].shape[-2])
-            if "lengths" in values and values["lengths"].min() < needed:
-                raise ValueError(
-                    f"this model turns every window by its frame {needed}, but a sequence has "
-                    f"{values['lengths'].min()}; leave it out, or fit with heading=False"
-                )
-            values[name] = self.turned(values[name])[0]
-        return values
-
-    def _heading(self, batch: Batch) -> Tensor | None:
-        """The headings (B,) that the windows had; None if they stay."""
-        return self.turned(super()._mapping(_without_futures(batch))[self.history or WHOLE])[1]
-
-    def turned(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Windows (..., T, D) as the networks see them, and the headings (...) that they had; None if they stay."""
-        if not self.method.heading:
-            return x, None
-        return face_forward(x, self.skeleton, min(self.frames, x.shape[-2]) - 1)
-
-    def _back(self, values: dict[str, Tensor], heading: Tensor | None) -> dict[str, Tensor]:
-        """Motion as the networks make it, turned back: in place, sample by sample, as there may be many."""
-        for name in values.keys() & {WHOLE, *self.parts} if heading is not None else ():
-            for sample in values[name].view(-1, *values[name].shape[-3:]):  # (B, T, D)
-                sample.copy_(self._rotated(sample, heading))
-        return values
-
-    def _rotated(self, x: Tensor, angle: Tensor | None) -> Tensor:
-        """(..., B, T, D) turned about the up axis by (B,)."""
-        if angle is None:
-            return x
-        joints = rotate_about_up(x.unflatten(-1, (-1, 3)), angle[:, None, None], self.skeleton.up)
-        return joints.flatten(-2)
-
-    @torch.no_grad()
-    def reconstruct(self, batch: Batch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
-        """See `DynamicalVAE.reconstruct`."""
-        return self._back(super().reconstruct(batch, samples, chunk=chunk), self._heading(batch))
-
-
-def _without_futures(batch: Any) -> Any:
-    """The batch without the pseudo ground truths, which are no variables of the model."""
-    return {n: v for n, v in batch.items() if n not in ("pseudo", "valid")} if isinstance(batch, Mapping) else batch
+    def turned(self, x: Tensor) -> Tensor:
+        """Windows (..., T, D) as the networks see them."""
+        return x if self.heading is None else self.heading.face(x)

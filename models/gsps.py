@@ -41,9 +41,9 @@ from ..motion.body import body_parts
 from ..networks import GraphConv
 from ..notation import Factorization
 from ..options import Amount, Layers, Size
-from ..program.batch import CHUNK, WHOLE, Batch
-from ..program.model import DynamicalVAE
+from ..program.batch import CHUNK, Batch
 from ..program.rollout import Rollout
+from ..views import WHOLE, History, Parts
 from .energies import EnergyMethod, EnergyModel
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -223,8 +223,7 @@ class GSPSModel(EnergyModel):
                 for name in parts
             },
             heads={f"p({name})": Delta() for name in parts},
-            parts=parts,
-            history=HISTORY,
+            views=(History(HISTORY), Parts(parts)),
         )
         self.length = length
         self.draws = dict(zip(codes, _each(method.draws, method.parts), strict=True))
@@ -246,12 +245,13 @@ class GSPSModel(EnergyModel):
         given = batch[WHOLE] if isinstance(batch, Mapping) and WHOLE in batch else None
         return given is not None and given.shape[1] == self.length and options.get("length") is None
 
-    def penalties(self, rollout: Rollout, batch: Batch | None, draws: Mapping[str, int]) -> dict[str, Tensor]:
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
         """See `DynamicalVAE.penalties`: those of whole windows."""
         if not draws:
             return {}
-        assert isinstance(batch, Mapping)
-        return self.energies(self._with_whole(rollout.values), self.turned(batch[WHOLE])[0], batch)
+        if "mask" in data:
+            raise ValueError("the energies are of whole windows; leave 'mask' out of the batch")
+        return self.energies(self.shown(rollout.values), data[HISTORY], data)
 
     def energies(self, values: Mapping[str, Tensor], truth: Tensor, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The energies of futures that were drawn together, (B,) each; those of weight 0 are left out.
@@ -268,7 +268,7 @@ class GSPSModel(EnergyModel):
             found["history"] = energies.history_error(samples[:, :, :past], truth[:, :past])
         found |= self.realism(samples, truth[:, 0], slice(past, None))
         draws = list(self.draws.values())
-        names = list(self.parts)
+        names = list(self.view.parts)
         weights, scales = (_each(given, method.parts) for given in (method.diversity, method.diversity_scale))
         for i, rows in enumerate(accumulate(draws, mul)):
             if not weights[i]:
@@ -289,41 +289,27 @@ class GSPSModel(EnergyModel):
         fix: Mapping[str, Tensor] | None = None,
         chunk: int = CHUNK,
     ) -> dict[str, Tensor]:
-        """See `DynamicalVAE.forecast`; at most as far as the networks' T frames.
+        """See `DynamicalVAE.forecast`; at most as far as the networks' T frames, all of which a fixed part has.
 
         Raises:
             ValueError: other observed frames than the networks see, or a horizon beyond what they make.
         """
-        x = DynamicalVAE._mapping(self, batch)[HISTORY]
-        most = self.length - self.frames
-        if x.shape[1] != self.frames or not 1 <= horizon <= most:
+        data, most = self.read(batch), self.length - self.frames
+        past = data[HISTORY].shape[1]
+        if past != self.frames or not 1 <= horizon <= most:
             raise ValueError(
-                f"this model sees {self.frames} frames and makes up to {most} more, but was given {x.shape[1]} frames "
-                f"and asked for {horizon}"
+                f"this model sees {self.frames} frames and makes up to {most} more, but was given {past} frames and "
+                f"asked for {horizon}"
             )
-        given = {name: torch.as_tensor(value).to(x) for name, value in (fix or {}).items()}
-        for name in given.keys() & self.parts.keys():
-            if given[name].shape != (len(x), most, self.sizes[name]):
-                raise ValueError(
-                    f"the fixed {name} has shape {tuple(given[name].shape)}; it must have all {most} frames, "
-                    f"{(len(x), most, self.sizes[name])}"
-                )
-        heading = self.turned(x)[1]
-        back = None if heading is None else -heading
-        held = {name: self._rotated(v, back) if name in self.parts else v for name, v in given.items()}
-        out = self._back(super().forecast(batch, most, samples, fix=held, chunk=chunk), heading)
-        for name, value in given.items():  # turning there and back rounds
-            out[name] = value.expand_as(out[name])
-            if name in self.parts:
-                out[WHOLE][..., list(self.parts[name])] = value
-        return {name: value[:, :, :horizon] if name in (WHOLE, *self.parts) else value for name, value in out.items()}
+        out = super().forecast(data, most, samples, fix=fix, chunk=chunk)
+        return {
+            name: value[:, :, :horizon] if name in (WHOLE, *self.view.parts) else value for name, value in out.items()
+        }
 
     @torch.no_grad()
     def sample(self, n: int = 1, length: int | None = None, batch: Batch | None = None) -> dict[str, Tensor]:
         """See `DynamicalVAE.sample`; the batch holds what was observed."""
-        if batch is None:
-            raise ValueError("this model goes on from a history; give it as batch")
-        return self._back(super().sample(n, self.length if length is None else length, batch), self._heading(batch))
+        return super().sample(n, self.length if length is None else length, batch)
 
 
 def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factorization:

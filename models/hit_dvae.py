@@ -53,10 +53,10 @@ from ..networks import Attention, FrameGraph, NetworkSpec, PoseGraph, Recurrent,
 from ..networks.extract import share
 from ..notation import Factorization
 from ..options import Amount, Delay, Extra, Layers, Range, Share, Size
-from ..program.batch import CHUNK, WHOLE, Batch
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, SelfFeeding
 from ..schema import Schema
+from ..views import WHOLE
 from .energies import EnergyMethod, EnergyModel
 from .method import SHAPES, LatentMethod, start_priors
 
@@ -288,7 +288,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             start_priors(model, windows)
         if self.standardise:
             x = windows.sample(1024, torch.default_generator)["x"]
-            model.units[WHOLE].fit(model.turned(x)[0] if isinstance(model, EnergyModel) else x)
+            model.units[WHOLE].fit(model.turned(x) if isinstance(model, EnergyModel) else x)
             if self.emission == "fixed":
                 nn.init.zeros_(model.generator[WHOLE].head.log_scale)
 
@@ -331,9 +331,9 @@ class HiTModel(EnergyModel):
         joints = body_parts(skeleton, PARTS) if method.diversity else {}
         self.coordinates = {part: [3 * j + axis for j in held for axis in range(3)] for part, held in joints.items()}
 
-    def penalties(self, rollout: Rollout, batch: Batch | None, draws: Mapping[str, int]) -> dict[str, Tensor]:
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
         """See `DynamicalVAE.penalties`."""
-        if not draws or WHOLE not in rollout.values or batch is None:
+        if not draws or WHOLE not in rollout.values:
             return {}
         if rollout.lengths is not None or rollout.observed:
             raise ValueError(
@@ -350,20 +350,4 @@ class HiTModel(EnergyModel):
             if weight:
                 held = motions[..., self.coordinates[part]]
                 means[f"diversity_{part}"] = energies.pairwise_diversity(held, scale)
-        futures = batch if isinstance(batch, Mapping) else {}
-        return self.best(motions, truth, futures, everything) | {n: rollout.length * e for n, e in means.items()}
-
-    @torch.no_grad()
-    def forecast(
-        self,
-        batch: Batch,
-        horizon: int,
-        samples: int = 1,
-        *,
-        draw_emission: bool | None = None,
-        fix: Mapping[str, Tensor] | None = None,
-        chunk: int = CHUNK,
-    ) -> dict[str, Tensor]:
-        """See `DynamicalVAE.forecast`."""
-        out = super().forecast(batch, horizon, samples, draw_emission=draw_emission, fix=fix, chunk=chunk)
-        return self._back(out, self._heading(batch))
+        return self.best(motions, truth, data, everything) | {n: rollout.length * e for n, e in means.items()}

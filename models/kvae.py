@@ -317,7 +317,7 @@ def smooth(model: DynamicalVAE, batch: Batch, samples: int = 1) -> Smoothed:
         raise ValueError(f"smoothing needs the chain of a kvae model, but this one is {model.generative.text}")
     if samples < 1:
         raise ValueError(f"samples is at least 1, got {samples}")
-    data = {name: repeat(value, samples) for name, value in model._mapping(batch).items()}
+    data = {name: repeat(value, samples) for name, value in model.read(batch).items()}
     a = model.guide(data)["a"].transpose(0, 1)
     lengths = data.get("lengths")
     valid = None if lengths is None else valid_steps(lengths, len(a)).t()

@@ -26,16 +26,17 @@ from ..inference.fit import Stage
 from ..inference.objectives import Evidence
 from ..inference.recipe import Recipe
 from ..laws.families import FixedNormal, HeadSpec
-from ..motion import HUMAN36M, PROTOCOLS, Clip, Skeleton, Windows, rotate_about_up
+from ..motion import HUMAN36M, PROTOCOLS, Clip, Heading, Skeleton, Windows
 from ..motion.control import bend
 from ..motion.data import defect
 from ..motion.protocols import Poses
 from ..networks import NetworkSpec
 from ..options import Amount, Share, Size
-from ..program.batch import CHUNK, WHOLE, Batch, in_chunks, repeat, rows
+from ..program.batch import CHUNK, Batch, in_chunks, repeat, rows
 from ..program.model import DynamicalVAE
 from ..schema import Schema
 from ..turns import alone
+from ..views import WHOLE, Data, FirstFrame, View, Views
 from .poses import PoseMethod
 
 FIRST, GIVEN, REST = "s", "y", "r"
@@ -133,6 +134,27 @@ class TrajectoryMethod(PoseMethod):
         return Recipe(turned.given(self.keep), validation and validation.given(self.keep), stages)
 
 
+@dataclass(frozen=True)
+class Rest(View):
+    """Beside the motion, given trajectories and the joints that are not given; without trajectories none are.
+
+    Args:
+        complement: False for r that is all of x.
+    """
+
+    complement: bool
+
+    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+        """With y and r."""
+        if WHOLE not in data:
+            return dict(data)
+        x = data[WHOLE]
+        if (mask := data.get("mask", {}).get(WHOLE)) is not None:
+            x = torch.where(mask, x, 0.0)
+        given = data.get(GIVEN, torch.zeros_like(x))
+        return {REST: torch.where(given == 0, x, 0.0) if self.complement else x, **data, GIVEN: given}
+
+
 class TrajectoryModel(DynamicalVAE):
     """A model of motion given its first pose and some trajectories.
 
@@ -151,7 +173,10 @@ class TrajectoryModel(DynamicalVAE):
     def __init__(
         self, method: TrajectoryMethod, skeleton: Skeleton, frames: int | None, *arguments: Any, **options: Any
     ):
-        super().__init__(*arguments, **options)
+        seen: list[View] = [FirstFrame(FIRST, also=(GIVEN,)), Rest(method.complement)]
+        if method.heading:
+            seen.append(Heading(skeleton, pose=FIRST, turned=(FIRST, GIVEN, REST, WHOLE)))
+        super().__init__(*arguments, view=Views(*seen), **options)
         self.method, self.skeleton, self.frames = method, skeleton, frames
 
     def model(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
@@ -160,69 +185,13 @@ class TrajectoryModel(DynamicalVAE):
         Raises:
             ValueError: no pose to start from.
         """
-        data = self._mapping(batch)
+        data = self.read(batch)
         if FIRST not in data:
             raise ValueError("a motion starts from a pose: give a batch with s (B, D), or with windows x (B, 1 + T, D)")
         first, length = data[FIRST], options.get("length")
         if GIVEN not in data and length is not None:
             data[GIVEN] = first.new_zeros(len(first), length, first.shape[-1])
         return super().model(data, **options)
-
-    def _mapping(self, batch: Batch | None) -> dict[str, Any]:
-        """The variables as the networks see them."""
-        values = self._apart(batch)
-        if self.method.heading and FIRST in values:
-            if "mask" in values:
-                raise ValueError(
-                    "this model turns every window by its first pose, and missing entries cannot be turned; fit with "
-                    "heading=False"
-                )
-            back = -self._heading(values)
-            values |= {n: self._turned(values[n], back) for n in (FIRST, GIVEN, REST, WHOLE) if n in values}
-        return values
-
-    def _heading(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Where first poses face, (B,) radians."""
-        return self.skeleton.heading(values[FIRST].unflatten(-1, (-1, 3)))
-
-    def _turned(self, values: Tensor, angle: Tensor) -> Tensor:
-        """Motion (..., B, T, D), or poses (B, D), turned about the up axis by angles (B,)."""
-        angle = angle[:, None] if values.dim() == 2 else angle[:, None, None]
-        return rotate_about_up(values.unflatten(-1, (-1, 3)), angle, self.skeleton.up).flatten(-2)
-
-    def _back(self, out: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
-        """What the networks made, as the batch was turned."""
-        if self.method.heading:
-            out[WHOLE] = self._turned(out[WHOLE], self._heading(self._apart(batch)))
-        return out
-
-    def _apart(self, batch: Batch | None) -> dict[str, Any]:
-        """The variables that a batch of windows is made of."""
-        values = super()._mapping(batch)
-        if FIRST not in values and WHOLE in values:
-            if "lengths" in values:
-                raise ValueError("windows of motion have one length; leave 'lengths' out of the batch")
-            frames, given = values[WHOLE].shape[1], values.get(GIVEN)
-            if given is not None and not (given.shape[1] == frames if frames > 1 else given.shape[1] > 1):
-                raise ValueError(
-                    f"beside x {tuple(values[WHOLE].shape)}, whose first frame is the pose to start from, y is as long "
-                    f"as the whole window, (B, 1 + T, D); got {tuple(given.shape)}"
-                )
-            values[FIRST] = values[WHOLE][:, 0]
-            if isinstance(values.get("mask"), Mapping):
-                values["mask"] = values["mask"][WHOLE]
-            for name in {WHOLE, GIVEN, "mask"} & values.keys():
-                values[name] = values[name][:, 1:]
-            if not values[WHOLE].shape[1]:
-                del values[WHOLE]
-                values.pop("mask", None)
-        if WHOLE in values:
-            x = values[WHOLE]
-            if isinstance(mask := values.get("mask"), Tensor):
-                x = torch.where(mask, x, 0.0)
-            given = values.setdefault(GIVEN, torch.zeros_like(x))
-            values.setdefault(REST, torch.where(given == 0, x, 0.0) if self.method.complement else x)
-        return values
 
     @alone
     @torch.no_grad()
@@ -264,7 +233,7 @@ class TrajectoryModel(DynamicalVAE):
             raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
         if not 0 <= temperature < inf:
             raise ValueError(f"temperature is {temperature}; it must be finite and at least 0")
-        data = self._mapping(batch)
+        data = self.read(batch)
         if WHOLE in data or FIRST not in data:
             raise ValueError("a motion goes on from one pose: x (B, 1, D) or s (B, D)")
         data = self._whole(data, horizon)
@@ -275,7 +244,6 @@ class TrajectoryModel(DynamicalVAE):
                 stacklevel=3,  # torch.no_grad is between
             )
         length = data[GIVEN].shape[1]
-        heading = self._heading(self._apart(batch)) if self.method.heading else None
         distinct = samples if temperature or draw_emission else 1
 
         def futures(part: slice, count: int) -> dict[str, Tensor]:
@@ -288,17 +256,15 @@ class TrajectoryModel(DynamicalVAE):
             out = program(repeat(some, count), length=length, mean_emission=not draw_emission)
             made = {name: out[name].unflatten(0, (count, -1)) for name in (WHOLE, *self.latents)}
             made[WHOLE] = made[WHOLE][:, :, :horizon]
-            if heading is not None:
-                made[WHOLE] = self._turned(made[WHOLE], heading[part])
-            return made
+            return self.shown(made, some)
 
         with self._evaluating():
             out = in_chunks(futures, len(data[FIRST]), distinct, chunk)
         # Samples that are all the same are one: rows of one product may differ in their last bits.
         return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
 
-    def _whole(self, data: Mapping[str, Tensor], horizon: int) -> dict[str, Tensor]:
-        """The first pose, and trajectories over all frames that the networks are to make for a horizon.
+    def _whole(self, data: Mapping[str, Any], horizon: int) -> dict[str, Any]:
+        """The data, and trajectories over all frames that the networks are to make for a horizon.
 
         Raises:
             ValueError: trajectories that end before the horizon or are not of the poses' size.
@@ -317,18 +283,7 @@ class TrajectoryModel(DynamicalVAE):
             )
         made = max(horizon, self.frames or horizon)
         rest = given[:, -1:].expand(-1, max(made - given.shape[1], 0), -1)
-        return {FIRST: first, GIVEN: torch.cat([given[:, :made], rest], 1)}
-
-    @torch.no_grad()
-    def sample(self, n: int = 1, length: int | None = None, batch: Batch | None = None) -> dict[str, Tensor]:
-        """See `DynamicalVAE.sample`."""
-        out = super().sample(n, length, batch)
-        return out if batch is None else self._back(out, batch)
-
-    @torch.no_grad()
-    def reconstruct(self, batch: Batch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
-        """See `DynamicalVAE.reconstruct`."""
-        return self._back(super().reconstruct(batch, samples, chunk=chunk), batch)
+        return {**data, GIVEN: torch.cat([given[:, :made], rest], 1)}
 
     @alone
     def complete(
@@ -441,7 +396,7 @@ class TrajectoryModel(DynamicalVAE):
         self, batch: Mapping[str, Tensor], latents: Tensor, known: Tensor, **options: Any
     ) -> tuple[Tensor, Tensor]:
         """Motions (S, T, D) on the given paths where these are known, and their corrections."""
-        data = self._whole(self._mapping(batch), len(known))
+        data = self._whole(self.read(batch), len(known))
         known = torch.cat([known, known.new_zeros(data[GIVEN].shape[1] - len(known), known.shape[1])])
         bones = self.skeleton.limbs(data[FIRST][0]).norm(dim=-1)
         with self._evaluating():
@@ -450,7 +405,7 @@ class TrajectoryModel(DynamicalVAE):
             x, corrections = bend(
                 lambda z: self._means(data, z), latents, scale, data[GIVEN][0], known, self.skeleton, bones, **options
             )
-        return self._back({WHOLE: x}, batch)[WHOLE], corrections
+        return self.shown({WHOLE: x}, data)[WHOLE], corrections
 
     def _means(self, data: Mapping[str, Tensor], latents: Tensor) -> Tensor:
         """Means of x (S, T, D) given latents."""

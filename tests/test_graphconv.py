@@ -10,9 +10,11 @@ from dvae.networks import GraphConv
 from dvae.networks.base import Input
 from dvae.networks.dct import cosine_basis
 from dvae.notation import Relation
+from dvae.views import History, Parts, Views
 
 OBSERVED, LENGTH, JOINTS = 4, 9, 5
 EVERYTHING = {"h": range(JOINTS), "lower": (0, 3), "upper": (1, 2, 4)}
+PARTS = Views(History("h"), Parts({"lower": [0, 1, 2, 9, 10, 11], "upper": [3, 4, 5, 6, 7, 8, 12, 13, 14]}))
 FIRST = Relation.custom("1:O", lambda T: np.arange(T)[None] < OBSERVED)
 ALL = Relation.parse("1:T")
 
@@ -149,8 +151,7 @@ def test_it_generates_in_a_model_of_ones_own():
             "p(lower)": dvae.laws.FixedNormal(0.1),
             "p(upper)": dvae.laws.FixedNormal(0.1),
         },
-        parts={"lower": [0, 1, 2, 9, 10, 11], "upper": [3, 4, 5, 6, 7, 8, 12, 13, 14]},
-        history="h",
+        view=PARTS,
         masks={"1:O": lambda T: np.arange(T)[None] < OBSERVED},
     )
     x = torch.randn(4, LENGTH, 15)
@@ -158,7 +159,7 @@ def test_it_generates_in_a_model_of_ones_own():
     assert torch.isfinite(dvae.SequenceELBO().terms(model, x).bound).all()
     forecast = model.forecast(x[:, :OBSERVED], LENGTH - OBSERVED, 2)
     assert forecast["x"].shape == (2, 4, LENGTH - OBSERVED, 15)
-    assert torch.equal(forecast["x"][..., model.parts["lower"]], forecast["lower"])
+    assert torch.equal(forecast["x"][..., PARTS.parts["lower"]], forecast["lower"])
 
 
 def generator(**options):
@@ -170,8 +171,7 @@ def generator(**options):
         {"a": 2, "h": 15, "lower": 6, "upper": 9},
         {f"p({name})": GraphConv(EVERYTHING, name, LENGTH, 3, 6, 1) for name in ("lower", "upper")},
         {f"p({name})": dvae.laws.FixedNormal(0.1) for name in ("lower", "upper")},
-        parts={"lower": [0, 1, 2, 9, 10, 11], "upper": [3, 4, 5, 6, 7, 8, 12, 13, 14]},
-        history="h",
+        view=PARTS,
         masks={"1:O": lambda T: np.arange(T)[None] < OBSERVED},
         **options,
     ).double()
@@ -192,7 +192,7 @@ def test_a_history_hides_what_its_data_hide():
 
 def test_a_history_is_refused_where_a_forecast_would_not_have_it():
     with pytest.raises(ValueError, match="a forecast has the past alone"):
-        dvae.DynamicalVAE("p(z) p(x_t | h_{<t}, z)", "q(z | x_{1:T})", {"z": 1, "x": 2, "h": 2}, history="h")
+        dvae.DynamicalVAE("p(z) p(x_t | h_{<t}, z)", "q(z | x_{1:T})", {"z": 1, "x": 2, "h": 2}, view=History("h"))
     with pytest.raises(ValueError, match="more than the first 3 frames of h"):
         generator().forecast(torch.randn(2, 3, 15), LENGTH - 3)
 

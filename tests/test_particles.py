@@ -187,7 +187,7 @@ def test_without_resampling_it_weighs_its_draws_as_the_program_does(pair, kind, 
 
 def textbook(model, batch, particles, resample_below):
     """The same filter with every conditional evaluated from scratch at every step, on draws moved by hand."""
-    everyone = repeat(model._mapping(batch), particles)
+    everyone = repeat(model.read(batch), particles)
     latents, n = {}, len(everyone["x"])
 
     def program(factorization, conditionals):

@@ -18,6 +18,7 @@ from dvae.models.method import LatentMethod
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.testing import FactorizationContract
 from dvae.turns import alone
+from dvae.views import History
 
 SRNN = ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})")
 
@@ -223,12 +224,12 @@ def test_the_past_as_context_is_filled_in_its_units():
         "q(z | x_{1:T})",
         {"z": 1, "x": 1, "h": 1},
         Attention(8, 2),
-        history="h",
+        view=History("h"),
         masks=masks,
     )
     model.standardise("h").fit(10 + torch.randn(50, 1))
     x = 10 + torch.randn(2, 4, 1)
-    read = model._mapping({"x": x, "mask": torch.zeros(2, 4, 1, dtype=torch.bool)})["h"]
+    read = model.read({"x": x, "mask": torch.zeros(2, 4, 1, dtype=torch.bool)})["h"]
     assert torch.equal(read, model.units["h"].mean.expand_as(read))
 
 

@@ -176,7 +176,7 @@ def test_cvae_rnn_reads_its_own_means_alone(windows):
     method, model = small("cvae-rnn"), build(windows, "cvae-rnn")
     batch = double(method.train(windows).batches.sample(2, torch.Generator().manual_seed(0)))
     latents = model.guide(batch)
-    told = {**model._mapping(batch), "r": torch.zeros_like(batch["x"][:, 1:])}
+    told = {**model.read(batch), "r": torch.zeros_like(batch["x"][:, 1:])}
     other = {**told, "x": told["x"] + 1}
     means = []
     for data in (told, other):
@@ -234,14 +234,14 @@ def test_every_joint_is_given_over_a_whole_window_or_not_at_all(windows):
 def test_the_model_tells_windows_apart_into_what_is_given_and_the_rest(windows):
     method = small()
     batch = double(method.train(windows).batches.sample(4, torch.Generator().manual_seed(0)))
-    found = build(windows)._mapping(batch)
+    found = build(windows).read(batch)
     x, y = batch["x"], batch["y"]
     assert torch.equal(found["s"], x[:, 0])
     assert torch.equal(found["x"], x[:, 1:])
     assert torch.equal(found["y"], y[:, 1:])
     assert torch.equal(found["r"], torch.where(y[:, 1:] == 0, x[:, 1:], 0.0))
-    assert torch.equal(build(windows, complement=False)._mapping(batch)["r"], x[:, 1:])
-    without = build(windows)._mapping({"x": x})
+    assert torch.equal(build(windows, complement=False).read(batch)["r"], x[:, 1:])
+    without = build(windows).read({"x": x})
     assert (without["y"] == 0).all()
     assert torch.equal(without["r"], x[:, 1:])
 
@@ -252,12 +252,12 @@ def test_hidden_entries_are_unknown_to_the_guide(windows):
     mask[:, 5:, 3:9] = False
     path = torch.zeros_like(x)
     path[..., 6:12] = x[..., 6:12]  # of a joint that is hidden, and of another one
-    both = model._mapping({"x": x, "y": path, "mask": mask})
+    both = model.read({"x": x, "y": path, "mask": mask})
     assert torch.equal(both["r"], torch.where((path == 0) & mask, x, 0.0)[:, 1:])
-    assert torch.equal(model._mapping({"x": x, "mask": {"x": mask}})["mask"], mask[:, 1:])
-    found = model._mapping({"x": x, "mask": mask})
+    assert torch.equal(model.read({"x": x, "mask": {"x": mask}})["mask"]["x"], mask[:, 1:])
+    found = model.read({"x": x, "mask": mask})
     assert (found["r"][:, 4:, 3:9] == 0).all()
-    assert torch.equal(found["mask"], mask[:, 1:])
+    assert torch.equal(found["mask"]["x"], mask[:, 1:])
     broken = x.masked_fill(~mask, torch.nan)
     torch.manual_seed(0)
     bound = dvae.SequenceELBO().terms(model, {"x": x, "mask": mask}).bound
@@ -351,10 +351,33 @@ def test_with_a_heading_turned_windows_have_turned_motions(windows, walk, name):
     )
 
 
-def test_with_a_heading_missing_entries_are_refused(windows):
-    x = windows.all()["x"][:2].double()
-    with pytest.raises(ValueError, match="missing entries cannot be turned; fit with heading=False"):
-        build(windows, heading=True).guide({"x": x, "mask": torch.ones_like(x, dtype=torch.bool)})
+@pytest.mark.parametrize("name", SMALL)
+def test_with_a_heading_missing_entries_are_those_of_windows_turned_by_hand(windows, name):
+    x, mask = windows.all()["x"][:2].double(), torch.ones(2, 21, 51, dtype=torch.bool)
+    mask[:, 5:, 3:9] = False
+    torch.manual_seed(0)
+    model = build(windows, name, heading=True).eval()
+    torch.manual_seed(0)
+    plain = build(windows, name, heading=False).eval()
+    facing = motion.Heading(windows.skeleton, 1)
+    found = []
+    for each, data in ((model, x.masked_fill(~mask, torch.nan)), (plain, facing.face(x))):
+        torch.manual_seed(1)
+        terms = dvae.SequenceELBO().terms(each, {"x": data, "mask": mask})
+        found.append((terms.bound, each.reconstruct({"x": data, "mask": mask})["x"]))
+    (bound, ours), (same, theirs) = found
+    torch.testing.assert_close(bound, same)
+    torch.testing.assert_close(ours, facing.inverse({"x": theirs, "heading": facing.of(x)})["x"])
+
+
+def test_of_a_first_pose_that_is_missing_in_part_nothing_is_read(windows):
+    model, x = build(windows), windows.all()["x"][:2].double()
+    mask = torch.ones_like(x, dtype=torch.bool)
+    mask[:, 0, 3:6] = False
+    seen = model.read({"x": x.masked_fill(~mask, torch.nan), "mask": mask})
+    assert torch.equal(seen["s"], torch.where(mask[:, 0], x[:, 0], 0.0))
+    future = model.forecast({"x": x[:, :1].masked_fill(~mask[:, :1], torch.nan), "mask": mask[:, :1]}, 20)
+    assert torch.isfinite(future["x"]).all()
 
 
 def test_without_left_and_right_nobody_has_a_heading():

@@ -8,8 +8,9 @@ from .forecasts import Forecasts, is_forecasts
 from .formats import load, read_paths, save
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
 from .simulate import simulate
-from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, face_forward, rotate_about_up
+from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
 from .truths import PseudoTruths, WithPseudoTruths
+from .views import Heading
 
 __all__ = [
     "HUMAN36M",
@@ -21,6 +22,7 @@ __all__ = [
     "Clip",
     "Exchanged",
     "Forecasts",
+    "Heading",
     "MotionData",
     "MotionSet",
     "Poses",
@@ -30,7 +32,6 @@ __all__ = [
     "Windows",
     "WithPseudoTruths",
     "estimate_angle_limits",
-    "face_forward",
     "is_forecasts",
     "load",
     "read_paths",

@@ -246,12 +246,24 @@ class Skeleton:
         limbs = self.limbs(poses)
         return (limbs * inverse_lengths(limbs)[..., None]).flatten(-2)
 
+    @property
+    def sides(self) -> tuple[list[int], list[int]]:
+        """The joints where left and where right chains leave the trunk: hips and shoulders.
+
+        Raises:
+            ValueError: the skeleton does not say what is left and right.
+        """
+        left = [joint for joint in self.left if self.parents[joint] not in self.left]
+        right = [joint for joint in self.right if self.parents[joint] not in self.right]
+        if not left or not right:
+            raise ValueError(f"skeleton {self.name!r} has no left and right joints, so nobody's heading is known")
+        return left, right
+
     def heading(self, positions: Tensor) -> Tensor:
         """Angle about the up axis, in radians, from which a person faces.
 
-        The left-right axis is the sum over hips and shoulders: the joints where a left chain leaves the
-        trunk, less those where a right chain does. Zero is the left side towards +x: facing +z where y is up,
-        -y where z is up.
+        The left-right axis is the sum over the left ones of the `sides`, less that over the right ones. Zero is the
+        left side towards +x: facing +z where y is up, -y where z is up.
 
         Args:
             positions: (..., J, 3).
@@ -262,10 +274,7 @@ class Skeleton:
         Raises:
             ValueError: the skeleton does not say what is left and right.
         """
-        left = [joint for joint in self.left if self.parents[joint] not in self.left]
-        right = [joint for joint in self.right if self.parents[joint] not in self.right]
-        if not left or not right:
-            raise ValueError(f"skeleton {self.name!r} has no left and right joints, so nobody's heading is known")
+        left, right = self.sides
         across = positions[..., left, :].sum(-2) - positions[..., right, :].sum(-2)
         first, second = (self.vertical + 1) % 3, (self.vertical + 2) % 3
         towards_x = 0.0 if first == 0 else pi / 2
@@ -379,25 +388,6 @@ def rotate_about_up(positions: Tensor, angle: Tensor, up: str) -> Tensor:
     rotated[..., first] = cos * positions[..., first] - sin * positions[..., second]
     rotated[..., second] = sin * positions[..., first] + cos * positions[..., second]
     return rotated
-
-
-def face_forward(x: Tensor, skeleton: Skeleton, frame: int) -> tuple[Tensor, Tensor]:
-    """Windows turned about the up axis so that one of their frames has heading zero.
-
-    Args:
-        x: (..., T, D), D = 3 J, or 3 (J - 1) without the root, which is the origin.
-        skeleton: the tree, with left and right.
-        frame: which frame.
-
-    Returns:
-        The windows (..., T, D), and the headings (...) that they had.
-    """
-    joints = x.unflatten(-1, (-1, 3))
-    pose, root = joints[..., frame, :, :], skeleton.root
-    if pose.shape[-2] < skeleton.joints:
-        pose = torch.cat([pose[..., :root, :], torch.zeros_like(pose[..., :1, :]), pose[..., root:, :]], -2)
-    heading = skeleton.heading(pose)
-    return rotate_about_up(joints, -heading[..., None, None], skeleton.up).flatten(-2), heading
 
 
 HUMAN36M = Skeleton(

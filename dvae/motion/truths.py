@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from .protocols import Windows
-from .skeleton import face_forward
+from .views import Heading
 
 _ROUNDING = 1e-3  # of |x|, by which a distance from matrix products may be off in single precision
 
@@ -80,7 +80,7 @@ class PseudoTruths:
         self._last = torch.empty(len(x), len(nodes) * 3)
         self._futures = torch.empty(len(nodes), len(x), 3, x.shape[1] - 1)  # so that products and sums run over rows
         for block in torch.arange(len(x)).split(512):
-            joints = (face_forward(x[block], self._skeleton, 0)[0] if heading else x[block]).unflatten(-1, (-1, 3))
+            joints = (Heading(self._skeleton).face(x[block]) if heading else x[block]).unflatten(-1, (-1, 3))
             lengths = self._lengths(joints)
             joints = self._chains @ ((self._average / lengths.clamp(min=1e-9))[..., None] * (self._limbs @ joints))
             self._last[block] = joints[:, 0].flatten(1)
@@ -93,7 +93,7 @@ class PseudoTruths:
 
     def turn(self, x: Tensor) -> Tensor:
         """Windows (..., T, D), turned about the up axis so that the last observed frame has heading zero."""
-        return face_forward(x, self._skeleton, self._observed - 1)[0]
+        return Heading(self._skeleton, self._observed).face(x)
 
     def of(self, x: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Further futures of windows.

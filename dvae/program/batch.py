@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,10 +12,9 @@ from torch.nn import functional
 
 from ..networks.base import valid_steps
 from ..notation import Factorization
+from ..views import WHOLE, View
 from .rollout import Rollout
 
-WHOLE = "x"
-"""Name of the array that the parts of a model with parts are coordinates of."""
 CHUNK = 2048
 """Sequences times samples that a forecast holds at once."""
 
@@ -30,20 +29,21 @@ class Reader:
         sizes: dimension of every variable.
         local: whether a variable has a value for every step.
         observed, context: names of the data variables, and of those that a batch has to give.
-        parts, history: of `DynamicalVAE`.
-        given: those of the parts that a program can be given, as they have a density.
+        view: what the model sees of the data.
+        extras: names of what else a batch may hold.
+        made: those of the data that are functions of their parents, which a program is not given.
     """
 
     sizes: Mapping[str, int]
     local: Mapping[str, bool]
     observed: tuple[str, ...]
     context: tuple[str, ...]
-    parts: Mapping[str, tuple[int, ...]]
-    history: str | None
-    given: Collection[str]
+    view: View
+    extras: tuple[str, ...]
+    made: frozenset[str]
 
-    def mapping(self, batch: Batch | None, dtype: torch.dtype, means: Mapping[str, Tensor]) -> dict[str, Any]:
-        """The batch by name, in this precision, with the parts of the whole.
+    def read(self, batch: Batch | None, dtype: torch.dtype, means: Mapping[str, Tensor]) -> dict[str, Any]:
+        """The batch by name, in this precision, as the model sees it; what was read stays as it is.
 
         Args:
             batch: see `DynamicalVAE.model`.
@@ -51,41 +51,43 @@ class Reader:
             means: name to what stands for missing entries of a variable, where that is not 0.
 
         Raises:
-            ValueError: names that the model does not have.
+            ValueError: names that the model does not have, or a mask of nothing.
         """
         if batch is None:
             return {}
-        whole_name = WHOLE if self.parts else self.observed[0]
+        names = tuple(dict.fromkeys((*self.view.names, *self.sizes)))
+        whole = WHOLE if self.view.parts else self.observed[0]
         if not isinstance(batch, Mapping):
-            if len(self.observed) > 1 and not self.parts:
+            if len(self.observed) > 1 and not self.view.parts:
                 raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
-            batch = {whole_name: batch}
-        names = (*([WHOLE] if self.parts else []), *self.sizes)
-        if unknown := [name for name in batch if name not in (*names, "lengths", "mask")]:
+            batch = {whole: batch}
+        if unknown := [name for name in batch if name not in (*names, *self.extras, "lengths", "mask")]:
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
             )
         values = _tensors(batch, dtype)
-        whole = values.pop(WHOLE, None) if self.parts else values.get(whole_name)
-        mask = values.get("mask")
-        if isinstance(mask, Mapping):
-            mask = mask.get(whole_name)
-        if whole is not None and self.parts:
-            values = {**self._apart(whole), **values}
-            if mask is not None:
-                values["mask"] = {name: mask[..., list(places)] for name, places in self.parts.items()}
-        if whole is not None and self.history is not None:
-            fill = means.get(self.history, whole.new_zeros(()))
-            seen = whole if mask is None or mask.shape != whole.shape else torch.where(mask, whole, fill)
-            values.setdefault(self.history, seen)
-        return values
+        if "mask" in values:
+            masks = values["mask"] if isinstance(values["mask"], Mapping) else {whole: values["mask"]}
+            values["mask"] = masks
+            for name, seen in masks.items():
+                self._check_mask(name, seen, values)
+        seen = self.view(values)
+        for name in self.made - values.keys():
+            seen.pop(name, None)
+            seen.get("mask", {}).pop(name, None)
+        for name, mask in seen.get("mask", {}).items():
+            seen[name] = torch.where(mask, seen[name], means.get(name, 0.0))
+        return seen
 
-    def _apart(self, whole: Tensor) -> dict[str, Tensor]:
-        """The parts of the data that a program can be given: those with a density."""
-        size = sum(map(len, self.parts.values()))
-        if whole.dim() != 3 or whole.shape[-1] != size:
-            raise ValueError(f"{WHOLE} has shape {tuple(whole.shape)}, expected (B, T, {size})")
-        return {name: whole[..., list(places)] for name, places in self.parts.items() if name in self.given}
+    def _check_mask(self, name: str, mask: Tensor, values: Mapping[str, Any]) -> None:
+        if name not in (*self.observed, *self.context, WHOLE) or name not in values:
+            given = {n: v for n, v in values.items() if isinstance(v, Tensor)}
+            raise ValueError(f"there is a mask of {name}, but the batch holds no data of that name: {shapes(given)}")
+        if mask.shape != values[name].shape or mask.dtype != torch.bool:
+            raise ValueError(
+                f"the mask of {name} is {mask.dtype} {tuple(mask.shape)}; expected bool {tuple(values[name].shape)}, "
+                "True where an entry was observed"
+            )
 
     def rollout(
         self,
@@ -94,23 +96,20 @@ class Reader:
         values: dict[str, Any],
         length: int | None,
         size: int,
-        means: Mapping[str, Tensor],
     ) -> Rollout:
         """A run of the factorization over a batch.
 
         Args:
             factorization, conditionals: what is run.
-            values: of `mapping`.
+            values: of `read`.
             length: T; None for the batch's.
             size: B, where the batch does not tell.
-            means: see `mapping`.
 
         Raises:
             ValueError: a batch that cannot be read.
         """
-        values = dict(values)
-        lengths, mask = values.pop("lengths", None), values.pop("mask", None)
-        masks = mask if isinstance(mask, Mapping) else {} if mask is None else {self.observed[0]: mask}
+        lengths, masks = values.get("lengths"), values.get("mask", {})
+        values = {name: value for name, value in values.items() if name in self.sizes}
         for name, value in values.items():
             self.check(name, value)
         size, length = _extent(values, length, size)
@@ -121,7 +120,6 @@ class Reader:
             raise ValueError(
                 f"expected {length} steps (fewer of data to continue), but the batch holds {shapes(local)}"
             )
-        self._fill(values, masks, means)
         if lengths is not None:
             if lengths.is_floating_point() or lengths.shape != (size,) or lengths.min() < 1 or lengths.max() > length:
                 raise ValueError(f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}")
@@ -141,33 +139,19 @@ class Reader:
             values={name: v for name, v in values.items() if name not in prefix},
             data=frozenset(self.observed),
             lengths=lengths,
-            observed=masks,
+            observed={name: masks[name] for name in self.observed if name in masks},
             prefix={name: values[name] for name in prefix},
         )
 
     def _extend_history(self, factorization: Factorization, values: dict[str, Any], length: int) -> None:
         """Lengthens the history to all steps: its mask hides what is not there yet."""
-        name = self.history
+        name = self.view.history
         if name is None or name not in values or (past := values[name].shape[1]) >= length:
             return
         for factor in factorization.factors:
             if factor.parent(name) is not None and factor.mask(name, length)[:, past:].any():
                 raise ValueError(f"{factor} reads more than the first {past} frames of {name}, which are all there are")
         values[name] = functional.pad(values[name], (0, 0, 0, length - past))
-
-    def _fill(self, values: dict[str, Any], masks: Mapping[str, Tensor], means: Mapping[str, Tensor]) -> None:
-        """Puts what networks read in place of missing entries."""
-        for name, seen in masks.items():
-            if name not in self.observed or name not in values:
-                raise ValueError(
-                    f"there is a mask of {name}, but the batch holds no data of that name: {shapes(values)}"
-                )
-            if seen.shape != values[name].shape or seen.dtype != torch.bool:
-                raise ValueError(
-                    f"the mask of {name} is {seen.dtype} {tuple(seen.shape)}; expected bool "
-                    f"{tuple(values[name].shape)}, True where an entry was observed"
-                )
-            values[name] = torch.where(seen, values[name], means.get(name, values[name].new_zeros(())))
 
     def _check_context(self, factorization: Factorization, values: Mapping[str, Tensor]) -> None:
         for factor in factorization.factors:

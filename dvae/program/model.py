@@ -13,7 +13,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from itertools import accumulate
 from operator import mul
-from typing import Any
+from typing import Any, ClassVar
 
 import pyro
 import pyro.distributions as dist
@@ -27,7 +27,8 @@ from ..networks import NetworkSpec, Recurrent
 from ..notation import Factorization, check_pair
 from ..turns import alone
 from ..units import Units
-from .batch import CHUNK, WHOLE, Batch, Reader, in_chunks, repeat, rows
+from ..views import View
+from .batch import CHUNK, Batch, Reader, in_chunks, repeat, rows
 from .conditional import Conditional
 from .rollout import Rollout, SelfFeeding, like
 
@@ -48,11 +49,8 @@ class DynamicalVAE(nn.Module):
         heads: the same for the heads; `heads.Normal()` where nothing is said.
         priors: static latent without parents to its prior, in place of N(0, I).
         observed: names of the data variables; every other variable with a generative factor is a latent.
-        parts: data variable to its coordinates of one array x, which then stands for all of them in batches and
-            forecasts. Every coordinate belongs to one part.
-        history: name of a context variable that is the data x themselves. Its relation is a mask of one's own, such as
-            h_{1:O}, that hides the frames to be generated.
         masks: relations of one's own, name to function of T (see `Factorization.parse`).
+        view: what the model sees of the data, such as their parts; as it is where nothing is said (see `dvae.views`).
 
     Raises:
         ValueError: equations that cannot be read or do not fit together; sizes missing or unknown.
@@ -62,6 +60,9 @@ class DynamicalVAE(nn.Module):
         >>> model.sample(5, length=10)["x"].shape
         torch.Size([5, 10, 3])
     """
+
+    extras: ClassVar[tuple[str, ...]] = ()
+    """What a batch may hold that is no variable, for `penalties`."""
 
     @alone
     def __init__(
@@ -74,16 +75,15 @@ class DynamicalVAE(nn.Module):
         priors: Mapping[str, Prior] | None = None,
         observed: tuple[str, ...] = ("x",),
         masks: Mapping[str, MaskFunction] | None = None,
-        parts: Mapping[str, Collection[int]] | None = None,
-        history: str | None = None,
+        *,
+        view: View | None = None,
     ):
         super().__init__()
         self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
         self.generative = _factorization(generative, masks)
         self.feeding = SelfFeeding(0.0)
-        self.parts = {name: tuple(places) for name, places in (parts or {}).items()}
-        self.history = history
-        observed = tuple(self.parts) or observed
+        self.view = view or View()
+        observed = tuple(self.view.parts) or observed
         self.inference = (
             self.generative.prior_guide(observed) if inference is None else _factorization(inference, masks)
         )
@@ -99,7 +99,7 @@ class DynamicalVAE(nn.Module):
         keys = {f"{f.kind}({f.child})" for f in (*self.generative.factors, *self.inference.factors)}
         for key in {*self.networks, *self.heads} - keys - {"p", "q", "default"}:
             raise ValueError(f"no factor {key!r}; keys are {', '.join(sorted(keys))}, 'p', 'q' and 'default'")
-        self._check_parts()
+        self.view.check(self.sizes, self.context, self.generative)
         self.generator: Any = self._conditionals(self.generative)
         if inference is None:  # the very modules of the prior, which are not to be registered twice
             object.__setattr__(self, "encoder", {name: self.generator[name] for name in self.latents})
@@ -111,9 +111,9 @@ class DynamicalVAE(nn.Module):
             {**_locality(self.inference), **_locality(self.generative)},
             self.observed,
             self.context,
-            self.parts,
-            self.history,
-            [name for name in self.parts if not self.generator[name].head.deterministic],
+            self.view,
+            self.extras,
+            frozenset(name for name in self.view.parts if self.generator[name].head.deterministic),
         )
         self.units: Any = nn.ModuleDict()
         self.priors = nn.ModuleDict(dict(priors or {}))
@@ -152,26 +152,6 @@ class DynamicalVAE(nn.Module):
                         f"gradient would reach the guide through them; give it a continuous head such as "
                         f"heads.Normal(), or name {name} as observed where it is data"
                     )
-
-    def _check_parts(self) -> None:
-        places = sorted(place for part in self.parts.values() for place in part)
-        if places != list(range(len(places))):
-            raise ValueError(f"the parts must share the coordinates 0, 1, ... of x among them, once each; got {places}")
-        for name, part in self.parts.items():
-            if len(part) != self.sizes[name]:
-                raise ValueError(f"the part {name} has {len(part)} coordinates, but its size is {self.sizes[name]}")
-        if self.parts and WHOLE in self.sizes:
-            raise ValueError(f"with parts, {WHOLE!r} is the name of the whole; no variable can have it")
-        if self.history is not None and self.history not in self.context:
-            raise ValueError(f"history={self.history!r}, but the context is {', '.join(self.context) or 'none'}")
-        for factor in self.generative.factors:
-            read = None if self.history is None else factor.parent(self.history)
-            if read is not None and (read.relation is None or read.relation.intervals is not None):
-                raise ValueError(
-                    f"{factor} reads {read}, but {self.history} is the data themselves, of which a forecast has the "
-                    f"past alone; give {self.history} a mask of your own that hides the frames to be made, such as "
-                    f'{self.history}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
-                )
 
     def standardise(self, name: str) -> Units:
         """Has networks read a variable without unit, by a mean and a scale that `fit` of the result takes.
@@ -229,7 +209,8 @@ class DynamicalVAE(nn.Module):
         """
         self._register()
         self._check_draws(draws or {})
-        rollout = self._rollout(self.generative, self.generator, batch, length, size)
+        data = self.read(batch)
+        rollout = self._rollout(self.generative, self.generator, data, length, size)
         for name, value in (prefix or {}).items():
             if name not in self.latents or value.dim() != 3 or value.shape[1] > rollout.length:
                 raise ValueError(
@@ -248,18 +229,19 @@ class DynamicalVAE(nn.Module):
                 rollout = rollout.fork((draws or {}).get(name, 1))
                 with rollout.plate:
                     rollout.know(name, self._site(name, rollout))
-        penalties = self.penalties(rollout, batch, draws or {})
+        penalties = self.penalties(rollout, data, draws or {})
         with pyro.plate("windows", rollout.batch // rollout.draws, dim=-1) if penalties else nullcontext():
             for name, energy in penalties.items():
                 pyro.factor(name, -energy)
         return dict(rollout.values)
 
-    def penalties(self, rollout: Rollout, batch: Batch | None, draws: Mapping[str, int]) -> Mapping[str, Tensor]:
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> Mapping[str, Tensor]:
         """Energies that the program adds at its end as `pyro.factor` sites; none, unless a subclass has some.
 
         Args:
             rollout: the run, with the value of every variable, and `evaluate` for the conditionals.
-            batch, draws: as the program was given them.
+            data: the batch, as `read` gives it.
+            draws: as the program was given them.
 
         Returns:
             Name to (B,), positive where it costs.
@@ -333,8 +315,9 @@ class DynamicalVAE(nn.Module):
         Returns:
             Name to draws (n, T, D), or (n, D) of a static latent.
         """
+        data = self.read(batch)
         with self._evaluating():
-            return self._with_whole(self.model(batch, length=length, size=n))
+            return self.shown(self.model(data, length=length, size=n), data)
 
     @alone
     @torch.no_grad()
@@ -369,15 +352,16 @@ class DynamicalVAE(nn.Module):
         Raises:
             ValueError: a ragged batch, a local context that ends before the horizon, or a fixed value that cannot be.
         """
-        data = self._mapping(batch)
+        data = self.read(batch)
         if "lengths" in data:
             raise ValueError(
                 "forecast continues sequences of one length; cut the batch to it, or forecast them in turn"
             )
         if horizon < 1 or samples < 1:
             raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
-        size, past = data[self.history or self.observed[0]].shape[:2]
-        fixed = self._fixed(fix or {}, data, horizon)
+        size, past = data[self.view.history or self.observed[0]].shape[:2]
+        given = {name: torch.as_tensor(value).to(like(self)) for name, value in (fix or {}).items()}
+        fixed = self._fixed(given, data, horizon)
         drawn = {n: self.generator[n].discrete if draw_emission is None else draw_emission for n in self.observed}
         means = [name for name in self.observed if not drawn[name]]
         seen = {
@@ -395,37 +379,46 @@ class DynamicalVAE(nn.Module):
             known |= {name: value for name, value in held.items() if name in self.observed}
             out = program(known, length=past + horizon, prefix=prefix, mean_emission=means)
             made = {name: out[name].unflatten(0, (count, -1)) for name in (*self.observed, *self.latents)}
-            return self._with_whole({n: v[:, :, past:] if n in self.observed else v for n, v in made.items()})
+            made = self.shown(
+                {n: v[:, :, past:] if n in self.observed else v for n, v in made.items()}, rows(data, part)
+            )
+            again = {n: rows(v, part).expand_as(made[n]) for n, v in given.items() if n in self.observed}
+            return self.shown({**made, **again}) if again else made  # as it was given: the way there and back rounds
 
         with self._evaluating():
             return in_chunks(futures, size, samples, chunk)
 
-    def _fixed(self, fix: Mapping[str, Tensor], data: Mapping[str, Tensor], horizon: int) -> dict[str, Tensor]:
-        """The values of `forecast(fix=...)`, those of data over past and future."""
-        fixed, size = {}, len(data[self.history or self.observed[0]])
+    def _fixed(self, given: Mapping[str, Tensor], data: Mapping[str, Any], horizon: int) -> dict[str, Tensor]:
+        """The values of `forecast(fix=...)` as the model sees them, those of data over past and future."""
+        history = self.view.history
+        size = len(data[history or self.observed[0]])
         free = {*self.observed, *(name for name in self.latents if not self.generative.local(name))}
-        for name, given in fix.items():
-            if name not in free or free & set(self.observed) <= set(fix):
+        for name, value in given.items():
+            if name not in free or free & set(self.observed) <= set(given):
                 raise ValueError(
-                    f"cannot fix {', '.join(fix)}; some of {', '.join(sorted(free))} can be, but not all of the data"
+                    f"cannot fix {', '.join(given)}; some of {', '.join(sorted(free))} can be, but not all of the data"
                 )
-            value = torch.as_tensor(given).to(like(self))
             shape = (size, horizon, self.sizes[name]) if name in self.observed else (size, self.sizes[name])
             if value.shape != shape:
                 raise ValueError(f"the fixed {name} has shape {tuple(value.shape)}, expected {shape}")
-            if name in self.observed:
-                past = data[name] if name in data else data[str(self.history)][..., list(self.parts[name])]
-                value = torch.cat([past, value], dim=1)
-            fixed[name] = value
-        return fixed
+        fixed = self.view(given, data)
+        for name in fixed.keys() & {*self.observed}:
+            past = data[name] if name in data else data[str(history)][..., list(self.view.parts[name])]
+            fixed[name] = torch.cat([past, fixed[name]], dim=1)
+        return {name: fixed[name] for name in given}
 
-    def _with_whole(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The values, and the whole that their parts make."""
-        if not self.parts:
-            return values
-        places = torch.tensor([place for part in self.parts.values() for place in part])
-        whole = torch.cat([values[name] for name in self.parts], dim=-1)
-        return {**values, WHOLE: whole[..., places.argsort().to(whole.device)]}
+    def shown(self, values: Mapping[str, Tensor], data: Mapping[str, Any] | None = None) -> dict[str, Tensor]:
+        """Values that the model made, with those of the data as the data are: back through the view.
+
+        Args:
+            values: name to (..., B, T, D), as the model sees them.
+            data: the batch that they belong to, as `read` gives it; without it they stay as they were turned.
+
+        Returns:
+            The same with the whole, where the view makes parts of it.
+        """
+        added = {name: data[name] for name in self.view.names if name in data} if data else {}
+        return {**values, **self.view.inverse(added | {n: v for n, v in values.items() if n in self.observed})}
 
     @alone
     @torch.no_grad()
@@ -440,7 +433,7 @@ class DynamicalVAE(nn.Module):
         Returns:
             Name to (S, B, T, D) for every data variable, and the whole where these are parts.
         """
-        data = self._mapping(batch)
+        data = self.read(batch)
         whole = self._rollout(self.inference, self.encoder, data, None, 1)  # refuses what cannot be read
 
         def means(part: slice, count: int) -> dict[str, Tensor]:
@@ -454,7 +447,8 @@ class DynamicalVAE(nn.Module):
                     rollout.know(name, rollout.draw(name))
                 if name in self.observed:
                     found[name] = rollout.evaluate(name, rollout.values[name]).mean
-            return self._with_whole({name: mean.unflatten(0, (count, -1)) for name, mean in found.items()})
+            made = {name: mean.unflatten(0, (count, -1)) for name, mean in found.items()}
+            return self.shown(made, rows(data, part))
 
         with self._evaluating():
             return in_chunks(means, whole.batch, samples, chunk)
@@ -489,18 +483,21 @@ class DynamicalVAE(nn.Module):
     def _evaluating(self) -> Any:
         return _Evaluating(self) if self.training else nullcontext()
 
-    @property
-    def _fills(self) -> dict[str, Tensor]:
-        """What stands for missing entries of variables with units."""
-        return {name: units.mean for name, units in self.units.items()}
+    def read(self, batch: Batch | None) -> dict[str, Any]:
+        """A batch as programs read it: by name, in the model's precision, as the view shows it, missing entries filled.
 
-    def _mapping(self, batch: Batch | None) -> dict[str, Any]:
-        return self.reader.mapping(batch, like(self).dtype, self._fills)
+        What was read is read as it is.
+
+        Raises:
+            ValueError: names that the model does not have, a mask of nothing, or data that the view cannot show.
+        """
+        means = {name: units.mean for name, units in self.units.items()}
+        return self.reader.read(batch, like(self).dtype, means)
 
     def _rollout(
         self, factorization: Factorization, conditionals: Any, batch: Batch | None, length: int | None, size: int
     ) -> Rollout:
-        return self.reader.rollout(factorization, conditionals, self._mapping(batch), length, size, self._fills)
+        return self.reader.rollout(factorization, conditionals, self.read(batch), length, size)
 
 
 class _Evaluating:

@@ -38,7 +38,8 @@ from ...laws import QRFlow
 from ...options import Layers, Range
 from ...turns import alone
 from ..protocols import Poses, Windows
-from ..skeleton import Skeleton, face_forward, rotate_about_up
+from ..skeleton import Skeleton, rotate_about_up
+from ..views import Heading
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,7 @@ class PosePriorModel(nn.Module):
 
     def facing(self, x: Tensor) -> Tensor:
         """Windows (..., T, D) as the density reads them."""
-        return x if self.forward_at is None else face_forward(x, self.skeleton, self.forward_at)[0]
+        return x if self.forward_at is None else Heading(self.skeleton, self.forward_at + 1).face(x)
 
     def log_prob(self, poses: Tensor) -> Tensor:
         """Log density (...) of the limb directions of poses (..., D), in nats.

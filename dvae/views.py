@@ -1,0 +1,275 @@
+"""Views: bijections between the data and what a model sees of them, with their log-determinants.
+
+A model has one view. A batch goes through it where it is read (`DynamicalVAE.read`), and what the model makes of the
+data goes back through it where it is handed out (`DynamicalVAE.shown`): between the two, everything is as the model
+sees it. Views of one kind of data are with that data, as `dvae.motion.views.Heading` is.
+
+Views keep volume, so that bounds of what a model sees are bounds of the data. Another unit does not: it is one of the
+networks and of the laws (`dvae.units`), beside which densities stay in a variable's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .notation import Factorization
+
+WHOLE = "x"
+"""Name of the data where a view makes several variables of them."""
+
+Data = Mapping[str, Any]
+"""Values by name, with "lengths" and, by name, "mask"."""
+
+
+class View:
+    """What a model sees of the data; this view, all as it is.
+
+    What a view finds in the data and needs for the way back, as a heading, it adds under a name of its own. Data that
+    were seen are seen as they are.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in batches, beside those of the variables: what the view reads, and what it adds."""
+        return ()
+
+    @property
+    def parts(self) -> Mapping[str, Collection[int]]:
+        """Data variables that are coordinates of x, in place of it."""
+        return {}
+
+    @property
+    def history(self) -> str | None:
+        """Name of the context that is the data themselves."""
+        return None
+
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        """Refuses a model that cannot have this view.
+
+        Raises:
+            ValueError: saying why.
+        """
+
+    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+        """The data as they are seen.
+
+        Args:
+            data: values (B, ...) by name.
+            beside: a batch that was seen, where the data are more of the same sequences.
+
+        Raises:
+            ValueError: data that cannot be seen so.
+        """
+        return dict(data)
+
+    def inverse(self, seen: Data) -> dict[str, Any]:
+        """The data that are seen so; values (..., B, T, D) of these and of what the view added, (B, ...)."""
+        return dict(seen)
+
+    def log_det(self, data: Data) -> Tensor:
+        """(B,) log of the absolute determinant of the Jacobian: 0, as views keep volume."""
+        some = next(iter(data.values()))
+        return some.new_zeros(len(some))
+
+
+class Views(View):
+    """Views one after the other.
+
+    Args:
+        *views: the first sees the data, the last one shows the model.
+    """
+
+    def __init__(self, *views: View):
+        self.views = views
+
+    def __repr__(self) -> str:
+        return f"Views({', '.join(map(repr, self.views))})"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All of them."""
+        return tuple(name for view in self.views for name in view.names)
+
+    @property
+    def parts(self) -> Mapping[str, Collection[int]]:
+        """Those of the view that has some."""
+        return next((view.parts for view in self.views if view.parts), {})
+
+    @property
+    def history(self) -> str | None:
+        """That of the view that has one."""
+        return next((view.history for view in self.views if view.history), None)
+
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        """As each does."""
+        for view in self.views:
+            view.check(sizes, context, generative)
+
+    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+        """Through each in turn."""
+        for view in self.views:
+            data = view(data, beside)
+        return dict(data)
+
+    def inverse(self, seen: Data) -> dict[str, Any]:
+        """Back through each."""
+        for view in reversed(self.views):
+            seen = view.inverse(seen)
+        return dict(seen)
+
+
+@dataclass(frozen=True)
+class Parts(View):
+    """Data variables that are coordinates of one array x, which stands for all of them in batches and forecasts.
+
+    Args:
+        places: variable to its coordinates. Every coordinate belongs to one of them.
+
+    Example:
+        >>> view = Parts({"legs": [0, 2], "arms": [1]})
+        >>> view({"x": torch.tensor([[[1.0, 2.0, 3.0]]])})["legs"]
+        tensor([[[1., 3.]]])
+    """
+
+    places: Mapping[str, Sequence[int]]
+
+    def __post_init__(self) -> None:
+        places = sorted(place for part in self.places.values() for place in part)
+        if places != list(range(len(places))):
+            raise ValueError(f"the parts must share the coordinates 0, 1, ... of x among them, once each; got {places}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """x."""
+        return (WHOLE,)
+
+    @property
+    def parts(self) -> Mapping[str, Sequence[int]]:
+        """The places."""
+        return self.places
+
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        """Refuses parts of other sizes than their variables, and a variable that has the name of the whole."""
+        for name, places in self.places.items():
+            if len(places) != sizes[name]:
+                raise ValueError(f"the part {name} has {len(places)} coordinates, but its size is {sizes[name]}")
+        if WHOLE in sizes:
+            raise ValueError(f"with parts, {WHOLE!r} is the name of the whole; no variable can have it")
+
+    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+        """The whole in its parts."""
+        if WHOLE not in data:
+            return dict(data)
+        seen, masks = dict(data), dict(data.get("mask", {}))
+        whole, mask = seen.pop(WHOLE), masks.pop(WHOLE, None)
+        size = sum(map(len, self.places.values()))
+        if whole.dim() < 2 or whole.shape[-1] != size:
+            raise ValueError(f"{WHOLE} has shape {tuple(whole.shape)}, expected (B, T, {size})")
+        for name, places in self.places.items():
+            seen.setdefault(name, whole[..., list(places)])
+            if mask is not None:
+                masks[name] = mask[..., list(places)]
+        return {**seen, "mask": masks} if mask is not None else seen
+
+    def inverse(self, seen: Data) -> dict[str, Any]:
+        """The parts, and the whole that they make."""
+        if not self.places.keys() <= seen.keys():
+            return dict(seen)
+        places = torch.tensor([place for part in self.places.values() for place in part])
+        whole = torch.cat([seen[name] for name in self.places], dim=-1)
+        return {**seen, WHOLE: whole[..., places.argsort().to(whole.device)]}
+
+
+@dataclass(frozen=True)
+class History(View):
+    """The data once more, as a context variable.
+
+    Its relation is a mask of one's own, such as h_{1:O}, that hides the frames to be generated.
+
+    Args:
+        name: of the context variable.
+        of: name of the data.
+    """
+
+    name: str
+    of: str = WHOLE
+
+    @property
+    def history(self) -> str:
+        """The name."""
+        return self.name
+
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        """Refuses a model that reads of the history what a forecast does not have."""
+        if self.name not in context:
+            raise ValueError(f"the history is {self.name!r}, but the context is {', '.join(context) or 'none'}")
+        for factor in generative.factors:
+            read = factor.parent(self.name)
+            if read is not None and (read.relation is None or read.relation.intervals is not None):
+                raise ValueError(
+                    f"{factor} reads {read}, but {self.name} is the data themselves, of which a forecast has the past "
+                    f"alone; give {self.name} a mask of your own that hides the frames to be made, such as "
+                    f'{self.name}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
+                )
+
+    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+        """Beside the data, what was observed of them."""
+        if self.of not in data or self.name in data or beside is not None:
+            return dict(data)
+        masks = data.get("mask", {})
+        seen = {**data, self.name: data[self.of]}
+        return {**seen, "mask": {**masks, self.name: masks[self.of]}} if self.of in masks else seen
+
+
+@dataclass(frozen=True)
+class FirstFrame(View):
+    """The first frame of x as a static variable, from which the others go on.
+
+    Args:
+        name: of the first frame, (B, D).
+        also: names of context over the same frames, of which the first says nothing more.
+
+    Example:
+        >>> {name: tuple(value.shape) for name, value in FirstFrame("s")({"x": torch.zeros(2, 5, 3)}).items()}
+        {'x': (2, 4, 3), 's': (2, 3)}
+    """
+
+    name: str
+    also: tuple[str, ...] = ()
+
+    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+        """The first frame and the rest; of one frame, the first alone."""
+        if WHOLE not in data or self.name in data or beside is not None:
+            return dict(data)
+        if "lengths" in data:
+            raise ValueError("windows that start at a frame of their own have one length; leave 'lengths' out")
+        whole, frames = data[WHOLE], data[WHOLE].shape[1]
+        for name in self.also:
+            if name in data and not (data[name].shape[1] == frames if frames > 1 else data[name].shape[1] > 1):
+                raise ValueError(
+                    f"beside x {tuple(whole.shape)}, whose first frame is {self.name}, {name} is as long as the whole "
+                    f"window, (B, 1 + T, D); got {tuple(data[name].shape)}"
+                )
+        cut = {name: data[name][:, 1:] for name in (WHOLE, *self.also) if name in data}
+        masks = data.get("mask", {})
+        masks = {name: mask[:, 1:] if name in cut else mask for name, mask in masks.items()} | (
+            {self.name: masks[WHOLE][:, 0]} if WHOLE in masks else {}
+        )
+        seen = {**data, **cut, self.name: whole[:, 0], **({"mask": masks} if masks else {})}
+        if frames == 1:
+            del seen[WHOLE]
+            masks.pop(WHOLE, None)
+        return seen
+
+    def inverse(self, seen: Data) -> dict[str, Any]:
+        """The whole, where the first frame is there."""
+        if self.name not in seen:
+            return dict(seen)
+        data, first = dict(seen), seen[self.name][..., None, :]
+        del data[self.name]
+        return {**data, WHOLE: torch.cat([first, seen[WHOLE]], -2) if WHOLE in seen else first}

@@ -1,0 +1,195 @@
+"""Views: bijections that keep volume, and models that see through them as one would turn the data by hand."""
+
+import pytest
+import torch
+
+import dvae
+from dvae import motion
+from dvae.models.trajectories import Rest
+from dvae.motion import HUMANEVA, WALKER, Heading, rotate_about_up
+from dvae.networks import Recurrent
+from dvae.units import Units
+from dvae.views import FirstFrame, History, Parts, View, Views
+
+B, T, J = 3, 5, WALKER.joints
+D = 3 * J - 3
+LEGS = [i for i in range(D) if i % 6 < 3]
+ARMS = [i for i in range(D) if i % 6 >= 3]
+TURNED = ("x", "s", "y", "r", "legs", "arms")
+VIEWS = {
+    "as it is": (View(), D),
+    "parts": (Parts({"legs": LEGS, "arms": ARMS}), D),
+    "parts and history": (Views(History("h"), Parts({"legs": LEGS, "arms": ARMS})), D),
+    "first frame": (FirstFrame("s"), D),
+    "heading": (Heading(WALKER, 3), D),
+    "heading with the root": (Heading(WALKER, 9), 3 * J),
+    "heading of parts": (Views(Heading(WALKER, 3, turned=TURNED), Parts({"legs": LEGS, "arms": ARMS})), D),
+    "heading of a first pose": (Views(FirstFrame("s"), Rest(True), Heading(WALKER, pose="s", turned=TURNED)), 3 * J),
+}
+
+
+def people(*shape):
+    return torch.randn(*shape, dtype=torch.float64)
+
+
+def turn(x, angle, skeleton=WALKER):
+    joints = x.unflatten(-1, (-1, 3))
+    return rotate_about_up(joints, torch.as_tensor(angle, dtype=x.dtype), skeleton.up).flatten(-2)
+
+
+@pytest.fixture(params=VIEWS)
+def view_and_data(request):
+    view, size = VIEWS[request.param]
+    return view, {"x": people(B, T, size)}
+
+
+def test_the_way_back_is_the_inverse(view_and_data):
+    view, data = view_and_data
+    torch.testing.assert_close(view.inverse(view(data))["x"], data["x"])
+
+
+def test_what_was_seen_is_seen_as_it_is(view_and_data):
+    view, data = view_and_data
+    once = view(data)
+    again = view(once)
+    assert once.keys() == again.keys()
+    assert all(torch.equal(once[name], again[name]) for name in once)
+
+
+def test_samples_of_the_future_go_back_as_the_past_was_seen(view_and_data):
+    """Seen values (S, B, H, D) beside what the view added to the past."""
+    view, data = view_and_data
+    past, future = data["x"], people(B, 7, data["x"].shape[-1])
+    seen = view({"x": past})
+    added = {name: seen[name] for name in view.names if name in seen}
+    if isinstance(view, FirstFrame) or "s" in seen:  # frames that go on from it are seen as such
+        later = {n: v for n, v in view({"x": torch.cat([past[:, :1], future], 1)}).items() if n != "s"}
+    else:
+        later = view({"x": future}, seen)
+    made = {
+        name: value.expand(2, *value.shape) for name, value in later.items() if name not in ("heading", "h", "y", "r")
+    }
+    torch.testing.assert_close(view.inverse({**added, **made})["x"], future.expand(2, *future.shape))
+
+
+def test_views_keep_volume(view_and_data):
+    """The Jacobian of what is seen, by autograd; of a turn, at the heading that the window has."""
+    view, data = view_and_data
+    heading = {"heading": torch.tensor([0.7], dtype=torch.float64)}
+    given = heading if "heading" in view.names and "s" not in view(data) else None
+    names = [name for name in view(data) if name not in ("heading", "h", "y", "r")]
+
+    def seen(x):
+        found = view({"x": x[None]}, given)
+        return torch.cat([found[name].flatten() for name in names])
+
+    if "s" in names and "heading" in view.names:  # which tells the heading; the rest is turned by it
+        first, names = data["x"][0, :1], ["x"]
+        jacobian = torch.autograd.functional.jacobian(lambda x: seen(torch.cat([first, x])), data["x"][0, 1:])
+    else:
+        jacobian = torch.autograd.functional.jacobian(seen, data["x"][0])
+    rows = len(jacobian)
+    _, log_det = torch.linalg.slogdet(jacobian.reshape(rows, rows))
+    torch.testing.assert_close(log_det, view.log_det(data)[0], rtol=0, atol=1e-9)
+
+
+def test_units_have_their_determinant():
+    units, x = Units(3).double(), 4 + 0.1 * people(2, 4, 3)
+    units.fit(x)
+    torch.testing.assert_close(units.inverse(units(x)), x)
+    jacobian = torch.autograd.functional.jacobian(units, x[0]).reshape(12, 12)
+    torch.testing.assert_close(units.log_det(x), torch.linalg.slogdet(jacobian)[1].expand(2))
+
+
+@pytest.mark.parametrize("skeleton", [WALKER, HUMANEVA])
+def test_every_window_faces_one_way_and_stays_the_same_otherwise(skeleton):
+    x = people(B, T, 3 * skeleton.joints)
+    for angle in (0.0, 2.5):
+        seen = Heading(skeleton, 2)({"x": turn(x, angle, skeleton)})
+        torch.testing.assert_close(skeleton.heading(seen["x"].unflatten(-1, (-1, 3))[:, 1]), torch.zeros(B).double())
+        torch.testing.assert_close(seen["x"], Heading(skeleton, 2).face(x))
+
+
+# ------------------------------------------------------------------------------------------------- models that see so
+
+
+def build(view):
+    torch.manual_seed(0)
+    sizes = {"z": 2, "x": D}
+    equations = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
+    return dvae.DynamicalVAE(*equations, sizes, Recurrent(4), view=view).double().eval()
+
+
+def seeded(call, *arguments, **options):
+    torch.manual_seed(1)
+    return call(*arguments, **options)
+
+
+def missing():
+    """Windows, and a mask of whole joints and of heights that leaves the third pose alone."""
+    x, seen = people(B, T, D), torch.rand(B, T, J - 1, 1) < 0.7
+    mask = seen.expand(-1, -1, -1, 3).clone()
+    mask[..., WALKER.vertical] &= torch.rand(B, T, J - 1) < 0.8
+    mask[:, 2] = True
+    return x, mask.flatten(-2)
+
+
+@pytest.mark.parametrize("hidden", [0.0, 50.0, torch.nan])
+def test_missing_entries_through_a_view_are_those_of_windows_turned_by_hand(hidden):
+    heading = Heading(WALKER, 3)
+    model, plain = build(heading), build(None)
+    x, mask = missing()
+    angle = heading.of(x)
+    ours = {"x": torch.where(mask, x, hidden), "mask": mask}
+    theirs = {"x": heading.face(x), "mask": mask}
+    imputed = seeded(plain.reconstruct, theirs, 2)["x"]
+    torch.testing.assert_close(seeded(model.reconstruct, ours, 2)["x"], turn(imputed, angle[:, None, None]))
+    elbo = dvae.SequenceELBO()
+    torch.testing.assert_close(seeded(elbo.terms, model, ours).bound, seeded(elbo.terms, plain, theirs).bound)
+    past, by_hand = ({name: value[:, :4] for name, value in each.items()} for each in (ours, theirs))
+    future = seeded(plain.forecast, by_hand, 3, 2, draw_emission=True)["x"]
+    found = seeded(model.forecast, past, 3, 2, draw_emission=True)["x"]
+    torch.testing.assert_close(found, turn(future, angle[:, None, None]))
+
+
+def test_what_a_turn_cannot_carry_is_refused():
+    model, (x, mask) = build(Heading(WALKER, 3)), missing()
+    hip = WALKER.names.index("LHip") - 1
+    half, hipless = mask.clone(), mask.clone()
+    half[1, 4, 6:9] = torch.tensor([True, True, False])
+    hipless[2, 2, 3 * hip : 3 * hip + 3] = False
+    with pytest.raises(ValueError, match=r"window 1 lacks one horizontal coordinate of .* and has the other"):
+        model.guide({"x": x, "mask": half})
+    with pytest.raises(ValueError, match="window 2 lacks LHip in the pose by which this model turns it"):
+        model.guide({"x": x, "mask": hipless})
+    with pytest.raises(ValueError, match=r"the mask of x is torch\.float64"):
+        model.guide({"x": x, "mask": mask.double()})
+    with pytest.raises(ValueError, match="have 51 coordinates, or 48 without the root"):
+        model.guide(x[..., :30])
+
+
+def test_samples_beside_a_batch_are_turned_back():
+    """Whatever a model hands out of the data goes through the view; before any batch there is no heading."""
+    model, x = build(Heading(WALKER, 3)), people(B, T, D)
+    torch.testing.assert_close(model.sample(batch=x)["x"], x)
+    assert model.sample(2, length=4)["x"].shape == (2, 4, D)
+
+
+def test_a_fixed_part_comes_back_bit_for_bit_and_is_seen_turned():
+    view = Views(Heading(WALKER, 3, turned=TURNED), Parts({"legs": LEGS, "arms": ARMS}))
+    equations = "p(z) p(legs_t | legs_{<t}, z) p(arms_t | legs_{<=t}, arms_{<t}, z)", "q(z | legs_{1:T}, arms_{1:T})"
+    sizes = {"z": 2, "legs": len(LEGS), "arms": len(ARMS)}
+    model = dvae.DynamicalVAE(*equations, sizes, Recurrent(4), view=view).double().eval()
+    past, legs = people(B, 4, D), people(B, 3, len(LEGS))
+    found = seeded(model.forecast, past, 3, 2, fix={"legs": legs})
+    assert torch.equal(found["legs"], legs.expand(2, -1, -1, -1))
+    assert torch.equal(found["x"][..., LEGS], found["legs"])
+    turned = seeded(model.forecast, turn(past, 1.0), 3, 2, fix={"legs": turn(legs, 1.0)})
+    torch.testing.assert_close(turned["x"], turn(found["x"], 1.0))
+
+
+def test_windows_of_the_simulator_face_one_way():
+    windows = motion.windows(motion.simulate(clips=4, frames=90), motion.PROTOCOLS["simulated"], "train")
+    x = Heading(windows.skeleton, 15).face(windows.all()["x"])
+    poses = windows.positions(x)[:, 14]
+    assert windows.skeleton.heading(poses).abs().max() < 1e-5
