@@ -21,7 +21,7 @@ import pyro
 # Without it a second model silently receives the first one's parameters from Pyro's global store.
 pyro.settings.set(module_local_params=True)
 
-from . import laws, motion, networks  # noqa: E402
+from . import laws, motion, networks, views  # noqa: E402
 from .graph import Audit, audit  # noqa: E402
 from .inference.bounds import SequenceELBO, Terms, importance_bound  # noqa: E402
 from .inference.compare import Comparison, compare  # noqa: E402
@@ -68,4 +68,5 @@ __all__ = [
     "price",
     "traverse",
     "twin",
+    "views",
 ]

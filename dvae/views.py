@@ -1,8 +1,8 @@
-"""Views: bijections between the data and what a model sees of them, with their log-determinants.
+"""Views: bijections between the data and what a model sees of them.
 
 A model has one view. A batch goes through it where it is read (`DynamicalVAE.read`), and what the model makes of the
 data goes back through it where it is handed out (`DynamicalVAE.shown`): between the two, everything is as the model
-sees it. Views of one kind of data are with that data, as `dvae.motion.views.Heading` is.
+sees it. Views of one kind of data are with that data, as `dvae.motion.Heading` is.
 
 Views keep volume, so that bounds of what a model sees are bounds of the data. Another unit does not: it is one of the
 networks and of the laws (`dvae.units`), beside which densities stay in a variable's own.
@@ -11,11 +11,12 @@ networks and of the laws (`dvae.units`), beside which densities stay in a variab
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from .notation import Factorization
 
@@ -33,20 +34,12 @@ class View:
     were seen are seen as they are.
     """
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names in batches, beside those of the variables: what the view reads, and what it adds."""
-        return ()
-
-    @property
-    def parts(self) -> Mapping[str, Collection[int]]:
-        """Data variables that are coordinates of x, in place of it."""
-        return {}
-
-    @property
-    def history(self) -> str | None:
-        """Name of the context that is the data themselves."""
-        return None
+    names: tuple[str, ...] = ()
+    """Names in batches, beside those of the variables: what the view reads, and what it adds."""
+    parts: Mapping[str, Sequence[int]] | None = None
+    """Data variables that are coordinates of x, in place of it."""
+    history: str | None = None
+    """Name of the context that is the data themselves."""
 
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
         """Refuses a model that cannot have this view.
@@ -86,38 +79,26 @@ class Views(View):
 
     def __init__(self, *views: View):
         self.views = views
+        self.names = tuple(name for view in views for name in view.names)
+        self.parts = next((view.parts for view in views if view.parts), None)
+        self.history = next((view.history for view in views if view.history), None)
 
     def __repr__(self) -> str:
         return f"Views({', '.join(map(repr, self.views))})"
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """All of them."""
-        return tuple(name for view in self.views for name in view.names)
-
-    @property
-    def parts(self) -> Mapping[str, Collection[int]]:
-        """Those of the view that has some."""
-        return next((view.parts for view in self.views if view.parts), {})
-
-    @property
-    def history(self) -> str | None:
-        """That of the view that has one."""
-        return next((view.history for view in self.views if view.history), None)
-
+    @override
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
-        """As each does."""
         for view in self.views:
             view.check(sizes, context, generative)
 
+    @override
     def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
-        """Through each in turn."""
         for view in self.views:
             data = view(data, beside)
         return dict(data)
 
+    @override
     def inverse(self, seen: Data) -> dict[str, Any]:
-        """Back through each."""
         for view in reversed(self.views):
             seen = view.inverse(seen)
         return dict(seen)
@@ -128,7 +109,7 @@ class Parts(View):
     """Data variables that are coordinates of one array x, which stands for all of them in batches and forecasts.
 
     Args:
-        places: variable to its coordinates. Every coordinate belongs to one of them.
+        parts: variable to its coordinates. Every coordinate belongs to one of them.
 
     Example:
         >>> view = Parts({"legs": [0, 2], "arms": [1]})
@@ -136,52 +117,41 @@ class Parts(View):
         tensor([[[1., 3.]]])
     """
 
-    places: Mapping[str, Sequence[int]]
+    parts: Mapping[str, Sequence[int]] = field()
+    names = (WHOLE,)
 
-    def __post_init__(self) -> None:
-        places = sorted(place for part in self.places.values() for place in part)
+    @override
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        places = sorted(place for part in self.parts.values() for place in part)
         if places != list(range(len(places))):
             raise ValueError(f"the parts must share the coordinates 0, 1, ... of x among them, once each; got {places}")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """x."""
-        return (WHOLE,)
-
-    @property
-    def parts(self) -> Mapping[str, Sequence[int]]:
-        """The places."""
-        return self.places
-
-    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
-        """Refuses parts of other sizes than their variables, and a variable that has the name of the whole."""
-        for name, places in self.places.items():
-            if len(places) != sizes[name]:
-                raise ValueError(f"the part {name} has {len(places)} coordinates, but its size is {sizes[name]}")
+        for name, part in self.parts.items():
+            if len(part) != sizes[name]:
+                raise ValueError(f"the part {name} has {len(part)} coordinates, but its size is {sizes[name]}")
         if WHOLE in sizes:
             raise ValueError(f"with parts, {WHOLE!r} is the name of the whole; no variable can have it")
 
+    @override
     def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
-        """The whole in its parts."""
         if WHOLE not in data:
             return dict(data)
         seen, masks = dict(data), dict(data.get("mask", {}))
         whole, mask = seen.pop(WHOLE), masks.pop(WHOLE, None)
-        size = sum(map(len, self.places.values()))
+        size = sum(map(len, self.parts.values()))
         if whole.dim() < 2 or whole.shape[-1] != size:
             raise ValueError(f"{WHOLE} has shape {tuple(whole.shape)}, expected (B, T, {size})")
-        for name, places in self.places.items():
+        for name, places in self.parts.items():
             seen.setdefault(name, whole[..., list(places)])
             if mask is not None:
                 masks[name] = mask[..., list(places)]
         return {**seen, "mask": masks} if mask is not None else seen
 
+    @override
     def inverse(self, seen: Data) -> dict[str, Any]:
-        """The parts, and the whole that they make."""
-        if not self.places.keys() <= seen.keys():
+        if not self.parts.keys() <= seen.keys():
             return dict(seen)
-        places = torch.tensor([place for part in self.places.values() for place in part])
-        whole = torch.cat([seen[name] for name in self.places], dim=-1)
+        places = torch.tensor([place for part in self.parts.values() for place in part])
+        whole = torch.cat([seen[name] for name in self.parts], dim=-1)
         return {**seen, WHOLE: whole[..., places.argsort().to(whole.device)]}
 
 
@@ -192,38 +162,34 @@ class History(View):
     Its relation is a mask of one's own, such as h_{1:O}, that hides the frames to be generated.
 
     Args:
-        name: of the context variable.
+        history: name of the context variable.
         of: name of the data.
     """
 
-    name: str
+    history: str = field()
     of: str = WHOLE
 
-    @property
-    def history(self) -> str:
-        """The name."""
-        return self.name
-
+    @override
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
-        """Refuses a model that reads of the history what a forecast does not have."""
-        if self.name not in context:
-            raise ValueError(f"the history is {self.name!r}, but the context is {', '.join(context) or 'none'}")
+        name = self.history
+        if name not in context:
+            raise ValueError(f"the history is {name!r}, but the context is {', '.join(context) or 'none'}")
         for factor in generative.factors:
-            read = factor.parent(self.name)
+            read = factor.parent(name)
             if read is not None and (read.relation is None or read.relation.intervals is not None):
                 raise ValueError(
-                    f"{factor} reads {read}, but {self.name} is the data themselves, of which a forecast has the past "
-                    f"alone; give {self.name} a mask of your own that hides the frames to be made, such as "
-                    f'{self.name}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
+                    f"{factor} reads {read}, but {name} is the data themselves, of which a forecast has the past "
+                    f"alone; give {name} a mask of your own that hides the frames to be made, such as "
+                    f'{name}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
                 )
 
+    @override
     def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
-        """Beside the data, what was observed of them."""
-        if self.of not in data or self.name in data or beside is not None:
+        if self.of not in data or self.history in data or beside is not None:
             return dict(data)
         masks = data.get("mask", {})
-        seen = {**data, self.name: data[self.of]}
-        return {**seen, "mask": {**masks, self.name: masks[self.of]}} if self.of in masks else seen
+        seen = {**data, self.history: data[self.of]}
+        return {**seen, "mask": {**masks, self.history: masks[self.of]}} if self.of in masks else seen
 
 
 @dataclass(frozen=True)
@@ -242,34 +208,31 @@ class FirstFrame(View):
     name: str
     also: tuple[str, ...] = ()
 
+    @override
     def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
-        """The first frame and the rest; of one frame, the first alone."""
         if WHOLE not in data or self.name in data or beside is not None:
             return dict(data)
         if "lengths" in data:
-            raise ValueError("windows that start at a frame of their own have one length; leave 'lengths' out")
-        whole, frames = data[WHOLE], data[WHOLE].shape[1]
+            raise ValueError("windows that go on from their first frame have one length; leave 'lengths' out")
+        whole, masks = data[WHOLE], data.get("mask", {})
         for name in self.also:
-            if name in data and not (data[name].shape[1] == frames if frames > 1 else data[name].shape[1] > 1):
+            if name in data and data[name].shape[1] != whole.shape[1] > 1:
                 raise ValueError(
                     f"beside x {tuple(whole.shape)}, whose first frame is {self.name}, {name} is as long as the whole "
                     f"window, (B, 1 + T, D); got {tuple(data[name].shape)}"
                 )
-        cut = {name: data[name][:, 1:] for name in (WHOLE, *self.also) if name in data}
-        masks = data.get("mask", {})
-        masks = {name: mask[:, 1:] if name in cut else mask for name, mask in masks.items()} | (
-            {self.name: masks[WHOLE][:, 0]} if WHOLE in masks else {}
-        )
-        seen = {**data, **cut, self.name: whole[:, 0], **({"mask": masks} if masks else {})}
-        if frames == 1:
+        later = {name: data[name][:, 1:] for name in (WHOLE, *self.also) if name in data}
+        seen = {**data, **later, self.name: whole[:, 0]}
+        if WHOLE in masks:
+            seen["mask"] = {**masks, WHOLE: masks[WHOLE][:, 1:], self.name: masks[WHOLE][:, 0]}
+        if whole.shape[1] == 1:
             del seen[WHOLE]
-            masks.pop(WHOLE, None)
+            seen.get("mask", {}).pop(WHOLE, None)
         return seen
 
+    @override
     def inverse(self, seen: Data) -> dict[str, Any]:
-        """The whole, where the first frame is there."""
         if self.name not in seen:
             return dict(seen)
-        data, first = dict(seen), seen[self.name][..., None, :]
-        del data[self.name]
-        return {**data, WHOLE: torch.cat([first, seen[WHOLE]], -2) if WHOLE in seen else first}
+        first = seen[self.name][..., None, :]
+        return {**seen, WHOLE: torch.cat([first, seen[WHOLE]], -2) if WHOLE in seen else first}

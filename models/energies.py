@@ -144,7 +144,7 @@ class EnergyModel(DynamicalVAE):
         views: Sequence[View] = (),
         **options: Any,
     ):
-        turned = (WHOLE, *(name for view in views for name in view.parts))
+        turned = (WHOLE, *(name for view in views for name in view.parts or ()))
         heading = Heading(skeleton, observed, turned=turned) if method.heading else None
         super().__init__(*arguments, view=Views(*([heading] if heading else []), *views), **options)
         self.method, self.skeleton, self.frames, self.heading = method, skeleton, observed, heading

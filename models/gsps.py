@@ -268,7 +268,7 @@ class GSPSModel(EnergyModel):
             found["history"] = energies.history_error(samples[:, :, :past], truth[:, :past])
         found |= self.realism(samples, truth[:, 0], slice(past, None))
         draws = list(self.draws.values())
-        names = list(self.view.parts)
+        names = self.observed
         weights, scales = (_each(given, method.parts) for given in (method.diversity, method.diversity_scale))
         for i, rows in enumerate(accumulate(draws, mul)):
             if not weights[i]:
@@ -303,7 +303,7 @@ class GSPSModel(EnergyModel):
             )
         out = super().forecast(data, most, samples, fix=fix, chunk=chunk)
         return {
-            name: value[:, :, :horizon] if name in (WHOLE, *self.view.parts) else value for name, value in out.items()
+            name: value[:, :, :horizon] if name in (WHOLE, *self.observed) else value for name, value in out.items()
         }
 
     @torch.no_grad()

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from pyro import poutine
 from torch import Tensor
+from typing_extensions import override
 
 from ..inference.fit import Stage
 from ..inference.objectives import Evidence
@@ -144,8 +145,8 @@ class Rest(View):
 
     complement: bool
 
+    @override
     def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
-        """With y and r."""
         if WHOLE not in data:
             return dict(data)
         x = data[WHOLE]

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from ..views import WHOLE, Data, View
 from .skeleton import Skeleton, rotate_about_up
@@ -37,18 +38,10 @@ class Heading(View):
     frames: int = 1
     pose: str | None = None
     turned: tuple[str, ...] = (WHOLE,)
+    names = (HEADING,)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The heading's."""
-        return (HEADING,)
-
+    @override
     def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
-        """The windows turned, and the headings that they had.
-
-        Raises:
-            ValueError: windows that end before the pose, or that lack what tells the heading or what a turn mixes.
-        """
         source = self.pose or WHOLE
         found = (beside or {}).get(HEADING)
         if HEADING in data or (source not in data if beside is None else found is None):
@@ -63,8 +56,8 @@ class Heading(View):
             found = self.of(seen[source])
         return self._turn(seen, -found) | {HEADING: found}
 
+    @override
     def inverse(self, seen: Data) -> dict[str, Any]:
-        """The windows as they were turned."""
         data = dict(seen)
         heading = data.pop(HEADING, None)
         return data if heading is None else self._turn(data, heading)

@@ -28,8 +28,9 @@ from ..notation import Factorization, check_pair
 from ..turns import alone
 from ..units import Units
 from ..views import View
-from .batch import CHUNK, Batch, Reader, in_chunks, repeat, rows
+from .batch import CHUNK, Batch, Reader
 from .conditional import Conditional
+from .forecast import forecast, reconstruct
 from .rollout import Rollout, SelfFeeding, like
 
 _COUNT = itertools.count()
@@ -83,7 +84,7 @@ class DynamicalVAE(nn.Module):
         self.generative = _factorization(generative, masks)
         self.feeding = SelfFeeding(0.0)
         self.view = view or View()
-        observed = tuple(self.view.parts) or observed
+        observed = tuple(self.view.parts or observed)
         self.inference = (
             self.generative.prior_guide(observed) if inference is None else _factorization(inference, masks)
         )
@@ -113,7 +114,7 @@ class DynamicalVAE(nn.Module):
             self.context,
             self.view,
             self.extras,
-            frozenset(name for name in self.view.parts if self.generator[name].head.deterministic),
+            frozenset(name for name in self.view.parts or () if self.generator[name].head.deterministic),
         )
         self.units: Any = nn.ModuleDict()
         self.priors = nn.ModuleDict(dict(priors or {}))
@@ -352,73 +353,7 @@ class DynamicalVAE(nn.Module):
         Raises:
             ValueError: a ragged batch, a local context that ends before the horizon, or a fixed value that cannot be.
         """
-        data = self.read(batch)
-        if "lengths" in data:
-            raise ValueError(
-                "forecast continues sequences of one length; cut the batch to it, or forecast them in turn"
-            )
-        if horizon < 1 or samples < 1:
-            raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
-        size, past = data[self.view.history or self.observed[0]].shape[:2]
-        given = {name: torch.as_tensor(value).to(like(self)) for name, value in (fix or {}).items()}
-        fixed = self._fixed(given, data, horizon)
-        drawn = {n: self.generator[n].discrete if draw_emission is None else draw_emission for n in self.observed}
-        means = [name for name in self.observed if not drawn[name]]
-        seen = {
-            name: value[:, :past] if name in self.context and value.dim() == 3 else value
-            for name, value in data.items()
-        }
-        self._rollout(self.inference, self.encoder, seen, None, 1)  # refuses what cannot be read, of all sequences
-
-        def futures(part: slice, count: int) -> dict[str, Tensor]:
-            known, held, observed = (repeat(rows(each, part), count) for each in (data, fixed, seen))
-            latents = poutine.condition(self.guide, {n: v for n, v in held.items() if n in self.latents})(observed)
-            statics = {name: value for name, value in latents.items() if not self.generative.local(name)}
-            program = poutine.condition(self.model, data=statics) if statics else self.model
-            prefix = {name: value for name, value in latents.items() if name not in statics}
-            known |= {name: value for name, value in held.items() if name in self.observed}
-            out = program(known, length=past + horizon, prefix=prefix, mean_emission=means)
-            made = {name: out[name].unflatten(0, (count, -1)) for name in (*self.observed, *self.latents)}
-            made = self.shown(
-                {n: v[:, :, past:] if n in self.observed else v for n, v in made.items()}, rows(data, part)
-            )
-            again = {n: rows(v, part).expand_as(made[n]) for n, v in given.items() if n in self.observed}
-            return self.shown({**made, **again}) if again else made  # as it was given: the way there and back rounds
-
-        with self._evaluating():
-            return in_chunks(futures, size, samples, chunk)
-
-    def _fixed(self, given: Mapping[str, Tensor], data: Mapping[str, Any], horizon: int) -> dict[str, Tensor]:
-        """The values of `forecast(fix=...)` as the model sees them, those of data over past and future."""
-        history = self.view.history
-        size = len(data[history or self.observed[0]])
-        free = {*self.observed, *(name for name in self.latents if not self.generative.local(name))}
-        for name, value in given.items():
-            if name not in free or free & set(self.observed) <= set(given):
-                raise ValueError(
-                    f"cannot fix {', '.join(given)}; some of {', '.join(sorted(free))} can be, but not all of the data"
-                )
-            shape = (size, horizon, self.sizes[name]) if name in self.observed else (size, self.sizes[name])
-            if value.shape != shape:
-                raise ValueError(f"the fixed {name} has shape {tuple(value.shape)}, expected {shape}")
-        fixed = self.view(given, data)
-        for name in fixed.keys() & {*self.observed}:
-            past = data[name] if name in data else data[str(history)][..., list(self.view.parts[name])]
-            fixed[name] = torch.cat([past, fixed[name]], dim=1)
-        return {name: fixed[name] for name in given}
-
-    def shown(self, values: Mapping[str, Tensor], data: Mapping[str, Any] | None = None) -> dict[str, Tensor]:
-        """Values that the model made, with those of the data as the data are: back through the view.
-
-        Args:
-            values: name to (..., B, T, D), as the model sees them.
-            data: the batch that they belong to, as `read` gives it; without it they stay as they were turned.
-
-        Returns:
-            The same with the whole, where the view makes parts of it.
-        """
-        added = {name: data[name] for name in self.view.names if name in data} if data else {}
-        return {**values, **self.view.inverse(added | {n: v for n, v in values.items() if n in self.observed})}
+        return forecast(self, batch, horizon, samples, draw_emission, fix, chunk)
 
     @alone
     @torch.no_grad()
@@ -433,25 +368,7 @@ class DynamicalVAE(nn.Module):
         Returns:
             Name to (S, B, T, D) for every data variable, and the whole where these are parts.
         """
-        data = self.read(batch)
-        whole = self._rollout(self.inference, self.encoder, data, None, 1)  # refuses what cannot be read
-
-        def means(part: slice, count: int) -> dict[str, Tensor]:
-            some = repeat(rows(data, part), count)
-            latents = self.guide(some)
-            rollout = self._rollout(self.generative, self.generator, some, None, 1)
-            rollout.values.update(latents)
-            found = {}
-            for name in self.generative.variables:
-                if name in self.observed and name not in rollout.values:  # a function of its parents
-                    rollout.know(name, rollout.draw(name))
-                if name in self.observed:
-                    found[name] = rollout.evaluate(name, rollout.values[name]).mean
-            made = {name: mean.unflatten(0, (count, -1)) for name, mean in found.items()}
-            return self.shown(made, rows(data, part))
-
-        with self._evaluating():
-            return in_chunks(means, whole.batch, samples, chunk)
+        return reconstruct(self, batch, samples, chunk)
 
     @alone
     @torch.no_grad()
@@ -478,7 +395,7 @@ class DynamicalVAE(nn.Module):
         if any(getattr(handler, "param_only", False) for handler in poutine.runtime._PYRO_STACK):
             pyro.module(self._name, self)
 
-    # Reading a batch -----------------------------------------------------------------------------------------------
+    # What is read, and what is handed out --------------------------------------------------------------------------
 
     def _evaluating(self) -> Any:
         return _Evaluating(self) if self.training else nullcontext()
@@ -493,6 +410,19 @@ class DynamicalVAE(nn.Module):
         """
         means = {name: units.mean for name, units in self.units.items()}
         return self.reader.read(batch, like(self).dtype, means)
+
+    def shown(self, values: Mapping[str, Tensor], data: Mapping[str, Any] | None = None) -> dict[str, Tensor]:
+        """Values that the model made, with those of the data as the data are: back through the view.
+
+        Args:
+            values: name to (..., B, T, D), as the model sees them.
+            data: the batch that they belong to, as `read` gives it; without it they stay as they were turned.
+
+        Returns:
+            The same with the whole, where the view makes parts of it.
+        """
+        added = {name: data[name] for name in self.view.names if name in data} if data else {}
+        return {**values, **self.view.inverse(added | {n: v for n, v in values.items() if n in self.observed})}
 
     def _rollout(
         self, factorization: Factorization, conditionals: Any, batch: Batch | None, length: int | None, size: int

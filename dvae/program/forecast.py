@@ -1,0 +1,101 @@
+"""What a fitted model makes of data: sequences that go on, and means given latents of the guide.
+
+These are the bodies of `DynamicalVAE.forecast` and `DynamicalVAE.reconstruct`, which say what they take and return.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from .batch import Batch, in_chunks, repeat, rows
+from .rollout import like
+
+
+def forecast(
+    model: Any,
+    batch: Batch,
+    horizon: int,
+    samples: int,
+    draw_emission: bool | None,
+    fix: Mapping[str, Tensor] | None,
+    chunk: int,
+) -> dict[str, Tensor]:
+    """The latents of the past from the guide, then the model runs free."""
+    data = model.read(batch)
+    if "lengths" in data:
+        raise ValueError("forecast continues sequences of one length; cut the batch to it, or forecast them in turn")
+    if horizon < 1 or samples < 1:
+        raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
+    size, past = data[model.view.history or model.observed[0]].shape[:2]
+    given = {name: torch.as_tensor(value).to(like(model)) for name, value in (fix or {}).items()}
+    fixed = _fixed(model, given, data, size, horizon)
+    drawn = {n: model.generator[n].discrete if draw_emission is None else draw_emission for n in model.observed}
+    means = [name for name in model.observed if not drawn[name]]
+    local = {name for name in data if name in model.context and data[name].dim() == 3}
+    seen = {name: value[:, :past] if name in local else value for name, value in data.items()}
+    model._rollout(model.inference, model.encoder, seen, None, 1)  # refuses what cannot be read, of all sequences
+
+    def futures(part: slice, count: int) -> dict[str, Tensor]:
+        known, held, observed = (repeat(rows(each, part), count) for each in (data, fixed, seen))
+        latents = poutine.condition(model.guide, {n: v for n, v in held.items() if n in model.latents})(observed)
+        statics = {name: value for name, value in latents.items() if not model.generative.local(name)}
+        program = poutine.condition(model.model, data=statics) if statics else model.model
+        prefix = {name: value for name, value in latents.items() if name not in statics}
+        known |= {name: value for name, value in held.items() if name in model.observed}
+        out = program(known, length=past + horizon, prefix=prefix, mean_emission=means)
+        made = {name: out[name].unflatten(0, (count, -1)) for name in (*model.observed, *model.latents)}
+        made |= {name: made[name][:, :, past:] for name in model.observed}
+        made = model.shown(made, rows(data, part))
+        again = {n: rows(v, part).expand_as(made[n]) for n, v in given.items() if n in model.observed}
+        return model.shown({**made, **again}) if again else made  # as it was given: the way there and back rounds
+
+    with model._evaluating():
+        return in_chunks(futures, size, samples, chunk)
+
+
+def _fixed(
+    model: Any, given: Mapping[str, Tensor], data: Mapping[str, Any], size: int, horizon: int
+) -> dict[str, Tensor]:
+    """What is fixed as the model sees it, that of data over past and future."""
+    free = {*model.observed, *(name for name in model.latents if not model.generative.local(name))}
+    for name, value in given.items():
+        if name not in free or free & set(model.observed) <= set(given):
+            raise ValueError(
+                f"cannot fix {', '.join(given)}; some of {', '.join(sorted(free))} can be, but not all of the data"
+            )
+        shape = (size, horizon, model.sizes[name]) if name in model.observed else (size, model.sizes[name])
+        if value.shape != shape:
+            raise ValueError(f"the fixed {name} has shape {tuple(value.shape)}, expected {shape}")
+    fixed: dict[str, Tensor] = {name: value for name, value in model.view(given, data).items() if name in given}
+    for name in fixed.keys() & {*model.observed}:
+        past = data[name] if name in data else data[model.view.history][..., list(model.view.parts[name])]
+        fixed[name] = torch.cat([past, fixed[name]], dim=1)
+    return fixed
+
+
+def reconstruct(model: Any, batch: Batch, samples: int, chunk: int) -> dict[str, Tensor]:
+    """Means of the data given latents from the guide, teacher-forced."""
+    data = model.read(batch)
+    whole = model._rollout(model.inference, model.encoder, data, None, 1)  # refuses what cannot be read
+
+    def means(part: slice, count: int) -> dict[str, Tensor]:
+        some = repeat(rows(data, part), count)
+        latents = model.guide(some)
+        rollout = model._rollout(model.generative, model.generator, some, None, 1)
+        rollout.values.update(latents)
+        found = {}
+        for name in model.generative.variables:
+            if name in model.observed and name not in rollout.values:  # a function of its parents
+                rollout.know(name, rollout.draw(name))
+            if name in model.observed:
+                found[name] = rollout.evaluate(name, rollout.values[name]).mean
+        made = {name: mean.unflatten(0, (count, -1)) for name, mean in found.items()}
+        return model.shown(made, rows(data, part))
+
+    with model._evaluating():
+        return in_chunks(means, whole.batch, samples, chunk)
