@@ -72,15 +72,15 @@ class Reader:
             for name, seen in masks.items():
                 self._check_mask(name, seen, values)
         seen = self.view(values)
-        for name in self.made - values.keys():
-            seen.pop(name, None)
-            seen.get("mask", {}).pop(name, None)
-        for name, mask in seen.get("mask", {}).items():
-            seen[name] = torch.where(mask, seen[name], means.get(name, 0.0))
+        seen = {name: value for name, value in seen.items() if name in values or name not in self.made}
+        if "mask" in seen:  # of context too, which is told no more of it
+            known = {name: mask for name, mask in seen["mask"].items() if name in seen}
+            seen |= {name: torch.where(mask, seen[name], means.get(name, 0.0)) for name, mask in known.items()}
+            seen["mask"] = {name: mask for name, mask in known.items() if name in self.observed}
         return seen
 
     def _check_mask(self, name: str, mask: Tensor, values: Mapping[str, Any]) -> None:
-        if name not in (*self.observed, *self.context, WHOLE) or name not in values:
+        if name not in (*self.observed, WHOLE) or name not in values:
             given = {n: v for n, v in values.items() if isinstance(v, Tensor)}
             raise ValueError(f"there is a mask of {name}, but the batch holds no data of that name: {shapes(given)}")
         if mask.shape != values[name].shape or mask.dtype != torch.bool:
