@@ -12,7 +12,7 @@ BIN := .venv/bin
 export OMP_NUM_THREADS := 1
 
 # Numerical tests, for the second run: other instructions round otherwise.
-NUMERICAL := bounds compare control forecasts graphconv heads metrics model networks oracle particles trajectories
+NUMERICAL := bounds compare control forecasts graphconv laws metrics model networks oracle particles trajectories
 
 .PHONY: venv demo test fuzz bench notebooks clean
 

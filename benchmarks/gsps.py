@@ -21,13 +21,13 @@ from speed import report, seconds, start, training_step
 
 import dvae
 from dvae import motion
-from dvae.laws.flow import QRFlow
+from dvae.laws.flow import QRFlowLaw
 from dvae.models.gsps import PRESETS, GSPSModel
 
 TARGETS = {"step": ("at most", 28.0), "prior": ("at least", 3.0), "memory": ("at most", 6.7)}
 
 
-def sequential(flow: QRFlow, x: torch.Tensor) -> torch.Tensor:
+def sequential(flow: QRFlowLaw, x: torch.Tensor) -> torch.Tensor:
     """What the flow makes of x, by one reflection after the other."""
     for layer, (upper, bias) in enumerate(zip(flow.factors()[1], flow.bias, strict=True)):
         if layer:
@@ -69,7 +69,10 @@ def main() -> None:
 
     flow, poses = model.pose_prior.flow, torch.randn(53_000, 48, requires_grad=True)
     both = seconds(
-        *(lambda f=f: f().square().sum().backward() for f in (lambda: sequential(flow, poses), lambda: flow(poses)[0])),
+        *(
+            lambda f=f: f().square().sum().backward()
+            for f in (lambda: sequential(flow, poses), lambda: flow.to_noise(poses)[0])
+        ),
         repeat=3,
     )
     found["prior"] = both[0] / both[1]

@@ -25,7 +25,7 @@ model = dvae.DynamicalVAE(
     inference="q(w | x_{1:T}) q(z_t | x_{1:T}, w)",
     sizes={"w": 16, "z": 16, "x": train.size},
     network=dvae.networks.Recurrent(width=64),
-    heads={"p(x)": dvae.laws.FixedNormal(scale=0.1, learned=True)},
+    laws={"p(x)": dvae.laws.FixedNormal(scale=0.1, learned=True)},
 )
 dvae.fit(model, train, validation, steps=6000, batch_size=16, learning_rate=6e-3, decay=0.5)
 

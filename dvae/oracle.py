@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .laws.families import FixedNormal, FixedNormalHead, StandardNormal
+from .laws.families import FixedNormal, FixedNormalLaw, Gaussian
 from .networks.linear import Linear, LinearNetwork
 from .notation import Factorization
 from .program.model import DynamicalVAE
@@ -41,17 +41,18 @@ def twin(
         scale: standard deviation of the weights.
     """
     equations = [f if isinstance(f, Factorization) else Factorization.parse(f) for f in (generative, inference)]
-    heads = {
+    laws = {
         f"{factor.kind}({factor.child})": FixedNormal(
             scale=0.7, learned=True, project=False, steps=steps if factor.local else 0
         )
         for equation in equations
         for factor in equation.factors
+        if factor.parents or factor.kind == "q"
     }
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         p, q = equations
-        return DynamicalVAE(p, q, sizes, Linear(steps, scale), heads, observed=observed).double()
+        return DynamicalVAE(p, q, sizes, Linear(steps, scale), laws, observed=observed).double()
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,6 @@ class Oracle:
     def __init__(self, model: DynamicalVAE, steps: int):
         if model.context:
             raise ValueError(f"the oracle knows no law of the context {', '.join(model.context)}")
-        if len(model.priors):
-            raise ValueError("the oracle knows normal priors only")
         self.model, self.steps = model, steps
 
     def _size(self, name: str) -> int:
@@ -100,16 +99,17 @@ class Oracle:
         biases, scales = [], []
         for name in names:
             conditional = conditionals[name]
-            head = conditional.head
-            if not isinstance(head, StandardNormal) and not (
+            law = conditional.law
+            linear = (
                 isinstance(conditional.network, LinearNetwork)
-                and isinstance(head, FixedNormalHead)
-                and isinstance(head.out, nn.Identity)
-                and not head.residual
-            ):
+                and isinstance(law, FixedNormalLaw)
+                and isinstance(law.out, nn.Identity)
+                and not law.residual
+            )
+            if not linear and not (conditional.network is None and isinstance(law, Gaussian)):
                 raise ValueError(
                     f"{conditional.factor} is not linear-Gaussian: the oracle needs networks.Linear with "
-                    "heads.FixedNormal(project=False), as dvae.oracle.twin builds"
+                    "laws.FixedNormal(project=False), as dvae.oracle.twin builds, or without parents a normal"
                 )
             zeros = {
                 parent: torch.zeros(1, self._size(parent), dtype=torch.float64).unflatten(

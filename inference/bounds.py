@@ -182,13 +182,14 @@ def site_log_prob(fn: Any, value: Tensor) -> Tensor:
     """(B, T) of a local variable, (B,) of a static one."""
     if not isinstance(fn, Sequence):
         return fn.log_prob(value)
-    return _over_entries(fn.elementwise(value).log_prob(value), fn)
+    return _over_entries(fn.steps(value).log_prob(value), fn)
 
 
 def _over_entries(entries: Tensor, fn: Sequence) -> Tensor:
     mask = fn.rollout.mask(fn.name)
     # where, not a product: an entry that does not count may be infinite
-    return (entries if mask is None else torch.where(mask, entries, 0.0)).sum(-1)
+    entries = entries if mask is None else torch.where(mask, entries, 0.0)
+    return entries.sum(-1) if entries.dim() == 3 else entries
 
 
 def _closed_forms(model_sites: Mapping[str, Any], guide_sites: Mapping[str, Any]) -> set[str]:
@@ -214,7 +215,7 @@ def _kl(p: Any, q: Any, value: Tensor, closed: bool) -> Tensor:
     if closed:
         try:
             if isinstance(p, Sequence) and isinstance(q, Sequence):
-                return _over_entries(kl_divergence(q.elementwise(value), p.elementwise(value)), p)
+                return _over_entries(kl_divergence(q.steps(value), p.steps(value)), p)
             return kl_divergence(q, p)
         except NotImplementedError:  # no closed form for this pair of families
             pass

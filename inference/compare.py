@@ -783,7 +783,7 @@ def _posterior_means(model: Any, batch: Batch) -> dict[str, Tensor]:
     for name, site in sites_of(poutine.trace(model.guide).get_trace(batch)).items():
         fn, value = site["fn"], site["value"]
         local = isinstance(fn, SequenceLaw)
-        means[name] = fn.elementwise(value).mean if local else fn.mean[:, None]
+        means[name] = fn.steps(value).mean if local else fn.mean[:, None]
     return means
 
 

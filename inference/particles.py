@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..laws.families import Parameters
+from ..laws.base import Parameters
 from ..networks.base import computing_once, valid_steps
 from ..networks.rows import Rows, pick, select
 from ..notation import Factor, Parent
@@ -138,7 +138,7 @@ class Filter:
             guide = {name: self._law(model.encoder[name], self.known.values) for name in self._local(model.latents)}
             prior = {name: self._law(model.generator[name], self.shared) for name in self._local(self._order())}
         noise = {
-            name: law.conditional.head.noise((len(self.sequence), length, law.conditional.size), bound).unbind(1)
+            name: law.conditional.law.noise((len(self.sequence), length, law.conditional.size), bound).unbind(1)
             for name, law in guide.items()
         }
         data = {name: self._by_step(self.known.values[name]) for name in self._local(model.observed)}
@@ -184,8 +184,8 @@ class Filter:
     def _step(
         self,
         t: int,
-        guide: Mapping[str, Law],
-        prior: Mapping[str, Law],
+        guide: Mapping[str, Stepwise],
+        prior: Mapping[str, Stepwise],
         noise: Mapping[str, tuple[Tensor, ...]],
         data: Mapping[str, Rows],
         counted: Mapping[str, Rows | None],
@@ -195,7 +195,7 @@ class Filter:
         history = {**data, **self.paths}
         for name, law in guide.items():
             parameters = law.step(t, history)
-            self.paths[name][t] = law.conditional.head.draw(parameters, noise[name][t])
+            self.paths[name][t] = law.conditional.law.draw(parameters, noise[name][t])
             total = total - _log_prob(law.conditional, parameters, self.paths[name][t], _at(counted[name], t))
         for name, law in prior.items():
             parameters = law.step(t, history)
@@ -213,8 +213,8 @@ class Filter:
             if not model.generative.local(name) and (name in self.late) == late:
                 conditional = model.encoder[name]
                 parameters = self._parameters(conditional, self.known.values)
-                noise = conditional.head.noise((len(self.sequence), conditional.size), total)
-                self.statics[name] = Rows([conditional.head.draw(parameters, noise)])
+                noise = conditional.law.noise((len(self.sequence), conditional.size), total)
+                self.statics[name] = Rows([conditional.law.draw(parameters, noise)])
                 total = total - _log_prob(conditional, parameters, self.statics[name][0])
         known = {**self.shared, **self.drawn}
         for factor in model.generative.factors:
@@ -222,11 +222,8 @@ class Filter:
                 continue
             name = factor.child
             value = known[name] if name in self.statics else pick(known[name], self.sequence)
-            if name in model.priors:
-                total = total + model._prior(name, len(self.sequence)).log_prob(value)
-            else:
-                conditional = model.generator[name]
-                total = total + _log_prob(conditional, self._parameters(conditional, self.shared), value)
+            conditional = model.generator[name]
+            total = total + _log_prob(conditional, self._parameters(conditional, self.shared), value)
         return total
 
     def _parameters(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Parameters:
@@ -234,15 +231,15 @@ class Filter:
         given, size, lengths, rows = self._given(conditional, shared)
         return tuple(pick(p, rows) for p in conditional(given, size, self.known.length, lengths))
 
-    def _law(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Law:
+    def _law(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Stepwise:
         given, size, lengths, rows = self._given(conditional, shared)
         live = [name for name in conditional.parents if name not in given]
         if not live:
             everywhere = conditional(given, size, self.known.length, lengths)
-            return Law(conditional, select([p.unbind(1) for p in everywhere], rows), [])
+            return Stepwise(conditional, select([p.unbind(1) for p in everywhere], rows), [])
         state = conditional.start(given, size, self.known.length, lengths)
-        reads = [*live, conditional.factor.child] if conditional.head.residual else live
-        return Law(conditional, conditional.network.select(state, rows), reads)  # type: ignore[union-attr]
+        reads = [*live, conditional.factor.child] if conditional.law.residual else live
+        return Stepwise(conditional, conditional.network.select(state, rows), reads)  # type: ignore[union-attr]
 
     def _given(
         self, conditional: Conditional, shared: Mapping[str, Tensor]
@@ -262,7 +259,7 @@ class Filter:
 
 
 @dataclass
-class Law:
+class Stepwise:
     """A local variable's conditional for all particles, one step after another.
 
     Args:
@@ -276,17 +273,17 @@ class Law:
     reads: list[str]
 
     def step(self, t: int, history: Mapping[str, Rows]) -> Parameters:
-        """The head's parameters (N, D) at step t."""
+        """The law's parameters (N, D) at step t."""
         if not self.reads:
             return tuple(parameter[t] for parameter in self.state)
         parameters, self.state = self.conditional.step(self.state, t, {name: history[name] for name in self.reads})
         return parameters
 
-    def select(self, rows: Tensor) -> Law:
+    def select(self, rows: Tensor) -> Stepwise:
         """For these of its particles."""
         network = self.conditional.network if self.reads else None
         moved = select(self.state, rows) if network is None else network.select(self.state, rows)
-        return Law(self.conditional, moved, self.reads)
+        return Stepwise(self.conditional, moved, self.reads)
 
 
 def effective_size(log_weights: Tensor) -> Tensor:
@@ -315,9 +312,12 @@ def _log_mean(log_weights: Tensor) -> Tensor:
 
 def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, counted: Tensor | None = None) -> Tensor:
     """(N,) of values (N, D); entries that are not `counted` are left out."""
-    entries = conditional.head.distribution(parameters).log_prob(value)
+    entries = conditional.law.distribution(parameters).log_prob(value)
+    if counted is not None and counted.dim() != entries.dim():  # one of guide and model has whole events
+        counted = counted.all(-1) if conditional.whole else counted[:, None]
     # where, not a product: an entry that does not count may be infinite
-    return (entries if counted is None else torch.where(counted, entries, 0.0)).sum(-1)
+    entries = entries if counted is None else torch.where(counted, entries, 0.0)
+    return entries if conditional.whole else entries.sum(-1)
 
 
 def _at(values: Rows | None, t: int) -> Tensor | None:

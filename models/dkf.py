@@ -18,7 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..laws.families import Head, HeadSpec, Parameters
+from ..laws.base import LawSpec, Parameters, Shape
+from ..laws.families import Gaussian
 from ..networks import Dense, Input, NetworkSpec, Recurrent
 from ..networks.base import Network, at, shift
 from ..options import Extra, Size
@@ -31,7 +32,7 @@ class Gated:
 
         g = sigmoid(MLP(z))    h = MLP(z)    mean = (1 - g) * L(z) + g * h    variance = softplus(L(relu(h)))
 
-    Its features are the mean and relu(h); `GatedNormal` is its head.
+    Its features are the mean and relu(h); `GatedNormal` is its law.
     """
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> GatedTransition:
@@ -82,15 +83,13 @@ class GatedNormal:
 
     min_scale: float = 1e-3
 
-    def build(self, features: int, size: int, local: bool = True) -> GatedHead:
-        """The head from features (..., 2 D)."""
-        return GatedHead(self, size)
+    def build(self, shape: Shape) -> GatedLaw:
+        """The law of a variable, from features (..., 2 D)."""
+        return GatedLaw(self, shape.size)
 
 
-class GatedHead(Head):
+class GatedLaw(Gaussian):
     """See `GatedNormal`."""
-
-    location_scale = True
 
     def __init__(self, spec: GatedNormal, size: int):
         super().__init__()
@@ -98,7 +97,7 @@ class GatedHead(Head):
         self.variance = nn.Linear(size, size)
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Head.forward`."""
+        """See `Law.forward`."""
         mean, proposal = features.chunk(2, dim=-1)
         return mean, torch.sqrt(functional.softplus(self.variance(proposal)) + self.min_variance)
 
@@ -137,6 +136,6 @@ class DKF(LatentMethod):
             "q(z)": Recurrent(self.width, embed=self.embed, extract=extract, hidden=self.hidden, mean=True),
         }
 
-    def heads(self) -> Mapping[str, HeadSpec]:
+    def laws(self) -> Mapping[str, LawSpec]:
         """The gated transition has its own."""
-        return {**super().heads(), **({} if self.transition else {"p(z)": GatedNormal()})}
+        return {**super().laws(), **({} if self.transition else {"p(z)": GatedNormal()})}

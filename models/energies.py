@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ..inference.batches import Source
-from ..laws.priors import VampPrior
+from ..laws.priors import VampLaw
 from ..motion import Heading, Skeleton, Windows, energies
 from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
 from ..motion.judges.pose_prior import PosePriorModel, fit_pose_prior, load_pose_prior
@@ -89,9 +89,9 @@ class EnergyMethod(PoseMethod):
         Raises:
             ValueError: a pose prior of another skeleton.
         """
-        for prior in model.priors.values():
-            if isinstance(prior, VampPrior):
-                prior.start_at({WHOLE: model.turned(windows.sample(prior.components, torch.default_generator)["x"])})
+        for law in model.modules():
+            if isinstance(law, VampLaw):
+                law.start_at({WHOLE: model.turned(windows.sample(law.components, torch.default_generator)["x"])})
         if model.limits is not None:
             limits = estimate_angle_limits(windows.poses(), windows.skeleton, self.angle_quantile)
             model.angle_low.copy_(limits.low)

@@ -64,4 +64,4 @@ class Equations(LatentMethod):
         generative, inference = self.equations()
         latents = {name: self.latents.get(name, self.latent) for name in generative.variables if name not in given}
         sizes = {**latents, **given}
-        return DynamicalVAE(generative, inference, sizes, self.networks(), self.heads(), self.priors(sizes))
+        return DynamicalVAE(generative, inference, sizes, self.networks(), self.laws())

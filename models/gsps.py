@@ -35,7 +35,7 @@ from torch import Tensor
 from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
-from ..laws.families import Delta
+from ..laws import Delta
 from ..motion import Skeleton, Windows, energies
 from ..motion.body import body_parts
 from ..networks import GraphConv
@@ -222,7 +222,7 @@ class GSPSModel(EnergyModel):
                 f"p({name})": GraphConv(everything, name, length, method.coefficients, method.width, method.blocks)
                 for name in parts
             },
-            heads={f"p({name})": Delta() for name in parts},
+            laws={f"p({name})": Delta() for name in parts},
             views=(History(HISTORY), Parts(parts)),
         )
         self.length = length

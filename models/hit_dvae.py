@@ -234,11 +234,11 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             return method._finished(super(HiTDVAE, method).build(schema), observed)
         self.poses(schema)
         sizes = {**method.sizes(), **schema.sizes}
-        heads: dict[str, Any] = dict(method.heads())
+        laws: dict[str, Any] = dict(method.laws())
         if method.selects == "loss":
-            heads["p(x)"] = replace(heads["p(x)"], fitted="scale")
-        parts = (sizes, method.networks(), heads, method.priors(sizes))
-        model = HiTModel(method, schema.skeleton, observed, *method.equations(), *parts)
+            laws["p(x)"] = replace(laws["p(x)"], fitted="scale")
+        networks = method.networks()
+        model = HiTModel(method, schema.skeleton, observed, *method.equations(), sizes, networks, laws)
         return method._finished(model, observed)
 
     def _finished(self, model: Any, observed: int) -> Any:
@@ -290,7 +290,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             x = windows.sample(1024, torch.default_generator)["x"]
             model.units[WHOLE].fit(model.turned(x) if isinstance(model, EnergyModel) else x)
             if self.emission == "fixed":
-                nn.init.zeros_(model.generator[WHOLE].head.log_scale)
+                nn.init.zeros_(model.generator[WHOLE].law.log_scale)
 
     def objective(self) -> Objective:
         """See `Method.objective`.

@@ -34,7 +34,7 @@ from torch.nn import functional
 
 from ..inference.fit import Stage
 from ..inference.recipe import Recipe
-from ..laws.families import Head, HeadSpec, Parameters
+from ..laws.base import Law, LawSpec, Parameters, Shape
 from ..laws.kalman import LinearGaussianChain, update
 from ..laws.triangular import InverseCholesky, TriangularNormal
 from ..networks import Dense, Input, Network, NetworkSpec
@@ -86,9 +86,9 @@ class KVAE(LatentMethod):
             "q(a)": Dense(self.hidden),
         }
 
-    def heads(self) -> Mapping[str, HeadSpec]:
+    def laws(self) -> Mapping[str, LawSpec]:
         """The filter's prediction has a full covariance."""
-        return {**super().heads(), "p(a)": Triangular()}
+        return {**super().laws(), "p(a)": Triangular()}
 
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """See `phases`. In a run of fewer than three steps there is one."""
@@ -104,19 +104,17 @@ class KVAE(LatentMethod):
 
 @dataclass(frozen=True)
 class Triangular:
-    """A normal with full covariance, whose features are its location and whitening matrix; for a latent variable.
+    """A normal with full covariance, whose features are its location and whitening matrix."""
 
-    (For data with missing entries its terms, each given the coordinates before it, would not be those of what is seen.)
-    """
-
-    def build(self, features: int, size: int, local: bool = True) -> Head:
-        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
-        if features != size + size**2:
-            raise ValueError(f"a triangular head takes {size + size**2} features, but the network gives {features}")
-        return TriangularHead(size)
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
+        needed = shape.size + shape.size**2
+        if shape.features != needed:
+            raise ValueError(f"a Triangular law takes {needed} features, but the network gives {shape.features}")
+        return TriangularLaw(shape.size)
 
 
-class TriangularHead(Head):
+class TriangularLaw(Law):
     """See `Triangular`; its parameters are (..., D) and (..., D * D)."""
 
     def __init__(self, size: int):
@@ -124,16 +122,16 @@ class TriangularHead(Head):
         self.size = size
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Head.forward`."""
+        """See `Law.forward`."""
         return features.split([self.size, self.size**2], dim=-1)
 
     def distribution(self, parameters: Parameters) -> TriangularNormal:
-        """See `Head.distribution`."""
+        """See `Law.distribution`."""
         loc, whitening = parameters
         return TriangularNormal(loc, whitening.unflatten(-1, (self.size, self.size)), validate_args=False)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """See `Head.draw`."""
+        """See `Law.draw`."""
         return self.distribution(parameters).color(noise)
 
 

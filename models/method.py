@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
@@ -14,10 +14,10 @@ from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe, Trainable
 from ..inference.schedules import Cosine, Linear, Logistic, Schedule
-from ..laws.families import FixedNormal, HeadSpec, Normal, StudentT
-from ..laws.priors import FlowPrior, MixturePrior, Prior, VampPrior
+from ..laws import FixedNormal, Flow, LawSpec, Mixture, Normal, StudentT, Vamp
+from ..laws.priors import VampLaw
 from ..networks import NetworkSpec
-from ..notation import Factor, Factorization
+from ..notation import Factorization
 from ..options import Amount, Delay, Range, Share, Size
 from ..program.model import DynamicalVAE
 from ..program.rollout import SelfFeeding
@@ -46,7 +46,7 @@ class Method(Trainable):
 class LatentMethod(Method):
     """A method with a likelihood whose model follows from its networks and laws, and is trained on the evidence.
 
-    A subclass gives `networks`, and `sizes` and `heads` where these are other ones.
+    A subclass gives `networks`, and `sizes` and `laws` where these are other ones.
 
     Args:
         latent: size of z.
@@ -88,52 +88,39 @@ class LatentMethod(Method):
             'factor, such as {"default": Recurrent(64)}, or a `build` of its own'
         )
 
-    def heads(self) -> Mapping[str, HeadSpec]:
-        """Heads by factor."""
-        kinds: dict[str, HeadSpec] = {
+    def laws(self) -> Mapping[str, LawSpec]:
+        """Laws by factor: that of x, and of static latents without parents, where `prior` is not "standard".
+
+        Raises:
+            ValueError: a prior without such a latent.
+        """
+        emissions: dict[str, LawSpec] = {
             "normal": Normal(residual=self.residual),
             "fixed": FixedNormal(scale=0.1, learned=True, residual=self.residual),
             "unit": FixedNormal(residual=self.residual),
             "student": StudentT(residual=self.residual),
         }
-        return {"p(x)": kinds[self.emission]}
-
-    def priors(self, sizes: Mapping[str, int]) -> Mapping[str, Prior]:
-        """Priors of the static latents without parents, where `prior` is not "standard".
-
-        Args:
-            sizes: dimension of every variable.
-
-        Raises:
-            ValueError: a prior without such a latent.
-        """
+        laws = {"p(x)": emissions[self.emission]}
         if self.prior == "standard":
-            return {}
-        p, q = self.equations()
-        guides = {
-            f.child: q.factor(f.child) for f in p.factors if f.child in q.variables and not (f.local or f.parents)
+            return laws
+        priors: dict[str, LawSpec] = {
+            "mixture": Mixture(self.prior_components),
+            "vamp": Vamp(self.prior_components, self.prior_steps),
+            "flow": Flow(),
         }
-        if not guides:
+        p, q = self.equations()
+        latents = [f.child for f in p.factors if f.child in q.variables and not (f.local or f.parents)]
+        if not latents:
             raise ValueError(
                 f"prior={self.prior!r} is for a static latent without parents, such as p(w), which {p.text} does not "
                 'have; use prior="standard"'
             )
-        kinds: dict[str, Callable[[Factor], Prior]] = {
-            "mixture": lambda guide: MixturePrior(sizes[guide.child], self.prior_components),
-            "vamp": lambda guide: VampPrior(
-                sizes[guide.child],
-                {parent.name: sizes[parent.name] for parent in guide.parents},
-                self.prior_components,
-                self.prior_steps,
-            ),
-            "flow": lambda guide: FlowPrior(sizes[guide.child]),
-        }
-        return {name: kinds[self.prior](guide) for name, guide in guides.items()}
+        return laws | {f"p({name})": priors[self.prior] for name in latents}
 
     def build(self, data: Any) -> DynamicalVAE:
         """The model of these equations."""
         sizes = {**self.sizes(), **Schema.of(data).sizes}
-        model = DynamicalVAE(*self.equations(), sizes, self.networks(), self.heads(), self.priors(sizes))
+        model = DynamicalVAE(*self.equations(), sizes, self.networks(), self.laws())
         model.feeding = SelfFeeding(0.0, gradient=False)
         return model
 
@@ -161,7 +148,7 @@ class LatentMethod(Method):
 
 
 def start_priors(model: nn.Module, train: Any) -> None:
-    """Has the pseudo-sequences of VampPriors start at windows of the training data."""
-    for prior in getattr(model, "priors", {}).values():
-        if isinstance(prior, VampPrior):
-            prior.start_at(train.sample(prior.components, torch.default_generator))
+    """Has the pseudo-sequences of Vamp priors start at windows of the training data."""
+    for law in model.modules():
+        if isinstance(law, VampLaw):
+            law.start_at(train.sample(law.components, torch.default_generator))

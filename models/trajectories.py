@@ -26,7 +26,7 @@ from typing_extensions import override
 from ..inference.fit import Stage
 from ..inference.objectives import Evidence
 from ..inference.recipe import Recipe
-from ..laws.families import FixedNormal, HeadSpec
+from ..laws import FixedNormal, LawSpec
 from ..motion import HUMAN36M, PROTOCOLS, Clip, Heading, Skeleton, Windows
 from ..motion.control import bend
 from ..motion.data import defect
@@ -87,7 +87,7 @@ class TrajectoryMethod(PoseMethod):
         """See `Method.selects`: beta is part of the model, which the bound does not know."""
         return "loss"
 
-    def heads(self) -> Mapping[str, HeadSpec]:
+    def laws(self) -> Mapping[str, LawSpec]:
         """x is normal with variance 1/2, minus whose log-density is the squared error."""
         return {"p(x)": FixedNormal(scale=sqrt(0.5))}
 
@@ -124,7 +124,7 @@ class TrajectoryMethod(PoseMethod):
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         sizes = {**self.sizes(), **dict.fromkeys((WHOLE, FIRST, GIVEN, REST), size)}
-        return kind(*arguments, *self.equations(), sizes, self.networks(), self.heads())
+        return kind(*arguments, *self.equations(), sizes, self.networks(), self.laws())
 
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
         """Minimises squared errors and the weighted KL, on windows that are turned anyhow, with some paths given."""

@@ -27,7 +27,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..laws.families import FixedNormal, Head, HeadSpec, Normal, NormalHead, Parameters
+from ..laws.base import Law, LawSpec, Parameters, Shape
+from ..laws.families import FixedNormal, Normal, NormalLaw
 from ..motion import Skeleton
 from ..networks import CosineEncoder, MotionDecoder, NetworkSpec
 from ..networks.base import share_modules
@@ -134,9 +135,9 @@ class TrajeVAE(TrajectoryMethod):
             found["p(z)"] = encoder
         return {**found, "p(x)": MotionDecoder(hidden=2 * shape["width"], **shape)}
 
-    def heads(self) -> Mapping[str, HeadSpec]:
+    def laws(self) -> Mapping[str, LawSpec]:
         """The decoder makes poses; normal latents, of which those beyond `components` are noise that nothing reads."""
-        latent: HeadSpec = SlowNormal(steps=self.components) if self.components else Normal()
+        latent: LawSpec = SlowNormal(steps=self.components) if self.components else Normal()
         emission = FixedNormal(scale=sqrt(0.5), project=False)
         return {"p(x)": emission, "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
 
@@ -164,20 +165,20 @@ class SlowNormal(Normal):
 
     steps: int = 0
 
-    def build(self, features: int, size: int, local: bool = True) -> Head:
+    def build(self, shape: Shape) -> Law:
         """See `Normal.build`."""
-        return SlowNormalHead(self, features, size)
+        return SlowNormalLaw(self, shape)
 
 
-class SlowNormalHead(NormalHead):
+class SlowNormalLaw(NormalLaw):
     """See `SlowNormal`."""
 
-    def __init__(self, spec: SlowNormal, features: int, size: int):
-        super().__init__(spec, features, size)
+    def __init__(self, spec: SlowNormal, shape: Shape):
+        super().__init__(spec, shape)
         self.steps = spec.steps
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Head.forward`."""
+        """See `Law.forward`."""
         loc, scale = super().forward(features, previous, t)
         if t is not None:
             return (loc, scale) if t < self.steps else (torch.zeros_like(loc), torch.ones_like(scale))

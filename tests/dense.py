@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from dvae.inference.bounds import SequenceELBO
-from dvae.laws import Head
+from dvae.laws import Law
 from dvae.notation import Factorization, Relation
 from dvae.program.conditional import CONSTANT
 
@@ -58,7 +58,7 @@ def exact_bound(model, x, *, length=None, seen=None, fed=None, detach=False):
                 for column in np.flatnonzero(factorization.mask(name, parent.name, padded)[row]):
                     value = values[parent.name, column + 1 if parent.local else None]
                     mean = mean + value @ network.weights[parent.name][row, column].T
-            log_scale = conditionals[name].head.log_scale
+            log_scale = conditionals[name].law.log_scale
             make(name, t, mean, (log_scale if log_scale.dim() == 1 else log_scale[row]).exp())
 
     bound = x.new_zeros(())
@@ -119,7 +119,7 @@ def library_bound(model, x, *, lengths=None, seen=None, fed=None, feeding=None):
         return points[:, used - width : used].reshape(shape)
 
     with ExitStack() as patched:
-        patched.enter_context(mock.patch.object(Head, "noise", lambda self, shape, like: take(shape)))
+        patched.enter_context(mock.patch.object(Law, "noise", lambda self, shape, like: take(shape)))
         patched.enter_context(mock.patch("torch.distributions.normal._standard_normal", take))
         if fed is not None:  # frames with 0 are fed, those with 1 are not
             frames = (~fed).to(x.dtype).repeat(2 * noise, 1)[..., None]

@@ -11,9 +11,8 @@ from pyro import poutine
 from pyro.infer import Trace_ELBO, TraceMeanField_ELBO
 from pyro.infer.autoguide.initialization import InitMessenger, init_to_value
 
-from dvae import DynamicalVAE, Oracle, SequenceELBO, importance_bound, twin
+from dvae import DynamicalVAE, Oracle, SequenceELBO, importance_bound, laws, twin
 from dvae.inference.bounds import _closed_forms, _khat, _traces, sites_of
-from dvae.laws import families as heads
 from dvae.networks import Attention, Linear, Recurrent
 from dvae.program.rollout import SelfFeeding, Sequence
 
@@ -87,10 +86,10 @@ def test_it_is_a_pyro_elbo():
     assert all(p.grad is not None for p in model.parameters())
 
 
-@pytest.mark.parametrize("head", [heads.Normal(), heads.StudentT()])
-def test_particles_average_to_pyros_trace_elbo(head):
+@pytest.mark.parametrize("law", [laws.Normal(), laws.StudentT()])
+def test_particles_average_to_pyros_trace_elbo(law):
     # A Student t prior has no closed form, and its KL is a log-ratio then.
-    model, batch = build(heads={"p(x)": heads.Normal(), "p(z)": head}), data()
+    model, batch = build(laws={"p(x)": laws.Normal(), "p(z)": law}), data()
     n = 150
     with torch.no_grad():
         ours = torch.stack([SequenceELBO().terms(model, batch).bound.sum() for _ in range(n)])
@@ -126,7 +125,7 @@ def test_steps_sum_to_terms_and_terms_to_the_bound(lengths):
 
 @pytest.mark.parametrize("analytic", [True, False])
 def test_terms_of_a_ragged_batch_are_those_of_its_sequences(analytic):
-    model = build(heads=None if analytic else {"p(z)": heads.StudentT()})
+    model = build(laws=None if analytic else {"p(z)": laws.StudentT()})
     lengths = torch.tensor([5, 2, 1])
     batch = data(lengths=lengths)
     latents = {name: value.detach() for name, value in model.guide(batch).items()}
@@ -218,7 +217,7 @@ def test_an_exact_guide_has_equal_weights_and_a_poor_one_a_heavy_tail():
     assert oracle.evidence(x).detach() == pytest.approx(importance_bound(exact, x, 50).bound, abs=0.05)
     with torch.no_grad():
         for conditional in exact.encoder.values():
-            conditional.head.log_scale.sub_(2.0)
+            conditional.law.log_scale.sub_(2.0)
     assert importance_bound(exact, x, 400).khat.mean() > 0.7
 
 
@@ -300,7 +299,7 @@ def test_a_guide_that_can_be_exact_reaches_the_evidence_where_entries_are_missin
         batch = {"x": x, "mask": seen}
         values = {"z": x.new_tensor(z).reshape(1, steps, 1)}
         trace = poutine.trace(poutine.condition(model.model, data=values)).get_trace(batch)
-        law = trace.nodes["x"]["fn"].elementwise(x)
+        law = trace.nodes["x"]["fn"].steps(x)
         return law.mean[0, -1, 0], law.stddev[0, -1, 0]
 
     offset, scale = mean(0, 0, 0)
@@ -337,7 +336,7 @@ def test_a_backward_guide_has_no_analytic_kl_where_the_model_reads_its_own_means
 def test_nor_where_data_are_functions_of_latents():
     """p(z_t | x_{t-1}) reads z_{t-1} then, whatever is missing."""
     equations = "p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | z_{t+1}, c_t)"
-    own = {"p(x)": heads.Delta(), "q(z)": heads.FixedNormal(0.7), "p(z)": heads.FixedNormal(0.7)}
+    own = {"p(x)": laws.Delta(), "q(z)": laws.FixedNormal(0.7), "p(z)": laws.FixedNormal(0.7)}
     networks = {"p(x)": Linear(3, 1.0), "p(z)": Recurrent(4, hidden=(5,)), "q": Recurrent(4, hidden=(5,))}
     model = DynamicalVAE(*equations, {"z": 1, "x": 1, "c": 1}, networks, own).double()
     batch = {"c": torch.randn(2, 3, 1, dtype=torch.float64)}

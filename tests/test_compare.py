@@ -326,7 +326,7 @@ def test_information_is_the_mutual_information_of_a_linear_guide(pair, latent):
 def test_information_is_at_most_the_log_of_the_contrasts():
     model = build(STATIC, x=3)
     with torch.no_grad():
-        model.encoder["w"].head.log_scale.fill_(-9.0)  # the latent tells every sequence apart
+        model.encoder["w"].law.log_scale.fill_(-9.0)  # the latent tells every sequence apart
     x = draws(model, 40)
     assert run({"a": model}, x, contrasts=10).rows["a"].information["w"][0] == pytest.approx(math.log(10))
     assert run({"a": model}, x, contrasts=1).rows["a"].information["w"][0] == pytest.approx(0)
@@ -341,7 +341,7 @@ def collapsed():
         guide.network.weights["x"].zero_()
         guide.network.weights["z"].copy_(prior.network.weights["z"])
         guide.network.bias.copy_(prior.network.bias)
-        guide.head.log_scale.copy_(prior.head.log_scale)
+        guide.law.log_scale.copy_(prior.law.log_scale)
     return model
 
 

@@ -414,7 +414,7 @@ def test_posterior_replicates_of_driven_models_read_their_own_past():
     model = twin("p(z_t | x_{t-1}, z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})", {"z": 1, "x": 9}, T)
     with torch.no_grad():
         for conditional in model.encoder.values():
-            conditional.head.log_scale.fill_(-40.0)  # latents are known: what is left is the mean program
+            conditional.law.log_scale.fill_(-40.0)  # latents are known: what is left is the mean program
     x = model.sample(3, T)["x"]
     z = model.guide({"x": x})["z"]
     statistic = {"x": Statistic(lambda p: p[..., -1, 2, 2])}
@@ -512,7 +512,7 @@ def test_the_posteriors_unit_is_the_guides_standard_deviation():
     model = twin(STATIC, "q(w | x_{1:T})", {"w": 2, "x": 1}, T)
     found = traverse(model, model.sample(3, T)["x"], "w", unit="posterior", draws=4000)
     torch.testing.assert_close(
-        found.scale, model.encoder["w"].head.log_scale.exp().detach().flatten(), rtol=0.05, atol=0
+        found.scale, model.encoder["w"].law.log_scale.exp().detach().flatten(), rtol=0.05, atol=0
     )
 
 

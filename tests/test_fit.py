@@ -241,7 +241,7 @@ def test_stages_follow_one_another_on_one_global_step():
 
 
 def test_a_stage_keeps_what_it_freezes_also_across_a_resume(tmp_path):
-    stages = [Stage(30, frozen=("generator.z.", "generator.x.head")), Stage(30)]
+    stages = [Stage(30, frozen=("generator.z.", "generator.x.law")), Stage(30)]
     start = build().state_dict()
 
     def moved(state):

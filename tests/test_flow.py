@@ -7,15 +7,24 @@ import pytest
 import torch
 from scipy import stats
 
+from dvae import DynamicalVAE, SequenceELBO
 from dvae.inference.checkpoints import CheckpointError, load_weights, save_weights
-from dvae.laws import QRFlow
+from dvae.laws import QRFlow, Shape
 
 SIZES = [(1, 1), (1, 3), (2, 3), (5, 1), (5, 3)]
 
 
+def start(size=5, layers=3):
+    return QRFlow(layers).build(Shape(size, local=False))
+
+
+def law_of(flow):
+    return flow.distribution(flow(flow.location.new_empty(0)))
+
+
 def build(size=5, layers=3, whitened=True):
     """A flow with parameters that are not those it starts with."""
-    flow = QRFlow(size, layers).double()
+    flow = start(size, layers).double()
     with torch.no_grad():
         for parameter in flow.parameters():
             parameter.add_(0.5 * torch.randn_like(parameter) / size**0.5)
@@ -37,7 +46,7 @@ def values(count, size=5):
 @pytest.mark.parametrize(("size", "parameters"), [(48, 13_970), (42, 10_712)])
 def test_it_has_the_published_number_of_parameters(size, parameters):
     """Of Human3.6M and HumanEva-I; the latter's log rounds to 0.01071 million."""
-    assert sum(parameter.numel() for parameter in QRFlow(size).parameters()) == parameters
+    assert sum(parameter.numel() for parameter in start(size).parameters()) == parameters
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 48])
@@ -60,9 +69,9 @@ def test_q_is_the_product_of_the_reflections_the_last_one_first(size):
 @pytest.mark.parametrize(("size", "layers"), SIZES)
 def test_the_determinant_is_that_of_the_jacobian(size, layers, whitened):
     flow, x = build(size, layers, whitened), values(6, size)
-    _, log_det = flow(x)
+    _, log_det = flow.to_noise(x)
     for each, found in zip(x, log_det, strict=True):
-        jacobian = torch.autograd.functional.jacobian(lambda v: flow(v)[0], each)
+        jacobian = torch.autograd.functional.jacobian(lambda v: flow.to_noise(v)[0], each)
         torch.testing.assert_close(torch.linalg.slogdet(jacobian).logabsdet, found, rtol=0, atol=1e-10)
 
 
@@ -70,15 +79,15 @@ def test_the_determinant_is_that_of_the_jacobian(size, layers, whitened):
 @pytest.mark.parametrize(("size", "layers"), [*SIZES, (48, 3)])
 def test_the_inverse_is_exact(size, layers, whitened):
     flow, x = build(size, layers, whitened), values(20, size).unflatten(0, (4, 5))
-    z, log_det = flow(x)
+    z, log_det = flow.to_noise(x)
     assert (z.shape, log_det.shape) == (x.shape, x.shape[:-1])
-    torch.testing.assert_close(flow.inverse(z), x, rtol=0, atol=1e-10)
-    torch.testing.assert_close(flow(flow.inverse(x))[0], x, rtol=0, atol=1e-10)
+    torch.testing.assert_close(flow.from_noise(z), x, rtol=0, atol=1e-10)
+    torch.testing.assert_close(flow.to_noise(flow.from_noise(x))[0], x, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("whitened", [False, True])
 def test_in_one_dimension_it_is_a_density_and_draws_follow_it(whitened):
-    law = build(1, whitened=whitened).distribution()
+    law = law_of(build(1, whitened=whitened))
     draws = law.sample((2000,))[:, 0]
     span = 20 * draws.std()
     axis = torch.linspace(draws.mean() - span, draws.mean() + span, 400_001, dtype=torch.float64)
@@ -89,7 +98,7 @@ def test_in_one_dimension_it_is_a_density_and_draws_follow_it(whitened):
 
 
 def test_in_two_dimensions_it_is_a_density():
-    law = build(2).distribution()
+    law = law_of(build(2))
     draws = law.sample((10_000,))
     middle, spread = draws.mean(0), draws.std(0)
     axes = [torch.linspace(m - 9 * s, m + 9 * s, 1501, dtype=torch.float64) for m, s in zip(middle, spread)]
@@ -100,14 +109,14 @@ def test_in_two_dimensions_it_is_a_density():
 
 def test_a_linear_flow_is_the_normal_of_the_values_that_whitened_it():
     x = values(40)
-    flow = QRFlow(5).double()
+    flow = start(5).double()
     with torch.no_grad():
         for parameter in (flow.triangular, flow.bias, flow.log_slope):
             parameter.zero_()
     flow.whiten(x)
     expected = dist.MultivariateNormal(x.mean(0), x.T.cov())
     points = values(7)
-    torch.testing.assert_close(flow.distribution().log_prob(points), expected.log_prob(points), rtol=0, atol=1e-6)
+    torch.testing.assert_close(law_of(flow).log_prob(points), expected.log_prob(points), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("whitened", [False, True])
@@ -115,7 +124,7 @@ def test_on_normal_data_it_learns_the_closed_form_density(whitened):
     size, train, held_out = 4, 2000, 4000
     data = values(train + held_out, size).float()
     torch.manual_seed(1)
-    flow = QRFlow(size)
+    flow = start(size)
     if whitened:
         flow.whiten(data[:train])
     steps = 600
@@ -123,9 +132,9 @@ def test_on_normal_data_it_learns_the_closed_form_density(whitened):
     for step in range(steps):
         optimizer.param_groups[0]["lr"] = 0.02 * (1 - step / steps)
         optimizer.zero_grad()
-        (-flow.distribution().log_prob(data[:train]).mean()).backward()
+        (-law_of(flow).log_prob(data[:train]).mean()).backward()
         optimizer.step()
-    excess = normal(size).log_prob(data[train:]) - flow.distribution().log_prob(data[train:]).detach()
+    excess = normal(size).log_prob(data[train:]) - law_of(flow).log_prob(data[train:]).detach()
     # p parameters fitted to N values cost p / 2N nats a value on average: .023 for the 92 that are used here
     assert abs(excess.mean()) < 0.023 + 3 * excess.std() / held_out**0.5
 
@@ -133,7 +142,7 @@ def test_on_normal_data_it_learns_the_closed_form_density(whitened):
 @pytest.mark.parametrize("layers", [1, 3])
 def test_every_parameter_that_is_used_learns(layers):
     flow = build(5, layers)
-    flow.distribution().log_prob(values(8)).sum().backward()
+    law_of(flow).log_prob(values(8)).sum().backward()
     assert (flow.triangular.grad.triu() != 0).sum() == layers * 15
     assert (flow.triangular.grad.tril(-1) == 0).all()
     for parameter in (flow.reflections, flow.bias, flow.log_slope):
@@ -143,7 +152,7 @@ def test_every_parameter_that_is_used_learns(layers):
 def test_gradients_are_right():
     flow, x = build(3), values(4, 3).requires_grad_()
     parameters = tuple(flow.parameters())
-    assert torch.autograd.gradcheck(lambda x, *_: flow.distribution().log_prob(x), (x, *parameters))
+    assert torch.autograd.gradcheck(lambda x, *_: law_of(flow).log_prob(x), (x, *parameters))
 
 
 def test_it_is_a_distribution_of_pyro():
@@ -151,14 +160,14 @@ def test_it_is_a_distribution_of_pyro():
 
     def model(x=None):
         with pyro.plate("rows", 3, dim=-2), pyro.plate("columns", 4, dim=-1):
-            return pyro.sample("x", flow.distribution(), obs=x)
+            return pyro.sample("x", law_of(flow), obs=x)
 
     x = values(12).unflatten(0, (3, 4))
     trace = pyro.poutine.trace(model).get_trace(x)
     assert trace.nodes["x"]["fn"].batch_shape == (3, 4)
-    torch.testing.assert_close(trace.log_prob_sum(), flow.distribution().log_prob(x).sum())
+    torch.testing.assert_close(trace.log_prob_sum(), law_of(flow).log_prob(x).sum())
     assert model().shape == (3, 4, 5)
-    law = flow.distribution().expand((4,))
+    law = law_of(flow).expand((4,))
     assert law.log_prob(x[0, 0]).shape == (4,)
     draws = law.rsample((2, 3))
     assert draws.shape == (2, 3, 4, 5)
@@ -170,11 +179,11 @@ def test_what_it_computes_follows_its_weights(tmp_path):
     """There is nothing that outlives a change of the weights, and the whitening is stored with them."""
     first, second, x = build(), build(), values(6)
     second.whiten(values(30) - 7)
-    before = second.distribution().log_prob(x)
+    before = law_of(second).log_prob(x)
     save_weights(first, tmp_path / "flow.safetensors")
     load_weights(second, tmp_path / "flow.safetensors")
-    assert torch.equal(second.distribution().log_prob(x), first.distribution().log_prob(x))
-    assert not torch.equal(second.distribution().log_prob(x), before)
+    assert torch.equal(law_of(second).log_prob(x), law_of(first).log_prob(x))
+    assert not torch.equal(law_of(second).log_prob(x), before)
     with pytest.raises(CheckpointError, match="another model"):
         load_weights(build(4), tmp_path / "flow.safetensors")
 
@@ -184,30 +193,40 @@ def test_values_that_do_not_vary_are_whitened_too():
     x[:, 2] = 0.5
     flow = build()
     flow.whiten(x)
-    z, log_det = flow(x)
+    z, log_det = flow.to_noise(x)
     assert torch.isfinite(z).all()
     assert torch.isfinite(log_det).all()
     flow.whiten(torch.zeros(10, 5))
-    assert torch.isfinite(flow(torch.zeros(5))[0]).all()
+    assert torch.isfinite(flow.to_noise(torch.zeros(5))[0]).all()
 
 
 def test_it_computes_in_its_own_precision():
     flow = build().float()
     with torch.autocast("cpu", torch.bfloat16):
-        z, log_det = flow(values(3).bfloat16())
+        z, log_det = flow.to_noise(values(3).bfloat16())
     assert (z.dtype, log_det.dtype) == (torch.float32, torch.float32)
     with pytest.raises(ValueError, match="no half precision"):
-        flow.bfloat16()(values(3))
+        flow.bfloat16().to_noise(values(3))
+
+
+def test_it_is_the_law_of_a_latent_like_others():
+    pair, sizes = ("p(w) p(x_t | w)", "q(w | x_{1:T})"), {"w": 5, "x": 2}
+    model = DynamicalVAE(*pair, sizes, laws={"p(w)": QRFlow(2)}).double()
+    x, w = torch.randn(3, 4, 2, dtype=torch.float64), values(3)
+    flow = model.generator["w"].law
+    torch.testing.assert_close(model.log_joint(x, {"w": w})["w"], law_of(flow).log_prob(w))
+    SequenceELBO().differentiable_loss(model, model.guide, x).backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in flow.parameters())
 
 
 @pytest.mark.parametrize(
     ("run", "message"),
     [
-        (lambda: QRFlow(0), "size 0 and 3 layers; both must be at least 1"),
-        (lambda: QRFlow(2, 0), "size 2 and 0 layers"),
-        (lambda: QRFlow(5)(torch.zeros(2, 4)), r"takes \(..., 5\), got \(2, 4\)"),
-        (lambda: QRFlow(5).inverse(torch.zeros(4)), r"takes \(..., 5\), got \(4,\)"),
-        (lambda: QRFlow(5).whiten(torch.zeros(5, 5)), "takes more than 5 values, got 5"),
+        (lambda: start(0), "size 0 and 3 layers; both must be at least 1"),
+        (lambda: start(2, 0), "size 2 and 0 layers"),
+        (lambda: start(5).to_noise(torch.zeros(2, 4)), r"takes \(..., 5\), got \(2, 4\)"),
+        (lambda: start(5).from_noise(torch.zeros(4)), r"takes \(..., 5\), got \(4,\)"),
+        (lambda: start(5).whiten(torch.zeros(5, 5)), "takes more than 5 values, got 5"),
     ],
 )
 def test_what_it_refuses(run, message):

@@ -83,7 +83,7 @@ def test_the_built_model_leaks_nothing_from_the_present_or_the_future(windows, a
 
     def means(x, z):
         sites = poutine.trace(poutine.condition(model.model, data={**latents, "z": z})).get_trace(x).nodes
-        return [sites[name]["fn"].elementwise(sites[name]["value"]) for name in ("x", "z")]
+        return [sites[name]["fn"].steps(sites[name]["value"]) for name in ("x", "z")]
 
     def moved(x, z):
         before, after = means(x0, z0), means(x, z)
@@ -145,12 +145,12 @@ def test_the_loss_is_the_papers(windows):
     x, pseudo = (model.turned(batch[name]) for name in ("x", "pseudo"))
     again = {"x": batch["x"].repeat(K, 1, 1)}
     program = poutine.trace(poutine.condition(model.model, data={"z": z, "w": w})).get_trace(again).nodes
-    motions = program["x"]["fn"].elementwise(x.repeat(K, 1, 1)).loc.unflatten(0, (K, B))
+    motions = program["x"]["fn"].steps(x.repeat(K, 1, 1)).loc.unflatten(0, (K, B))
 
     def kl(name):
         p, q = (nodes[name]["fn"] for nodes in (program, sites))
         if name == "z":
-            p, q = p.elementwise(z), q.elementwise(z)
+            p, q = p.steps(z), q.steps(z)
         return torch.distributions.kl_divergence(getattr(q, "base_dist", q), getattr(p, "base_dist", p)).unflatten(
             0, (K, B)
         )
@@ -191,7 +191,7 @@ def test_the_density_fits_the_scale_and_energies_the_poses(windows):
         for (name, _), g in zip(x.named_parameters(), likelihood, strict=True)
         if g is not None and g.abs().sum() > 0
     }
-    assert reached == {"head.log_scale"}
+    assert reached == {"law.log_scale"}
     objective(found, 10**6).backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.parameters() if p.requires_grad)
 
@@ -249,7 +249,7 @@ def test_a_prepared_model_starts_at_the_spread_of_poses(windows):
     model = method.build(windows)
     method.train(windows).prepare(model)
     x = windows.all()["x"][:2]
-    scale = poutine.trace(model.model).get_trace(x).nodes["x"]["fn"].elementwise(x).scale
+    scale = poutine.trace(model.model).get_trace(x).nodes["x"]["fn"].steps(x).scale
     assert scale.mean().item() == pytest.approx(windows.poses().var(0).mean().sqrt().item(), rel=0.05)
 
 

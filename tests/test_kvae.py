@@ -10,6 +10,7 @@ from torch.distributions import MultivariateNormal, kl_divergence
 
 import dvae
 from dvae.inference.fit import Callback
+from dvae.laws import Shape
 from dvae.laws.kalman import LinearGaussianChain
 from dvae.laws.triangular import InverseCholesky, TriangularNormal
 from dvae.models.kvae import KVAE, Kalman, KalmanNetwork, Triangular, smooth
@@ -237,29 +238,23 @@ def triangular(*shape):
 
 
 @pytest.mark.parametrize("shape", [(4, 3), (2, 3, 1)])
-def test_terms_of_the_chain_rule_sum_to_the_density(shape):
+def test_its_density_is_that_of_the_normal(shape):
     ours, whole = triangular(*shape)
     value = torch.randn(shape, dtype=torch.float64)
-    torch.testing.assert_close(ours.log_prob(value).sum(-1), whole.log_prob(value))
+    torch.testing.assert_close(ours.log_prob(value), whole.log_prob(value))
     torch.testing.assert_close(ours.variance, whole.covariance_matrix.diagonal(dim1=-2, dim2=-1))
-    # the first term is the first coordinate's own density: it reads nothing after it
-    first = Normal(ours.loc[..., 0], whole.covariance_matrix[..., 0, 0].sqrt()).log_prob(value[..., 0])
-    torch.testing.assert_close(ours.log_prob(value)[..., 0], first)
 
 
 def test_the_divergence_of_a_diagonal_normal_is_exact():
     ours, whole = triangular(5, 3)
     q = Normal(torch.randn(5, 3, dtype=torch.float64), torch.rand(5, 3, dtype=torch.float64) + 0.2)
     expected = kl_divergence(MultivariateNormal(q.loc, torch.diag_embed(q.scale**2)), whole)
-    torch.testing.assert_close(kl_divergence(q, ours).sum(-1), expected)
-    draws = q.sample([40_000])
-    entries = q.log_prob(draws) - ours.log_prob(draws)
-    assert ((entries.mean(0) - kl_divergence(q, ours)).abs() < 5 * entries.std(0) / 200).all()
+    torch.testing.assert_close(kl_divergence(q, ours), expected)
 
 
 def test_draws_of_it_have_its_covariance():
     ours, whole = triangular(3)
-    draws = ours.expand((3,)).rsample([50_000])
+    draws = ours.expand((1,)).rsample([50_000])[:, 0]
     largest = whole.covariance_matrix.diagonal().max()
     assert (torch.cov(draws.T) - whole.covariance_matrix).abs().max() < 5 * largest * (2 / 50_000) ** 0.5
     value = ours.rsample()
@@ -411,7 +406,7 @@ def test_half_precision_is_left_at_the_filter():
         (lambda: KVAE(components=0), "components is 0; it must be at least 1"),
         (lambda: smooth(dvae.method("vae").build({"x": 2}), torch.zeros(1, 2, 2)), "needs the chain of a kvae model"),
         (lambda: smooth(small(), torch.zeros(1, 2, 4), samples=0), "samples is at least 1, got 0"),
-        (lambda: Triangular().build(5, 2), "a triangular head takes 6 features, but the network gives 5"),
+        (lambda: Triangular().build(Shape(2, 5)), "a Triangular law takes 6 features, but the network gives 5"),
         (
             lambda: Kalman().build([Input("a", 2, Relation.parse("t-1"))], True, 2),
             r"from all of its own past, p\(a_t \| a_\{<t\}\), but the parents here are a at \{t-1\}",

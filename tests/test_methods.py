@@ -234,7 +234,7 @@ def refusal(name, option):
     if "prior" in option and all(factor.local for factor in generative.factors):
         return f"prior='{option['prior']}' is for a static latent without parents"
     if "residual" in option and "x" not in {parent.name for parent in generative.factor("x").parents}:
-        return "has a residual head, which adds"
+        return "has a residual law, which adds"
     return None
 
 
@@ -277,7 +277,7 @@ def test_options_of_the_loss_reach_it():
                 "inference": "q(v | x_{1:T}) q(w | x_{1:T}, v)",
                 "prior": "vamp",
             },
-            r"a VampPrior of w needs a guide that reads the data x over time and nothing else",
+            r"a Vamp of w needs a guide that reads the data x over time and nothing else",
         ),
     ],
 )
@@ -304,7 +304,7 @@ PUBLISHED = {  # parameters of the public implementation at its sizes for motion
 def test_the_default_networks_have_the_published_size(name):
     statics = {"static": 10} if name == "dsae" else {}
     model = dvae.method(name, latent=10, **statics).build({"x": 96})
-    scales = model.generator["x"].head.log_scale.numel()  # one a coordinate: the public code has no likelihood of x
+    scales = model.generator["x"].law.log_scale.numel()  # one a coordinate: the public code has no likelihood of x
     assert sum(parameter.numel() for parameter in model.parameters()) - scales == PUBLISHED[name]
 
 

@@ -13,10 +13,8 @@ from hypothesis import strategies as st
 from pyro import poutine
 from pyro.infer import Predictive, Trace_ELBO
 
-from dvae import DynamicalVAE
+from dvae import DynamicalVAE, laws
 from dvae.inference.bounds import SequenceELBO
-from dvae.laws import families as heads
-from dvae.laws import priors
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.program.batch import in_chunks, rows
 from dvae.program.reference import reference
@@ -179,7 +177,7 @@ def per_step(model, data, latents):
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("pair", PAIRS)
 def test_the_vectorised_joint_is_that_of_the_per_step_program(pair, network):
-    model = build(pair, network, priors={"w": priors.NormalPrior(2)} if pair == "dsae" else None)
+    model = build(pair, network, laws={"p(w)": laws.FixedNormal(learned=True)} if pair == "dsae" else None)
     data = draw(model)
     latents = {name: value.detach() for name, value in model.guide(data).items()}
     close(per_step(model, data, latents), model.log_joint(data, latents))
@@ -255,7 +253,7 @@ def test_the_value_of_a_missing_entry_changes_nothing(pair, network):
 
 
 def test_the_likelihood_is_that_of_the_observed_entries():
-    model = build("dkf", heads={"p(x)": heads.FixedNormal(scale=1.0)})
+    model = build("dkf", laws={"p(x)": laws.FixedNormal(scale=1.0)})
     x, seen = draw(model)["x"], torch.rand(B, T, 3) < 0.5
     z = torch.randn(B, T, 2, dtype=torch.float64)
     mean = model.generator["x"]({"z": z}, B, T)[0]
@@ -320,8 +318,8 @@ def test_a_seed_repeats_a_forecast_and_emissions_may_be_drawn():
     assert not torch.equal(run(1), run(1, draw_emission=True))
 
 
-class Bits(heads.Head):
-    """A head of binary data, as one writes it."""
+class Bits(laws.Law):
+    """A law of binary data, as one writes it."""
 
     def __init__(self, features, size):
         super().__init__()
@@ -341,13 +339,13 @@ class Bits(heads.Head):
 
 
 class BitsSpec:
-    def build(self, features, size, local=True):
-        return Bits(features, size)
+    def build(self, shape):
+        return Bits(shape.features, shape.size)
 
 
 @pytest.mark.parametrize("pair", ["srnn", "dkf", "rvae"])  # x in a loop, and at once
 def test_a_forecast_draws_discrete_data_and_takes_the_means_of_others(pair):
-    model = build(pair, heads={"p(x)": BitsSpec()})
+    model = build(pair, laws={"p(x)": BitsSpec()})
     x = (torch.rand(B, T, 3, dtype=torch.float64) < 0.5).double()
     forecast = partial(model.forecast, x, 4, 6)
     assert forecast()["x"].unique().tolist() == [0, 1]
@@ -357,7 +355,7 @@ def test_a_forecast_draws_discrete_data_and_takes_the_means_of_others(pair):
 
 
 def test_discrete_and_other_data_are_forecast_side_by_side():
-    model = build("body parts", heads={"p(y)": BitsSpec()})
+    model = build("body parts", laws={"p(y)": BitsSpec()})
     data = draw(model)
     data["y"] = (data["y"] > 0).double()
     out = model.forecast(data, 3, 4)
@@ -459,7 +457,7 @@ def test_sampling_draws_every_variable_and_leaves_the_training_mode(pair):
 @pytest.mark.parametrize("pair", ["storn", "srnn", "hit-dvae", "body parts", "context"])
 @pytest.mark.parametrize("residual", [False, True])
 def test_feeding_on_ones_own_means(pair, network, residual):
-    model = build(pair, network, heads={"p(x)": heads.Normal(residual=residual)})
+    model = build(pair, network, laws={"p(x)": laws.Normal(residual=residual)})
     data = draw(model)
     latents = {name: value.detach() for name, value in model.guide(data).items()}
     program = poutine.condition(model.model, data=latents)
@@ -481,7 +479,7 @@ def test_feeding_on_ones_own_means(pair, network, residual):
         if not model.generative.local(name):
             expected[name] = exact[name]
             continue
-        law = conditional.head.distribution(conditional({**data, **latents, **fed}, B, T))
+        law = conditional.law.distribution(conditional({**data, **latents, **fed}, B, T))
         expected[name] = law.log_prob({**data, **latents}[name]).sum((1, 2)).detach()
     close(exact, expected)
     close(logs(SelfFeeding(1.0, passes=T)), exact)
@@ -533,7 +531,7 @@ def test_self_feeding_passes_no_gradient_where_none_is_asked_for(feeding):
     expected = torch.tensor(0.0, dtype=torch.float64)
     for name in model.generative.variables:
         conditional = model.generator[name]
-        law = conditional.head.distribution(conditional(as_data, B, T))
+        law = conditional.law.distribution(conditional(as_data, B, T))
         expected = expected + law.log_prob(values[name]).sum()
     parameters = list(model.parameters())
     both = trace.log_prob_sum(), expected
@@ -550,7 +548,7 @@ def test_two_models_do_not_share_parameters():
     for model in (first, second):
         Trace_ELBO()(model, model.guide)(data).backward()
     assert not {id(p) for p in first.parameters()} & {id(p) for p in second.parameters()}
-    assert not torch.equal(first.generator["z"].head.out.weight, second.generator["z"].head.out.weight)
+    assert not torch.equal(first.generator["z"].law.out.weight, second.generator["z"].law.out.weight)
     assert not len(pyro.get_param_store())
 
 
@@ -579,21 +577,21 @@ def test_a_copied_model_runs_on_its_own():
     assert other.sample(2, T)["x"].std() > 0
 
 
-def test_networks_and_heads_are_chosen_by_factor():
+def test_networks_and_laws_are_chosen_by_factor():
     model = build(
         "dkf",
         {"p": Dense((3,)), "q(z)": Attention(8, heads=2), "default": Recurrent(4)},
-        heads={"p(x)": heads.StudentT(), "q": heads.FixedNormal(scale=0.5)},
+        laws={"p(x)": laws.StudentT(), "q": laws.FixedNormal(scale=0.5)},
     )
     assert type(model.generator["z"].network).__name__ == "DenseNetwork"
     assert type(model.encoder["z"].network).__name__ == "AttentionNetwork"
-    assert type(model.generator["x"].head).__name__ == "StudentTHead"
-    assert type(model.generator["z"].head).__name__ == "NormalHead"
-    assert type(model.encoder["z"].head).__name__ == "FixedNormalHead"
+    assert type(model.generator["x"].law).__name__ == "StudentTLaw"
+    assert type(model.generator["z"].law).__name__ == "NormalLaw"
+    assert type(model.encoder["z"].law).__name__ == "FixedNormalLaw"
 
 
 def test_a_guides_factor_without_parents_has_a_law_of_its_own():
-    model = build(("p(w) p(x_t | w)", "q(w)"), heads={"q": heads.FixedNormal(scale=0.25)})
+    model = build(("p(w) p(x_t | w)", "q(w)"), laws={"q": laws.FixedNormal(scale=0.25)})
     values = model.encoder["w"]({}, B, T)
     assert torch.allclose(values[1], torch.tensor(0.25, dtype=torch.float64))
     Trace_ELBO()(model, model.guide)(draw(model)).backward()
@@ -630,13 +628,16 @@ X = torch.zeros(B, T, 3, dtype=torch.float64)
             {"network": {"p(y)": Dense()}},
             r"no factor 'p\(y\)'; keys are p\(x\), p\(z\), q\(z\), 'p', 'q' and 'default'",
         ),
-        ({"heads": {"p(y)": heads.Normal()}}, r"no factor 'p\(y\)'"),
+        ({"laws": {"p(y)": laws.Normal()}}, r"no factor 'p\(y\)'"),
         ({"network": "gru"}, "the network of 'default' is 'gru'; expected a description such as Recurrent"),
         (
-            {"heads": {"p(x)": torch.nn.Linear(2, 2)}},
-            r"the head of 'p\(x\)' is Linear.*; expected a description such as Normal",
+            {"laws": {"p(x)": torch.nn.Linear(2, 2)}},
+            r"the law of 'p\(x\)' is Linear.*; expected a description such as Normal",
         ),
-        ({"priors": {"z": priors.NormalPrior(2)}}, r"a prior replaces a factor p\(z\) of a static latent"),
+        (
+            {"laws": {"p(z)": laws.Mixture()}},
+            r"static latents .* but z has parents and has a value at every step",
+        ),
         (
             {"inference": "q(z_t | x_t) q(y_t | x_t)"},
             r"q\(y_t \| x_t\): no latent y in .*; remove this factor, or add p\(y_t \| \.\.\.\) to the generative",

@@ -7,10 +7,8 @@ import pytest
 import torch
 from pyro import poutine
 
-from dvae import DynamicalVAE, Oracle, SequenceELBO, importance_bound, particle_bound, twin
+from dvae import DynamicalVAE, Oracle, SequenceELBO, importance_bound, laws, particle_bound, twin
 from dvae.inference.particles import Filter, ancestors, effective_size
-from dvae.laws import families as heads
-from dvae.laws import priors
 from dvae.networks import Attention, Dense, Input, Linear, Recurrent
 from dvae.networks.rows import Rows, select
 from dvae.notation import Factorization, Relation
@@ -78,7 +76,7 @@ def bounded(pair, seed=1):
     Oracle(model, T).fit_guide(100)
     with torch.no_grad():
         for conditional in model.encoder.values():
-            conditional.head.log_scale.add_(0.2)
+            conditional.law.log_scale.add_(0.2)
     return model
 
 
@@ -138,10 +136,10 @@ def test_on_long_sequences_it_is_tighter_than_importance_weighting(guide):
         p, q = model.generator["z"], model.encoder["z"]
         q.network.bias.copy_(p.network.bias)
         q.network.weights["z"].copy_(p.network.weights["z"])
-        q.head.log_scale.copy_(p.head.log_scale)
+        q.law.log_scale.copy_(p.law.log_scale)
         if "x" in q.network.weights:
             q.network.weights["x"].zero_()
-            q.head.log_scale.sub_(0.05)
+            q.law.log_scale.sub_(0.05)
         x = model.sample(20, steps)["x"]
         evidence = Oracle(model, steps).evidence(x)
         before = -math.inf
@@ -265,15 +263,14 @@ def test_it_is_the_textbooks_filter(pair, kind, extra):
 
 
 @torch.no_grad()
-def test_heads_and_priors_of_every_kind():
-    options = {"p(x)": heads.Normal(residual=True), "p(z)": heads.StudentT(), "q(z)": heads.Normal(residual=True)}
+def test_laws_of_every_kind():
+    options = {"p(x)": laws.Normal(residual=True), "p(z)": laws.StudentT(), "q(z)": laws.Normal(residual=True)}
     model = DynamicalVAE(
         "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{<t}, z_t)",
         "q(w | x_{1:T}) q(z_t | z_{<t}, x_{1:T}, w)",
         {"w": 2, "z": 2, "x": 3},
         NETWORKS["lstm"],
-        options,
-        {"w": priors.MixturePrior(2, 3)},
+        {**options, "p(w)": laws.Mixture(3)},
     ).double()
     for extra in BATCHES.values():
         batch = data(model, **extra())

@@ -10,36 +10,37 @@ import torch
 from scipy import stats
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO, importance_bound, motion
+from dvae import DynamicalVAE, SequenceELBO, importance_bound, laws, motion
 from dvae.cli import main
 from dvae.inference.checkpoints import load_weights, save_weights
-from dvae.laws import priors
 from dvae.motion.dataset import MotionData
 from dvae.networks import Dense, Recurrent
 from dvae.runs import directory as runs
 
 B, T = 3, 5
 PRIORS = {
-    "normal": priors.NormalPrior,
-    "mixture": lambda size: priors.MixturePrior(size, components=3),
-    "vamp": lambda size: priors.VampPrior(size, {"x": 2}, components=3, steps=4),
-    "flow": priors.FlowPrior,
+    "normal": laws.FixedNormal(learned=True),
+    "mixture": laws.Mixture(components=3),
+    "vamp": laws.Vamp(components=3, steps=4),
+    "flow": laws.Flow(),
 }
+SIZES = {"w": 2, "z": 2, "x": 2}
 PAIR = "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t, w)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
 
 
 def build(kind, size=2, pair=PAIR, network=None):
     """A model with such a prior, and parameters that are not those it starts with."""
     sizes = {name: d for name, d in {"w": size, "z": 2, "x": 2}.items() if f"({name}" in pair[0]}
-    model = DynamicalVAE(*pair, sizes, network or Recurrent(4, hidden=(4,)), priors={"w": PRIORS[kind](size)}).double()
+    model = DynamicalVAE(*pair, sizes, network or Recurrent(4, hidden=(4,)), laws={"p(w)": PRIORS[kind]}).double()
     with torch.no_grad():
-        for name, parameter in (*model.priors.named_parameters(), *model.encoder["w"].named_parameters()):
+        for name, parameter in (*model.generator["w"].named_parameters(), *model.encoder["w"].named_parameters()):
             parameter.add_((0.05 if ".nn." in name else 0.2) * torch.randn_like(parameter))  # .nn.: of a coupling
     return model
 
 
 def law(model, batch=1):
-    return model.priors["w"](batch, model.encoder["w"])
+    conditional = model.generator["w"]
+    return conditional.law.joint(conditional({}, batch, T))
 
 
 def data(batch=B, steps=T):
@@ -86,7 +87,7 @@ def test_every_parameter_of_a_prior_learns(kind, size):
 def test_bounds_lie_below_the_evidence_which_quadrature_knows(kind):
     model = build(kind, 1, ("p(w) p(x_t | w)", "q(w | x_{1:T})"), {"q": Recurrent(4), "p": Dense((4,))})
     with torch.no_grad():
-        model.encoder["w"].head.out.bias[1:].fill_(1.0)  # wide enough that importance weights have a variance
+        model.encoder["w"].law.out.bias[1:].fill_(1.0)  # wide enough that importance weights have a variance
     x = data()
     points = torch.linspace(-15, 15, 6_001, dtype=torch.float64)[:, None]
     for i in range(B):
@@ -109,7 +110,7 @@ def test_where_no_closed_form_is_known_the_kl_is_the_log_ratio_at_the_draw(kind)
     kl = SequenceELBO().terms(model, x).kl["w"]
     torch.manual_seed(1)
     w = model.guide(x)["w"]
-    ours = model.encoder["w"].head.distribution(model.encoder["w"]({"x": x}, B, T)).to_event(1)
+    ours = model.encoder["w"].law.distribution(model.encoder["w"]({"x": x}, B, T)).to_event(1)
     torch.testing.assert_close(kl, ours.log_prob(w) - law(model, B).log_prob(w))
 
 
@@ -119,7 +120,7 @@ def test_a_prior_follows_its_parameters_and_keeps_nothing(kind):
     model, points = build(kind), torch.randn(4, 2, dtype=torch.float64)
     with torch.no_grad():
         before = law(model, 4).log_prob(points)
-        for parameter in (*model.priors.parameters(), *model.encoder["w"].parameters()):
+        for parameter in (*model.generator["w"].parameters(), *model.encoder["w"].parameters()):
             parameter.add_(0.1 * torch.randn_like(parameter))
         assert ((law(model, 4).log_prob(points) - before).abs() > 1e-6).all()
     after = law(model, 4).log_prob(points)
@@ -138,11 +139,15 @@ def test_a_saved_prior_is_the_one_loaded(kind, tmp_path):
 
 def test_the_vamp_prior_is_the_mean_of_the_guides_posteriors_at_its_pseudo_sequences():
     model, points = build("vamp"), torch.randn(6, 2, dtype=torch.float64)
-    pseudo = model.priors["w"].pseudo["x"]
+    pseudo = model.generator["w"].law.pseudo["x"]
     loc, scale = model.encoder["w"]({"x": pseudo}, 3, 4)
     each = torch.distributions.Normal(loc, scale).log_prob(points[:, None]).sum(-1)
     torch.testing.assert_close(law(model, 6).log_prob(points), each.logsumexp(1) - math.log(3))
-    assert [name for name, _ in model.priors.named_parameters()] == ["w.pseudo.x"]  # the guide stays the model's
+    assert [name for name, _ in model.generator["w"].named_parameters()] == [
+        "law.pseudo.x"
+    ]  # the guide stays the model's
+    twin = copy.deepcopy(model)
+    assert twin.generator["w"].law.guide is twin.encoder["w"]
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])
@@ -150,47 +155,74 @@ def test_the_density_of_a_flow_is_that_of_its_noise_over_the_volume_it_takes(siz
     flow = law(build("flow", size))
 
     def move(noise):
+        value = noise[None]
         for transform in flow.transforms:
-            noise = transform(noise)
-        return noise
+            value = transform(value)
+        return value[0]
 
     for noise in torch.randn(20, size, dtype=torch.float64):
         volume = torch.autograd.functional.jacobian(move, noise).slogdet()[1]
         expected = torch.distributions.Normal(0.0, 1.0).log_prob(noise).sum() - volume
-        torch.testing.assert_close(flow.log_prob(move(noise))[0], expected)
+        torch.testing.assert_close(flow.log_prob(move(noise)[None])[0], expected)
 
 
 def test_a_flow_starts_near_the_standard_normal():
     points = torch.randn(200, 3)
-    flow = priors.FlowPrior(3)(200, None).log_prob(points)
+    flow = laws.Flow().build(laws.Shape(3, local=False))
+    start = flow.distribution(flow(points[:, :0])).log_prob(points)
     standard = torch.distributions.Normal(0.0, 1.0).log_prob(points).sum(-1)
-    assert (flow - standard).abs().mean() < 1
+    assert (start - standard).abs().mean() < 1
     with pytest.raises(ValueError, match=r"no half precision, but its parameters are torch.bfloat16; use mixed"):
-        priors.FlowPrior(3).bfloat16()(1, None)
+        flow.bfloat16()(points)
 
 
 @pytest.mark.parametrize(
-    ("prior", "guide", "message"),
+    ("guide", "not_this"),
+    [("q(w | x_{1:T}, z_{1:T})", r"q\(w \| x_\{1:T\}, z_"), ("q(w)", r"q\(w\)"), (None, "the prior itself")],
+)
+def test_a_vamp_needs_a_guide_of_data_alone(guide, not_this):
+    message = (
+        r"a Vamp of w needs a guide that reads the data x over time and nothing else, such as q\(w \| x_\{1:T\}\), not "
+    )
+    with pytest.raises(ValueError, match=message + not_this):
+        DynamicalVAE(PAIR[0], guide and f"{guide} q(z_t | x_{{1:T}})", SIZES, laws={"p(w)": laws.Vamp()})
+
+
+@pytest.mark.parametrize("law", [laws.Mixture(), laws.Vamp(), laws.Flow(), laws.QRFlow()])
+@pytest.mark.parametrize(
+    ("key", "what"),
     [
-        (priors.FlowPrior(3), "q(w | x_{1:T})", "the prior of w has size 3, but w 2"),
-        (
-            priors.VampPrior(2, {"x": 3}),
-            "q(w | x_{1:T})",
-            r"given data of sizes \{'x': 3\}, but q\(w \| x_\{1:T\}\) reads \{'x': 2\}",
-        ),
-        (
-            priors.VampPrior(2, {"x": 2, "z": 2}),
-            "q(w | x_{1:T}, z_{1:T})",
-            r"a VampPrior of w needs a guide that reads the data x over time and nothing else, such as q\(w \| x_",
-        ),
-        (priors.VampPrior(2, {}), r"q(w)", r"nothing else, such as q\(w \| x_\{1:T\}\), not q\(w\)"),
+        ("p(v)", "v is data"),
+        ("p(z)", "z has parents and has a value at every step"),
+        ("q(w)", "w has parents"),
+        ("p(u)", "u has a value at every step"),
     ],
 )
-def test_priors_that_do_not_suit(prior, guide, message):
-    with pytest.raises(ValueError, match=message):
-        DynamicalVAE(
-            PAIR[0], f"{guide} q(z_t | x_{{1:T}})", {"w": 2, "z": 2, "x": 2}, Recurrent(4), priors={"w": prior}
-        )
+def test_a_prior_is_of_a_static_latent_without_parents(law, key, what):
+    p, q = (
+        "p(v) p(w) p(u_t) p(z_t | z_{t-1}, w) p(x_t | v, u_t, z_t)",
+        "q(w | x_{1:T}) q(u_t | x_t) q(z_t | x_{1:T}, w)",
+    )
+    with pytest.raises(
+        ValueError, match=rf"is a law of static latents without parents, such as w in p\(w\), but {what}"
+    ):
+        DynamicalVAE(p, q, {**SIZES, "u": 2, "v": 2}, observed=("x", "v"), laws={key: law})
+
+
+def test_a_mixture_that_is_its_own_guide_would_learn_nothing():
+    with pytest.raises(ValueError, match=r"draws of the latent w are not reparameterised by the law of p\(w\)"):
+        DynamicalVAE(PAIR[0], None, SIZES, laws={"p(w)": laws.Mixture()})
+
+
+def test_weights_of_heads_and_priors_are_found_under_their_new_names():
+    model = build("mixture")
+    old = {"priors.w.logits", "priors.w.loc", "priors.w.log_scale"}
+    for name in model.state_dict():
+        if not name.startswith("generator.w."):
+            old.add(name.replace(".law.", ".head."))
+    assert any(".head." in name for name in old)
+    assert {laws.renamed(name) for name in old} == set(model.state_dict())
+    assert all(laws.renamed(name) == name for name in model.state_dict())
 
 
 # ------------------------------------------------------------------------------------------------------- in a run
@@ -217,7 +249,7 @@ def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
     starts = []
     for seed, name in ((0, "a"), (0, "b"), (1, "c")):
         runs.fit(method, data, tmp_path / name, dvae.Training(**{**vars(still), "seed": seed}))
-        starts.append(dvae.load(tmp_path / name).model.priors["w"].pseudo["x"])
+        starts.append(dvae.load(tmp_path / name).model.generator["w"].law.pseudo["x"])
     assert torch.equal(starts[0], starts[1])
     assert not torch.equal(starts[0], starts[2])
     windows = data.windows("train").all(stride=1)["x"][:, :6]

@@ -11,9 +11,8 @@ import torch
 from pyro.infer import SVI, Trace_ELBO
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO, twin
+from dvae import DynamicalVAE, SequenceELBO, laws, twin
 from dvae.inference.particles import Filter
-from dvae.laws import families as heads
 from dvae.models.method import LatentMethod
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.testing import FactorizationContract
@@ -52,9 +51,9 @@ def test_the_model_reads_its_own_mean_in_place_of_a_missing_entry():
 
 
 def test_a_gap_does_not_wreck_the_next_frame_of_a_residual_model():
-    model = srnn(heads={"p(x)": dvae.laws.FixedNormal(residual=True)})
+    model = srnn(laws={"p(x)": dvae.laws.FixedNormal(residual=True)})
     with torch.no_grad():
-        for parameter in model.generator["x"].head.parameters():
+        for parameter in model.generator["x"].law.parameters():
             parameter.zero_()
     x = torch.full((1, 6, 3), 5.0).double()
     means = model.reconstruct(gap(x, 2))["x"]
@@ -65,9 +64,9 @@ def test_a_gap_does_not_wreck_the_next_frame_of_a_residual_model():
 
 def test_removing_frames_of_a_well_predicted_sequence_raises_no_alarm():
     """A missing frame takes its own log-likelihood along, and little of its neighbours'."""
-    model = srnn(heads={"p(x)": dvae.laws.FixedNormal(scale=0.05, residual=True)})
+    model = srnn(laws={"p(x)": dvae.laws.FixedNormal(scale=0.05, residual=True)})
     with torch.no_grad():
-        for parameter in model.generator["x"].head.parameters():
+        for parameter in model.generator["x"].law.parameters():
             parameter.zero_()
     x = torch.full((2, 20, 3), 0.8).double()
     z = torch.zeros(2, 20, 2).double()
@@ -166,7 +165,7 @@ class TestRowMaskOfLinear(RowMask):
     network = Linear(12)
 
 
-def test_a_residual_head_is_held_to_a_custom_mask_at_every_length():
+def test_a_residual_law_is_held_to_a_custom_mask_at_every_length():
     def near(length: int) -> np.ndarray:
         return np.tri(length, k=-1, dtype=bool) if length != 12 else np.tri(length, k=-2, dtype=bool)
 
@@ -175,11 +174,11 @@ def test_a_residual_head_is_held_to_a_custom_mask_at_every_length():
         "q(z_t | x_t)",
         {"z": 1, "x": 1},
         Attention(8, 2),
-        heads={"p(x)": heads.Normal(residual=0.5)},
+        laws={"p(x)": laws.Normal(residual=0.5)},
         masks={"near": near},
     )
     model.sample(2, length=11)
-    with pytest.raises(ValueError, match=r"residual head, which adds x_{t-1}, but it does not read that at 12 steps"):
+    with pytest.raises(ValueError, match=r"residual law, which adds x_{t-1}, but it does not read that at 12 steps"):
         model.sample(2, length=12)
 
 

@@ -48,7 +48,7 @@ def worsen(model, by):
     other = twin(*PAIR, {"z": 1, "x": 1}, 3)
     other.load_state_dict(model.state_dict())
     with torch.no_grad():
-        other.encoder["z"].head.log_scale += by
+        other.encoder["z"].law.log_scale += by
     return other
 
 

@@ -31,14 +31,14 @@ def test_units_come_from_values_that_vary(shape, fill):
 
 @pytest.mark.parametrize("network", [Attention(8, heads=2), Recurrent(4)])
 @pytest.mark.parametrize(
-    "head", [dvae.laws.Normal(residual=0.5), dvae.laws.FixedNormal(0.3, learned=True), dvae.laws.StudentT()]
+    "law", [dvae.laws.Normal(residual=0.5), dvae.laws.FixedNormal(0.3, learned=True), dvae.laws.StudentT()]
 )
-def test_a_standardised_model_is_the_same_model_of_standardised_data(network, head):
+def test_a_standardised_model_is_the_same_model_of_standardised_data(network, law):
     """log p(x) = log p(u) - T D log s for u = (x - m) / s, with the guide's draws the same."""
     torch.manual_seed(0)
-    plain = dvae.DynamicalVAE(*PAIR, SIZES, network, {"p(x)": head}).double()
+    plain = dvae.DynamicalVAE(*PAIR, SIZES, network, {"p(x)": law}).double()
     torch.manual_seed(0)
-    model = dvae.DynamicalVAE(*PAIR, SIZES, network, {"p(x)": head}).double()
+    model = dvae.DynamicalVAE(*PAIR, SIZES, network, {"p(x)": law}).double()
     units = model.standardise("x").double()
     x = 4 + 0.1 * torch.randn(5, 6, 3, dtype=torch.float64)
     units.fit(x)
@@ -66,11 +66,11 @@ def test_a_standardised_model_is_the_same_model_of_standardised_data(network, he
 
 
 def test_a_scale_that_is_given_is_in_the_variables_own_unit():
-    model = dvae.DynamicalVAE(*PAIR, SIZES, heads={"p(x)": dvae.laws.FixedNormal(0.3)})
+    model = dvae.DynamicalVAE(*PAIR, SIZES, laws={"p(x)": dvae.laws.FixedNormal(0.3)})
     x = 4 + 0.1 * torch.randn(5, 6, 3)
     model.standardise("x").fit(x)
     site = poutine.trace(model.model).get_trace(x).nodes["x"]
-    assert torch.allclose(site["fn"].elementwise(x).scale, torch.tensor(0.3))
+    assert torch.allclose(site["fn"].steps(x).scale, torch.tensor(0.3))
 
 
 def test_only_variables_have_units():

@@ -1,21 +1,23 @@
 """Laws: distributions of a variable given features, and what they are made of."""
 
-from .families import Delta, FixedNormal, Head, HeadSpec, Normal, StandardNormal, StudentT
+from .base import Law, LawSpec, Shape, renamed
+from .families import Delta, FixedNormal, Normal, StandardNormal, StudentT
 from .flow import FlowDistribution, QRFlow
-from .priors import FlowPrior, MixturePrior, Prior, VampPrior
+from .priors import Flow, Mixture, Vamp
 
 __all__ = [
     "Delta",
     "FixedNormal",
+    "Flow",
     "FlowDistribution",
-    "FlowPrior",
-    "Head",
-    "HeadSpec",
-    "MixturePrior",
+    "Law",
+    "LawSpec",
+    "Mixture",
     "Normal",
-    "Prior",
     "QRFlow",
+    "Shape",
     "StandardNormal",
     "StudentT",
-    "VampPrior",
+    "Vamp",
+    "renamed",
 ]

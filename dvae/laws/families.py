@@ -1,15 +1,11 @@
-"""Heads: features to the distribution of one variable.
-
-A head turns features (..., H) into the parameters of an elementwise distribution over (..., D). The parameters are
-plain tensors, so that a loop over time handles no distribution objects.
-"""
+"""Families: laws whose parameters are read from features."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol
+from typing import Literal
 
 import pyro.distributions as dist
 import torch
@@ -17,72 +13,18 @@ from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
 from torch.nn import functional
 
-Parameters = tuple[Tensor, ...]
+from .base import Law, Parameters, Shape
 
 
-class Head(nn.Module):
-    """Features to the parameters of a distribution whose first parameter is its location.
+class Gaussian(Law):
+    """A law of independent normals; its parameters are their locations and scales, (..., D) each."""
 
-    A head of one's own gives `forward`, `distribution` and `draw`, and where the distribution is a location and a scale
-    says so. As it stands, it is one of normals.
-
-    Args:
-        residual: share of the variable's own previous value that its location keeps, so that features give the rest:
-            1 (True) for an offset. Below 1 a free run forgets where it was, and cannot drift without bound. A
-            residual head starts near that share, with weights a hundredth of the usual.
-
-    Raises:
-        ValueError: a share that is not between 0 and 1.
-    """
-
-    deterministic: ClassVar[bool] = False
-    """Whether the variable is a function of its parents, without a density."""
-    location_scale: ClassVar[bool] = False
-    """Whether the first two parameters (or the one) are a location and a scale, which `in_units` can put into another
-    unit. Probabilities and rates cannot be."""
-
-    def __init__(self, residual: float = False):
-        super().__init__()
-        if not 0 <= residual <= 1:
-            raise ValueError(f"residual is {residual}; it is a share of the previous value, from 0 to 1")
-        self.residual = float(residual)
-
-    def projection(self, features: int, out: int, locations: int) -> nn.Linear:
-        """The linear layer to `out` parameters, of which the first so many are locations."""
-        layer = nn.Linear(features, out)
-        if self.residual:
-            with torch.no_grad():
-                layer.weight[:locations] *= 0.01
-                layer.bias[:locations] *= 0.01
-        return layer
-
-    def moved(self, loc: Tensor, previous: Tensor | None) -> Tensor:
-        """The location from what the features give and the variable's own previous value."""
-        return loc if previous is None else torch.add(loc, previous, alpha=self.residual)
-
-    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """Parameters (..., D) from features and the variable's own previous value, where the head is residual.
-
-        Args:
-            features: (B, T, H) at all steps, or (B, H) of a static variable or at step `t`.
-            previous: (B, T, D) or (B, D).
-            t: the step, in a loop over time.
-        """
-        raise NotImplementedError
+    location_scale = True
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """The elementwise distribution over (..., D): a density for each coordinate, without event dimensions."""
+        """The normals."""
         loc, scale = parameters
         return dist.Normal(loc, scale, validate_args=False)
-
-    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """The parameters of mean + scale * variable, from those of the variable, of a location-scale family."""
-        loc, *rest = parameters
-        return torch.addcmul(mean, loc, scale), *(rest[:1] and [rest[0] * scale]), *rest[1:]
-
-    def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
-        """Noise for all steps at once; `draw` turns it into values."""
-        return torch.randn(*shape, dtype=like.dtype, device=like.device)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         """Reparameterised values (..., D)."""
@@ -90,43 +32,33 @@ class Head(nn.Module):
         return torch.addcmul(loc, scale, noise)
 
 
-class HeadSpec(Protocol):
-    """A description of a head: a frozen dataclass that `build`s one."""
-
-    def build(self, features: int, size: int, local: bool = True) -> Head:
-        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
-        ...
-
-
 @dataclass(frozen=True)
 class Normal:
-    """A diagonal normal whose location and scale are both read from the features.
+    """A diagonal normal whose location and scale are both read from the features, or learned without any.
 
     Args:
         min_scale: the scale stays above it; a likelihood whose scale can vanish has no maximum.
-        residual: see `Head`.
+        residual: see `Law`.
     """
 
     min_scale: float = 1e-3
     residual: float = False
 
-    def build(self, features: int, size: int, local: bool = True) -> Head:
-        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
-        return NormalHead(self, features, size)
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
+        return NormalLaw(self, shape)
 
 
-class NormalHead(Head):
+class NormalLaw(Gaussian):
     """See `Normal`."""
 
-    location_scale = True
-
-    def __init__(self, spec: Normal, features: int, size: int):
+    def __init__(self, spec: Normal, shape: Shape):
         super().__init__(spec.residual)
         self.min_scale = spec.min_scale
-        self.out = self.projection(features, 2 * size, size)
+        self.out = self.projection(shape.features, 2 * shape.size, shape.size)
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Head.forward`."""
+        """See `Law.forward`."""
         loc, raw = self.out(features).chunk(2, dim=-1)
         # contiguous: on a slice, softplus is not vectorised and takes nine times as long
         scale = functional.softplus(raw.contiguous()) + self.min_scale
@@ -135,14 +67,14 @@ class NormalHead(Head):
 
 @dataclass(frozen=True)
 class FixedNormal:
-    """A normal whose scale does not depend on the parents.
+    """A normal whose scale does not depend on the parents. Without parents its location is learned too.
 
     Args:
         scale: standard deviation, the initial one where it is learned.
         learned: one learned scale per dimension.
         project: a linear layer from features to location; False takes the features themselves.
         steps: with `learned`, one scale per time step too, for up to so many steps. For a local variable only.
-        residual: see `Head`.
+        residual: see `Law`.
         fitted: what the density's gradient reaches: "both", or the "scale" alone, where the location learns from
             energies in its place.
     """
@@ -154,30 +86,30 @@ class FixedNormal:
     residual: float = False
     fitted: Literal["both", "scale"] = "both"
 
-    def build(self, features: int, size: int, local: bool = True) -> Head:
-        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
         if self.scale <= 0:
             raise ValueError(f"FixedNormal's scale is positive, got {self.scale}")
-        if self.steps and not local:
+        if self.steps and not shape.local:
             raise ValueError(
                 f"FixedNormal(steps={self.steps}) has one scale per time step, but its variable is static, with one "
-                "value per sequence; give static variables a head of their own, with steps=0"
+                "value per sequence; give static variables a law of their own, with steps=0"
             )
-        if not self.project and features != size:
-            raise ValueError(f"a head without projection takes {size} features, but the network gives {features}")
-        return FixedNormalHead(self, features, size)
+        if not self.project and shape.features != shape.size:
+            raise ValueError(
+                f"a FixedNormal without projection takes {shape.size} features, but the network gives {shape.features}"
+            )
+        return FixedNormalLaw(self, shape)
 
 
-class FixedNormalHead(Head):
+class FixedNormalLaw(Gaussian):
     """See `FixedNormal`."""
 
-    location_scale = True
-
-    def __init__(self, spec: FixedNormal, features: int, size: int):
+    def __init__(self, spec: FixedNormal, shape: Shape):
         super().__init__(spec.residual)
-        self.out: nn.Module = self.projection(features, size, size) if spec.project else nn.Identity()
-        shape = (spec.steps, size) if spec.steps else (size,)
-        log_scale = torch.full(shape, math.log(spec.scale))
+        size = shape.size
+        self.out = self.projection(shape.features, size, size) if spec.project else nn.Identity()
+        log_scale = torch.full((spec.steps, size) if spec.steps else (size,), math.log(spec.scale))
         if spec.learned:
             self.log_scale = nn.Parameter(log_scale)
         else:
@@ -186,17 +118,17 @@ class FixedNormalHead(Head):
         self.fitted, self.learned = spec.fitted, spec.learned
 
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """See `Head.in_units`; a scale that is given is in the variable's own unit."""
+        """See `Law.in_units`; a scale that is given is in the variable's own unit."""
         loc, own = super().in_units(parameters, mean, scale)
         return loc, own if self.learned else parameters[1]
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """See `Head.distribution`."""
+        """See `Law.distribution`."""
         loc, scale = parameters
         return super().distribution((loc.detach() if self.fitted == "scale" else loc, scale))
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Head.forward`."""
+        """See `Law.forward`."""
         loc = self.out(features)
         scale = self.log_scale.exp()
         if self.steps:
@@ -216,40 +148,40 @@ class StudentT:
     Args:
         df: degrees of freedom, the initial ones; learned, one per dimension, and kept above 2.
         min_scale: the scale stays above it.
-        residual: see `Head`.
+        residual: see `Law`.
     """
 
     df: float = 5.0
     min_scale: float = 1e-3
     residual: float = False
 
-    def build(self, features: int, size: int, local: bool = True) -> Head:
-        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
         if self.df <= 2:
             raise ValueError(f"StudentT needs df > 2, where the variance is finite; got {self.df}")
-        return StudentTHead(self, features, size)
+        return StudentTLaw(self, shape)
 
 
-class StudentTHead(Head):
+class StudentTLaw(Law):
     """See `StudentT`."""
 
     location_scale = True
 
-    def __init__(self, spec: StudentT, features: int, size: int):
+    def __init__(self, spec: StudentT, shape: Shape):
         super().__init__(spec.residual)
         self.min_scale = spec.min_scale
-        self.out = self.projection(features, 2 * size, size)
-        self.raw_df = nn.Parameter(torch.full((size,), math.log(math.expm1(spec.df - 2))))
+        self.out = self.projection(shape.features, 2 * shape.size, shape.size)
+        self.raw_df = nn.Parameter(torch.full((shape.size,), math.log(math.expm1(spec.df - 2))))
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Head.forward`."""
+        """See `Law.forward`."""
         loc, raw = self.out(features).chunk(2, dim=-1)
         loc = self.moved(loc, previous)
         df = functional.softplus(self.raw_df) + 2
         return loc, functional.softplus(raw.contiguous()) + self.min_scale, df.expand_as(loc)
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """See `Head.distribution`."""
+        """See `Law.distribution`."""
         loc, scale, df = parameters
         return dist.StudentT(df, loc, scale, validate_args=False)
 
@@ -268,51 +200,57 @@ class Delta:
     energies.
     """
 
-    def build(self, features: int, size: int, local: bool = True) -> Head:
-        """The head from features H to a variable of dimension D; `local`: one value per step, not per sequence."""
-        if features != size:
-            raise ValueError(f"a Delta of size {size} takes so many features, but the network gives {features}")
-        return DeltaHead()
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
+        if shape.features != shape.size:
+            raise ValueError(
+                f"a Delta of size {shape.size} takes so many features, but the network gives {shape.features}"
+            )
+        return DeltaLaw()
 
 
-class DeltaHead(Head):
+class DeltaLaw(Law):
     """See `Delta`."""
 
     deterministic = True
     location_scale = True
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Head.forward`."""
+        """See `Law.forward`."""
         return (features,)
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """See `Head.distribution`."""
+        """See `Law.distribution`."""
         return dist.Delta(parameters[0])
 
     def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
-        """See `Head.noise`; there is none."""
+        """See `Law.noise`; there is none."""
         return like.new_empty(()).expand(*shape)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """See `Head.draw`."""
+        """See `Law.draw`."""
         return parameters[0]
 
 
-class StandardNormal(Head):
-    """N(0, I), the prior of a variable without parents; it reads no features."""
+@dataclass(frozen=True)
+class StandardNormal:
+    """N(0, I), whatever the features: the law of a model's variable without parents, where nothing else is said."""
 
-    location_scale = True
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
+        return StandardNormalLaw(shape.size)
+
+
+class StandardNormalLaw(Gaussian):
+    """See `StandardNormal`."""
+
     zero: Tensor
 
     def __init__(self, size: int):
         super().__init__()
-        self.size = size
         self.register_buffer("zero", torch.zeros(size), persistent=False)
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Head.forward`; only the shape of the features is read."""
-        loc = self.zero.expand(*features.shape[:-1], self.size)
+        """See `Law.forward`."""
+        loc = self.zero.expand(*features.shape[:-1], -1)
         return loc, torch.ones_like(loc)
-
-
-__all__ = ["Delta", "FixedNormal", "Head", "HeadSpec", "Normal", "StandardNormal", "StudentT"]

@@ -14,6 +14,7 @@ it is, in closed form,
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -21,24 +22,40 @@ from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
 from torch.distributions import constraints
 
+from .base import Law, Parameters, Shape
+from .priors import check_prior
 
-class QRFlow(nn.Module):
-    """A bijection of R^D with a known determinant, and the density that it gives. See the file.
+
+@dataclass(frozen=True)
+class QRFlow:
+    """The law of a vector without parents that a bijection of R^D with a known determinant gives. See the file.
 
     The diagonal of R is the exponential of that of `triangular`, whose part below it is unused. Ours: the parameter of
     a PReLU is the logarithm of its slope, which so stays positive; and the first layer reads W (x - m), where location
     m and whitening W are no parameters: 0 and the identity, unless `whiten` took them from data.
 
     Args:
-        size: D.
         layers: L.
-
-    Raises:
-        ValueError: a size or number of layers below 1.
     """
 
-    def __init__(self, size: int, layers: int = 3):
+    layers: int = 3
+
+    def build(self, shape: Shape) -> QRFlowLaw:
+        """The law of a static latent without parents.
+
+        Raises:
+            ValueError: a size or number of layers below 1.
+        """
+        check_prior(self, shape)
+        return QRFlowLaw(self, shape.size)
+
+
+class QRFlowLaw(Law):
+    """See `QRFlow`; its one parameter says no more than how many values there are."""
+
+    def __init__(self, spec: QRFlow, size: int):
         super().__init__()
+        layers = spec.layers
         if size < 1 or layers < 1:
             raise ValueError(f"a QRFlow has size {size} and {layers} layers; both must be at least 1")
         self.size = size
@@ -72,7 +89,15 @@ class QRFlow(nn.Module):
         diagonal = self.triangular.diagonal(dim1=1, dim2=2)
         return q, self.triangular.triu(1) + torch.diag_embed(diagonal.exp())
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Law.forward`."""
+        return (self.location.expand(*features.shape[:-1], -1),)
+
+    def distribution(self, parameters: Parameters) -> FlowDistribution:
+        """See `Law.distribution`."""
+        return FlowDistribution(self, parameters[0].shape[:-1])
+
+    def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The noise that stands for a value.
 
         Args:
@@ -102,7 +127,7 @@ class QRFlow(nn.Module):
                 z = nn.functional.linear(z, matrix, bias)
         return z, log_det
 
-    def inverse(self, z: Tensor) -> Tensor:
+    def from_noise(self, z: Tensor) -> Tensor:
         """The value x (..., D) for which noise z (..., D) stands."""
         self._check(z)
         with torch.autocast(z.device.type, enabled=False):
@@ -141,10 +166,6 @@ class QRFlow(nn.Module):
         self.location.copy_(values.mean(0))
         self.whitening.copy_(torch.linalg.solve_triangular(root, identity, upper=False))
 
-    def distribution(self) -> FlowDistribution:
-        """The distribution of x, event (D,)."""
-        return FlowDistribution(self)
-
     def _check(self, value: Tensor) -> None:
         if value.shape[-1:] != (self.size,):
             raise ValueError(f"a QRFlow of size {self.size} takes (..., {self.size}), got {tuple(value.shape)}")
@@ -162,7 +183,7 @@ class FlowDistribution(TorchDistribution):
     support = constraints.real_vector
     has_rsample = True
 
-    def __init__(self, flow: QRFlow, batch_shape: Any = ()):
+    def __init__(self, flow: QRFlowLaw, batch_shape: Any = ()):
         self.flow = flow
         super().__init__(torch.Size(batch_shape), torch.Size([flow.size]), validate_args=False)
 
@@ -170,11 +191,11 @@ class FlowDistribution(TorchDistribution):
         """Draws (*sample_shape, *batch_shape, D)."""
         bias = self.flow.bias
         noise = torch.randn(self._extended_shape(torch.Size(sample_shape)), dtype=bias.dtype, device=bias.device)
-        return self.flow.inverse(noise)
+        return self.flow.from_noise(noise)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """log p (...) of values (..., D), in nats."""
-        noise, log_det = self.flow(value)
+        noise, log_det = self.flow.to_noise(value)
         found = log_det - noise.square().sum(-1) / 2 - self.flow.size / 2 * math.log(2 * math.pi)
         return found.expand(torch.broadcast_shapes(found.shape, self.batch_shape))
 

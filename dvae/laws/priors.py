@@ -1,121 +1,110 @@
-"""Learnable priors of static latents, in place of N(0, I)."""
+"""Laws of static latents without parents, in place of N(0, I)."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import pyro.distributions as dist
 import torch
 from pyro.distributions import transforms
+from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
 
-from ..notation import Factor
+from .base import Law, Parameters, Shape
 
 
-class Prior(nn.Module):
-    """A distribution over (D,) with parameters of its own.
-
-    Args:
-        size: D.
-    """
-
-    def __init__(self, size: int):
-        super().__init__()
-        self.size = size
-
-    def check(self, guide: Factor, sizes: Mapping[str, int], observed: tuple[str, ...]) -> None:
-        """Whether it suits a latent.
-
-        Args:
-            guide: the guide's factor q(w | ...) of the latent.
-            sizes: dimension of every variable.
-            observed: names of the data variables.
-
-        Raises:
-            ValueError: when it does not.
-        """
-        if self.size != sizes[guide.child]:
-            raise ValueError(f"the prior of {guide.child} has size {self.size}, but {guide.child} {sizes[guide.child]}")
-
-    def forward(self, batch: int, guide: Any) -> dist.Distribution:
-        """The prior of `batch` sequences: batch (B,), event (D,).
-
-        Args:
-            batch: B.
-            guide: the guide's q(w | ...) of the same latent; the model hands it over at each call.
-        """
-        raise NotImplementedError
+def check_prior(spec: Any, shape: Shape) -> None:
+    """Refuses to build the law of anything but a static latent without parents."""
+    wrong = {
+        "has parents": shape.features > 0,
+        "has a value at every step": shape.local,
+        "is data": shape.name in shape.data,
+    }
+    if any(wrong.values()):
+        raise ValueError(
+            f"{spec} is a law of static latents without parents, such as w in p(w), but {shape.name} "
+            f"{' and '.join(what for what, so in wrong.items() if so)}"
+        )
 
 
-class NormalPrior(Prior):
-    """A diagonal normal with learned location and scale.
-
-    Args:
-        size: D.
-    """
-
-    def __init__(self, size: int):
-        super().__init__(size)
-        self.loc = nn.Parameter(torch.zeros(size))
-        self.log_scale = nn.Parameter(torch.zeros(size))
-
-    def forward(self, batch: int, guide: Any) -> dist.Distribution:
-        """See `Prior.forward`."""
-        return dist.Normal(self.loc, self.log_scale.exp()).expand((batch, self.size)).to_event(1)
-
-
-class MixturePrior(Prior):
+@dataclass(frozen=True)
+class Mixture:
     """A mixture of diagonal normals with learned weights, locations and scales.
 
     Args:
-        size: D.
         components: number of normals.
     """
 
-    def __init__(self, size: int, components: int = 8):
-        super().__init__(size)
-        self.logits = nn.Parameter(torch.zeros(components))
-        self.loc = nn.Parameter(torch.randn(components, size) / math.sqrt(size))
-        self.log_scale = nn.Parameter(torch.zeros(components, size))
+    components: int = 8
 
-    def forward(self, batch: int, guide: Any) -> dist.Distribution:
-        """See `Prior.forward`."""
-        parts = dist.Normal(self.loc, self.log_scale.exp()).to_event(1)
-        return dist.MixtureSameFamily(dist.Categorical(logits=self.logits), parts).expand((batch,))
+    def build(self, shape: Shape) -> Law:
+        """The law of a static latent without parents."""
+        check_prior(self, shape)
+        return MixtureLaw(self, shape.size)
 
 
-class VampPrior(Prior):
+class MixtureLaw(Law):
+    """See `Mixture`; its parameters are (B, K), (B, K, D) and (B, K, D)."""
+
+    def __init__(self, spec: Mixture, size: int):
+        super().__init__()
+        self.logits = nn.Parameter(torch.zeros(spec.components))
+        self.loc = nn.Parameter(torch.randn(spec.components, size) / math.sqrt(size))
+        self.log_scale = nn.Parameter(torch.zeros(spec.components, size))
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Law.forward`."""
+        return repeated((self.logits, self.loc, self.log_scale.exp()), features)
+
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        """See `Law.distribution`."""
+        logits, loc, scale = parameters
+        return dist.MixtureSameFamily(dist.Categorical(logits=logits), dist.Normal(loc, scale).to_event(1))
+
+
+@dataclass(frozen=True)
+class Vamp:
     """The variational mixture of posteriors, p(w) = 1/K sum_k q(w | u_k), with learned pseudo-sequences u_k.
 
     Tomczak and Welling, 2018, arXiv 1705.07120. The guide is the model's own, so it must read data alone.
 
     Args:
-        size: D of the latent.
-        data: dimension of every data variable that the guide reads.
         components: K.
         steps: length of the pseudo-sequences.
     """
 
-    def __init__(self, size: int, data: Mapping[str, int], components: int = 16, steps: int = 16):
-        super().__init__(size)
-        self.components, self.steps = components, steps
-        self.pseudo = nn.ParameterDict({name: torch.randn(components, steps, d) for name, d in data.items()})
+    components: int = 16
+    steps: int = 16
 
-    def check(self, guide: Factor, sizes: Mapping[str, int], observed: tuple[str, ...]) -> None:
-        """See `Prior.check`."""
-        super().check(guide, sizes, observed)
-        if not guide.parents or any(parent.name not in observed or not parent.local for parent in guide.parents):
+    def build(self, shape: Shape) -> VampLaw:
+        """The law of a static latent without parents, whose guide reads data over time."""
+        check_prior(self, shape)
+        guide = shape.guide and shape.guide.factor
+        reads = guide.parents if guide else ()
+        if not reads or any(parent.name not in shape.data or not parent.local for parent in reads):
             raise ValueError(
-                f"a VampPrior of {guide.child} needs a guide that reads the data {', '.join(observed)} over time and "
-                f"nothing else, such as q({guide.child} | {observed[0]}_{{1:T}}), not {guide}"
+                f"a Vamp of {shape.name} needs a guide that reads the data {', '.join(shape.data)} over time and "
+                f"nothing else, such as q({shape.name} | {shape.data[0]}_{{1:T}}), not {guide or 'the prior itself'}"
             )
-        reads = {parent.name: sizes[parent.name] for parent in guide.parents}
-        given = {name: pseudo.shape[-1] for name, pseudo in self.pseudo.items()}
-        if given != reads:
-            raise ValueError(f"a VampPrior of {guide.child} was given data of sizes {given}, but {guide} reads {reads}")
+        return VampLaw(self, shape.guide)
+
+
+class VampLaw(Law):
+    """See `Vamp`; its parameters are those of the guide's posteriors, (B, K, ...)."""
+
+    guide: Any
+
+    def __init__(self, spec: Vamp, guide: Any):
+        super().__init__()
+        self.components, self.steps = spec.components, spec.steps
+        object.__setattr__(self, "guide", guide)  # the model's, which is not to be registered twice
+        self.pseudo = nn.ParameterDict(
+            {parent.name: torch.randn(self.components, self.steps, parent.size) for parent in guide.network.inputs}
+        )
 
     @torch.no_grad()
     def start_at(self, data: Mapping[str, Tensor]) -> None:
@@ -130,37 +119,53 @@ class VampPrior(Prior):
         for name, pseudo in self.pseudo.items():
             if data[name].shape[1] < self.steps:
                 raise ValueError(
-                    f"a VampPrior has pseudo-sequences of {self.steps} steps, but those of {name} that it is to start "
-                    f"at have {data[name].shape[1]}; give it at most so many steps"
+                    f"a Vamp has pseudo-sequences of {self.steps} steps, but those of {name} that it is to start at "
+                    f"have {data[name].shape[1]}; give it at most so many steps"
                 )
             pseudo.copy_(data[name][:, : self.steps])
 
-    def forward(self, batch: int, guide: Any) -> dist.Distribution:
-        """See `Prior.forward`."""
-        parameters = guide(dict(self.pseudo.items()), self.components, self.steps)
-        parts = guide.head.distribution(parameters).to_event(1)
-        weights = dist.Categorical(logits=parameters[0].new_zeros(self.components))
-        return dist.MixtureSameFamily(weights, parts).expand((batch,))
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Law.forward`."""
+        return repeated(self.guide(dict(self.pseudo.items()), self.components, self.steps), features)
+
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        """See `Law.distribution`."""
+        posteriors = self.guide.law.joint(parameters)
+        weights = dist.Categorical(logits=parameters[0].new_zeros(posteriors.batch_shape))
+        return dist.MixtureSameFamily(weights, posteriors)
 
 
-class FlowPrior(Prior):
+@dataclass(frozen=True)
+class Flow:
     """A normalizing flow: N(0, I) moved by monotonic splines and affine couplings, in turn, and a location and scale.
 
     Dinh et al., 2017, arXiv 1605.08803 (couplings); Dolatabadi et al., 2020, arXiv 2001.05168 (linear rational
     splines). Density and draws are exact, and take one pass each. It starts near N(0, I); with Pyro's own initial
-    weights it would start far from it, with heavy tails.
+    weights it would start far from it, with heavy tails. In one dimension there is nothing to couple, and the splines
+    alone bend the normal.
 
     Args:
-        size: D. With D = 1 there is nothing to couple, and the splines alone bend the normal.
         layers: of a spline and a coupling.
         bins: pieces of each spline.
     """
 
-    def __init__(self, size: int, layers: int = 4, bins: int = 8):
-        super().__init__(size)
+    layers: int = 4
+    bins: int = 8
+
+    def build(self, shape: Shape) -> Law:
+        """The law of a static latent without parents."""
+        check_prior(self, shape)
+        return FlowLaw(self, shape.size)
+
+
+class FlowLaw(Law):
+    """See `Flow`; its parameters are the location and scale after all layers, (B, D)."""
+
+    def __init__(self, spec: Flow, size: int):
+        super().__init__()
         self.layers: Any = nn.ModuleList()
-        for _ in range(layers):
-            spline = transforms.Spline(size, bins, bound=4.0)
+        for _ in range(spec.layers):
+            spline = transforms.Spline(size, spec.bins, bound=4.0)
             for parameter in spline.parameters():
                 nn.init.normal_(parameter, std=0.01)
             nn.init.normal_(spline.unnormalized_derivatives, math.log(math.e - 1), 0.01)  # the softplus of this is 1
@@ -173,20 +178,29 @@ class FlowPrior(Prior):
         self.loc = nn.Parameter(torch.zeros(size))
         self.log_scale = nn.Parameter(torch.zeros(size))
 
-    def forward(self, batch: int, guide: Any) -> dist.Distribution:
-        """See `Prior.forward`.
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """See `Law.forward`.
 
         Raises:
             ValueError: parameters in half precision, which Pyro's splines do not take.
         """
         if torch.finfo(self.loc.dtype).bits < 32:
             raise ValueError(
-                f"a FlowPrior has no half precision, but its parameters are {self.loc.dtype}; use mixed precision"
+                f"a Flow has no half precision, but its parameters are {self.loc.dtype}; use mixed precision"
             )
+        return repeated((self.loc, self.log_scale.exp()), features)
+
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        """See `Law.distribution`."""
+        loc, scale = parameters
         # Pyro's transforms keep their last value and result. On copies these go with the distribution; else they would
         # outlive a change of the parameters, and the module could not be deep-copied.
-        reverse = transforms.Permute(torch.arange(self.size - 1, -1, -1, device=self.loc.device), cache_size=0)
+        reverse = transforms.Permute(torch.arange(loc.shape[-1] - 1, -1, -1, device=loc.device), cache_size=0)
         moves = [part for layer in self.layers for part in (*map(copy.copy, layer), reverse)]
-        moves.append(transforms.AffineTransform(self.loc, self.log_scale.exp(), event_dim=1, cache_size=1))
-        noise = dist.Normal(torch.zeros_like(self.loc), 1.0).expand((batch, self.size)).to_event(1)
-        return dist.TransformedDistribution(noise, moves)
+        moves.append(transforms.AffineTransform(loc, scale, event_dim=1, cache_size=1))
+        return dist.TransformedDistribution(dist.Normal(torch.zeros_like(loc), 1.0).to_event(1), moves)
+
+
+def repeated(parameters: Parameters, features: Tensor) -> Parameters:
+    """Parameters that are the same for all, (...), in the batch shape of the features (B, H): (B, ...)."""
+    return tuple(p.expand(*features.shape[:-1], *p.shape) for p in parameters)

@@ -1,4 +1,4 @@
-"""A normal with full covariance, coordinate by coordinate."""
+"""A normal with full covariance, by the root of its precision."""
 
 from __future__ import annotations
 
@@ -14,14 +14,9 @@ from torch.distributions.kl import register_kl
 
 
 class TriangularNormal(TorchDistribution):
-    """N(loc, (U'U)^-1) as the chain of its coordinates, v_d given v_{<d}, with a lower triangular U.
+    """N(loc, (U'U)^-1) with a lower triangular U: batch (...), event (D,).
 
-    The shape (..., D) is a batch: `log_prob` gives the D terms of the chain rule,
-
-        log p(v_d | v_{<d}) = log U_dd - e_d^2 / 2 - log(2 pi) / 2,        e = U (v - loc),
-
-    so that their sum is the density of v, and they are masked and summed as those of any elementwise distribution.
-    The divergence of a diagonal normal from it has the expectations of log q(v_d) - log p(v_d | v_{<d}) as its entries.
+        log p(v) = sum_d log U_dd - e_d^2 / 2 - log(2 pi) / 2,        e = U (v - loc)
 
     Args:
         loc: (..., D).
@@ -32,12 +27,12 @@ class TriangularNormal(TorchDistribution):
         "loc": constraints.real_vector,
         "whitening": constraints.lower_cholesky,
     }
-    support = constraints.real
+    support = constraints.real_vector
     has_rsample = True
 
     def __init__(self, loc: Tensor, whitening: Tensor, validate_args: bool | None = None):
         self.loc, self.whitening = loc, whitening
-        super().__init__(loc.shape, torch.Size(), validate_args=validate_args)
+        super().__init__(loc.shape[:-1], loc.shape[-1:], validate_args=validate_args)
 
     @property
     def mean(self) -> Tensor:
@@ -46,7 +41,7 @@ class TriangularNormal(TorchDistribution):
 
     @property
     def variance(self) -> Tensor:
-        """(..., D), of v_d alone, not given v_{<d}."""
+        """(..., D)."""
         identity = torch.eye(self.loc.shape[-1], dtype=self.loc.dtype, device=self.loc.device)
         return (torch.linalg.solve_triangular(self.whitening, identity, upper=False) ** 2).sum(-1)
 
@@ -65,25 +60,26 @@ class TriangularNormal(TorchDistribution):
 
     @property
     def log_precision(self) -> Tensor:
-        """(..., D) log U_dd."""
-        return self.whitening.diagonal(dim1=-2, dim2=-1).log()
+        """(...) the sum of log U_dd."""
+        return self.whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """(..., D) terms of the chain rule."""
-        return self.log_precision - 0.5 * self.whiten(value) ** 2 - 0.5 * math.log(2 * math.pi)
+        """(...), in nats."""
+        constant = self.event_shape[0] * math.log(2 * math.pi)
+        return self.log_precision - 0.5 * ((self.whiten(value) ** 2).sum(-1) + constant)
 
     def expand(self, batch_shape: Any, _instance: object = None) -> TriangularNormal:
         """With loc and whitening expanded."""
-        shape = torch.Size(batch_shape)
+        shape = torch.Size([*batch_shape, *self.event_shape])
         whitening = self.whitening.expand(*shape, shape[-1])
         return TriangularNormal(self.loc.expand(shape), whitening, validate_args=False)
 
 
 @register_kl(Normal, TriangularNormal)
 def _from_diagonal(q: Normal, p: TriangularNormal) -> Tensor:
-    distance = p.whiten(q.loc) ** 2
-    spread = ((p.whitening * q.scale[..., None, :]) ** 2).sum(-1)
-    return 0.5 * (distance + spread - 1) - p.log_precision - q.scale.log()
+    distance = (p.whiten(q.loc) ** 2).sum(-1)
+    spread = ((p.whitening * q.scale[..., None, :]) ** 2).sum((-2, -1))
+    return 0.5 * (distance + spread - p.event_shape[0]) - p.log_precision - q.scale.log().sum(-1)
 
 
 class InverseCholesky(torch.autograd.Function):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +32,7 @@ class Reader:
         view: what the model sees of the data.
         extras: names of what else a batch may hold.
         made: those of the data that are functions of their parents, which a program is not given.
+        whole: data of which all that a step has is one event.
     """
 
     sizes: Mapping[str, int]
@@ -41,6 +42,7 @@ class Reader:
     view: View
     extras: tuple[str, ...]
     made: frozenset[str]
+    whole: Collection[str]
 
     def read(self, batch: Batch | None, dtype: torch.dtype, means: Mapping[str, Tensor]) -> dict[str, Any]:
         """The batch by name, in this precision, as the model sees it; what was read stays as it is.
@@ -75,6 +77,13 @@ class Reader:
         seen = {name: value for name, value in seen.items() if name in values or name not in self.made}
         if "mask" in seen:  # of context too, which is told no more of it
             known = {name: mask for name, mask in seen["mask"].items() if name in seen}
+            for name in known.keys() & self.whole:
+                if not torch.equal(known[name].any(-1), known[name].all(-1)):
+                    raise ValueError(
+                        f"the mask of {name} hides some entries of a step and not others, but the law of {name} has "
+                        "one density for all of them; hide whole steps, or give it a law with one for each, such as "
+                        "Normal()"
+                    )
             seen |= {name: torch.where(mask, seen[name], means.get(name, 0.0)) for name, mask in known.items()}
             seen["mask"] = {name: mask for name, mask in known.items() if name in self.observed}
         return seen

@@ -1,17 +1,18 @@
-"""One factor of a factorization as a module: a network on the parents, a head on its features."""
+"""One factor of a factorization as a module: a network on the parents, a law of its features."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from ..laws.base import LawSpec, Parameters, Shape
 from ..laws.chain import DERIVATIVES, gaussian_chain
-from ..laws.families import Head, HeadSpec, NormalHead, Parameters, StandardNormal
+from ..laws.families import NormalLaw
 from ..networks.base import Input, Network, NetworkSpec, at, shift
 from ..networks.rows import Rows
 from ..notation import Factor
@@ -30,18 +31,47 @@ class Standardised:
     lengths: Tensor | None
 
 
+@contextmanager
+def evaluating(*modules: nn.Module) -> Iterator[None]:
+    """eval() for the length of a block."""
+    training = [part for module in modules for part in module.modules() if part.training]
+    for module in modules:
+        module.eval()
+    try:
+        yield
+    finally:
+        for part in training:
+            part.training = True
+
+
+def like(module: nn.Module) -> Tensor:
+    """A tensor of the module's type and device."""
+    for tensor in module.parameters():
+        return tensor
+    return next(module.buffers())
+
+
 class Conditional(nn.Module):
     """p(child | parents) or q(child | parents).
 
     Args:
-        factor: the factor. Without parents a generative one is N(0, I); a guide's has the network read a constant.
+        factor: the factor. Without parents a generative one has no network; a guide's reads a constant.
         sizes: dimension of every variable.
-        network, head: descriptions of the two parts.
+        network, law: descriptions of the two parts.
         generative: p rather than q.
+        data: names of the data variables.
+        guide: of a static latent without parents its q(w | ...), which some priors are made of.
     """
 
     def __init__(
-        self, factor: Factor, sizes: Mapping[str, int], network: NetworkSpec, head: HeadSpec, generative: bool
+        self,
+        factor: Factor,
+        sizes: Mapping[str, int],
+        network: NetworkSpec,
+        law: LawSpec,
+        generative: bool,
+        data: tuple[str, ...] = (),
+        guide: Conditional | None = None,
     ):
         super().__init__()
         self.factor = factor
@@ -50,56 +80,53 @@ class Conditional(nn.Module):
         inputs = [Input(p.name, sizes[p.name], p.relation if p.local else None) for p in factor.parents]
         if inputs or not generative:
             self.network = network.build(inputs or [Input(CONSTANT, 1)], factor.local, self.size)
-            self.head: Head = head.build(self.network.features, self.size, factor.local)
-        else:
-            self.head = StandardNormal(self.size)
+        features = 0 if self.network is None else self.network.features
+        self.law = law.build(Shape(self.size, features, factor.local, factor.child, data, guide))
         self.parents = [parent.name for parent in factor.parents]
         self.units: dict[str, Units] = {}  # not registered here: they are the model's
-        self.discrete, self.reparameterised = self._try_head()
+        with evaluating(self.law, *([guide] if guide else [])):  # statistics of what they normalise are of data
+            self.discrete, self.reparameterised, self.whole = self._try_law(features)
         for length in range(2, 9):
             self.check(length)
 
     @torch.inference_mode(False)
-    def _try_head(self) -> tuple[bool, bool]:
-        """Whether the head's values are discrete, and whether its draws have a gradient.
+    def _try_law(self, features: int) -> tuple[bool, bool, bool]:
+        """Whether the law's values are discrete, its draws have a gradient, and all coordinates are one event.
 
         Raises:
-            ValueError: a distribution of which several coordinates are one event.
+            ValueError: a distribution of another shape.
         """
         rows = (1, 1) if self.factor.local else (1,)
-        training, own = self.head.training, list(self.head.parameters())
-        self.head.eval()  # statistics of what it normalises are of data
+        own = list(self.law.parameters())
         with torch.random.fork_rng(devices=[]), torch.set_grad_enabled(not any(p.is_inference() for p in own)):
-            features = torch.randn(*rows, 1 if self.network is None else self.network.features)
-            features.requires_grad_(torch.is_grad_enabled())
-            previous = torch.randn(*rows, self.size) if self.head.residual else None
-            parameters = self.head(features, previous)
-            law = self.head.distribution(parameters)
-            value = self.head.draw(parameters, self.head.noise((*rows, self.size), features))
-        self.head.train(training)
-        if law.event_shape or law.batch_shape != (*rows, self.size):
+            read = torch.randn(*rows, features)
+            read.requires_grad_(torch.is_grad_enabled())
+            previous = torch.randn(*rows, self.size) if self.law.residual else None
+            parameters = self.law(read, previous)
+            law = self.law.distribution(parameters)
+            value = self.law.draw(parameters, self.law.noise((*rows, self.size), read))
+        if (law.batch_shape, law.event_shape) not in (((*rows, self.size), ()), (rows, (self.size,))):
             raise ValueError(
-                f"the head of {self.factor} makes a {type(law).__name__} of batch {tuple(law.batch_shape)} and event "
-                f"{tuple(law.event_shape)}; a head's distribution has one density for each coordinate, here batch "
-                f"{(*rows, self.size)} and no event, so that masks and bounds by step mean something; let latents "
-                "carry what the coordinates have in common"
+                f"the law of {self.factor} makes a {type(law).__name__} of batch {tuple(law.batch_shape)} and event "
+                f"{tuple(law.event_shape)}; it has either one density for each coordinate, here batch "
+                f"{(*rows, self.size)} and no event, or one for all of a step, batch {rows} and event {(self.size,)}"
             )
         discrete = False
         with suppress(NotImplementedError):  # a distribution that says nothing of its support
             discrete = law.support is not None and law.support.is_discrete
         learns = value.requires_grad or not any(parameter.requires_grad for parameter in parameters)
-        return discrete, learns and not discrete  # torch.bernoulli has a gradient, of zero
+        return discrete, learns and not discrete, bool(law.event_shape)  # torch.bernoulli has a gradient, of zero
 
     def check(self, length: int) -> None:
-        """Refuses a residual head that reads what the factor does not, at sequences of this length.
+        """Refuses a residual law that reads what the factor does not, at sequences of this length.
 
         Raises:
             ValueError: the factor does not read the child's own value a step before.
         """
         own = self.factor.parent(self.factor.child)
-        if self.head.residual and not (own and own.relation and own.relation.reads(-1, length)):
+        if self.law.residual and not (own and own.relation and own.relation.reads(-1, length)):
             raise ValueError(
-                f"{self.factor} has a residual head, which adds {self.factor.child}_{{t-1}}, but it does not read that "
+                f"{self.factor} has a residual law, which adds {self.factor.child}_{{t-1}}, but it does not read that "
                 f"at {length} steps; add {self.factor.child}_{{t-1}} or {self.factor.child}_{{<t}} to its parents, or "
                 "use residual=0"
             )
@@ -107,16 +134,16 @@ class Conditional(nn.Module):
     def forward(
         self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None
     ) -> Parameters:
-        """The head's parameters at all steps, (B, T, D), or (B, D) for a static child."""
+        """The law's parameters at all steps, (B, T, D), or (B, D) for a static child."""
         if self.network is None:
-            shape = (batch, length, 1) if self.factor.local else (batch, 1)
-            return self._in_units(self.head(next(self.head.buffers()).new_ones(shape)))
+            shape = (batch, length, 0) if self.factor.local else (batch, 0)
+            return self._in_units(self.law(like(self.law).new_empty(shape)))
         read = self._read(parents, batch, lengths)
         features = self.network(read, length, lengths)
         previous = None
-        if self.head.residual:
+        if self.law.residual:
             previous = shift((parents if self._made_in is None else read)[self.factor.child], -1)
-        return self._in_units(self.head(features, previous))
+        return self._in_units(self.law(features, previous))
 
     def _read(self, values: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> dict[str, Tensor]:
         """The parents among `values`, without unit, or a constant in place of none."""
@@ -127,12 +154,12 @@ class Conditional(nn.Module):
 
     @property
     def _made_in(self) -> Units | None:
-        """The units that the head's parameters are put into, where these can be."""
-        return self.units.get(self.factor.child) if self.head.location_scale else None
+        """The units that the law's parameters are put into, where these can be."""
+        return self.units.get(self.factor.child) if self.law.location_scale else None
 
     def _in_units(self, parameters: Parameters) -> Parameters:
         units = self._made_in
-        return parameters if units is None else self.head.in_units(parameters, units.mean, units.scale)
+        return parameters if units is None else self.law.in_units(parameters, units.mean, units.scale)
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """The state before a loop that draws those of the parents that are not `given`."""
@@ -140,14 +167,14 @@ class Conditional(nn.Module):
             return tuple(p.unbind(1) for p in self(given, batch, length))
         state = self.network.start(self._read(given, batch, lengths), batch, length, lengths)
         # read from the draws, given or not
-        own = self.factor.child if self.head.residual and self._made_in is not None else None
+        own = self.factor.child if self.law.residual and self._made_in is not None else None
         live = [name for name in self.units if name in self.parents and (name not in given or name == own)]
         if not live:
             return state
         return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)
 
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Parameters, Any]:
-        """The head's parameters (B, D) at step t, and the next state."""
+        """The law's parameters (B, D) at step t, and the next state."""
         if self.network is None:
             return tuple(p[t] for p in state), state
         read = drawn
@@ -158,9 +185,9 @@ class Conditional(nn.Module):
         else:
             features, state = self.network.step(state, t, read)
         previous = None
-        if self.head.residual:
+        if self.law.residual:
             previous = at((drawn if self._made_in is None else read)[self.factor.child], t - 1, features, self.size)
-        return self._in_units(self.head(features, previous, t)), state
+        return self._in_units(self.law(features, previous, t)), state
 
     def chain(self, state: Any, direction: int, noise: Tensor) -> tuple[Tensor, Parameters] | None:
         """Draws (B, T, D) and their parameters by one fused loop, where the factor is a Gaussian chain; else None."""
@@ -171,9 +198,9 @@ class Conditional(nn.Module):
         form = None if self.network is None else self.network.chain(state)
         if form is None or form.lag != -direction or form.join.kind not in DERIVATIVES:
             return None
-        if not isinstance(self.head, NormalHead) or self.head.residual:
+        if not isinstance(self.law, NormalLaw) or self.law.residual:
             return None
-        join, out = form.join, self.head.out
+        join, out = form.join, self.law.out
         batch, length, _ = noise.shape
         hoisted = form.hoisted if join.first else join.hoist(form.hoisted.known, batch, length, out)
         linear = [layer for layer in join.rest if isinstance(layer, nn.Linear)]
@@ -191,7 +218,7 @@ class Conditional(nn.Module):
             [(hoisted.weights[0], None), *following],
             before=form.before,
             cell=None if form.cell is None else (into(form.cell[0]), form.cell[1]),
-            min_scale=self.head.min_scale,
+            min_scale=self.law.min_scale,
             activation=join.kind,
         )
         value, *parameters = map(back, drawn)

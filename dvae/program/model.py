@@ -8,7 +8,7 @@ with different things known.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from itertools import accumulate
@@ -21,17 +21,17 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
-from ..laws.families import HeadSpec, Normal
-from ..laws.priors import Prior
+from ..laws.base import LawSpec
+from ..laws.families import Normal, StandardNormal
 from ..networks import NetworkSpec, Recurrent
-from ..notation import Factorization, check_pair
+from ..notation import Factor, Factorization, check_pair
 from ..turns import alone
 from ..units import Units
 from ..views import View
 from .batch import CHUNK, Batch, Reader
-from .conditional import Conditional
+from .conditional import Conditional, evaluating, like
 from .forecast import forecast, reconstruct
-from .rollout import Rollout, SelfFeeding, like
+from .rollout import Rollout, SelfFeeding
 
 _COUNT = itertools.count()
 MaskFunction = Callable[[int], Any]
@@ -47,8 +47,8 @@ class DynamicalVAE(nn.Module):
         sizes: dimension of every variable, context included.
         network: description of the networks, or a mapping from factors to descriptions. Its keys are "p(x)" for one
             factor, "p" for all generative ones, "q" for the guide's, and "default".
-        heads: the same for the heads; `heads.Normal()` where nothing is said.
-        priors: static latent without parents to its prior, in place of N(0, I).
+        laws: the same for the laws; `laws.Normal()` where nothing is said. A generative factor without parents is
+            N(0, I) unless "p(w)" itself is a key, such as of `laws.Mixture()`.
         observed: names of the data variables; every other variable with a generative factor is a latent.
         masks: relations of one's own, name to function of T (see `Factorization.parse`).
         view: what the model sees of the data, such as their parts; as it is where nothing is said (see `dvae.views`).
@@ -72,8 +72,7 @@ class DynamicalVAE(nn.Module):
         inference: str | Factorization | None,
         sizes: Mapping[str, int],
         network: NetworkSpec | Mapping[str, NetworkSpec] | None = None,
-        heads: HeadSpec | Mapping[str, HeadSpec] | None = None,
-        priors: Mapping[str, Prior] | None = None,
+        laws: LawSpec | Mapping[str, LawSpec] | None = None,
         observed: tuple[str, ...] = ("x",),
         masks: Mapping[str, MaskFunction] | None = None,
         *,
@@ -96,16 +95,19 @@ class DynamicalVAE(nn.Module):
             if hasattr(nn.ModuleDict, name):
                 raise ValueError(f"a variable cannot be named {name!r}, which is an attribute of torch's modules")
         self.networks = _by_factor(network, Recurrent(), "network")
-        self.heads = _by_factor(heads, Normal(), "head")
+        self.laws = _by_factor(laws, Normal(), "law")
         keys = {f"{f.kind}({f.child})" for f in (*self.generative.factors, *self.inference.factors)}
-        for key in {*self.networks, *self.heads} - keys - {"p", "q", "default"}:
+        for key in {*self.networks, *self.laws} - keys - {"p", "q", "default"}:
             raise ValueError(f"no factor {key!r}; keys are {', '.join(sorted(keys))}, 'p', 'q' and 'default'")
         self.view.check(self.sizes, self.context, self.generative)
-        self.generator: Any = self._conditionals(self.generative)
+        roots, rest = ([f for f in self.generative.factors if bool(f.parents) == more] for more in (False, True))
+        self.generator: Any = self._conditionals(rest)
+        guides = {} if inference is None else self._conditionals(self.inference.factors)
+        self.generator.update(self._conditionals(roots, guides))  # last: priors may be made of the guide
         if inference is None:  # the very modules of the prior, which are not to be registered twice
             object.__setattr__(self, "encoder", {name: self.generator[name] for name in self.latents})
         else:
-            self.encoder: Any = self._conditionals(self.inference)
+            self.encoder: Any = guides
         self._check_latents()
         self.reader = Reader(
             self.sizes,
@@ -114,32 +116,30 @@ class DynamicalVAE(nn.Module):
             self.context,
             self.view,
             self.extras,
-            frozenset(name for name in self.view.parts or () if self.generator[name].head.deterministic),
+            frozenset(name for name in self.view.parts or () if self.generator[name].law.deterministic),
+            [name for name in self.observed if self.generator[name].whole],
         )
         self.units: Any = nn.ModuleDict()
-        self.priors = nn.ModuleDict(dict(priors or {}))
-        for name, prior in (priors or {}).items():
-            factor = self.generative.factor(name)
-            if factor.local or factor.parents or name not in self.latents:
-                raise ValueError(
-                    f"a prior replaces a factor p({name}) of a static latent without parents, not {factor}"
-                )
-            prior.check(self.inference.factor(name), self.sizes, self.observed)
 
-    def _conditionals(self, factorization: Factorization) -> Any:
-        def pick(table: Mapping[str, Any], kind: str, child: str) -> Any:
-            return table.get(f"{kind}({child})", table.get(kind, table["default"]))
+    def _conditionals(self, factors: Iterable[Factor], guides: Mapping[str, Conditional] | None = None) -> Any:
+        def pick(table: Mapping[str, Any], factor: Factor) -> Any:
+            own = f"{factor.kind}({factor.child})"
+            if table is self.laws and factor.kind == "p" and not factor.parents:
+                return table.get(own, StandardNormal())
+            return table.get(own, table.get(factor.kind, table["default"]))
 
         return nn.ModuleDict(
             {
                 factor.child: Conditional(
                     factor,
                     self.sizes,
-                    pick(self.networks, factor.kind, factor.child),
-                    pick(self.heads, factor.kind, factor.child),
+                    pick(self.networks, factor),
+                    pick(self.laws, factor),
                     generative=factor.kind == "p",
+                    data=self.observed,
+                    guide=guides[factor.child] if guides and factor.child in guides else None,
                 )
-                for factor in factorization.factors
+                for factor in factors
             }
         )
 
@@ -149,15 +149,15 @@ class DynamicalVAE(nn.Module):
                 if conditional.discrete or (conditional is self.encoder[name] and not conditional.reparameterised):
                     what = "are discrete" if conditional.discrete else "are not reparameterised"
                     raise ValueError(
-                        f"the draws of the latent {name} {what} by the head of {conditional.factor}, so that no "
-                        f"gradient would reach the guide through them; give it a continuous head such as "
-                        f"heads.Normal(), or name {name} as observed where it is data"
+                        f"the draws of the latent {name} {what} by the law of {conditional.factor}, so that no "
+                        f"gradient would reach the guide through them; give it a continuous law such as "
+                        f"laws.Normal(), or name {name} as observed where it is data"
                     )
 
     def standardise(self, name: str) -> Units:
         """Has networks read a variable without unit, by a mean and a scale that `fit` of the result takes.
 
-        They make it without unit too where its head is a location and a scale (`Head.location_scale`); probabilities
+        They make it without unit too where its law is a location and a scale (`Law.location_scale`); probabilities
         and rates are made as they are. Densities and values stay in the variable's own unit; call it before the model
         is fitted.
 
@@ -173,8 +173,8 @@ class DynamicalVAE(nn.Module):
 
     @property
     def likelihood(self) -> bool:
-        """Whether the data have a density given the latents; without it there is no bound (see `heads.Delta`)."""
-        return not any(self.generator[name].head.deterministic for name in self.observed)
+        """Whether the data have a density given the latents; without it there is no bound (see `laws.Delta`)."""
+        return not any(self.generator[name].law.deterministic for name in self.observed)
 
     # The Pyro program ----------------------------------------------------------------------------------------------
 
@@ -251,12 +251,11 @@ class DynamicalVAE(nn.Module):
 
     def _site(self, name: str, rollout: Rollout) -> Tensor:
         data = rollout.values.get(name)
-        if self.generator[name].head.deterministic:  # a deterministic site in Pyro's sense, with no density to score
+        if self.generator[name].law.deterministic:  # a deterministic site in Pyro's sense, with no density to score
             value = rollout.draw(name) if data is None else data
             infer: Any = {**_note(self.generative, rollout), "_deterministic": True}
             return pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 1).mask(False), obs=value, infer=infer)
-        law = self._prior(name, rollout.batch) if name in self.priors else rollout.law(name)
-        return pyro.sample(name, law, obs=data, infer=_note(self.generative, rollout))
+        return pyro.sample(name, rollout.law(name), obs=data, infer=_note(self.generative, rollout))
 
     def guide(self, batch: Batch, *, draws: Mapping[str, int] | None = None, **_: Any) -> dict[str, Tensor]:
         """The inference program q, with the arguments of `model`.
@@ -277,11 +276,7 @@ class DynamicalVAE(nn.Module):
             n = (draws or {}).get(name, 1)
             one, rollout = rollout, rollout.fork(n)
             with rollout.plate:
-                own = name in self.priors and self.encoder[name] is self.generator[name]
-                if own:
-                    law = self._prior(name, rollout.batch)
-                else:
-                    law = rollout.law(name) if self.inference.local(name) else one.law(name, n)
+                law = rollout.law(name) if self.inference.local(name) else one.law(name, n)
                 values[name] = pyro.sample(name, law, infer=_note(self.inference, rollout))
                 rollout.know(name, values[name])
         return values
@@ -386,10 +381,6 @@ class DynamicalVAE(nn.Module):
         trace.compute_log_prob(site_filter=lambda name, site: name in self.generative.variables)
         return {name: trace.nodes[name]["log_prob"] for name in self.generative.variables}
 
-    def _prior(self, name: str, batch: int) -> Any:
-        """The distribution (B, D) of a static latent that has a prior of its own."""
-        return self.priors[name](batch, self.encoder[name])
-
     def _register(self) -> None:
         """Names the parameters in Pyro's store while `pyro.infer.SVI` looks for them, and else costs nothing."""
         if any(getattr(handler, "param_only", False) for handler in poutine.runtime._PYRO_STACK):
@@ -398,7 +389,7 @@ class DynamicalVAE(nn.Module):
     # What is read, and what is handed out --------------------------------------------------------------------------
 
     def _evaluating(self) -> Any:
-        return _Evaluating(self) if self.training else nullcontext()
+        return evaluating(self) if self.training else nullcontext()
 
     def read(self, batch: Batch | None) -> dict[str, Any]:
         """A batch as programs read it: by name, in the model's precision, as the view shows it, missing entries filled.
@@ -428,21 +419,6 @@ class DynamicalVAE(nn.Module):
         self, factorization: Factorization, conditionals: Any, batch: Batch | None, length: int | None, size: int
     ) -> Rollout:
         return self.reader.rollout(factorization, conditionals, self.read(batch), length, size)
-
-
-class _Evaluating:
-    """eval() for the length of a block."""
-
-    def __init__(self, module: nn.Module):
-        self.module = module
-
-    def __enter__(self) -> None:
-        self.training = [module for module in self.module.modules() if module.training]
-        self.module.eval()
-
-    def __exit__(self, *_: object) -> None:
-        for module in self.training:
-            module.training = True
 
 
 def _factorization(equations: str | Factorization, masks: Mapping[str, MaskFunction] | None) -> Factorization:

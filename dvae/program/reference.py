@@ -29,22 +29,20 @@ def reference(model: Any, batch: Batch) -> None:
         for other, values in sofar.items():
             later = torch.randn(size, length - len(values), model.sizes[other]).to(like(model))
             parents[other] = torch.cat([torch.stack(values, 1), later], 1) if values else later
-        return conditional.head, conditional(parents, size, length)
+        return conditional.law, conditional(parents, size, length)
 
     with pyro.plate("sequences", size, dim=-1):
         for block in model.generative.blocks:
             if not model.generative.local(block.names[0]):
                 (name,) = block.names
-                head, parameters = law(name, {})
-                own = name in model.priors
-                prior = model._prior(name, size) if own else head.distribution(parameters).to_event(1)
-                known[name] = pyro.sample(name, prior)
+                own, parameters = law(name, {})
+                known[name] = pyro.sample(name, own.joint(parameters))
                 continue
             sofar: dict[str, list[Tensor]] = {name: [] for name in block.names}
             for t in pyro.markov(range(length), history=length):
                 for name in block.names:
-                    head, parameters = law(name, sofar)
-                    at_t = head.distribution(tuple(p[:, t] for p in parameters)).to_event(1)
+                    own, parameters = law(name, sofar)
+                    at_t = own.joint(tuple(p[:, t] for p in parameters))
                     data = rollout.values[name][:, t] if name in model.observed else None
                     sofar[name].append(pyro.sample(f"{name}_{t + 1}", at_t, obs=data))
             known |= {name: torch.stack(values, 1) for name, values in sofar.items()}

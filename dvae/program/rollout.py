@@ -15,13 +15,13 @@ import numpy as np
 import pyro
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
-from torch import Tensor, nn
+from torch import Tensor
 from torch.distributions import constraints
 
-from ..laws.families import Parameters
+from ..laws.base import Parameters, as_event
 from ..networks.base import valid_steps
 from ..notation import Block, Factorization
-from .conditional import Conditional
+from .conditional import Conditional, like
 
 
 @dataclass(frozen=True)
@@ -146,8 +146,9 @@ class Rollout:
             return Sequence(self, name)
         known = {**self.values, **self.history(name)}
         parameters = conditional(known, self.batch, self.length, self.lengths)
-        law = conditional.head.distribution(tuple(p.repeat(draws, 1) for p in parameters))
-        return (law.mask(self.observed[name]) if name in self.observed else law).to_event(1)
+        law = conditional.law.distribution(tuple(p.repeat(draws, *[1] * (p.dim() - 1)) for p in parameters))
+        mask = self.mask(name)
+        return as_event(law if mask is None else law.mask(mask), 1)
 
     def know(self, name: str, value: Tensor) -> None:
         """Record the value of a site, which later sites read."""
@@ -162,19 +163,25 @@ class Rollout:
         self.values[name] = value
 
     def mask(self, name: str) -> Tensor | None:
-        """(B, T, 1 or D) True at the entries that count, or None if all do."""
+        """True where a density of the variable counts, (B, T, D), or (B, T) of whole events; None if all do.
+
+        That of a static variable has no T.
+        """
+        conditional = self.conditionals[name]
         mask = self.observed.get(name)
-        if self._valid is None:
+        if mask is not None and conditional.whole:
+            mask = mask.all(-1)
+        if self._valid is None or not conditional.factor.local:
             return mask
-        valid = self._valid.expand(-1, -1, self.conditionals[name].size)
+        valid = self._valid[..., 0] if conditional.whole else self._valid.expand(-1, -1, conditional.size)
         return valid if mask is None else mask & valid
 
     def evaluate(self, name: str, value: Tensor) -> TorchDistribution:
-        """The conditionals of a local variable at all steps, over (B, T, D)."""
-        return self.conditionals[name].head.distribution(self.parameters(name, value))
+        """The conditionals of a local variable at all steps: batch (B, T, D), or (B, T) of whole events."""
+        return self.conditionals[name].law.distribution(self.parameters(name, value))
 
     def parameters(self, name: str, value: Tensor) -> Parameters:
-        """Those of `evaluate`, (B, T, D) each, of which the first is the location; computed once for a value."""
+        """Those of `evaluate`, (B, T, ...), of which the first is the mean (B, T, D); computed once for a value."""
         if name not in self._evaluated or self._evaluated[name][0] is not value:
             known = {**self.values, name: value, **self.history(name)}
             self._evaluated[name] = (value, self.conditionals[name](known, self.batch, self.length, self.lengths))
@@ -244,7 +251,7 @@ class Rollout:
         given = {name: value for name, value in {**self.values, **(fed or {})}.items() if name not in live}
         loop = any(parent in live for name in live for parent in self.conditionals[name].parents)
         noise = {
-            name: self.conditionals[name].head.noise(
+            name: self.conditionals[name].law.noise(
                 (self.batch, self.length, self.conditionals[name].size), like(self.conditionals[name])
             )
             for name in live
@@ -256,7 +263,7 @@ class Rollout:
         for name in live:
             conditional = self.conditionals[name]
             parameters = conditional(given, self.batch, self.length, self.lengths)
-            value = conditional.head.draw(parameters, noise[name]) if name in noise else parameters[0]
+            value = conditional.law.draw(parameters, noise[name]) if name in noise else parameters[0]
             if hidden is not None:
                 value = hidden[name].fill(self.values[name], value)
             elif name in self.prefix:
@@ -293,7 +300,7 @@ class Rollout:
                 conditional = self.conditionals[name]
                 parameters, states[name] = conditional.step(states[name], t, drawn)
                 evaluated[name].append(parameters)
-                value = conditional.head.draw(parameters, steps[name][t]) if name in steps else parameters[0]
+                value = conditional.law.draw(parameters, steps[name][t]) if name in steps else parameters[0]
                 if hidden is not None:
                     value = hidden[name].fill(self.values[name][:, t], value, t)
                 elif name in self.prefix and t < self.prefix[name].shape[1]:
@@ -356,15 +363,15 @@ class Sequence(TorchDistribution):
         """`rsample` without its gradient, which variables that are drawn with it keep."""
         return self.rsample(sample_shape).detach()
 
-    def elementwise(self, value: Tensor) -> TorchDistribution:
-        """All conditionals at once, over (B, T, D), given `value` and the run's other values."""
+    def steps(self, value: Tensor) -> TorchDistribution:
+        """The conditionals at all steps, given `value` and the run's other values; see `Rollout.evaluate`."""
         return self.rollout.evaluate(self.name, value)
 
     def given(self, value: Tensor) -> TorchDistribution:
-        """`elementwise` with padding and missing entries masked out: batch (B,), event (T, D)."""
-        base = self.elementwise(value)
+        """`steps` with padding and missing entries masked out: batch (B,), event (T, D)."""
+        base = self.steps(value)
         mask = self.rollout.mask(self.name)
-        return (base if mask is None else base.mask(mask)).to_event(2)
+        return as_event(base if mask is None else base.mask(mask), 2)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """(B,)."""
@@ -401,10 +408,3 @@ def _check_custom_masks(factorization: Factorization, length: int) -> None:
 def _same(value: Tensor, drawn: Tensor) -> bool:
     """Whether a site's value is the draw: Pyro may hand it back detached."""
     return value is drawn or torch.equal(value, drawn)
-
-
-def like(module: nn.Module) -> Tensor:
-    """A tensor of the module's type and device."""
-    for tensor in module.parameters():
-        return tensor
-    return next(module.buffers())

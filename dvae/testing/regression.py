@@ -39,7 +39,7 @@ from scipy import stats
 from torch import Tensor, nn
 
 from ..inference.bounds import SequenceELBO
-from ..program.model import _Evaluating
+from ..program.conditional import evaluating
 
 Array = NDArray[np.float64]
 
@@ -302,7 +302,7 @@ def measure(model: Callable[..., Any], guide: Callable[..., Any], data: Any, par
         for program in (model, guide):
             module = getattr(program, "__self__", program)
             if isinstance(module, nn.Module):
-                stack.enter_context(_Evaluating(module))
+                stack.enter_context(evaluating(module))
         found = []
         for each in np.random.SeedSequence(seed).generate_state(particles).tolist():
             torch.manual_seed(each)

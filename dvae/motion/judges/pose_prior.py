@@ -34,7 +34,7 @@ from ...inference.checkpoints import Run, load_weights
 from ...inference.fit import Stage
 from ...inference.recipe import Recipe, Trainable
 from ...inference.result import progress_bar
-from ...laws import QRFlow
+from ...laws import FlowDistribution, QRFlow, Shape
 from ...options import Layers, Range
 from ...turns import alone
 from ..protocols import Poses, Windows
@@ -130,7 +130,7 @@ class PosePriorModel(nn.Module):
     def __init__(self, skeleton: Skeleton, layers: int = 3, forward_at: int | None = None):
         super().__init__()
         self.skeleton, self.forward_at = skeleton, forward_at
-        self.flow = QRFlow(3 * (skeleton.joints - 1), layers)
+        self.flow = QRFlow(layers).build(Shape(3 * (skeleton.joints - 1), local=False))
 
     def model(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
         """The Pyro program: one site d, batch (B, T), event (3 (J - 1),), observed at the poses' directions.
@@ -145,19 +145,23 @@ class PosePriorModel(nn.Module):
             raise ValueError(f"a pose prior reads whole poses in every frame; leave {' and '.join(sorted(extra))} out")
         d = self.skeleton.directions(self.facing(batch["x"]))
         with pyro.plate("sequences", d.shape[0], dim=-2), pyro.plate("frames", d.shape[1], dim=-1):
-            return {"d": pyro.sample("d", self.flow.distribution(), obs=d)}
+            return {"d": pyro.sample("d", self.density(), obs=d)}
 
     def guide(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
         """Nothing is latent."""
         return {}
 
     def forward(self, given: Batch | Tensor, **options: Any) -> Any:
-        """On a batch, the program, which bounds take; on directions (..., 3 (J - 1)), see `QRFlow.forward`."""
-        return self.model(given, **options) if isinstance(given, Mapping) else self.flow(given)
+        """On a batch, the program, which bounds take; on directions (..., 3 (J - 1)), see `QRFlowLaw.to_noise`."""
+        return self.model(given, **options) if isinstance(given, Mapping) else self.flow.to_noise(given)
 
     def facing(self, x: Tensor) -> Tensor:
         """Windows (..., T, D) as the density reads them."""
         return x if self.forward_at is None else Heading(self.skeleton, self.forward_at + 1).face(x)
+
+    def density(self) -> FlowDistribution:
+        """Of the limb directions of a pose, event (3 (J - 1),)."""
+        return self.flow.distribution(self.flow(self.flow.location.new_empty(0)))
 
     def log_prob(self, poses: Tensor) -> Tensor:
         """Log density (...) of the limb directions of poses (..., D), in nats.
@@ -165,12 +169,12 @@ class PosePriorModel(nn.Module):
         Raises:
             ValueError: poses of another skeleton.
         """
-        return self.flow.distribution().log_prob(self.skeleton.directions(poses))
+        return self.density().log_prob(self.skeleton.directions(poses))
 
     @torch.no_grad()
     def sample(self, count: int) -> Tensor:
         """Draws limb directions (count, 3 (J - 1)). The density is over all vectors, so their lengths vary about 1."""
-        return self.flow.distribution().sample((count,))
+        return self.density().sample((count,))
 
 
 @alone

@@ -1,0 +1,160 @@
+"""The one contract of laws: a description, built for a shape, is a module that turns features into a distribution.
+
+    LawSpec.build(Shape) -> Law        Law(features) -> parameters        Law.distribution(parameters) -> of Pyro
+
+The parameters are plain tensors, so that a loop over time handles no distribution objects. A law without features, of a
+variable without parents, has parameters of its own: priors are laws like any other.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import torch
+from pyro.distributions.torch_distribution import TorchDistribution
+from torch import Tensor, nn
+
+Parameters = tuple[Tensor, ...]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a law is built for.
+
+    Args:
+        size: D, of the variable.
+        features: H, of what the network gives; 0 of a model's variable without parents.
+        local: one value per step, not per sequence.
+        name: of the variable.
+        data: names of the data variables.
+        guide: of a static latent without parents its q(w | ...), a `Conditional`, for priors that are made of it.
+    """
+
+    size: int
+    features: int = 0
+    local: bool = True
+    name: str = "w"
+    data: tuple[str, ...] = ()
+    guide: Any = None
+
+
+class Law(nn.Module):
+    """Features to the distribution of one variable.
+
+    A law of one's own gives `forward` and `distribution`, and what of the rest is not so: that it is no point mass,
+    that it is not told by a location and a scale, and how it is drawn.
+
+    Args:
+        residual: share of the variable's own previous value that its location keeps, so that features give the rest:
+            1 (True) for an offset. Below 1 a free run forgets where it was, and cannot drift without bound. A
+            residual law starts near that share, with weights a hundredth of the usual.
+
+    Raises:
+        ValueError: a share that is not between 0 and 1.
+    """
+
+    deterministic: ClassVar[bool] = False
+    """Whether the variable is a function of its parents, without a density."""
+    location_scale: ClassVar[bool] = False
+    """Whether the first two parameters (or the one) are a location and a scale, which `in_units` can put into another
+    unit. Probabilities and rates cannot be."""
+
+    def __init__(self, residual: float = False):
+        super().__init__()
+        if not 0 <= residual <= 1:
+            raise ValueError(f"residual is {residual}; it is a share of the previous value, from 0 to 1")
+        self.residual = float(residual)
+
+    def projection(self, features: int, out: int, locations: int) -> Any:
+        """Features to `out` parameters, of which the first so many are locations; without features, learned ones."""
+        if not features:
+            return Constant(out)
+        layer = nn.Linear(features, out)
+        if self.residual:
+            with torch.no_grad():
+                layer.weight[:locations] *= 0.01
+                layer.bias[:locations] *= 0.01
+        return layer
+
+    def moved(self, loc: Tensor, previous: Tensor | None) -> Tensor:
+        """The location from what the features give and the variable's own previous value."""
+        return loc if previous is None else torch.add(loc, previous, alpha=self.residual)
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """Parameters, (..., D) or wider, from features and the variable's own previous value, where it is residual.
+
+        The first is the mean (..., D), which data have where they are missing; of a static latent it may be anything.
+
+        Args:
+            features: (B, T, H) at all steps, or (B, H) of a static variable or at step `t`.
+            previous: (B, T, D) or (B, D).
+            t: the step, in a loop over time.
+        """
+        raise NotImplementedError
+
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        """The distribution of a value (..., D).
+
+        Either with a density for each coordinate (batch (..., D), no event), or with one for all that a step has
+        (batch (...), event (D,)).
+        """
+        raise NotImplementedError
+
+    def joint(self, parameters: Parameters) -> TorchDistribution:
+        """The distribution with all coordinates as one event: batch (...), event (D,)."""
+        return as_event(self.distribution(parameters), 1)
+
+    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+        """The parameters of mean + scale * variable, from those of the variable, of a location-scale family."""
+        loc, *rest = parameters
+        return torch.addcmul(mean, loc, scale), *(rest[:1] and [rest[0] * scale]), *rest[1:]
+
+    def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
+        """Noise for all steps at once; `draw` turns it into values."""
+        return torch.randn(*shape, dtype=like.dtype, device=like.device)
+
+    def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
+        """Values (..., D), reparameterised where they can be; of the noise, unless the distribution makes its own."""
+        law = self.distribution(parameters)
+        return law.rsample() if law.has_rsample else law.sample()
+
+
+class LawSpec(Protocol):
+    """A description of a law: a frozen dataclass that `build`s one."""
+
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable; ValueError where it is none for that shape."""
+        ...
+
+
+class Constant(nn.Module):
+    """Parameters (..., P) that are the same whatever the features; 0 at first."""
+
+    def __init__(self, out: int):
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(out))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Only the shape of the features is read."""
+        return self.bias.expand(*features.shape[:-1], -1)
+
+
+def as_event(law: TorchDistribution, dims: int) -> TorchDistribution:
+    """The distribution with so many event dimensions, some of which it may have already."""
+    return law.to_event(dims - len(law.event_shape))
+
+
+def renamed(name: str) -> str:
+    """The name of a weight in a model's state, from what it was called when laws were heads and priors.
+
+    >>> renamed("generator.x.head.out.weight"), renamed("priors.w.logits"), renamed("encoder.z.network.out.bias")
+    ('generator.x.law.out.weight', 'generator.w.law.logits', 'encoder.z.network.out.bias')
+    """
+    name = re.sub(r"^priors\.([^.]+)\.", r"generator.\1.law.", name)
+    return re.sub(r"^(generator|encoder)\.([^.]+)\.head\.", r"\1.\2.law.", name)
+
+
+__all__ = ["Law", "LawSpec", "Parameters", "Shape", "renamed"]
