@@ -320,9 +320,9 @@ def smooth(model: DynamicalVAE, batch: Batch, samples: int = 1) -> Smoothed:
     lengths = data.get("lengths")
     valid = None if lengths is None else valid_steps(lengths, len(a)).t()
     chain, _, alpha = network.chain_of(a, valid)
-    mean, covariance, lag_one = chain.smoothed
+    mean, covariance = chain.smoothed
     z = chain.draw(torch.randn_like(mean))
-    results = [a, z, mean, covariance, lag_one, alpha]
+    results = [a, z, mean, covariance, chain.lag_one, alpha]
     if valid is not None:
         results = [r * valid[-len(r) :].view(*valid[-len(r) :].shape, *[1] * (r.dim() - 2)) for r in results]
     return Smoothed(*(r.transpose(0, 1).unflatten(0, (samples, -1)) for r in results))

@@ -18,10 +18,6 @@ def start(size=5, layers=3):
     return QRFlow(layers).build(Shape(size, local=False))
 
 
-def law_of(flow):
-    return flow.distribution(flow(flow.location.new_empty(0)))
-
-
 def build(size=5, layers=3, whitened=True):
     """A flow with parameters that are not those it starts with."""
     flow = start(size, layers).double()
@@ -87,7 +83,7 @@ def test_the_inverse_is_exact(size, layers, whitened):
 
 @pytest.mark.parametrize("whitened", [False, True])
 def test_in_one_dimension_it_is_a_density_and_draws_follow_it(whitened):
-    law = law_of(build(1, whitened=whitened))
+    law = build(1, whitened=whitened).prior()
     draws = law.sample((2000,))[:, 0]
     span = 20 * draws.std()
     axis = torch.linspace(draws.mean() - span, draws.mean() + span, 400_001, dtype=torch.float64)
@@ -98,7 +94,7 @@ def test_in_one_dimension_it_is_a_density_and_draws_follow_it(whitened):
 
 
 def test_in_two_dimensions_it_is_a_density():
-    law = law_of(build(2))
+    law = build(2).prior()
     draws = law.sample((10_000,))
     middle, spread = draws.mean(0), draws.std(0)
     axes = [torch.linspace(m - 9 * s, m + 9 * s, 1501, dtype=torch.float64) for m, s in zip(middle, spread)]
@@ -116,7 +112,7 @@ def test_a_linear_flow_is_the_normal_of_the_values_that_whitened_it():
     flow.whiten(x)
     expected = dist.MultivariateNormal(x.mean(0), x.T.cov())
     points = values(7)
-    torch.testing.assert_close(law_of(flow).log_prob(points), expected.log_prob(points), rtol=0, atol=1e-6)
+    torch.testing.assert_close(flow.prior().log_prob(points), expected.log_prob(points), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("whitened", [False, True])
@@ -132,9 +128,9 @@ def test_on_normal_data_it_learns_the_closed_form_density(whitened):
     for step in range(steps):
         optimizer.param_groups[0]["lr"] = 0.02 * (1 - step / steps)
         optimizer.zero_grad()
-        (-law_of(flow).log_prob(data[:train]).mean()).backward()
+        (-flow.prior().log_prob(data[:train]).mean()).backward()
         optimizer.step()
-    excess = normal(size).log_prob(data[train:]) - law_of(flow).log_prob(data[train:]).detach()
+    excess = normal(size).log_prob(data[train:]) - flow.prior().log_prob(data[train:]).detach()
     # p parameters fitted to N values cost p / 2N nats a value on average: .023 for the 92 that are used here
     assert abs(excess.mean()) < 0.023 + 3 * excess.std() / held_out**0.5
 
@@ -142,7 +138,7 @@ def test_on_normal_data_it_learns_the_closed_form_density(whitened):
 @pytest.mark.parametrize("layers", [1, 3])
 def test_every_parameter_that_is_used_learns(layers):
     flow = build(5, layers)
-    law_of(flow).log_prob(values(8)).sum().backward()
+    flow.prior().log_prob(values(8)).sum().backward()
     assert (flow.triangular.grad.triu() != 0).sum() == layers * 15
     assert (flow.triangular.grad.tril(-1) == 0).all()
     for parameter in (flow.reflections, flow.bias, flow.log_slope):
@@ -152,7 +148,7 @@ def test_every_parameter_that_is_used_learns(layers):
 def test_gradients_are_right():
     flow, x = build(3), values(4, 3).requires_grad_()
     parameters = tuple(flow.parameters())
-    assert torch.autograd.gradcheck(lambda x, *_: law_of(flow).log_prob(x), (x, *parameters))
+    assert torch.autograd.gradcheck(lambda x, *_: flow.prior().log_prob(x), (x, *parameters))
 
 
 def test_it_is_a_distribution_of_pyro():
@@ -160,14 +156,14 @@ def test_it_is_a_distribution_of_pyro():
 
     def model(x=None):
         with pyro.plate("rows", 3, dim=-2), pyro.plate("columns", 4, dim=-1):
-            return pyro.sample("x", law_of(flow), obs=x)
+            return pyro.sample("x", flow.prior(), obs=x)
 
     x = values(12).unflatten(0, (3, 4))
     trace = pyro.poutine.trace(model).get_trace(x)
     assert trace.nodes["x"]["fn"].batch_shape == (3, 4)
-    torch.testing.assert_close(trace.log_prob_sum(), law_of(flow).log_prob(x).sum())
+    torch.testing.assert_close(trace.log_prob_sum(), flow.prior().log_prob(x).sum())
     assert model().shape == (3, 4, 5)
-    law = law_of(flow).expand((4,))
+    law = flow.prior().expand((4,))
     assert law.log_prob(x[0, 0]).shape == (4,)
     draws = law.rsample((2, 3))
     assert draws.shape == (2, 3, 4, 5)
@@ -179,11 +175,11 @@ def test_what_it_computes_follows_its_weights(tmp_path):
     """There is nothing that outlives a change of the weights, and the whitening is stored with them."""
     first, second, x = build(), build(), values(6)
     second.whiten(values(30) - 7)
-    before = law_of(second).log_prob(x)
+    before = second.prior().log_prob(x)
     save_weights(first, tmp_path / "flow.safetensors")
     load_weights(second, tmp_path / "flow.safetensors")
-    assert torch.equal(law_of(second).log_prob(x), law_of(first).log_prob(x))
-    assert not torch.equal(law_of(second).log_prob(x), before)
+    assert torch.equal(second.prior().log_prob(x), first.prior().log_prob(x))
+    assert not torch.equal(second.prior().log_prob(x), before)
     with pytest.raises(CheckpointError, match="another model"):
         load_weights(build(4), tmp_path / "flow.safetensors")
 
@@ -214,7 +210,7 @@ def test_it_is_the_law_of_a_latent_like_others():
     model = DynamicalVAE(*pair, sizes, laws={"p(w)": QRFlow(2)}).double()
     x, w = torch.randn(3, 4, 2, dtype=torch.float64), values(3)
     flow = model.generator["w"].law
-    torch.testing.assert_close(model.log_joint(x, {"w": w})["w"], law_of(flow).log_prob(w))
+    torch.testing.assert_close(model.log_joint(x, {"w": w})["w"], flow.prior().log_prob(w))
     SequenceELBO().differentiable_loss(model, model.guide, x).backward()
     assert all(parameter.grad.abs().sum() > 0 for parameter in flow.parameters())
 

@@ -213,7 +213,7 @@ def gain(windows, steps):
     )
     normal = MultivariateNormal(first.mean(0), first.T.cov())
     with torch.no_grad():
-        return (prior.density().log_prob(second) - normal.log_prob(second)).mean()
+        return (prior.flow.prior().log_prob(second) - normal.log_prob(second)).mean()
 
 
 @pytest.mark.data

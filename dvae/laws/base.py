@@ -44,8 +44,8 @@ class Shape:
 class Law(nn.Module):
     """Features to the distribution of one variable.
 
-    A law of one's own gives `forward` and `distribution`, and what of the rest is not so: that it is no point mass,
-    that it is not told by a location and a scale, and how it is drawn.
+    A law of one's own gives `forward` and `distribution`, and says what else it is: a point mass, a location and a
+    scale, quicker to draw than its distribution.
 
     Args:
         residual: share of the variable's own previous value that its location keeps, so that features give the rest:
@@ -105,7 +105,8 @@ class Law(nn.Module):
 
     def joint(self, parameters: Parameters) -> TorchDistribution:
         """The distribution with all coordinates as one event: batch (...), event (D,)."""
-        return as_event(self.distribution(parameters), 1)
+        law = self.distribution(parameters)
+        return law.to_event(1 - len(law.event_shape))
 
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         """The parameters of mean + scale * variable, from those of the variable, of a location-scale family."""
@@ -140,11 +141,6 @@ class Constant(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Only the shape of the features is read."""
         return self.bias.expand(*features.shape[:-1], -1)
-
-
-def as_event(law: TorchDistribution, dims: int) -> TorchDistribution:
-    """The distribution with so many event dimensions, some of which it may have already."""
-    return law.to_event(dims - len(law.event_shape))
 
 
 def renamed(name: str) -> str:

@@ -22,8 +22,8 @@ from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
 from torch.distributions import constraints
 
-from .base import Law, Parameters, Shape
-from .priors import check_prior
+from .base import Shape
+from .priors import Prior
 
 
 @dataclass(frozen=True)
@@ -46,16 +46,15 @@ class QRFlow:
         Raises:
             ValueError: a size or number of layers below 1.
         """
-        check_prior(self, shape)
-        return QRFlowLaw(self, shape.size)
+        return QRFlowLaw(self, shape)
 
 
-class QRFlowLaw(Law):
-    """See `QRFlow`; its one parameter says no more than how many values there are."""
+class QRFlowLaw(Prior):
+    """See `QRFlow`."""
 
-    def __init__(self, spec: QRFlow, size: int):
-        super().__init__()
-        layers = spec.layers
+    def __init__(self, spec: QRFlow, shape: Shape):
+        super().__init__(spec, shape)
+        size, layers = shape.size, spec.layers
         if size < 1 or layers < 1:
             raise ValueError(f"a QRFlow has size {size} and {layers} layers; both must be at least 1")
         self.size = size
@@ -89,13 +88,9 @@ class QRFlowLaw(Law):
         diagonal = self.triangular.diagonal(dim1=1, dim2=2)
         return q, self.triangular.triu(1) + torch.diag_embed(diagonal.exp())
 
-    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
-        return (self.location.expand(*features.shape[:-1], -1),)
-
-    def distribution(self, parameters: Parameters) -> FlowDistribution:
-        """See `Law.distribution`."""
-        return FlowDistribution(self, parameters[0].shape[:-1])
+    def prior(self) -> FlowDistribution:
+        """See `Prior.prior`."""
+        return FlowDistribution(self)
 
     def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The noise that stands for a value.

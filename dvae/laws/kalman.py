@@ -32,14 +32,6 @@ class Moments(NamedTuple):
     covariance: Tensor
 
 
-class Smoothed(NamedTuple):
-    """Means (T, B, N) and covariances (T, B, N, N) of every z_t; lag_one (T - 1, B, N, N) is Cov(z_{t+1}, z_t)."""
-
-    mean: Tensor
-    covariance: Tensor
-    lag_one: Tensor
-
-
 @dataclass(frozen=True)
 class LinearGaussianChain:
     """The chain and its weights, see the file; time comes first. Gradients flow through all its results.
@@ -87,7 +79,7 @@ class LinearGaussianChain:
         return torch.linalg.solve(self.predicted.covariance[1:], self.transition @ self.filtered.covariance[:-1]).mT
 
     @cached_property
-    def smoothed(self) -> Smoothed:
+    def smoothed(self) -> Moments:
         """Of z_t given everything."""
         mean, covariance = ([last[-1]] for last in self.filtered)
         for t in range(len(self.transition) - 1, -1, -1):
@@ -96,8 +88,12 @@ class LinearGaussianChain:
             mean.append(self.filtered.mean[t] + _times(gain, change))
             change = covariance[-1] - self.predicted.covariance[t + 1]
             covariance.append(_symmetric(self.filtered.covariance[t] + gain @ change @ gain.mT))
-        covariances = torch.stack(covariance[::-1])
-        return Smoothed(torch.stack(mean[::-1]), covariances, covariances[1:] @ self._gain.mT)
+        return Moments(torch.stack(mean[::-1]), torch.stack(covariance[::-1]))
+
+    @property
+    def lag_one(self) -> Tensor:
+        """(T - 1, B, N, N) Cov(z_{t+1}, z_t) given everything."""
+        return self.smoothed.covariance[1:] @ self._gain.mT
 
     def draw(self, noise: Tensor) -> Tensor:
         """Reparameterised draws (T, B, N) of z_{1:T} given everything, from standard normal noise of that shape."""

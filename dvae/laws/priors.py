@@ -17,18 +17,38 @@ from torch import Tensor, nn
 from .base import Law, Parameters, Shape
 
 
-def check_prior(spec: Any, shape: Shape) -> None:
-    """Refuses to build the law of anything but a static latent without parents."""
-    wrong = {
-        "has parents": shape.features > 0,
-        "has a value at every step": shape.local,
-        "is data": shape.name in shape.data,
-    }
-    if any(wrong.values()):
-        raise ValueError(
-            f"{spec} is a law of static latents without parents, such as w in p(w), but {shape.name} "
-            f"{' and '.join(what for what, so in wrong.items() if so)}"
-        )
+class Prior(Law):
+    """A law without features: one distribution of (D,), the same for every sequence. One of one's own gives `prior`.
+
+    Args:
+        spec: its description.
+        shape: what it is built for.
+
+    Raises:
+        ValueError: another variable than a static latent without parents.
+    """
+
+    def __init__(self, spec: Any, shape: Shape):
+        super().__init__()
+        wrong = ["has parents"] * bool(shape.features) + ["has a value at every step"] * shape.local
+        wrong += ["is data"] * (shape.name in shape.data)
+        if wrong:
+            raise ValueError(
+                f"{spec} is a law of static latents without parents, such as w in p(w), but {shape.name} "
+                + " and ".join(wrong)
+            )
+
+    def prior(self) -> Any:
+        """The distribution: no batch, event (D,)."""
+        raise NotImplementedError
+
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        """The features themselves, which say how many sequences there are."""
+        return (features,)
+
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        """See `Law.distribution`."""
+        return self.prior().expand(parameters[0].shape[:-1])
 
 
 @dataclass(frozen=True)
@@ -43,27 +63,22 @@ class Mixture:
 
     def build(self, shape: Shape) -> Law:
         """The law of a static latent without parents."""
-        check_prior(self, shape)
-        return MixtureLaw(self, shape.size)
+        return MixtureLaw(self, shape)
 
 
-class MixtureLaw(Law):
-    """See `Mixture`; its parameters are (B, K), (B, K, D) and (B, K, D)."""
+class MixtureLaw(Prior):
+    """See `Mixture`."""
 
-    def __init__(self, spec: Mixture, size: int):
-        super().__init__()
+    def __init__(self, spec: Mixture, shape: Shape):
+        super().__init__(spec, shape)
         self.logits = nn.Parameter(torch.zeros(spec.components))
-        self.loc = nn.Parameter(torch.randn(spec.components, size) / math.sqrt(size))
-        self.log_scale = nn.Parameter(torch.zeros(spec.components, size))
+        self.loc = nn.Parameter(torch.randn(spec.components, shape.size) / math.sqrt(shape.size))
+        self.log_scale = nn.Parameter(torch.zeros(spec.components, shape.size))
 
-    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
-        return repeated((self.logits, self.loc, self.log_scale.exp()), features)
-
-    def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """See `Law.distribution`."""
-        logits, loc, scale = parameters
-        return dist.MixtureSameFamily(dist.Categorical(logits=logits), dist.Normal(loc, scale).to_event(1))
+    def prior(self) -> Any:
+        """See `Prior.prior`."""
+        parts = dist.Normal(self.loc, self.log_scale.exp()).to_event(1)
+        return dist.MixtureSameFamily(dist.Categorical(logits=self.logits), parts)
 
 
 @dataclass(frozen=True)
@@ -80,9 +95,18 @@ class Vamp:
     components: int = 16
     steps: int = 16
 
-    def build(self, shape: Shape) -> VampLaw:
+    def build(self, shape: Shape) -> Law:
         """The law of a static latent without parents, whose guide reads data over time."""
-        check_prior(self, shape)
+        return VampLaw(self, shape)
+
+
+class VampLaw(Prior):
+    """See `Vamp`."""
+
+    guide: Any
+
+    def __init__(self, spec: Vamp, shape: Shape):
+        super().__init__(spec, shape)
         guide = shape.guide and shape.guide.factor
         reads = guide.parents if guide else ()
         if not reads or any(parent.name not in shape.data or not parent.local for parent in reads):
@@ -90,20 +114,10 @@ class Vamp:
                 f"a Vamp of {shape.name} needs a guide that reads the data {', '.join(shape.data)} over time and "
                 f"nothing else, such as q({shape.name} | {shape.data[0]}_{{1:T}}), not {guide or 'the prior itself'}"
             )
-        return VampLaw(self, shape.guide)
-
-
-class VampLaw(Law):
-    """See `Vamp`; its parameters are those of the guide's posteriors, (B, K, ...)."""
-
-    guide: Any
-
-    def __init__(self, spec: Vamp, guide: Any):
-        super().__init__()
         self.components, self.steps = spec.components, spec.steps
-        object.__setattr__(self, "guide", guide)  # the model's, which is not to be registered twice
+        object.__setattr__(self, "guide", shape.guide)  # the model's, which is not to be registered twice
         self.pseudo = nn.ParameterDict(
-            {parent.name: torch.randn(self.components, self.steps, parent.size) for parent in guide.network.inputs}
+            {each.name: torch.randn(self.components, self.steps, each.size) for each in self.guide.network.inputs}
         )
 
     @torch.no_grad()
@@ -124,14 +138,10 @@ class VampLaw(Law):
                 )
             pseudo.copy_(data[name][:, : self.steps])
 
-    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
-        return repeated(self.guide(dict(self.pseudo.items()), self.components, self.steps), features)
-
-    def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """See `Law.distribution`."""
-        posteriors = self.guide.law.joint(parameters)
-        weights = dist.Categorical(logits=parameters[0].new_zeros(posteriors.batch_shape))
+    def prior(self) -> Any:
+        """See `Prior.prior`."""
+        posteriors = self.guide.law.joint(self.guide(dict(self.pseudo.items()), self.components, self.steps))
+        weights = dist.Categorical(logits=next(self.pseudo.parameters()).new_zeros(self.components))
         return dist.MixtureSameFamily(weights, posteriors)
 
 
@@ -154,15 +164,15 @@ class Flow:
 
     def build(self, shape: Shape) -> Law:
         """The law of a static latent without parents."""
-        check_prior(self, shape)
-        return FlowLaw(self, shape.size)
+        return FlowLaw(self, shape)
 
 
-class FlowLaw(Law):
-    """See `Flow`; its parameters are the location and scale after all layers, (B, D)."""
+class FlowLaw(Prior):
+    """See `Flow`."""
 
-    def __init__(self, spec: Flow, size: int):
-        super().__init__()
+    def __init__(self, spec: Flow, shape: Shape):
+        super().__init__(spec, shape)
+        size = shape.size
         self.layers: Any = nn.ModuleList()
         for _ in range(spec.layers):
             spline = transforms.Spline(size, spec.bins, bound=4.0)
@@ -178,29 +188,18 @@ class FlowLaw(Law):
         self.loc = nn.Parameter(torch.zeros(size))
         self.log_scale = nn.Parameter(torch.zeros(size))
 
-    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`.
+    def prior(self) -> Any:
+        """See `Prior.prior`.
 
         Raises:
             ValueError: parameters in half precision, which Pyro's splines do not take.
         """
-        if torch.finfo(self.loc.dtype).bits < 32:
-            raise ValueError(
-                f"a Flow has no half precision, but its parameters are {self.loc.dtype}; use mixed precision"
-            )
-        return repeated((self.loc, self.log_scale.exp()), features)
-
-    def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """See `Law.distribution`."""
-        loc, scale = parameters
+        loc = self.loc
+        if torch.finfo(loc.dtype).bits < 32:
+            raise ValueError(f"a Flow has no half precision, but its parameters are {loc.dtype}; use mixed precision")
         # Pyro's transforms keep their last value and result. On copies these go with the distribution; else they would
         # outlive a change of the parameters, and the module could not be deep-copied.
-        reverse = transforms.Permute(torch.arange(loc.shape[-1] - 1, -1, -1, device=loc.device), cache_size=0)
+        reverse = transforms.Permute(torch.arange(len(loc) - 1, -1, -1, device=loc.device), cache_size=0)
         moves = [part for layer in self.layers for part in (*map(copy.copy, layer), reverse)]
-        moves.append(transforms.AffineTransform(loc, scale, event_dim=1, cache_size=1))
+        moves.append(transforms.AffineTransform(loc, self.log_scale.exp(), event_dim=1, cache_size=1))
         return dist.TransformedDistribution(dist.Normal(torch.zeros_like(loc), 1.0).to_event(1), moves)
-
-
-def repeated(parameters: Parameters, features: Tensor) -> Parameters:
-    """Parameters that are the same for all, (...), in the batch shape of the features (B, H): (B, ...)."""
-    return tuple(p.expand(*features.shape[:-1], *p.shape) for p in parameters)

@@ -39,12 +39,6 @@ class TriangularNormal(TorchDistribution):
         """(..., D)."""
         return self.loc
 
-    @property
-    def variance(self) -> Tensor:
-        """(..., D)."""
-        identity = torch.eye(self.loc.shape[-1], dtype=self.loc.dtype, device=self.loc.device)
-        return (torch.linalg.solve_triangular(self.whitening, identity, upper=False) ** 2).sum(-1)
-
     def rsample(self, sample_shape: Any = ()) -> Tensor:
         """Draws (*sample_shape, ..., D)."""
         shape = self._extended_shape(torch.Size(sample_shape))
@@ -67,12 +61,6 @@ class TriangularNormal(TorchDistribution):
         """(...), in nats."""
         constant = self.event_shape[0] * math.log(2 * math.pi)
         return self.log_precision - 0.5 * ((self.whiten(value) ** 2).sum(-1) + constant)
-
-    def expand(self, batch_shape: Any, _instance: object = None) -> TriangularNormal:
-        """With loc and whitening expanded."""
-        shape = torch.Size([*batch_shape, *self.event_shape])
-        whitening = self.whitening.expand(*shape, shape[-1])
-        return TriangularNormal(self.loc.expand(shape), whitening, validate_args=False)
 
 
 @register_kl(Normal, TriangularNormal)

@@ -18,7 +18,7 @@ from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
-from ..laws.base import Parameters, as_event
+from ..laws.base import Parameters
 from ..networks.base import valid_steps
 from ..notation import Block, Factorization
 from .conditional import Conditional, like
@@ -148,7 +148,7 @@ class Rollout:
         parameters = conditional(known, self.batch, self.length, self.lengths)
         law = conditional.law.distribution(tuple(p.repeat(draws, *[1] * (p.dim() - 1)) for p in parameters))
         mask = self.mask(name)
-        return as_event(law if mask is None else law.mask(mask), 1)
+        return (law if mask is None else law.mask(mask)).to_event(1 - len(law.event_shape))
 
     def know(self, name: str, value: Tensor) -> None:
         """Record the value of a site, which later sites read."""
@@ -371,7 +371,7 @@ class Sequence(TorchDistribution):
         """`steps` with padding and missing entries masked out: batch (B,), event (T, D)."""
         base = self.steps(value)
         mask = self.rollout.mask(self.name)
-        return as_event(base if mask is None else base.mask(mask), 2)
+        return (base if mask is None else base.mask(mask)).to_event(2 - len(base.event_shape))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """(B,)."""

@@ -34,7 +34,7 @@ from ...inference.checkpoints import Run, load_weights
 from ...inference.fit import Stage
 from ...inference.recipe import Recipe, Trainable
 from ...inference.result import progress_bar
-from ...laws import FlowDistribution, QRFlow, Shape
+from ...laws import QRFlow, Shape
 from ...options import Layers, Range
 from ...turns import alone
 from ..protocols import Poses, Windows
@@ -145,7 +145,7 @@ class PosePriorModel(nn.Module):
             raise ValueError(f"a pose prior reads whole poses in every frame; leave {' and '.join(sorted(extra))} out")
         d = self.skeleton.directions(self.facing(batch["x"]))
         with pyro.plate("sequences", d.shape[0], dim=-2), pyro.plate("frames", d.shape[1], dim=-1):
-            return {"d": pyro.sample("d", self.density(), obs=d)}
+            return {"d": pyro.sample("d", self.flow.prior(), obs=d)}
 
     def guide(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
         """Nothing is latent."""
@@ -159,22 +159,18 @@ class PosePriorModel(nn.Module):
         """Windows (..., T, D) as the density reads them."""
         return x if self.forward_at is None else Heading(self.skeleton, self.forward_at + 1).face(x)
 
-    def density(self) -> FlowDistribution:
-        """Of the limb directions of a pose, event (3 (J - 1),)."""
-        return self.flow.distribution(self.flow(self.flow.location.new_empty(0)))
-
     def log_prob(self, poses: Tensor) -> Tensor:
         """Log density (...) of the limb directions of poses (..., D), in nats.
 
         Raises:
             ValueError: poses of another skeleton.
         """
-        return self.density().log_prob(self.skeleton.directions(poses))
+        return self.flow.prior().log_prob(self.skeleton.directions(poses))
 
     @torch.no_grad()
     def sample(self, count: int) -> Tensor:
         """Draws limb directions (count, 3 (J - 1)). The density is over all vectors, so their lengths vary about 1."""
-        return self.density().sample((count,))
+        return self.flow.prior().sample((count,))
 
 
 @alone
