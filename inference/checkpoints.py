@@ -38,6 +38,7 @@ from torch.nn.modules.module import (
 )
 
 from .. import files
+from ..laws.base import renamed
 
 try:
     import fcntl
@@ -286,7 +287,7 @@ def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tens
         CheckpointError: when they are not, or one is not finite.
     """
     try:
-        tensors = load_tensors(content)
+        tensors = {renamed(name): value for name, value in load_tensors(content).items()}
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:  # also for types it has none for
         raise CheckpointError(
             f"{path} is damaged or no safetensors file ({error}); copy it again, or fit again"
