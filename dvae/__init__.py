@@ -27,9 +27,11 @@ from .inference.bounds import SequenceELBO, Terms, importance_bound  # noqa: E40
 from .inference.compare import Comparison, compare  # noqa: E402
 from .inference.criticism import calibrate, predictive_checks, traverse  # noqa: E402
 from .inference.evaluate import Evaluation, evaluate  # noqa: E402
-from .inference.fit import Fit, Training, fit  # noqa: E402
+from .inference.fit import Fit, fit  # noqa: E402
 from .inference.objectives import Evidence  # noqa: E402
 from .inference.particles import particle_bound  # noqa: E402
+from .inference.svi import SVI  # noqa: E402
+from .inference.training import Training  # noqa: E402
 from .models.registry import method, methods  # noqa: E402
 from .motion import energies  # noqa: E402
 from .notation import Factorization  # noqa: E402
@@ -39,6 +41,7 @@ from .program.rollout import SelfFeeding  # noqa: E402
 from .runs.directory import load  # noqa: E402
 
 __all__ = [
+    "SVI",
     "Audit",
     "Comparison",
     "DynamicalVAE",

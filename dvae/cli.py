@@ -29,10 +29,12 @@ from .inference.checkpoints import Run
 from .inference.compare import compare as compare_models
 from .inference.criticism import Calibration, PredictiveChecks, calibrate, predictive_checks
 from .inference.evaluate import evaluate as evaluate_models
-from .inference.fit import Fit, Interrupted, Training, reason
+from .inference.fit import Fit, Interrupted
 from .inference.recipe import Trainable
 from .inference.result import Plain, Table
+from .inference.svi import reason
 from .inference.trackers import TensorBoard
+from .inference.training import Training
 from .models.method import LatentMethod
 from .models.registry import judges, methods
 from .models.registry import method as method_by_name

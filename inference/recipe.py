@@ -12,9 +12,10 @@ from torch import nn
 from ..options import check
 from ..schema import Schema, SchemaError
 from .batches import Source
-from .fit import Fit, Stage, fit
+from .fit import Fit, fit
 from .objectives import Objective
 from .schedules import Schedule
+from .training import Stage
 
 
 def _as_it_is(model: nn.Module) -> None:

@@ -32,9 +32,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
+from ..inference.training import Stage
 from ..laws import Delta
 from ..motion import Skeleton, Windows, energies
 from ..motion.body import body_parts

@@ -42,10 +42,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
 from ..inference.schedules import Linear, Schedule
+from ..inference.training import Stage
 from ..motion import Skeleton, energies
 from ..motion.body import body_parts
 from ..motion.protocols import Poses

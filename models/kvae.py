@@ -32,8 +32,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..inference.fit import Stage
 from ..inference.recipe import Recipe
+from ..inference.training import Stage
 from ..laws.base import Law, LawSpec, Parameters, Shape
 from ..laws.kalman import LinearGaussianChain, update
 from ..laws.triangular import InverseCholesky, TriangularNormal

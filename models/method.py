@@ -10,10 +10,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import torch
 from torch import nn
 
-from ..inference.fit import Stage
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe, Trainable
 from ..inference.schedules import Cosine, Linear, Logistic, Schedule
+from ..inference.training import Stage
 from ..laws import FixedNormal, Flow, LawSpec, Mixture, Normal, StudentT, Vamp
 from ..laws.priors import VampLaw
 from ..networks import NetworkSpec

@@ -23,9 +23,9 @@ from pyro import poutine
 from torch import Tensor
 from typing_extensions import override
 
-from ..inference.fit import Stage
 from ..inference.objectives import Evidence
 from ..inference.recipe import Recipe
+from ..inference.training import Stage
 from ..laws import FixedNormal, LawSpec
 from ..motion import HUMAN36M, PROTOCOLS, Clip, Heading, Skeleton, Windows
 from ..motion.control import bend

@@ -23,10 +23,12 @@ from dvae.inference import checkpoints
 from dvae.inference.batches import Sequences
 from dvae.inference.bounds import SequenceELBO, Terms
 from dvae.inference.checkpoints import CheckpointError, Run, load_weights, save_weights, weights
-from dvae.inference.fit import Callback, Interrupted, NonFiniteError, Stage, Training, fit
+from dvae.inference.fit import Callback, Interrupted, fit
 from dvae.inference.objectives import Evidence
 from dvae.inference.schedules import Linear, Piecewise
+from dvae.inference.svi import NonFiniteError
 from dvae.inference.trackers import JSONLines, Memory, TensorBoard, Terminal
+from dvae.inference.training import Stage, Training
 from dvae.networks import Dense
 from dvae.program.model import DynamicalVAE
 

@@ -17,10 +17,11 @@ from typing import Any
 import torch
 
 from ..inference.checkpoints import CONFIG, CheckpointError, Run, at_most, load_weights
-from ..inference.fit import Callback, Fit, Training
+from ..inference.fit import Callback, Fit
 from ..inference.recipe import Trainable
 from ..inference.schedules import from_config as option_from_config
 from ..inference.trackers import Tracker
+from ..inference.training import Training
 from ..models.registry import from_config
 from ..schema import Schema
 from ..turns import alone

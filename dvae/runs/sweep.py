@@ -21,8 +21,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 from uuid import uuid4
 
@@ -31,13 +31,16 @@ from joblib import Parallel, delayed
 from rich.live import Live
 
 from .. import files
-from ..inference import fit as loop
 from ..inference.checkpoints import Run
-from ..inference.fit import Fit, State, Training
+from ..inference.fit import Fit
+from ..inference.fit import Interrupted as RunInterrupted
 from ..inference.recipe import Trainable
 from ..inference.result import Plain, Table
 from ..inference.schedules import clamp
+from ..inference.signals import Signals
+from ..inference.svi import State, reason
 from ..inference.trackers import LARGEST_LOG, row_of
+from ..inference.training import Training
 from ..models.method import Method
 from ..options import flat
 from ..schema import Schema
@@ -152,7 +155,7 @@ def sweep(
     received, blind = None, False
     out.mkdir(parents=True, exist_ok=True)
     lease.touch(exist_ok=False)
-    with _Progress(waiting, training) as progress, _Stop(lease) as stop:
+    with _Progress(waiting, training) as progress, Signals(then=partial(lease.unlink, missing_ok=True)) as stop:
         try:
             for result in results.values():
                 progress.end(result)
@@ -218,10 +221,10 @@ def _fit(run: _Run) -> tuple[Result, list[str]]:
                 raise  # it is the sweep's own Ctrl-C: with one job, joblib starts no process
             if leased.orphaned():
                 os._exit(1)  # else it would wait for more work
-            if isinstance(stop, loop.Interrupted):
+            if isinstance(stop, RunInterrupted):
                 ended = stop.fit
         except Exception as failure:  # of any type, and it may not survive the way to the sweep's process
-            status, error = "failed", f"{type(failure).__name__}: {loop.reason(failure)}"
+            status, error = "failed", f"{type(failure).__name__}: {reason(failure)}"
         seconds = time.monotonic() - begin
     result = Result(run.path, run.method, run.training.seed, status, ended.step, ended.best_bound, seconds, error)
     return result, [str(warning.message) for warning in caught]
@@ -256,18 +259,6 @@ class _Leased:
     def on_validation(self, state: State) -> None: ...
 
     def on_end(self, state: State) -> None: ...
-
-
-class _Stop(loop._Signals):
-    """Ends the lease at the first Ctrl-C or SIGTERM."""
-
-    def __init__(self, lease: Path) -> None:
-        super().__init__()
-        self.lease = lease
-
-    def _remember(self, number: int, frame: FrameType | None) -> None:
-        super()._remember(number, frame)
-        self.lease.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -25,8 +25,8 @@ from pyro import distributions
 from torch import Tensor, nn
 
 from ...inference.batches import Batch
-from ...inference.fit import Stage
 from ...inference.recipe import Recipe, Trainable
+from ...inference.training import Stage
 from ...options import Layers, Size
 from ...schema import SchemaError
 from ..protocols import Poses, Protocol, Windows

@@ -31,9 +31,9 @@ from torch import Tensor, nn
 
 from ...inference.batches import Batch
 from ...inference.checkpoints import Run, load_weights
-from ...inference.fit import Stage
 from ...inference.recipe import Recipe, Trainable
 from ...inference.result import progress_bar
+from ...inference.training import Stage
 from ...laws import QRFlow, Shape
 from ...options import Layers, Range
 from ...turns import alone

@@ -1,0 +1,335 @@
+"""Stochastic variational inference (Hoffman et al. 2013, arXiv 1206.7051), a step at a time.
+
+`SVI` draws from the guide, asks the bound for its terms and the objective for a number, and takes a step of a torch
+optimiser. lightning-fabric runs the same code on a CPU, a GPU, in bfloat16, or in several processes. Whatever varies
+over time is a schedule of the global step, and random numbers are the run's own: what the caller draws between steps
+changes nothing, nor the reverse.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..turns import alone
+from .batches import Batch, Sequences, each, sequences
+from .bounds import SequenceELBO, Terms
+from .checkpoints import weights
+from .objectives import Objective
+from .schedules import schedule
+from .training import Stage, lay_out, stage_at
+
+# each of them can be fused
+OPTIMISERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch.optim.SGD}
+
+
+class NonFiniteError(FloatingPointError):
+    """A loss or its gradient is NaN or infinite; the step was not taken."""
+
+
+def reason(error: BaseException) -> str:
+    """What an error says, without the table of shapes that Pyro appends where it passes a program."""
+    return re.split(r"\n\s*Trace Shapes:", str(error))[0]
+
+
+@dataclass
+class State:
+    """Where a run stands. Callbacks of `fit` read it, and set `stop` to end the run after the step."""
+
+    model: nn.Module
+    step: int = 0
+    terms: Terms | None = None
+    row: dict[str, float] = field(default_factory=dict)
+    best: dict[str, Tensor] | None = None
+    best_step: int | None = None
+    best_bound: float | None = None
+    waited: int = 0
+    status: str = "running"
+    stop: bool = False
+
+
+class SVI:
+    """Stochastic variational inference by hand: what `fit` is made of, for an epoch of one's own.
+
+    On a CPU, steps on the batches that `fit` draws repeat its numbers bit for bit: `train.sample(batch_size,
+    svi.generator)`. To end and go on later, see `resuming`.
+
+    Args:
+        model: a `DynamicalVAE`, or any module that `SequenceELBO` takes.
+        objective: what to minimise; `Evidence()` by default.
+        stages: objectives one after the other, in place of `objective`; their steps are those of the run.
+        **options: fields of `Training`. Schedules and a decay end by `steps`; when to log, to validate and to stop is
+            the caller's to say.
+
+    Raises:
+        TypeError, ValueError: an option that does not exist or is out of range, or nothing to fit.
+
+    Example:
+        svi = dvae.SVI(model, steps=1000, learning_rate=1e-3)
+        state = svi.init()
+        for batch in loader:
+            svi.step(batch)
+            if state.step % 100 == 0:
+                print(state.step, svi.evaluate(held_out)["bound"])
+    """
+
+    def __init__(
+        self, model: nn.Module, objective: Objective | None = None, stages: Sequence[Stage] = (), **options: Any
+    ) -> None:
+        self.model = model
+        self.training, self.plan = lay_out(options, objective, stages)
+        trained = {name: parameter for name, parameter in model.named_parameters() if parameter.requires_grad}
+        if not trained:
+            raise ValueError(
+                f"{type(model).__name__} has no parameters that require gradients; there is nothing to fit"
+            )
+        for stage in self.plan:
+            if missing := [start for start in stage.frozen if not any(name.startswith(start) for name in trained)]:
+                raise ValueError(f"no parameter's name starts with {', '.join(missing)}; they are {', '.join(trained)}")
+            if all(name.startswith(stage.frozen) for name in trained):
+                raise ValueError(f"a stage of {stage.steps} steps has every parameter frozen; there is nothing to fit")
+        self.parameters = list(trained.values())
+        self.final_feeding = self.rates(self.training.steps - 1)["self_feeding"]
+        self._state: State | None = None
+
+    @property
+    def state(self) -> State:
+        """Where the run stands, from `init` on."""
+        if self._state is None:
+            raise RuntimeError("the run has not begun; call init() first, which makes its optimiser")
+        return self._state
+
+    @alone
+    def init(self) -> State:
+        """Begin at step 0, with a new optimiser and the random numbers of the seed; the weights stay as they are."""
+        from lightning_fabric import Fabric  # over a second to import, half of what `import dvae` would take
+
+        training = self.training
+        self.fabric: Fabric = Fabric(
+            accelerator=training.accelerator, devices=training.devices, precision=training.precision
+        )
+        self.fabric.launch()
+        with _forked(self.fabric.device):
+            optimizer = OPTIMISERS[training.optimizer](
+                self.parameters, lr=training.rate(0), weight_decay=training.weight_decay, fused=True
+            )
+            bound = _Bound(self.model, SequenceELBO(training.particles))
+            self.module, self.optimizer = self.fabric.setup(bound, optimizer)
+            self.generator = torch.Generator().manual_seed(training.seed + self.fabric.global_rank)
+            # Another seed than the generator's own: equal seeds would tie the latent draws to the choice of the batch.
+            torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
+            self.random = self._random_state()
+        self._state = State(self.model)
+        return self._state
+
+    @alone
+    def step(self, batch: Batch | Tensor) -> Terms:
+        """Take one optimiser step, in training mode, and return the terms of the bound before it.
+
+        Args:
+            batch: x as a tensor (B, T, D), or a batch.
+
+        Raises:
+            NonFiniteError: the loss or a gradient is NaN or infinite; the weights stay as they are.
+        """
+        state, training = self.state, self.training
+        stage, rates = stage_at(self.plan, state.step), self.rates(state.step)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rates["learning_rate"]
+        if not self.model.training:
+            self.module.train()
+        where = f"step {state.step + 1}"
+        with self.drawing():
+            terms = self._terms(batch, stage.objective, where, rates["self_feeding"])
+            loss = stage.objective(terms, state.step)
+            self.optimizer.zero_grad()
+            self.fabric.backward(loss)
+        for name, parameter in self.model.named_parameters() if stage.frozen else ():
+            if name.startswith(stage.frozen):
+                parameter.grad = None  # which the optimiser leaves out, with its state
+        gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
+        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
+        self._numbers = torch.stack([loss.detach(), norm])
+        if not torch.isfinite(self.total(self._numbers)).all():
+            raise NonFiniteError(
+                f"{where}: {_culprit(self.model, terms, loss)}; no step was taken. Try a lower learning "
+                "rate, a smaller gradient_clip or a longer warm-up"
+            )
+        if training.gradient_clip is not None and norm > training.gradient_clip:
+            for gradient in gradients:
+                gradient.mul_(training.gradient_clip / norm)
+        self.optimizer.step()
+        state.step += 1
+        state.terms = terms
+        return terms
+
+    def row(self) -> dict[str, float]:
+        """Return the numbers of the last step, in nats per frame (see `trackers`)."""
+        if self.state.terms is None:
+            raise RuntimeError("no step has been taken since init(), so there are no numbers of one")
+        loss, norm = self._numbers.tolist()
+        rates = self.rates(self.state.step - 1)
+        return {"loss": loss, "gradient_norm": norm, **rates, **_per_frame(_sums(self.state.terms))}
+
+    @alone
+    def evaluate(self, data: Any) -> dict[str, float]:
+        """Return the terms of the unweighted bound on data, in nats per frame; the model is left in evaluation mode.
+
+        The draws from the guide are the same each time, so that bounds differ by the weights alone. Every process
+        scores all the data. A model without a likelihood has no bound but a "loss", and so has an objective that
+        selects by it. A run with self-feeding also has "self_fed/bound": of the program fed as the run ends.
+
+        Args:
+            data: x as a tensor (N, T, D), a batch, or an object whose `all()` returns a batch.
+        """
+        held_out = data if isinstance(data, Sequences) else sequences(data)
+        row = self._score(held_out, 0.0)
+        if self.final_feeding:
+            what = "loss" if "loss" in row else "bound"
+            row[f"self_fed/{what}"] = self._score(held_out, self.final_feeding)[what]
+        return row
+
+    def validate(self, data: Any) -> dict[str, float]:
+        """Return what `evaluate` does, as "validation/bound" and so on; keep the weights if that is the best.
+
+        A run with self-feeding learns to run on its own output, which costs it bound on the true past. There
+        the best is by the bound of the self-fed program, once the schedule has reached its last value.
+
+        A model without a likelihood has no bound; there, and where the objective says so, the best is by the objective.
+        """
+        state, row = self.state, self.evaluate(data)
+        fed = "self_fed/" if self.final_feeding else ""
+        score = -row[f"{fed}loss"] if "loss" in row else row[f"{fed}bound"]
+        if not fed or self.rates(state.step - 1)["self_feeding"] == self.final_feeding:
+            state.waited += 1
+            if score > (-math.inf if state.best_bound is None else state.best_bound):  # never true of NaN
+                state.best_step, state.best_bound, state.waited = state.step, score, 0
+                state.best = weights(self.model)
+        return {f"validation/{name}": value for name, value in row.items()}
+
+    def rates(self, step: int) -> dict[str, float]:
+        """The learning rate and the probability of self-feeding at a global step."""
+        stage = stage_at(self.plan, step)
+        given = {"learning_rate": self.training.rate, "self_feeding": self.training.self_feeding}
+        own = {name: getattr(stage, name) for name in given}
+        return {name: schedule(given[name] if own[name] is None else own[name])(step) for name in given}
+
+    @contextmanager
+    def drawing(self) -> Iterator[None]:
+        """Within it, torch draws the run's random numbers; the caller's random state is left as it was."""
+        with _forked(self.fabric.device):
+            torch.set_rng_state(self.random["torch"])
+            if "cuda" in self.random:
+                torch.cuda.set_rng_state(self.random["cuda"], self.fabric.device)
+            yield
+            self.random = self._random_state()
+
+    def total(self, value: Tensor) -> Tensor:
+        """The sum over the processes."""
+        total = self.fabric.all_reduce(value.clone(), reduce_op="sum")
+        assert isinstance(total, Tensor)
+        return total
+
+    def _random_state(self) -> dict[str, Tensor]:
+        on_cuda = self.fabric.device.type == "cuda"
+        cuda = {"cuda": torch.cuda.get_rng_state(self.fabric.device)} if on_cuda else {}
+        return {"torch": torch.get_rng_state(), **cuda}
+
+    def _score(self, data: Sequences, feeding: float) -> dict[str, float]:
+        """The unweighted terms on held-out data, per frame, with the same draws each time."""
+        sums = dict[str, Tensor]()
+        objective = stage_at(self.plan, self.state.step).objective
+        last = self.training.steps  # of the weights, so that losses can be compared
+        self.module.eval()
+        with _forked(self.fabric.device), torch.no_grad():
+            torch.manual_seed(self.training.seed)
+            for batch in data.split(self.training.batch_size):
+                terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
+                found = _sums(terms)
+                if not terms.likelihood or getattr(objective, "select", "bound") == "loss":
+                    found["loss"] = objective(terms, last).double() * found["frames"]
+                for name, value in found.items():
+                    sums[name] = sums[name] + value if name in sums else value
+        # one verdict for every process, whatever the rounding on its device
+        totals = self.total(torch.stack(list(sums.values())))
+        return _per_frame(dict(zip(sums, totals, strict=True)))
+
+    def _terms(self, batch: Batch | Tensor, objective: Objective, where: str, feeding: float) -> Terms:
+        """Terms of a batch that the objective needs, on the device and in the precision of the model."""
+        dtype = self.parameters[0].dtype
+        named = {"x": batch} if isinstance(batch, Tensor) else batch
+        placed = each(named, lambda v: v.to(dtype) if v.is_floating_point() else v)
+        program: dict[str, Any] = {"self_feeding": feeding} if feeding else {}
+        if draws := getattr(objective, "draws", None):
+            program["draws"] = draws
+        try:
+            return Terms(**self.module(self.fabric.to_device(placed), program))
+        except ValueError as error:
+            # torch's distributions refuse NaN parameters and values before there is a term to look at
+            if "invalid values" not in str(error) and "within the support" not in str(error):
+                raise
+            raise NonFiniteError(f"{where}: {reason(error).partition(chr(10))[0]}") from error
+
+
+class _Bound(nn.Module):
+    """The bound's terms as the output of a module, which is what synchronises gradients between processes.
+
+    Pyro's `ELBOModule` does the same for a single number; objectives need the terms.
+    """
+
+    def __init__(self, model: nn.Module, estimator: SequenceELBO) -> None:
+        super().__init__()
+        self.model = model
+        self.estimator = estimator
+
+    def forward(self, batch: Batch, program: Mapping[str, Any]) -> dict[str, Any]:
+        return dict(vars(self.estimator.terms(self.model, batch, **program)))
+
+
+@contextmanager
+def _forked(device: torch.device) -> Iterator[None]:
+    """Put the random state of torch back at the end."""
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        yield
+
+
+def _sums(terms: Terms) -> dict[str, Tensor]:
+    """Each term summed over the sequences of a batch, and the number of frames."""
+    named = {
+        **({"bound": terms.bound} if terms.likelihood else {}),
+        **{f"log_likelihood/{name}": value for name, value in terms.log_likelihood.items()},
+        **{f"kl/{name}": value for name, value in terms.kl.items()},
+        **{f"energy/{name}": value for name, value in terms.energies.items()},
+        "frames": terms.frames,
+    }
+    return {name: value.detach().double().sum() for name, value in named.items()}
+
+
+def _per_frame(sums: Mapping[str, Tensor]) -> dict[str, float]:
+    return {name: float(value / sums["frames"]) for name, value in sums.items() if name != "frames"}
+
+
+def _culprit(model: nn.Module, terms: Terms, loss: Tensor) -> str:
+    """The first term, or else the loss or a gradient, that is not finite."""
+    groups = {"log likelihood": terms.log_likelihood, "KL": terms.kl, "energy": terms.energies}
+    for group, values in groups.items():
+        for name, value in values.items():
+            bad = ~torch.isfinite(value)
+            if bad.any():
+                first = f"the {group} of {name} is {value[bad][0].item()}"
+                where = f"in {int(bad.sum())} of {len(value)} sequences"
+                if name in terms.steps:
+                    frames = (~torch.isfinite(terms.steps[name])).any(0).nonzero().flatten().tolist()
+                    where += f", frames {', '.join(map(str, frames[:3]))}{'…' if len(frames) > 3 else ''}"
+                return f"{first} {where}"
+    if not torch.isfinite(loss):
+        return f"the loss is {loss.item()} though every term is finite, so a weight of the objective is not"
+    for name, parameter in model.named_parameters():
+        if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+            return f"the gradient of {name} is not finite though the loss is"
+    return "the norm of the gradient overflows, or the loss of another process is not finite"

@@ -1,0 +1,156 @@
+"""The loop by hand: steps of one's own are those of `fit`, bit for bit, and leave the caller's random state alone."""
+
+import pytest
+import torch
+
+import dvae
+from dvae.inference.batches import Sequences
+from dvae.inference.checkpoints import Run, weights
+from dvae.inference.objectives import Evidence
+from dvae.inference.resuming import restore, store
+from dvae.inference.schedules import Linear, Piecewise
+from dvae.inference.training import Stage
+from dvae.networks import Dense
+
+STEPS = 24
+
+
+def build(seed=0):
+    torch.manual_seed(seed)
+    equations = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)"
+    return dvae.DynamicalVAE(*equations, {"z": 2, "x": 3}, network=Dense(widths=(8,))).double()
+
+
+def walks(n, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(n, 4, 3, generator=generator, dtype=torch.float64).cumsum(1)
+
+
+TRAIN, HELD_OUT = walks(24), walks(7, seed=1)
+SHARED = {"batch_size": 8, "log_every": 1, "validate_every": 6, "learning_rate": 0.02, "progress": False}
+WARM_UP = Evidence(kl_weight=Linear(0.0, 1.0, 10), free_bits=0.1)
+RUNS = {
+    "clipped": {"steps": STEPS, "objective": WARM_UP, "gradient_clip": 0.5, "decay": 0.5},
+    "self-fed": {"steps": STEPS, "self_feeding": Piecewise(((0, 0.0), (11, 0.5))), "particles": 2},
+    "staged": {
+        "stages": [Stage(10, WARM_UP, frozen=("generator.z.",)), Stage(14, learning_rate=0.01, self_feeding=0.3)],
+        "optimizer": "adamw",
+        "weight_decay": 0.01,
+    },
+}
+
+
+def by_hand(svi, until=STEPS):
+    """Steps up to one, with validations; the rows of the log. What else the caller does changes nothing."""
+    source, rows = Sequences({"x": TRAIN}), []
+    while svi.state.step < until:
+        svi.step(source.sample(8, svi.generator))
+        rows.append({"step": svi.state.step, **svi.row()})
+        torch.rand(3)
+        svi.model.eval()
+        if svi.state.step % 6 == 0:
+            svi.evaluate(TRAIN)
+            rows.append({"step": svi.state.step, **svi.validate(HELD_OUT)})
+    return rows
+
+
+def same(first, second):
+    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("options", RUNS.values(), ids=RUNS)
+def test_steps_by_hand_repeat_a_fit_bit_for_bit(options):
+    fitted, mine = build(), build()
+    result = dvae.fit(fitted, TRAIN, HELD_OUT, **SHARED, **options)
+    svi = dvae.SVI(mine, **SHARED, **options)
+    svi.init()
+    assert by_hand(svi) == result.history
+    assert (svi.state.best_step, svi.state.best_bound) == (result.best_step, result.best_bound)
+    assert same(svi.state.best, weights(fitted))
+
+
+@pytest.mark.parametrize("options", RUNS.values(), ids=RUNS)
+def test_a_run_goes_on_by_hand_from_its_checkpoint(tmp_path, options):
+    whole = dvae.SVI(build(), **SHARED, **options)
+    whole.init()
+    rows = by_hand(whole)
+    first = dvae.SVI(build(), **SHARED, **options)
+    first.init()
+    before = by_hand(first, until=15)
+    store(first, Run(tmp_path))
+    second = dvae.SVI(build(seed=9), **SHARED, **options)
+    second.init()
+    restore(second, Run(tmp_path))
+    assert before + by_hand(second) == rows
+    assert same(weights(second.model), weights(whole.model))
+    assert same(second.state.best, whole.state.best)
+
+
+def test_by_hand_goes_on_from_the_checkpoint_of_a_fit(tmp_path):
+    options = {**SHARED, **RUNS["clipped"]}
+    whole = dvae.fit(build(), TRAIN, HELD_OUT, **options)
+    with pytest.raises(KeyboardInterrupt):
+        dvae.fit(build(), TRAIN, HELD_OUT, out=tmp_path, callbacks=[At(13)], **options)
+    svi = dvae.SVI(build(seed=9), **options)
+    svi.init()
+    restore(svi, Run(tmp_path))
+    assert by_hand(svi) == [row for row in whole.history if row["step"] > 13]
+
+
+class At:
+    """Interrupts a run after a step."""
+
+    def __init__(self, step):
+        self.step = step
+
+    def on_step(self, state):
+        if state.step == self.step:
+            raise KeyboardInterrupt
+
+    def on_validation(self, state): ...
+
+    def on_end(self, state): ...
+
+
+def test_the_callers_random_state_is_left_alone():
+    svi, before = dvae.SVI(build(), steps=STEPS), torch.get_rng_state()
+    svi.init()
+    svi.step(TRAIN)
+    svi.evaluate(HELD_OUT)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_evaluating_keeps_no_weights_and_a_step_trains_again():
+    svi = dvae.SVI(build(), steps=STEPS)
+    state = svi.init()
+    terms = svi.step(TRAIN)
+    assert svi.model.training
+    assert terms.bound.shape == (24,)
+    row = svi.evaluate(HELD_OUT)
+    assert svi.evaluate({"x": HELD_OUT}) == row
+    assert not svi.model.training
+    assert (state.step, state.best, state.waited) == (1, None, 0)
+    svi.step({"x": TRAIN})
+    assert svi.model.training
+
+
+def test_beginning_anew_is_beginning():
+    """The optimiser and the random numbers, not the weights."""
+    model = build()
+    start = weights(model)
+    svi = dvae.SVI(model, **SHARED, **RUNS["clipped"])
+    svi.init()
+    rows = by_hand(svi)
+    model.load_state_dict(start)
+    svi.init()
+    assert by_hand(svi) == rows
+
+
+def test_what_comes_too_early_is_refused_in_a_sentence():
+    svi = dvae.SVI(build())
+    for early in (lambda: svi.step(TRAIN), lambda: svi.evaluate(HELD_OUT), lambda: svi.state):
+        with pytest.raises(RuntimeError, match=r"the run has not begun; call init\(\) first"):
+            early()
+    svi.init()
+    with pytest.raises(RuntimeError, match="no step has been taken since init"):
+        svi.row()
