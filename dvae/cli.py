@@ -44,8 +44,7 @@ from .motion.judges.pose_prior import PosePriorModel
 from .notation import Factorization
 from .options import flat, nearest
 from .runs import directory as runs
-from .runs.sweep import ENDED
-from .runs.sweep import Interrupted as SweepInterrupted
+from .runs.sweep import ENDED, SweepInterrupted
 from .runs.sweep import sweep as sweep_methods
 
 if TYPE_CHECKING:
@@ -221,7 +220,7 @@ def fit(
             precision=precision,
         )
     opened = MotionData.open(data, protocol, skip_bad)
-    _report(runs.fit(method, opened, out, training, trackers=[TensorBoard(out)] if tensorboard else []))
+    _report(runs.fit_run(method, opened, out, training, trackers=[TensorBoard(out)] if tensorboard else []))
 
 
 @app.command
@@ -732,7 +731,7 @@ def animate(
     elif window is not None or samples is not None or figure is not None:
         raise UsageError(f"--window, --samples and --figure are about futures; {source} has none")
     else:
-        clips = motion.simulate() if source == SIMULATED else motion.load(source)
+        clips = motion.simulate() if source == SIMULATED else motion.read_motion(source)
         shown = clips.clips[0] if clip is None else _clip(clips, clip)
         save_html(animation(clips.skeleton, shown.positions, every=every, title="/".join(shown.key)), out)
         ERROR.print(f"wrote {out}: {'/'.join(shown.key)}, {shown.frames} frames")
@@ -763,7 +762,7 @@ def data_info(
         file: an npz file, or "simulated".
         skip_bad: leave out clips that cannot be used, and list them, instead of refusing the file.
     """
-    clips = motion.simulate() if file == SIMULATED else motion.load(file, skip_bad=skip_bad)
+    clips = motion.simulate() if file == SIMULATED else motion.read_motion(file, skip_bad=skip_bad)
     OUT.print(clips.info())
 
 

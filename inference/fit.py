@@ -23,7 +23,7 @@ from .result import as_they_are
 from .resuming import marking_failure, restore, store
 from .signals import Signals
 from .svi import SVI, State
-from .trackers import JSONLines, Memory, Terminal, Tracker
+from .trackers import History, JSONLines, Terminal, Tracker
 from .training import Stage, Training, recorded
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ def fit(
             fitted on training data with another `fingerprint`.
 
     Example:
-        warm_up = Evidence(kl_weight=Linear(0.0, 1.0, steps=500))
+        warm_up = Evidence(kl_weight=Ramp(0.0, 1.0, steps=500))
         result = fit(model, x, validation=y, objective=warm_up, steps=2000, out="runs/first")
     """
     svi = SVI(model, objective, stages, **options)
@@ -195,12 +195,12 @@ def fit(
         if run is not None and resume:
             restore(svi, run)
             svi.fabric.barrier()  # every process has read the checkpoint before the first one writes
-        history, receivers = Memory(), list[Tracker]()
+        history, receivers = History(), list[Tracker]()
         if first:
             if run is not None:
                 run.write_config((run.config if resume else {}) | record | dict(config or {}))
                 log = JSONLines(run.path / "log.jsonl")
-                history = Memory(log.read() if resume else [])
+                history = History(log.read() if resume else [])
                 receivers = [log]
             receivers += [history, *trackers, *([Terminal(training.steps)] if training.progress else [])]
         for tracker in receivers:

@@ -34,7 +34,7 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class _Ramp:
+class _Rise:
     """From `start` to `end` in `steps` steps, after `delay` steps at `start`; then constant."""
 
     start: Level
@@ -63,7 +63,7 @@ class _Ramp:
 
 
 @dataclass(frozen=True)
-class Linear(_Ramp):
+class Ramp(_Rise):
     """A line from `start` to `end` in `steps` steps after `delay` steps at `start`, then constant."""
 
     def _share(self, elapsed: float) -> float:
@@ -71,15 +71,15 @@ class Linear(_Ramp):
 
 
 @dataclass(frozen=True)
-class Cosine(_Ramp):
-    """Half a cosine wave from `start` to `end`: slow, fast, slow. Arguments as for `Linear`."""
+class Cosine(_Rise):
+    """Half a cosine wave from `start` to `end`: slow, fast, slow. Arguments as for `Ramp`."""
 
     def _share(self, elapsed: float) -> float:
         return (1 - math.cos(math.pi * elapsed)) / 2
 
 
 @dataclass(frozen=True)
-class Logistic(_Ramp):
+class Logistic(_Rise):
     """A logistic curve from `start` to `end`, stretched so that both ends are reached exactly.
 
     Args:
@@ -129,8 +129,10 @@ class Piecewise:
         return (1 - share) * low + share * high
 
 
-Schedule = Constant | Linear | Cosine | Logistic | Piecewise
-_SCHEDULES = {kind.__name__: kind for kind in (Constant, Linear, Cosine, Logistic, Piecewise)}
+Schedule = Constant | Ramp | Cosine | Logistic | Piecewise
+_SCHEDULES = {kind.__name__: kind for kind in (Constant, Ramp, Cosine, Logistic, Piecewise)}
+_FORMER = {"Linear": "Ramp"}
+"""Names in configs of before to those of now."""
 
 
 def schedule(value: float | Schedule) -> Schedule:
@@ -241,7 +243,7 @@ def from_config(config: Any) -> Any:
     arguments = {key: from_config(item) for key, item in config.items() if key != "schedule"}
     if "schedule" not in config:
         return arguments
-    name = config["schedule"]
+    name = _FORMER.get(config["schedule"], config["schedule"])
     if name not in _SCHEDULES:
         raise ValueError(f"unknown schedule {name!r}; the schedules are {', '.join(_SCHEDULES)}")
     kind = _SCHEDULES[name]

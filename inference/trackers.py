@@ -1,4 +1,4 @@
-"""Trackers: where the numbers of a run go, row by row. Memory, a file of JSON lines, TensorBoard, the
+"""Trackers: where the numbers of a run go, row by row. A history, a file of JSON lines, TensorBoard, the
 terminal.
 
 A row maps names to numbers: `bound`, `log_likelihood/x`, `kl/z` are those of a training batch, the same names
@@ -21,7 +21,6 @@ from .. import files
 from .checkpoints import CheckpointError
 from .result import Plain
 
-Row = Mapping[str, float]
 LARGEST_LOG = 2**25
 """Bytes of a file of JSON lines."""
 MOST_ROWS = 200_000
@@ -34,14 +33,14 @@ class Tracker(Protocol):
     def start(self, step: int) -> None:
         """Begin at a step; stored rows of later steps belong to an abandoned run and are dropped."""
 
-    def log(self, step: int, row: Row) -> None:
+    def log(self, step: int, row: Mapping[str, float]) -> None:
         """Store a row."""
 
     def close(self) -> None:
         """Release files and screen; called once, also when the run fails."""
 
 
-class Memory:
+class History:
     """Keeps the rows in `rows`, a list of dicts with the key "step".
 
     Args:
@@ -55,7 +54,7 @@ class Memory:
         """Drop rows after `step`."""
         self.rows = [row for row in self.rows if row["step"] <= step]
 
-    def log(self, step: int, row: Row) -> None:
+    def log(self, step: int, row: Mapping[str, float]) -> None:
         """Append a row."""
         self.rows.append({"step": step, **row})
 
@@ -80,7 +79,7 @@ class JSONLines:
             new.write("".join(kept).encode())
         self._file = files.open_plain(self.path, os.O_WRONLY | os.O_APPEND)
 
-    def log(self, step: int, row: Row) -> None:
+    def log(self, step: int, row: Mapping[str, float]) -> None:
         """Append a row."""
         with files.naming(self.path):
             files.put(self._file, (json.dumps({"step": step, **row}) + "\n").encode())
@@ -148,7 +147,7 @@ class TensorBoard:
         with files.naming(self.directory):
             self._writer = SummaryWriter(self.directory, purge_step=step + 1)
 
-    def log(self, step: int, row: Row) -> None:
+    def log(self, step: int, row: Mapping[str, float]) -> None:
         """Write each number of a row as a scalar."""
         with files.naming(self.directory):
             for name, value in row.items():
@@ -185,7 +184,7 @@ class Terminal:
             self._task = self._bar.add_task("fit", total=self.steps, completed=step, terms="", rate="")
             self._bar.start()
 
-    def log(self, step: int, row: Row) -> None:
+    def log(self, step: int, row: Mapping[str, float]) -> None:
         """Show a row."""
         self._step = step
         self._latest |= row

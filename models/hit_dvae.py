@@ -44,7 +44,7 @@ from torch import Tensor, nn
 
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
-from ..inference.schedules import Linear, Schedule
+from ..inference.schedules import Ramp, Schedule
 from ..inference.training import Stage
 from ..motion import Skeleton, energies
 from ..motion.body import body_parts
@@ -278,7 +278,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         """Over the paper's shares of the run."""
         if not self.self_feeding:
             return 0.0
-        return Linear(0.0, self.self_feeding, steps=max(round(0.16 * steps), 1), delay=round(0.04 * steps))
+        return Ramp(0.0, self.self_feeding, steps=max(round(0.16 * steps), 1), delay=round(0.04 * steps))
 
     def start(self, model: Any, windows: Any) -> None:
         """See `EnergyMethod.start`; and mean and spread of 1024 windows' poses, where a learned scale of x starts."""

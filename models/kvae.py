@@ -278,7 +278,7 @@ class KalmanNetwork(Network):
 
 
 @dataclass(frozen=True)
-class Smoothed:
+class SmoothedLatents:
     """What a sequence says of the latents of a `kvae` model, at S draws of a.
 
     Args:
@@ -297,7 +297,7 @@ class Smoothed:
     weights: Tensor
 
 
-def smooth(model: DynamicalVAE, batch: Batch, samples: int = 1) -> Smoothed:
+def smooth(model: DynamicalVAE, batch: Batch, samples: int = 1) -> SmoothedLatents:
     """The exact posterior of z given draws of a; reparameterised, so that gradients flow.
 
     Padded steps of a ragged batch are 0, and leave the others as they are alone.
@@ -325,4 +325,4 @@ def smooth(model: DynamicalVAE, batch: Batch, samples: int = 1) -> Smoothed:
     results = [a, z, mean, covariance, chain.lag_one, alpha]
     if valid is not None:
         results = [r * valid[-len(r) :].view(*valid[-len(r) :].shape, *[1] * (r.dim() - 2)) for r in results]
-    return Smoothed(*(r.transpose(0, 1).unflatten(0, (samples, -1)) for r in results))
+    return SmoothedLatents(*(r.transpose(0, 1).unflatten(0, (samples, -1)) for r in results))

@@ -12,7 +12,7 @@ from torch import nn
 
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe, Trainable
-from ..inference.schedules import Cosine, Linear, Logistic, Schedule
+from ..inference.schedules import Cosine, Logistic, Ramp, Schedule
 from ..inference.training import Stage
 from ..laws import FixedNormal, Flow, LawSpec, Mixture, Normal, StudentT, Vamp
 from ..laws.priors import VampLaw
@@ -23,7 +23,7 @@ from ..program.model import DynamicalVAE
 from ..program.rollout import SelfFeeding
 from ..schema import Schema
 
-SHAPES: dict[str, type[Linear | Cosine | Logistic]] = {"linear": Linear, "cosine": Cosine, "logistic": Logistic}
+SHAPES: dict[str, type[Ramp | Cosine | Logistic]] = {"linear": Ramp, "cosine": Cosine, "logistic": Logistic}
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class LatentMethod(Method):
         reads = {parent.name for factor in p.factors for parent in factor.parents}
         if not self.self_feeding or not reads & (set(p.variables) - set(q.variables)):
             return 0.0
-        return Linear(0.0, self.self_feeding, steps=max(steps // 3, 1), delay=steps // 10)
+        return Ramp(0.0, self.self_feeding, steps=max(steps // 3, 1), delay=steps // 10)
 
 
 def start_priors(model: nn.Module, train: Any) -> None:

@@ -105,7 +105,7 @@ def _chosen(table: Mapping[str, type[Any]], what: str, name: str, options: Mappi
     return kind(**options)
 
 
-def from_config(config: Mapping[str, Any]) -> Trainable:
+def configured(config: Mapping[str, Any]) -> Trainable:
     """The method or judge that `Trainable.config` wrote."""
     if "method" not in config:
         raise ValueError(f"the configuration names no method: it holds {', '.join(config) or 'nothing'}")

@@ -13,7 +13,7 @@ from dvae import motion
 from dvae.cli import main
 from dvae.inference.evaluate import Evaluation, evaluate, frechet_pseudo_values
 from dvae.inference.metrics import frechet_distance
-from dvae.models.registry import from_config, judge
+from dvae.models.registry import configured, judge
 from dvae.motion.dataset import MotionData
 from dvae.motion.judges.action_classifier import ActionClassifier, ActionClassifierModel
 from dvae.runs import directory as runs
@@ -142,7 +142,7 @@ def test_the_classes_are_those_of_the_training_clips_and_kept():
     train = windows("train")
     method = ActionClassifier(**SMALL).suited(train)
     assert method.classes == ("down", "up")
-    assert from_config(json.loads(json.dumps(method.config()))) == method
+    assert configured(json.loads(json.dumps(method.config()))) == method
     assert method.suited(windows("test", people(ways=("left", "right")))) == method
     assert method.equations()[0].text == "p(c | x_{1:T})"
     recipe = method.train(train)
@@ -156,13 +156,13 @@ def test_a_fitted_classifier_is_read_back_and_goes_on(run, file, tmp_path, capsy
     training = dvae.Training(steps=20, batch_size=16, validate_every=10, decay=0.5, progress=False)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     method = judge("action-classifier", **SMALL)
-    result = runs.fit(method, MotionData.open(file), whole, training)
+    result = runs.fit_run(method, MotionData.open(file), whole, training)
     assert "nats a window" in result.best
     x = loaded.data.windows("test").all()["x"][:, 15:]
     logits = loaded.model.logits(loaded.model.features(x))
     other = dvae.load(whole).model
     assert torch.equal(other.logits(other.features(x)), logits)
-    runs.fit(method, MotionData.open(file), parts, replace(training, steps=10))
+    runs.fit_run(method, MotionData.open(file), parts, replace(training, steps=10))
     assert main(["resume", str(parts), "--steps", "20"]) == 0
     assert f"score forecasts with: dvae evaluate RUN --classifier {parts}" in " ".join(capsys.readouterr().out.split())
     rows = [json.loads(line) for line in (parts / "log.jsonl").read_text().splitlines()]

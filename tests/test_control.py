@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dvae.motion import Skeleton, control
-from dvae.motion.control import bend, smooth
+from dvae.motion.control import bend, smooth_covariance
 
 POINT = Skeleton(("root", "tip"), (-1, 0))
 LOOSE = torch.full((1,), 1e9, dtype=torch.float64)
@@ -32,7 +32,7 @@ def test_a_linear_decoder_has_a_closed_form():
     found, corrections = bend(
         lambda z: (z @ weight.T).unflatten(-1, (steps, size)), drawn, scale, paths, known, POINT, LOOSE
     )
-    correction = control.CORRECTION**2 * torch.kron(smooth(steps), torch.eye(size, dtype=torch.float64))
+    correction = control.CORRECTION**2 * torch.kron(smooth_covariance(steps), torch.eye(size, dtype=torch.float64))
     covariance = (weight * scale.square()) @ weight.T + correction
     rows = known.flatten().bool()
     gain = torch.linalg.solve(covariance[rows][:, rows], covariance[rows]).T

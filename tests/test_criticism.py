@@ -576,7 +576,7 @@ def people(tmp_path_factory):
 
 
 def test_checks_and_traversals_of_motion_print_draw_and_write(people):
-    clips = motion.load(people)
+    clips = motion.read_motion(people)
     windows = motion.windows(clips, motion.PROTOCOLS["simulated"], "test")
     equations = "p(w) p(z_t | z_{t-1}) p(x_t | z_t, w)", "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T})"
     model = DynamicalVAE(*equations, {"w": 2, "z": 2, "x": windows.size})

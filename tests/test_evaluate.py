@@ -458,7 +458,7 @@ def test_bone_lengths_tell_stretched_people(people):
 def test_reference_rows_of_real_data_are_those_published_with_it(file, protocol, still, neighbours):
     if not (DATA / file).exists():
         pytest.skip(f"{file} is not beside the project")
-    clips = motion.load(DATA / file)
+    clips = motion.read_motion(DATA / file)
     test = motion.windows(clips, motion.PROTOCOLS[protocol], "test")
     x = test.all()["x"]
     training = motion.windows(clips, motion.PROTOCOLS[protocol], "train+validation").all()["x"]

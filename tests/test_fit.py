@@ -25,9 +25,9 @@ from dvae.inference.bounds import SequenceELBO, Terms
 from dvae.inference.checkpoints import CheckpointError, Run, load_weights, save_weights, weights
 from dvae.inference.fit import Callback, Interrupted, fit
 from dvae.inference.objectives import Evidence
-from dvae.inference.schedules import Linear, Piecewise
+from dvae.inference.schedules import Piecewise, Ramp
 from dvae.inference.svi import NonFiniteError
-from dvae.inference.trackers import JSONLines, Memory, TensorBoard, Terminal
+from dvae.inference.trackers import History, JSONLines, TensorBoard, Terminal
 from dvae.inference.training import Stage, Training
 from dvae.networks import Dense
 from dvae.program.model import DynamicalVAE
@@ -110,7 +110,7 @@ def test_the_unweighted_objective_is_minus_the_bound_per_frame():
 def test_kl_weights_free_bits_and_energies_enter_the_loss_as_documented():
     energy = terms(energies={"feet": [1.0, 5.0]})
     assert Evidence(kl_weight=0.5)(terms(), 0).item() == pytest.approx((12 + 0.5 * 7.2) / 6)
-    assert Evidence(kl_weight={"z": Linear(0.0, 1.0, 10)})(terms(), 5).item() == pytest.approx((12 + 1.2 + 3) / 6)
+    assert Evidence(kl_weight={"z": Ramp(0.0, 1.0, 10)})(terms(), 5).item() == pytest.approx((12 + 1.2 + 3) / 6)
     assert Evidence(free_bits=0.5)(terms(), 0).item() == pytest.approx((12 + 6) / 6 + 0.5)
     assert Evidence(free_bits={"w": 0.5})(terms(), 0).item() == pytest.approx((12 + 6) / 6 + 0.5)
     assert Evidence(energy_weights={"feet": 2.0})(energy, 0).item() == pytest.approx((12 + 7.2 + 12) / 6)
@@ -151,7 +151,7 @@ def test_an_objective_survives_json():
 
 
 def test_a_fit_raises_the_bound_and_reports_terms_that_add_up():
-    result = run(validation=HELD_OUT, objective=Evidence(kl_weight=Linear(0.2, 1.0, 40)))
+    result = run(validation=HELD_OUT, objective=Evidence(kl_weight=Ramp(0.2, 1.0, 40)))
     assert (result.status, result.step, result.run) == ("finished", 60, None)
     _, bounds = result.series("validation/bound")
     assert bounds[-1] > bounds[0]
@@ -166,7 +166,7 @@ def test_a_fit_raises_the_bound_and_reports_terms_that_add_up():
 
 def test_validation_losses_have_the_weights_of_the_end():
     """So that those of a warm-up are not the lowest for costing less."""
-    result = run(validation=HELD_OUT, objective=Evidence(kl_weight=Linear(0.0, 1.0, 60), select="loss"))
+    result = run(validation=HELD_OUT, objective=Evidence(kl_weight=Ramp(0.0, 1.0, 60), select="loss"))
     rows = [row for row in result.history if "validation/loss" in row]
     assert len(rows) > 1
     for row in rows:
@@ -232,7 +232,7 @@ def test_stages_follow_one_another_on_one_global_step():
     def spying(name):
         return lambda terms, step: (seen.append((name, step)), Evidence()(terms, step))[1]
 
-    stages = [Stage(3, spying("a")), Stage(2, spying("b"), learning_rate=Linear(0.0, 1.0, 5))]
+    stages = [Stage(3, spying("a")), Stage(2, spying("b"), learning_rate=Ramp(0.0, 1.0, 5))]
     result = run(stages=stages, log_every=1)
     assert seen == [("a", 0), ("a", 1), ("a", 2), ("b", 3), ("b", 4)]
     assert result.series("learning_rate")[1] == pytest.approx([0.02, 0.02, 0.02, 0.6, 0.8])
@@ -273,7 +273,7 @@ def test_the_program_receives_the_scheduled_probability_of_self_feeding():
             seen.append(options.get("self_feeding", 0.0))
             return super().model(batch, **options)
 
-    run(build(kind=Spy), validation=HELD_OUT, steps=4, validate_every=4, self_feeding=Linear(0.0, 0.4, 4))
+    run(build(kind=Spy), validation=HELD_OUT, steps=4, validate_every=4, self_feeding=Ramp(0.0, 0.4, 4))
     assert seen == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.0, 0.3])  # validated without, then as it ends
 
 
@@ -287,8 +287,8 @@ def test_with_self_feeding_the_best_is_by_the_self_fed_bound_from_its_last_value
 
 
 def test_a_warm_up_longer_than_the_run_is_clamped_with_a_message():
-    with pytest.warns(UserWarning, match="after the last step 10; clamped to Linear"):
-        run(objective=Evidence(kl_weight=Linear(0.0, 1.0, 500)), steps=10)
+    with pytest.warns(UserWarning, match="after the last step 10; clamped to Ramp"):
+        run(objective=Evidence(kl_weight=Ramp(0.0, 1.0, 500)), steps=10)
 
 
 def test_the_gradient_is_clipped_in_norm():
@@ -340,8 +340,8 @@ def test_an_interrupted_run_resumes_bit_for_bit(tmp_path, how):
     action = interrupt if how == "callback" else lambda state: signal.raise_signal(number)
     options = {
         "validation": HELD_OUT,
-        "objective": Evidence(kl_weight=Linear(0.0, 1.0, 50)),
-        "self_feeding": Linear(0.0, 0.5, 60),
+        "objective": Evidence(kl_weight=Ramp(0.0, 1.0, 50)),
+        "self_feeding": Ramp(0.0, 0.5, 60),
     }
     whole = run(out=tmp_path / "whole", **options)
     handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
@@ -421,7 +421,7 @@ def test_rows_after_the_checkpoint_are_dropped_on_resume(tmp_path):
 
 
 def test_the_config_records_what_was_run(tmp_path):
-    objective = Evidence(kl_weight=Linear(0.0, 1.0, 5))
+    objective = Evidence(kl_weight=Ramp(0.0, 1.0, 5))
     run(out=tmp_path, steps=10, objective=objective, config={"method": "dkf"})
     run(out=tmp_path, steps=12, objective=objective, resume=True)
     config = Run(tmp_path).config
@@ -520,7 +520,7 @@ def test_options_that_do_not_exist_or_make_sense_are_refused():
         *({"steps": 0}, {"patience": 0}, {"gradient_clip": 0.0}, {"gradient_clip": math.nan}, {"optimizer": "lion"}),
         *({"learning_rate": rate} for rate in (-1, math.nan, math.inf)),
         *({"weight_decay": -1.0}, {"decay": 1.5}, {"self_feeding": 2}, {"self_feeding": -0.1}),
-        {"decay": 0.5, "learning_rate": Linear(1e-3, 0.0, 10)},
+        {"decay": 0.5, "learning_rate": Ramp(1e-3, 0.0, 10)},
     ):
         with pytest.raises(ValueError, match=r"must be|unknown optimizer|leave decay 0"):
             Training(**wrong)
@@ -617,7 +617,7 @@ def test_the_weights_of_another_model_are_refused(finished, tmp_path):
     with pytest.raises(CheckpointError, match=r"holds the weights of another model: \S+ is \(.*\), the model's is"):
         load_weights(build(latent=3), finished)
     with pytest.raises(CheckpointError, match=r"another model: it has .*, which the model lacks"):
-        load_weights(torch.nn.Linear(2, 2), finished)
+        load_weights(torch.nn.Ramp(2, 2), finished)
     with pytest.raises(CheckpointError, match=r"is no run directory: it has no state.json"):
         load_weights(build(), tmp_path / "..")
     with pytest.raises(CheckpointError, match="does not exist; give a run directory or a safetensors file"):
@@ -692,7 +692,7 @@ def test_a_process_killed_at_any_moment_leaves_a_whole_checkpoint(tmp_path_facto
 
 
 def test_every_tracker_receives_every_row(tmp_path):
-    memory, board = Memory(), TensorBoard(tmp_path / "board")
+    memory, board = History(), TensorBoard(tmp_path / "board")
     result = run(trackers=[memory, board], out=tmp_path / "run", steps=10)
     assert memory.rows == result.history == JSONLines(tmp_path / "run" / "log.jsonl").read()
     assert list((tmp_path / "board").glob("events.*"))

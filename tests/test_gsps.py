@@ -10,7 +10,7 @@ import dvae
 from dvae import motion
 from dvae.inference.metrics import average_pairwise_distance
 from dvae.models.gsps import PRESETS, GSPSModel, part_by_part
-from dvae.models.registry import from_config, judge
+from dvae.models.registry import judge
 from dvae.motion import energies
 from dvae.motion.body import LIMBS, body_parts
 from dvae.motion.dataset import MotionData
@@ -34,7 +34,7 @@ def prior_run(people, tmp_path_factory):
     """A run of a pose prior, of two steps."""
     out = tmp_path_factory.mktemp("prior") / "run"
     method = judge("pose-prior", heading=True)
-    runs.fit(method, people, out, dvae.Training(steps=2, progress=False, accelerator="cpu"))
+    runs.fit_run(method, people, out, dvae.Training(steps=2, progress=False, accelerator="cpu"))
     return str(out)
 
 
@@ -358,7 +358,7 @@ def test_options_that_do_not_fit(options, message):
 def test_presets_by_skeleton(windows):
     chosen = dvae.method("gsps").suited(windows)
     assert None not in vars(chosen).values()
-    assert from_config(chosen.config()) == chosen
+    assert configured(chosen.config()) == chosen
     for skeleton in (motion.HUMAN36M, motion.HUMANEVA):
         published = dvae.method("gsps", width=64).suited(type("Windows", (), {"skeleton": skeleton}))
         assert published == replace(dvae.method("gsps", **PRESETS[skeleton.name]), width=64)
@@ -369,8 +369,8 @@ def test_presets_by_skeleton(windows):
 def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, people, prior_run):
     method = dvae.method("gsps", **{**SMALL, "pose_prior": 0.01, "pose_prior_run": prior_run, "draws": (2, 2)})
     options = {"batch_size": 4, "validate_every": 3, "progress": False, "accelerator": "cpu"}
-    whole = runs.fit(method, people, tmp_path / "whole", dvae.Training(steps=6, **options))
-    runs.fit(method, people, tmp_path / "half", dvae.Training(steps=3, **options))
+    whole = runs.fit_run(method, people, tmp_path / "whole", dvae.Training(steps=6, **options))
+    runs.fit_run(method, people, tmp_path / "half", dvae.Training(steps=3, **options))
     resumed = runs.resume(tmp_path / "half", steps=6, progress=False)
     losses = whole.series("validation/loss")[1]
     assert whole.best_bound == -min(losses)

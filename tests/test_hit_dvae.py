@@ -10,7 +10,6 @@ from pyro import poutine
 import dvae
 from dvae import motion
 from dvae.models.hit_dvae import PRESETS, HiTModel
-from dvae.models.registry import from_config
 from dvae.motion import energies
 from dvae.motion.body import body_parts
 from dvae.motion.dataset import MotionData
@@ -342,13 +341,13 @@ def test_every_ablation_is_fitted_loaded_and_forecasts(people, tmp_path, ablatio
     """And the best weights are by what is trained."""
     method = small(warm_up=1, **ABLATIONS[ablation])
     training = dvae.Training(steps=4, validate_every=2, batch_size=2, progress=False, accelerator="cpu")
-    result = runs.fit(method, people, tmp_path / "run", training)
+    result = runs.fit_run(method, people, tmp_path / "run", training)
     rows = [row for row in result.history if any(name.startswith("validation/") for name in row)]
     assert all(("validation/loss" in row) == (method.selects == "loss") for row in rows)
     assert ("validation loss" in result.best) == (method.selects == "loss")
     loaded = runs.load(tmp_path / "run")
     assert loaded.method == replace(method.suited(people.windows("train")))
-    assert from_config(loaded.method.config()) == loaded.method
+    assert configured(loaded.method.config()) == loaded.method
     assert loaded.model.feeding.probability == 0
     past = people.windows("test").all()["x"][:2, :15]
     assert torch.isfinite(loaded.model.forecast(past, 3, 2)["x"]).all()

@@ -17,7 +17,7 @@ from dvae.inference.batches import Sequences
 from dvae.models import registry
 from dvae.models.dkf import Gated
 from dvae.models.method import LatentMethod
-from dvae.models.registry import from_config
+from dvae.models.registry import configured
 from dvae.testing import FactorizationContract
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -478,7 +478,7 @@ def test_the_gated_transition_is_of_a_variable_on_itself():
 @pytest.mark.parametrize("name", SMALL)
 def test_a_method_survives_its_configuration(name):
     for method in (dvae.method(name), small(name)):
-        again = from_config(json.loads(json.dumps(method.config())))
+        again = configured(json.loads(json.dumps(method.config())))
         assert again == method
         torch.manual_seed(0)
         first = method.build({"x": 4}).state_dict()
@@ -507,8 +507,8 @@ def test_a_method_says_what_it_is(name):
             "unknown emission 'gamma'; known: fixed, unit, normal, student",
         ),
         (lambda: dvae.method("equations", network="gru").build({"x": 1}), "unknown network 'gru'; known: recurrent"),
-        (lambda: from_config({"latent": 3}), "the configuration names no method: it holds latent"),
-        (lambda: from_config({}), "the configuration names no method: it holds nothing"),
+        (lambda: configured({"latent": 3}), "the configuration names no method: it holds latent"),
+        (lambda: configured({}), "the configuration names no method: it holds nothing"),
     ],
 )
 def test_methods_that_are_not(run, message):
@@ -564,7 +564,7 @@ def people():
     file = DATA / "bandai" / "bandai2.npz"
     if not file.exists():
         pytest.skip("the real motion capture is not beside the project")
-    return motion.windows(motion.load(file), motion.PROTOCOLS["bandai2-by-style"], "train", length=10)
+    return motion.windows(motion.read_motion(file), motion.PROTOCOLS["bandai2-by-style"], "train", length=10)
 
 
 @pytest.mark.data

@@ -25,7 +25,7 @@ from dvae.motion import (
     MotionSet,
     Protocol,
     Skeleton,
-    load,
+    read_motion,
     rotate_about_up,
     save,
     simulate,
@@ -253,16 +253,16 @@ class TestArchive:
     @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
     def test_every_pickle_protocol_is_read(self, tmp_path, protocol):
         content = pickle.dumps(np.array(self.nested(), dtype=object), protocol)
-        read = load(archive(tmp_path / "a.npz", content), skeleton=WALKER)
+        read = read_motion(archive(tmp_path / "a.npz", content), skeleton=WALKER)
         assert read.fingerprint() == motion().fingerprint()
 
     def test_what_numpy_writes_is_read_under_old_and_new_module_names(self, tmp_path):
         np.savez_compressed(tmp_path / "a.npz", positions_3d=np.array(self.nested(), dtype=object))
-        assert load(tmp_path / "a.npz", skeleton=WALKER).fingerprint() == motion().fingerprint()
+        assert read_motion(tmp_path / "a.npz", skeleton=WALKER).fingerprint() == motion().fingerprint()
         content = pickle.dumps(np.array(self.nested(), dtype=object), 2)
         other = (b"numpy.core", b"numpy._core")[b"numpy.core" in content]
         here = b"numpy._core" if other == b"numpy.core" else b"numpy.core"
-        swapped = load(archive(tmp_path / "b.npz", content.replace(here, other)), skeleton=WALKER)
+        swapped = read_motion(archive(tmp_path / "b.npz", content.replace(here, other)), skeleton=WALKER)
         assert swapped.fingerprint() == motion().fingerprint()
 
     @pytest.mark.parametrize("protocol", [0, 2, 4])
@@ -283,13 +283,13 @@ class TestArchive:
         nested = {**self.nested(), "test": {"walk": hostile}}
         path = archive(tmp_path / "a.npz", pickle.dumps(nested, protocol))
         with pytest.raises(ValueError, match=rf"a\.npz: positions_3d: {named}"):
-            load(path, skeleton=WALKER)
+            read_motion(path, skeleton=WALKER)
         assert not (tmp_path / "pwned").exists()
 
     def test_a_pickle_outside_positions_3d_is_refused_unread(self, tmp_path):
         path = archive(tmp_path / "a.npz", pickle.dumps(Evil()), name="train/walk")
         with pytest.raises(ValueError, match="train/walk: holds pickled objects"):
-            load(path, skeleton=WALKER)
+            read_motion(path, skeleton=WALKER)
 
     @pytest.mark.parametrize(
         ("content", "message"),
@@ -305,7 +305,7 @@ class TestArchive:
     )
     def test_other_contents_are_explained(self, tmp_path, content, message):
         with pytest.raises(ValueError, match=message):
-            load(archive(tmp_path / "a.npz", content), skeleton=WALKER)
+            read_motion(archive(tmp_path / "a.npz", content), skeleton=WALKER)
 
     @settings(max_examples=60, deadline=None)
     @given(place=st.floats(0, 1), cut=st.booleans())
@@ -317,7 +317,7 @@ class TestArchive:
         content[at] ^= 0xFF
         path.write_bytes(content[:at] if cut else content)
         try:
-            read = load(path, skeleton=WALKER)
+            read = read_motion(path, skeleton=WALKER)
         except ValueError as refused:
             sentence = str(refused)
         else:  # bytes such as a time stamp mean nothing here
@@ -327,17 +327,17 @@ class TestArchive:
 
     def test_a_missing_file_and_a_file_of_another_kind(self, tmp_path):
         with pytest.raises(FileNotFoundError, match="no such file"):
-            load(tmp_path / "nothing.npz")
+            read_motion(tmp_path / "nothing.npz")
         (tmp_path / "text.npz").write_text("hello")
         with pytest.raises(ValueError, match="not an npz archive"):
-            load(tmp_path / "text.npz", skeleton=WALKER)
+            read_motion(tmp_path / "text.npz", skeleton=WALKER)
 
 
 class TestPlain:
     @pytest.mark.parametrize("made", [lambda: simulate(5, 20), motion], ids=["labelled", "bare"])
     def test_save_and_load_round_trip(self, tmp_path, made):
         save(tmp_path / "new" / "set.npz", made())
-        read = load(tmp_path / "new" / "set.npz")
+        read = read_motion(tmp_path / "new" / "set.npz")
         assert read.fingerprint() == made().fingerprint()
         assert read.skeleton == made().skeleton
         for old, new in zip(made(), read, strict=True):
@@ -352,7 +352,7 @@ class TestPlain:
         save(links[0], simulate(5, 20))
         assert victim.read_text() == "mine"
         assert not any(link.is_symlink() for link in links)
-        assert load(links[0]).fingerprint() == simulate(5, 20).fingerprint()
+        assert read_motion(links[0]).fingerprint() == simulate(5, 20).fingerprint()
 
     @pytest.mark.parametrize("name", ["a.npz", "skeleton.json", "labels.csv"])
     def test_a_full_disk_leaves_the_older_file_and_is_named(self, name, tmp_path, monkeypatch):
@@ -375,7 +375,7 @@ class TestPlain:
         frames = 80 * 10**6 // (WALKER.joints * 3 * 4)  # packs to less than a hundredth
         rest = np.repeat(people()[0].positions[:1].astype(np.float32), frames, 0)
         save(tmp_path / "a.npz", MotionSet([Clip("train", "rest", rest)], WALKER))
-        assert load(tmp_path / "a.npz").clips[0].positions.shape == rest.shape
+        assert read_motion(tmp_path / "a.npz").clips[0].positions.shape == rest.shape
 
     def test_a_forecast_of_a_body_at_rest_is_read_again(self, tmp_path):
         future = np.zeros((80 * 10**6 // (10 * WALKER.joints * 3 * 4), 1, 10, WALKER.joints, 3), np.float32)
@@ -387,14 +387,14 @@ class TestPlain:
     def test_fortran_order_other_numbers_and_keys_without_a_split(self, tmp_path):
         positions = people((9,))[0].positions
         np.savez(tmp_path / "a.npz", walk=np.asfortranarray(positions), **{"S1/Walking 1": positions})
-        read = load(tmp_path / "a.npz", skeleton=WALKER)
+        read = read_motion(tmp_path / "a.npz", skeleton=WALKER)
         assert [clip.key for clip in read] == [("all", "walk"), ("S1", "Walking 1")]
         for clip in read:
             np.testing.assert_array_equal(clip.positions, positions.astype(np.float32))
 
     def test_splits_may_have_slashes_and_clip_names_may_not(self, tmp_path):
         save(tmp_path / "a.npz", MotionSet(people((9,), "Train/S1"), WALKER))
-        assert load(tmp_path / "a.npz").clips[0].key == ("Train/S1", "clip_0")
+        assert read_motion(tmp_path / "a.npz").clips[0].key == ("Train/S1", "clip_0")
         with pytest.raises(ValueError, match="'S1/walk' has a slash"):
             save(tmp_path / "a.npz", MotionSet([replace(people()[0], name="S1/walk")], WALKER))
 
@@ -405,42 +405,42 @@ class TestPlain:
         with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
             file.writestr("train/walk.npy", stream.getvalue() + bytes(100))
         with pytest.raises(ValueError, match=r"train/walk: declares shape \(1000000000000, 17, 3\)"):
-            load(tmp_path / "a.npz", skeleton=WALKER)
+            read_motion(tmp_path / "a.npz", skeleton=WALKER)
 
     def test_without_a_skeleton_the_error_says_what_to_write(self, tmp_path):
         np.savez(tmp_path / "a.npz", walk=people()[0].positions)
         with pytest.raises(ValueError, match=r'skeleton\.json beside it \(\{"joint_names"'):
-            load(tmp_path / "a.npz")
+            read_motion(tmp_path / "a.npz")
 
     def test_labels_are_found_by_split_and_clip(self, tmp_path):
         save(tmp_path / "a.npz", motion())
         with (tmp_path / "mine.csv").open("w", newline="") as file:
             rows = [("clip", "split", "mood"), ("clip_0", "test", "glad"), ("clip_0", "train", "sad")]
             csv.writer(file).writerows(rows)
-        read = load(tmp_path / "a.npz", labels=tmp_path / "mine.csv")
+        read = read_motion(tmp_path / "a.npz", labels=tmp_path / "mine.csv")
         assert read["train", "clip_0"].labels["mood"] == "sad"
         assert read["test", "clip_0"].labels["mood"] == "glad"
         assert read["test", "clip_1"].labels == {}
         (tmp_path / "mine.csv").write_text("clip,split\nother,train\n")
         with pytest.raises(ValueError, match=r"no row names a clip of .*a.npz"):
-            load(tmp_path / "a.npz", labels=tmp_path / "mine.csv")
+            read_motion(tmp_path / "a.npz", labels=tmp_path / "mine.csv")
         (tmp_path / "mine.csv").write_text("name\nother\n")
         with pytest.raises(ValueError, match="expected a column named clip"):
-            load(tmp_path / "a.npz", labels=tmp_path / "mine.csv")
+            read_motion(tmp_path / "a.npz", labels=tmp_path / "mine.csv")
 
     def test_skip_bad_drops_what_load_refuses(self, tmp_path):
         good, bad = people((9,))[0].positions, damaged(with_nan).positions
         np.savez(tmp_path / "a.npz", **{"train/good": good, "train/bad": bad})
         with pytest.raises(ValueError, match="train/bad has NaN"):
-            load(tmp_path / "a.npz", skeleton=WALKER)
-        read = load(tmp_path / "a.npz", skeleton=WALKER, skip_bad=True)
+            read_motion(tmp_path / "a.npz", skeleton=WALKER)
+        read = read_motion(tmp_path / "a.npz", skeleton=WALKER, skip_bad=True)
         assert [clip.name for clip in read] == ["good"]
         assert read.skipped[0][:2] == ("train", "bad")
 
     def test_the_joints_of_a_larger_file_can_be_chosen(self, tmp_path):
         full = np.random.default_rng(0).uniform(-0.8, 0.8, (9, 32, 3)).astype(np.float32)
         np.savez(tmp_path / "a.npz", **{"S1/Walking": full})
-        read = load(tmp_path / "a.npz", skeleton=HUMAN36M, joints=HUMAN36M_KEPT)
+        read = read_motion(tmp_path / "a.npz", skeleton=HUMAN36M, joints=HUMAN36M_KEPT)
         np.testing.assert_array_equal(read.clips[0].positions, full[:, list(HUMAN36M_KEPT)])
 
     def test_the_known_archives_need_no_skeleton(self, tmp_path):
@@ -452,19 +452,19 @@ class TestPlain:
             ("stranger", {"S1": {"Walking": narrow}}),
         ):
             np.savez(tmp_path / f"{name}.npz", positions_3d=np.array(nested, dtype=object))
-        human36m, humaneva = load(tmp_path / "h36m.npz"), load(tmp_path / "humaneva.npz")
+        human36m, humaneva = read_motion(tmp_path / "h36m.npz"), read_motion(tmp_path / "humaneva.npz")
         assert (human36m.skeleton, humaneva.skeleton) == (HUMAN36M, HUMANEVA)
         np.testing.assert_array_equal(human36m.clips[0].positions, wide[:, list(HUMAN36M_KEPT)])
         np.testing.assert_array_equal(humaneva.clips[1].positions, narrow)
         with pytest.raises(ValueError, match=r"skeleton\.json beside it"):
-            load(tmp_path / "stranger.npz")
+            read_motion(tmp_path / "stranger.npz")
 
     def test_what_a_file_unpacks_to_is_limited_as_a_whole(self, tmp_path, monkeypatch):
         positions = people((9,))[0].positions
         np.savez_compressed(tmp_path / "a.npz", **{f"train/{i}": positions for i in range(4)})
         monkeypatch.setattr("dvae.motion.archive.LARGEST", 2 * positions.nbytes)
         with pytest.raises(ValueError, match=r"a\.npz: it would unpack to [\d,]+ bytes, at most 7,344 are read"):
-            load(tmp_path / "a.npz", skeleton=WALKER)
+            read_motion(tmp_path / "a.npz", skeleton=WALKER)
 
 
 class TestWindows:
@@ -631,12 +631,12 @@ class TestWindows:
 
 @pytest.fixture(scope="module")
 def bandai():
-    return load(DATA / "bandai" / "bandai2.npz")
+    return read_motion(DATA / "bandai" / "bandai2.npz")
 
 
 @pytest.fixture(scope="module")
 def cmu():
-    return load(DATA / "cmu" / "cmu8.npz")
+    return read_motion(DATA / "cmu" / "cmu8.npz")
 
 
 class TestRealData:

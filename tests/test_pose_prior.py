@@ -12,7 +12,7 @@ from torch.distributions import MultivariateNormal
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.models.registry import from_config, judge
+from dvae.models.registry import configured, judge
 from dvae.motion.dataset import MotionData
 from dvae.motion.judges.pose_prior import PosePrior, PosePriorModel, fit_pose_prior
 from dvae.runs import directory as runs
@@ -31,7 +31,7 @@ def people(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def train(people):
-    return motion.windows(motion.load(people), SHORT, "train")
+    return motion.windows(motion.read_motion(people), SHORT, "train")
 
 
 @pytest.fixture(scope="module")
@@ -145,9 +145,9 @@ def test_a_fitted_prior_is_read_back_and_goes_on(run, people, tmp_path):
     training = dvae.Training(steps=12, batch_size=4, validate_every=4, decay=0.5, progress=False)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     method, data = judge("pose-prior", noise=0.005), MotionData.open(people)
-    runs.fit(method, data, whole, training)
+    runs.fit_run(method, data, whole, training)
     assert torch.equal(dvae.load(whole).model.log_prob(x), loaded.model.log_prob(x))
-    runs.fit(method, data, parts, replace(training, steps=8))
+    runs.fit_run(method, data, parts, replace(training, steps=8))
     assert main(["resume", str(parts), "--steps", "12"]) == 0
     rates = [json.loads(line) for line in (parts / "log.jsonl").read_text().splitlines()]
     assert max(row["step"] for row in rates) == 12
@@ -173,7 +173,7 @@ def test_it_forecasts_nothing(command, run, tmp_path, capsys):
 
 def test_it_survives_its_configuration():
     method = PosePrior(layers=2, noise=0.0, turned=True, whiten=False)
-    assert from_config(json.loads(json.dumps(method.config()))) == method
+    assert configured(json.loads(json.dumps(method.config()))) == method
     recipe = method.train({})
     assert recipe.feeding == 0
     assert recipe.objective == dvae.Evidence()
@@ -221,5 +221,5 @@ def test_on_real_poses_it_is_at_least_the_normal_in_closed_form():
     file = DATA / "bandai" / "bandai2.npz"
     if not file.exists():
         pytest.skip("the real motion capture is not beside the project")
-    windows = motion.windows(motion.load(file), motion.PROTOCOLS["bandai2-by-style"], "train")
+    windows = motion.windows(motion.read_motion(file), motion.PROTOCOLS["bandai2-by-style"], "train")
     assert gain(windows, steps=200) > 0

@@ -247,7 +247,7 @@ def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
     still = dvae.Training(steps=1, batch_size=2, learning_rate=0.0, progress=False, validate_every=2)
     starts = []
     for seed, name in ((0, "a"), (0, "b"), (1, "c")):
-        runs.fit(method, data, tmp_path / name, dvae.Training(**{**vars(still), "seed": seed}))
+        runs.fit_run(method, data, tmp_path / name, dvae.Training(**{**vars(still), "seed": seed}))
         starts.append(dvae.load(tmp_path / name).model.generator["w"].law.pseudo["x"])
     assert torch.equal(starts[0], starts[1])
     assert not torch.equal(starts[0], starts[2])
@@ -256,8 +256,8 @@ def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
         assert (windows == pseudo).flatten(1).all(1).any()
 
     training = {**vars(still), "learning_rate": 0.01}
-    runs.fit(method, data, tmp_path / "whole", dvae.Training(**{**training, "steps": 6}))
-    runs.fit(method, data, tmp_path / "parts", dvae.Training(**{**training, "steps": 4}))
+    runs.fit_run(method, data, tmp_path / "whole", dvae.Training(**{**training, "steps": 6}))
+    runs.fit_run(method, data, tmp_path / "parts", dvae.Training(**{**training, "steps": 4}))
     runs.resume(tmp_path / "parts", steps=6)
     assert weights(tmp_path / "parts") == weights(tmp_path / "whole")
 
@@ -265,7 +265,7 @@ def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
 def test_pseudo_sequences_longer_than_the_windows(people, tmp_path):
     method = dvae.method("hit-dvae", **{**VAMP, "prior_steps": 400})
     with pytest.raises(ValueError, match=r"pseudo-sequences of 400 steps, but those of x that it is to start at have"):
-        runs.fit(method, MotionData.open(people), tmp_path / "run", dvae.Training(steps=1, progress=False))
+        runs.fit_run(method, MotionData.open(people), tmp_path / "run", dvae.Training(steps=1, progress=False))
 
 
 @pytest.mark.parametrize("prior", ["mixture", "vamp", "flow"])

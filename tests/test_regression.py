@@ -16,7 +16,7 @@ import torch
 from scipy import stats
 
 from dvae import DynamicalVAE, Oracle, networks, twin
-from dvae.testing.regression import Comparison, ElboRegression, Record, measure
+from dvae.testing.regression import Change, ElboRegression, Record, measure
 
 pytest_plugins = ["pytester"]
 
@@ -68,10 +68,10 @@ def test_the_rate_of_false_alarms_is_alpha(exact):
     model, x, _ = exact
     n, alpha = 1000, 0.05
     pairs = zip(repeated(model, x, n, 30, seed=1), repeated(model, x, n, 30, seed=2), strict=True)
-    found = [Comparison(old, new, alpha) for old, new in pairs]
+    found = [Change(old, new, alpha) for old, new in pairs]
     spread = 4 * math.sqrt(alpha * (1 - alpha) / n)
-    assert abs(np.mean([comparison.worse for comparison in found]) - alpha) < spread
-    assert abs(np.mean([comparison.better for comparison in found]) - alpha) < spread
+    assert abs(np.mean([change.worse for change in found]) - alpha) < spread
+    assert abs(np.mean([change.better for change in found]) - alpha) < spread
 
 
 @pytest.mark.parametrize("particles", [4, 100])
@@ -85,7 +85,7 @@ def test_false_alarms_are_as_rare_however_draws_are_coupled_and_sequences_spread
     first, second = random.normal(size=(2, n, particles, size))
     second = coupling * first + math.sqrt(1 - coupling**2) * second
     alarms = [
-        Comparison(Record.of(level + scale * a, {}), Record.of(level + scale * b, {}), alpha).worse
+        Change(Record.of(level + scale * a, {}), Record.of(level + scale * b, {}), alpha).worse
         for a, b in zip(first, second, strict=True)
     ]
     assert abs(np.mean(alarms) - alpha) < 4 * math.sqrt(alpha * (1 - alpha) / n)
@@ -126,8 +126,8 @@ class Poor:
 def test_false_alarms_are_as_rare_when_a_change_takes_other_random_numbers(change):
     n, alpha = 2000, 0.05
     pairs = zip(Poor().records(n, 30, seed=1), Poor(**change).records(n, 30, seed=1), strict=True)
-    found = [Comparison(old, new, alpha) for old, new in pairs]
-    for alarms in ([comparison.worse for comparison in found], [comparison.better for comparison in found]):
+    found = [Change(old, new, alpha) for old, new in pairs]
+    for alarms in ([change.worse for change in found], [change.better for change in found]):
         assert abs(np.mean(alarms) - alpha) < 4 * math.sqrt(alpha * (1 - alpha) / n)
 
 
@@ -142,7 +142,7 @@ def test_one_random_number_more_uncouples_one_draw_only():
     scaled = particles * (40 * mean - mean**2) / (math.sqrt(2) * 40 * 0.3 / math.sqrt(4))
     quantile = stats.t.ppf(1 - alpha, particles - 1)
     power = stats.norm.cdf(-scaled / (quantile + 1)) + stats.norm.cdf(-scaled / (quantile - 1)) - 1
-    rate = np.mean([Comparison(a, b, alpha).worse for a, b in zip(old, poor, strict=True)])
+    rate = np.mean([Change(a, b, alpha).worse for a, b in zip(old, poor, strict=True)])
     assert abs(rate - power) < 4 * math.sqrt(power * (1 - power) / n)
     assert power > 0.8
 
@@ -155,7 +155,7 @@ def test_the_note_tells_the_fall_that_is_found_nine_times_in_ten(tmp_path, exact
     fall = float(re.search(r"a loss of (\S+) would be found with probability 0.9", notes[0])[1])
     scale = Record.loads((tmp_path / "test_it.json").read_text()).mean_error * math.sqrt(particles)
     old, new = np.random.default_rng(0).normal(scale=scale, size=(2, n, particles, 1))
-    found = [Comparison(Record.of(a, {}), Record.of(b - fall, {}), 0.05).worse for a, b in zip(old, new, strict=True)]
+    found = [Change(Record.of(a, {}), Record.of(b - fall, {}), 0.05).worse for a, b in zip(old, new, strict=True)]
     assert 0.88 < np.mean(found) < 0.97
 
 
@@ -166,14 +166,14 @@ def test_a_worse_guide_is_found_as_often_as_its_nats_and_their_error_say(exact):
     fall = (Oracle(poor, 3).bound(x) - oracle.bound(x)).mean().item()
     assert fall < 0
     pairs = zip(repeated(model, x, n, particles, seed=1), repeated(poor, x, n, particles, seed=2), strict=True)
-    found = [Comparison(old, new, alpha) for old, new in pairs]
-    differences = np.array([comparison.difference for comparison in found])
+    found = [Change(old, new, alpha) for old, new in pairs]
+    differences = np.array([change.difference for change in found])
     error = differences.std()
     assert abs(differences.mean() - fall) < 4 * error / math.sqrt(n)
-    assert np.mean([comparison.error for comparison in found]) == pytest.approx(error, rel=0.15)
+    assert np.mean([change.error for change in found]) == pytest.approx(error, rel=0.15)
     power = stats.nct.cdf(stats.t.ppf(alpha, particles - 1), particles - 1, fall / error)
     assert 0.2 < power < 0.99
-    rate = np.mean([comparison.worse for comparison in found])
+    rate = np.mean([change.worse for change in found])
     assert abs(rate - power) < 4 * math.sqrt(power * (1 - power) / n)
 
 
@@ -182,16 +182,16 @@ def test_coupled_draws_find_a_loss_below_the_error_of_either_bound(tmp_path, exa
     poor = worsen(model, 0.05)
     fall = (Oracle(poor, 3).bound(x) - oracle.bound(x)).mean().item()
     old, new = (Record.of(measure(m.model, m.guide, x, 400, seed=3), {}) for m in (model, poor))
-    comparison = Comparison(old, new, 0.001)
-    assert comparison.worse
+    change = Change(old, new, 0.001)
+    assert change.worse
     assert abs(fall) < 2 * old.mean_error
-    assert abs(comparison.difference - fall) < 5 * comparison.error
+    assert abs(change.difference - fall) < 5 * change.error
 
 
 def test_rounding_is_no_fall_and_an_exact_bound_needs_no_error():
     def compare(fall):
         old = Record.of(np.full((10, 3), -1000.0), {})
-        return Comparison(old, Record.of(np.full((10, 3), -1000.0 - fall), {}), 0.001)
+        return Change(old, Record.of(np.full((10, 3), -1000.0 - fall), {}), 0.001)
 
     assert not compare(0.0).worse
     assert not compare(5e-4).worse

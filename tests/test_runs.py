@@ -47,7 +47,7 @@ def people(tmp_path_factory):
 @pytest.fixture(scope="module")
 def fitted(people, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "fitted"
-    runs.fit(METHOD, MotionData.open(people), out, TRAINING)
+    runs.fit_run(METHOD, MotionData.open(people), out, TRAINING)
     return out
 
 
@@ -580,7 +580,7 @@ def test_threads_take_turns(people, fitted, tmp_path):
         except BaseException as error:
             errors.append(error)
 
-    actions = {name: lambda name=name: runs.fit(METHOD, data, tmp_path / name, TRAINING) for name in ("a", "b")}
+    actions = {name: lambda name=name: runs.fit_run(METHOD, data, tmp_path / name, TRAINING) for name in ("a", "b")}
     actions["forecast"] = lambda: model.forecast({"x": x}, 4, 2)["x"].shape
     threads = [threading.Thread(target=work, args=each) for each in actions.items()]
     for thread in threads:

@@ -13,9 +13,9 @@ from dvae.inference.objectives import Evidence
 from dvae.inference.schedules import (
     Constant,
     Cosine,
-    Linear,
     Logistic,
     Piecewise,
+    Ramp,
     clamp,
     from_config,
     schedule,
@@ -25,7 +25,7 @@ from dvae.inference.schedules import (
 levels = st.floats(-10, 10).map(lambda value: round(value, 3))
 ramps = st.builds(
     lambda kind, start, end, steps, delay: kind(start, end, steps, delay),
-    st.sampled_from([Linear, Cosine, Logistic]),
+    st.sampled_from([Ramp, Cosine, Logistic]),
     levels,
     levels,
     st.integers(1, 500),
@@ -46,7 +46,7 @@ def test_a_ramp_reaches_both_ends_exactly_and_is_monotone(ramp):
     assert all(sign * (later - earlier) >= -1e-12 for earlier, later in pairwise(values))
 
 
-@pytest.mark.parametrize("kind", [Linear, Cosine, Logistic])
+@pytest.mark.parametrize("kind", [Ramp, Cosine, Logistic])
 def test_a_ramp_is_half_way_in_the_middle(kind):
     assert kind(0.0, 2.0, steps=100, delay=10)(60) == pytest.approx(1.0)
 
@@ -66,25 +66,29 @@ def test_json_round_trip(value):
     assert from_config(json.loads(json.dumps(to_config(value)))) == value
 
 
+def test_a_config_of_before_is_read_by_the_names_of_now():
+    assert from_config({"schedule": "Linear", "start": 0.0, "end": 1.0, "steps": 5, "delay": 2}) == Ramp(0.0, 1.0, 5, 2)
+
+
 def test_config_names_the_schedule_and_refuses_others():
-    assert to_config(Linear(0.0, 1.0, 5)) == {
-        "schedule": "Linear",
+    assert to_config(Ramp(0.0, 1.0, 5)) == {
+        "schedule": "Ramp",
         "start": 0.0,
         "end": 1.0,
         "steps": 5,
         "delay": 0,
     }
-    with pytest.raises(ValueError, match="unknown schedule 'Exponential'; the schedules are Constant, Linear"):
+    with pytest.raises(ValueError, match="unknown schedule 'Exponential'; the schedules are Constant, Ramp"):
         from_config({"schedule": "Exponential", "rate": 0.1})
-    with pytest.raises(ValueError, match="Linear takes start, end, steps, delay; the config gives begin"):
-        from_config({"schedule": "Linear", "begin": 0.0})
+    with pytest.raises(ValueError, match="Ramp takes start, end, steps, delay; the config gives begin"):
+        from_config({"schedule": "Ramp", "begin": 0.0})
     with pytest.raises(TypeError, match="expected numbers, text and schedules"):
         to_config(object())
 
 
 def test_numbers_are_constant_schedules_and_other_things_are_refused():
     assert schedule(0.5)(10**9) == 0.5
-    assert schedule(Linear(0.0, 1.0, 5)) == Linear(0.0, 1.0, 5)
+    assert schedule(Ramp(0.0, 1.0, 5)) == Ramp(0.0, 1.0, 5)
     for wrong in ("0.1", True, None, lambda step: 0.1):
         with pytest.raises(TypeError, match="expected a number or a schedule"):
             schedule(wrong)
@@ -93,7 +97,7 @@ def test_numbers_are_constant_schedules_and_other_things_are_refused():
 @pytest.mark.parametrize(
     "build",
     [
-        lambda: Linear(0.0, 1.0, steps=0),
+        lambda: Ramp(0.0, 1.0, steps=0),
         lambda: Cosine(0.0, 1.0, steps=5, delay=-1),
         lambda: Logistic(0.0, 1.0, steps=5, steepness=0.0),
         lambda: Piecewise(()),
@@ -115,9 +119,9 @@ def test_a_clamped_schedule_reaches_its_end_value_within_the_run(value, steps):
 
 
 def test_clamping_says_what_it_changed_and_leaves_the_rest_alone():
-    objective = Evidence(kl_weight={"w": 0.5, "z": Linear(0.0, 1.0, steps=800, delay=200)})
-    with pytest.warns(UserWarning, match=r"end at step 1000, after the last step 100; clamped to Linear"):
+    objective = Evidence(kl_weight={"w": 0.5, "z": Ramp(0.0, 1.0, steps=800, delay=200)})
+    with pytest.warns(UserWarning, match=r"end at step 1000, after the last step 100; clamped to Ramp"):
         clamped = clamp(objective, 100)
-    assert clamped == Evidence(kl_weight={"w": 0.5, "z": Linear(0.0, 1.0, steps=80, delay=20)})
+    assert clamped == Evidence(kl_weight={"w": 0.5, "z": Ramp(0.0, 1.0, steps=80, delay=20)})
     assert clamp(objective, 1000) is objective
     assert math.isinf(clamp(math.inf, 5))

@@ -5,7 +5,7 @@ import torch
 
 from dvae.motion import PROTOCOLS, WALKER, simulate, windows
 from dvae.motion.plot import futures, pose
-from dvae.motion.simulate import ACTIVITIES
+from dvae.motion.simulator import ACTIVITIES
 
 FEET = [WALKER.names.index(name) for name in ("LFoot", "RFoot")]
 

@@ -8,7 +8,7 @@ from dvae.inference.batches import Sequences
 from dvae.inference.checkpoints import Run, weights
 from dvae.inference.objectives import Evidence
 from dvae.inference.resuming import restore, store
-from dvae.inference.schedules import Linear, Piecewise
+from dvae.inference.schedules import Piecewise, Ramp
 from dvae.inference.training import Stage
 from dvae.networks import Dense
 
@@ -28,7 +28,7 @@ def walks(n, seed=0):
 
 TRAIN, HELD_OUT = walks(24), walks(7, seed=1)
 SHARED = {"batch_size": 8, "log_every": 1, "validate_every": 6, "learning_rate": 0.02, "progress": False}
-WARM_UP = Evidence(kl_weight=Linear(0.0, 1.0, 10), free_bits=0.1)
+WARM_UP = Evidence(kl_weight=Ramp(0.0, 1.0, 10), free_bits=0.1)
 RUNS = {
     "clipped": {"steps": STEPS, "objective": WARM_UP, "gradient_clip": 0.5, "decay": 0.5},
     "self-fed": {"steps": STEPS, "self_feeding": Piecewise(((0, 0.0), (11, 0.5))), "particles": 2},

@@ -19,7 +19,7 @@ from dvae.cli import main
 from dvae.motion.dataset import MotionData
 from dvae.runs import directory as runs
 from dvae.runs import sweep as sweeps
-from dvae.runs.sweep import Interrupted, Result, sweep
+from dvae.runs.sweep import Outcome, SweepInterrupted, sweep
 
 TRAINING = dvae.Training(steps=6, batch_size=4, validate_every=3)
 VAE = dvae.method("vae", latent=3, warm_up=4)
@@ -70,7 +70,7 @@ def test_a_run_of_a_sweep_is_bit_for_bit_what_it_is_alone(swept, data, tmp_path,
     out, methods, results = swept
     assert [result.path.name for result in results] == ["vae-z3-seed0", "vae-z2-seed0", "vae-z3-seed1", "vae-z2-seed1"]
     for result in results:
-        alone = runs.fit(result.method, data, tmp_path / result.path.name, replace(TRAINING, seed=result.seed))
+        alone = runs.fit_run(result.method, data, tmp_path / result.path.name, replace(TRAINING, seed=result.seed))
         assert weights(result.path) == weights(alone.run)
         assert (result.status, result.step, result.best_bound) == ("finished", 6, alone.best_bound)
         assert result.path.parent == out
@@ -237,7 +237,7 @@ def test_ctrl_c_in_a_sweep_of_one_job_is_the_sweeps(data, tmp_path):
             return super().objective()
 
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    with pytest.raises(Interrupted, match="interrupted with 1 of 4 runs finished") as stop:
+    with pytest.raises(SweepInterrupted, match="interrupted with 1 of 4 runs finished") as stop:
         sweep([VAE, Stopped(latent=3, warm_up=4)], data, tmp_path, [0, 1], TRAINING, jobs=1)
     assert stop.value.signal == signal.SIGTERM
     assert [result.path.name for result in stop.value.results] == ["vae-seed0"]
@@ -319,5 +319,5 @@ def test_runs_on_a_dask_cluster_are_those_of_this_machine(swept, data, people, t
 
 
 def test_a_result_reads_as_a_line(tmp_path):
-    result = Result(tmp_path / "vae-seed0", VAE, 0, "stopped early", 300, -1.25, 61.4)
+    result = Outcome(tmp_path / "vae-seed0", VAE, 0, "stopped early", 300, -1.25, 61.4)
     assert str(result) == "vae-seed0 stopped early at step 300 in 0:01:01, best bound -1.250 nats a frame"

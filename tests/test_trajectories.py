@@ -14,7 +14,7 @@ from scipy.stats import binomtest
 
 import dvae
 from dvae import motion
-from dvae.models.registry import from_config
+from dvae.models.registry import configured
 from dvae.motion import PROTOCOLS
 from dvae.motion.skeleton import HUMAN36M
 from dvae.testing import FactorizationContract
@@ -109,7 +109,7 @@ def test_models_of_human36m_have_the_published_size():
 @pytest.mark.parametrize("options", ABLATIONS.values(), ids=ABLATIONS)
 def test_ablations_are_options(windows, options):
     method = small(**options)
-    assert from_config(method.config()) == method
+    assert configured(method.config()) == method
     model = build(windows, **options)
     batch = double(method.train(windows).batches.sample(3, torch.Generator().manual_seed(0)))
     terms = dvae.SequenceELBO().terms(model, batch)

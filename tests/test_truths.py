@@ -190,7 +190,7 @@ def test_batches_are_those_of_the_windows_and_what_belongs_to_them(windows, head
 
 @pytest.mark.skipif(not (DATA / "cmu").exists(), reason="needs the motion files in ../shared/data")
 def test_where_people_have_the_same_limbs_futures_are_recorded_ones():
-    windows = motion.windows(motion.load(DATA / "cmu" / "cmu8.npz"), PROTOCOLS["cmu8"], "train")
+    windows = motion.windows(motion.read_motion(DATA / "cmu" / "cmu8.npz"), PROTOCOLS["cmu8"], "train")
     pseudo, valid = PseudoTruths(windows).of(drawn(windows, 32), generator())
     assert len(PseudoTruths(windows)) == len(windows.index(20))
     recorded, future = windows.all(20)["x"][:, 15:], pseudo[valid][:, 15:]

@@ -5,9 +5,9 @@ from .data import Clip, MotionSet
 from .dataset import MotionData
 from .exchange import Exchanged
 from .forecasts import Forecasts, is_forecasts
-from .formats import load, read_paths, save
+from .formats import read_motion, read_paths, save
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
-from .simulate import simulate
+from .simulator import simulate
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
 from .truths import PseudoTruths, WithPseudoTruths
 from .views import Heading
@@ -33,7 +33,7 @@ __all__ = [
     "WithPseudoTruths",
     "estimate_angle_limits",
     "is_forecasts",
-    "load",
+    "read_motion",
     "read_paths",
     "rotate_about_up",
     "save",

@@ -84,7 +84,7 @@ def _limit(size: int) -> int:
     return min(LARGEST, max(SMALL, DENSEST * size))
 
 
-def write(file: BinaryIO, arrays: Mapping[str, np.ndarray]) -> None:
+def write_arrays(file: BinaryIO, arrays: Mapping[str, np.ndarray]) -> None:
     """Write an npz that `archive` reads, compressed where that may be: motion that hardly moves packs too well.
 
     Args:

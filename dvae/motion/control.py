@@ -67,7 +67,7 @@ def bend(
     """
     if steps < 1:
         raise ValueError(f"steps is at least 1, got {steps}")
-    covariance = smooth(len(known))
+    covariance = smooth_covariance(len(known))
     root = CORRECTION * torch.linalg.cholesky(covariance)
     root, white, gain = (each.to(latents) for each in (root, torch.linalg.inv(root), gains(covariance, known)))
     kept = bones > SHORTEST
@@ -106,7 +106,7 @@ def bend(
     return torch.cat(motions), torch.cat(corrections)
 
 
-def smooth(frames: int) -> Tensor:
+def smooth_covariance(frames: int) -> Tensor:
     """Covariance (T, T), over frames 1 to T, of a Matern process of order 3/2 and variance 1 that is 0 at frame 0."""
     frame = torch.arange(frames + 1, dtype=torch.float64)
     apart = sqrt(3) / SMOOTH * (frame[:, None] - frame).abs()

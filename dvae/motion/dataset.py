@@ -9,9 +9,9 @@ from typing import Any, ClassVar, Self
 
 from ..options import check, tuples
 from .data import MotionSet
-from .formats import load
+from .formats import read_motion
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, named_protocol, windows
-from .simulate import simulate
+from .simulator import simulate
 
 SIMULATED = "simulated"
 DEFAULT_PROTOCOLS = {
@@ -71,7 +71,7 @@ class MotionData:
         """Reads a motion file, or simulates.
 
         Args:
-            path: of a file that `load` reads, or "simulated" for `simulate()`.
+            path: of a file that `read_motion` reads, or "simulated" for `simulate()`.
             protocol: one of `dvae.motion.PROTOCOLS` or its name; by default the one of the skeleton.
             skip_bad: leave out unusable clips instead of refusing the file.
 
@@ -80,7 +80,7 @@ class MotionData:
             ValueError: a file that cannot be read, an unknown protocol, or none for the skeleton.
         """
         name = os.fspath(path)
-        clips = simulate() if name == SIMULATED else load(name, skip_bad=skip_bad)
+        clips = simulate() if name == SIMULATED else read_motion(name, skip_bad=skip_bad)
         if protocol is None:
             if clips.skeleton.name not in DEFAULT_PROTOCOLS:
                 raise ValueError(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
-from .archive import archive, write
+from .archive import archive, write_arrays
 from .formats import read_arrays
 from .skeleton import Skeleton
 
@@ -91,7 +91,7 @@ class Forecasts:
             "fps": np.array(self.skeleton.fps),
         }
         with files.written(path) as file:
-            write(file, arrays)
+            write_arrays(file, arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Forecasts:

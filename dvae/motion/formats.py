@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .. import files
-from .archive import archive, write
+from .archive import archive, write_arrays
 from .data import Clip, MotionSet
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, read_text
 
@@ -32,7 +32,7 @@ _ARCHIVES = (
 """VideoPose3D's archives: subjects, joints, skeleton, and which of the joints make it up."""
 
 
-def load(
+def read_motion(
     path: str | Path,
     skeleton: Skeleton | None = None,
     labels: str | Path | None = None,
@@ -87,13 +87,14 @@ def load(
 
 
 def save(path: str | Path, motion: MotionSet) -> None:
-    """Write a plain npz, and beside it skeleton.json and (where there are labels) labels.csv, for `load`.
+    """Write a plain npz, and beside it skeleton.json and (where there are labels) labels.csv, for `read_motion`.
 
     Each takes the place of an older file, or of a link, once it is whole.
 
     Raises:
         OSError: one cannot be written; the error names it.
-        ValueError: a clip's name has a slash, which would be read as part of the split, or is one that `load` refuses.
+        ValueError: a clip's name has a slash, which would be read as part of the split, or is one that `read_motion`
+            refuses.
     """
     path = Path(path)
     if unnamed := [name for clip in motion for name in (clip.split, clip.name) if not is_name(name)]:
@@ -103,7 +104,7 @@ def save(path: str | Path, motion: MotionSet) -> None:
         raise ValueError(f"clip name {slashed[0]!r} has a slash, which separates split and clip in the file")
     arrays: dict[str, Any] = {f"{clip.split}/{clip.name}": clip.positions for clip in motion}
     with files.written(path) as file:
-        write(file, arrays)
+        write_arrays(file, arrays)
     motion.skeleton.to_json(path.with_name("skeleton.json"))
     columns = list(dict.fromkeys(name for clip in motion for name in clip.labels))
     if columns:

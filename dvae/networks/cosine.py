@@ -116,8 +116,8 @@ class CosineEncoderNetwork(AtOnce):
         if others or source.relation != ALL:
             raise ValueError(f"CosineEncoder reads one parent over all time, as in y_{{1:T}}; not {self.inputs}")
         self.spec, self.names = spec, (source.name, static.name)
-        self.over_time: Any = perceptron(source.size, spec.width)
-        self.static: Any = perceptron(static.size, spec.width)
+        self.over_time: Any = two_layers(source.size, spec.width)
+        self.static: Any = two_layers(static.size, spec.width)
         self.before: Any = transformer(self.features, spec)
         self.between: Any = transformer(self.features, spec)
         self.after: Any = transformer(self.features, spec)
@@ -150,7 +150,7 @@ class MotionDecoderNetwork(AtOnce):
             )
         self.spec, self.first = spec, static.name
         self.others = [name for name in sizes if name != spec.latent]
-        self.static: Any = perceptron(size, spec.width)
+        self.static: Any = two_layers(size, spec.width)
         into = sum(sizes.values()) + spec.width
         self.into = nn.Sequential(*_layer(into, spec.hidden), nn.Linear(spec.hidden, spec.hidden))
         self.transformer: Any = transformer(spec.hidden, spec)
@@ -217,7 +217,7 @@ class TransformerLayer(nn.TransformerEncoderLayer):
         return self.norm2(hidden + self.dropout2(self.linear2(self.dropout(self.linear1(hidden).relu()))))
 
 
-def perceptron(size: int, width: int) -> nn.Sequential:
+def two_layers(size: int, width: int) -> nn.Sequential:
     """Two layers with normalisation, pose by pose."""
     return nn.Sequential(*_layer(size, width), *_layer(width, width))
 

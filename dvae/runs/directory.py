@@ -22,7 +22,7 @@ from ..inference.recipe import Trainable
 from ..inference.schedules import from_config as option_from_config
 from ..inference.trackers import Tracker
 from ..inference.training import Training
-from ..models.registry import from_config
+from ..models.registry import configured
 from ..schema import Schema
 from ..turns import alone
 from .kinds import DATA, SCHEMAS, Data, opened
@@ -108,7 +108,7 @@ class Loaded:
 
 
 @alone
-def fit(
+def fit_run(
     method: Trainable,
     data: Data,
     out: str | os.PathLike[str],
@@ -212,7 +212,7 @@ def read_config(path: str | os.PathLike[str], data: str | os.PathLike[str] | Non
         schema, source, training = dict(config["schema"]), dict(config["data"]), config["training"]
         kind = source.pop("kind")
         return Config(
-            from_config(config["method"]),
+            configured(config["method"]),
             SCHEMAS[schema.pop("kind")].from_config(schema),
             kind,
             DATA[kind].source(**source),

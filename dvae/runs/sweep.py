@@ -1,6 +1,6 @@
 """Sweeps: methods x seeds fitted side by side with joblib, one process and one torch thread to a run.
 
-Every run has a directory of its own, as `runs.fit` writes it, with the same weights bit for bit. The same call again
+Every run has a directory of its own, as `fit_run` writes it, with the same weights bit for bit. The same call again
 continues a sweep: finished runs are left as they are, others go on from their last checkpoint.
 
 A sweep holds a lease, an empty file beside the run directories, which is removed when the sweep is told to stop or
@@ -32,8 +32,7 @@ from rich.live import Live
 
 from .. import files
 from ..inference.checkpoints import Run
-from ..inference.fit import Fit
-from ..inference.fit import Interrupted as RunInterrupted
+from ..inference.fit import Fit, Interrupted
 from ..inference.recipe import Trainable
 from ..inference.result import Plain, Table
 from ..inference.schedules import clamp
@@ -45,14 +44,14 @@ from ..models.method import Method
 from ..options import flat
 from ..schema import Schema
 from ..turns import alone
-from .directory import fit, read_config, resume
+from .directory import fit_run, read_config, resume
 from .kinds import Data
 
 ENDED = ("finished", "stopped early")
 
 
 @dataclass(frozen=True)
-class Result:
+class Outcome:
     """A run of a sweep.
 
     Args:
@@ -85,7 +84,7 @@ class Result:
         return f"{self.path.name} {self.status} at step {self.step} {how}{bound}"
 
 
-class Interrupted(KeyboardInterrupt):
+class SweepInterrupted(KeyboardInterrupt):
     """A sweep was stopped by Ctrl-C or SIGTERM. The same sweep, started again, continues.
 
     Args:
@@ -94,7 +93,7 @@ class Interrupted(KeyboardInterrupt):
         signal: number of the signal; a command line exits with 128 + signal.
     """
 
-    def __init__(self, results: Sequence[Result], total: int, signal: int) -> None:
+    def __init__(self, results: Sequence[Outcome], total: int, signal: int) -> None:
         ended = sum(result.status in ENDED for result in results)
         super().__init__(f"interrupted with {ended} of {total} runs finished; the same sweep again continues them")
         self.results = results
@@ -108,7 +107,7 @@ def sweep(
     seeds: Sequence[int] = (0, 1, 2),
     training: Training | None = None,
     jobs: int = 2,
-) -> list[Result]:
+) -> list[Outcome]:
     """Fits each method with each seed, several runs at a time.
 
     A run directory has the name of the method, the options in which methods of that name differ, and the seed, such as
@@ -131,7 +130,7 @@ def sweep(
     Raises:
         ValueError: nothing to fit, a run given twice, or a run of other options in its directory.
         CheckpointError: a damaged run.
-        Interrupted: after Ctrl-C or SIGTERM.
+        SweepInterrupted: after Ctrl-C or SIGTERM.
 
     Example:
         methods = [dvae.method("srnn", latent=latent) for latent in (8, 16)]
@@ -179,7 +178,7 @@ def sweep(
         warnings.warn(note)
     given = [replace(results[run.path], path=out / run.path.name) for run in runs if run.path in results]
     if received := stop.received or received:
-        raise Interrupted(given, len(runs), received)
+        raise SweepInterrupted(given, len(runs), received)
     if blind:
         raise RuntimeError(
             f"a worker does not see the files in {out.absolute()}; give a directory that all of them see"
@@ -200,7 +199,7 @@ class _Run:
     owner: int = field(default_factory=os.getpid)
 
 
-def _fit(run: _Run) -> tuple[Result, list[str]]:
+def _fit(run: _Run) -> tuple[Outcome, list[str]]:
     """Fits or resumes a run in a worker; its result, and the warnings."""
     parent = multiprocessing.parent_process()
     if parent is not None and parent.pid == run.owner:
@@ -214,19 +213,19 @@ def _fit(run: _Run) -> tuple[Result, list[str]]:
                 ended = resume(run.path, run.source, callbacks=[leased], progress=False)
             else:
                 training = replace(run.training, progress=False)
-                ended = fit(run.method, run.data, run.path, training, callbacks=[leased])
+                ended = fit_run(run.method, run.data, run.path, training, callbacks=[leased])
             status = ended.status
         except KeyboardInterrupt as stop:
             if run.owner == os.getpid() and threading.current_thread() is threading.main_thread():
                 raise  # it is the sweep's own Ctrl-C: with one job, joblib starts no process
             if leased.orphaned():
                 os._exit(1)  # else it would wait for more work
-            if isinstance(stop, RunInterrupted):
+            if isinstance(stop, Interrupted):
                 ended = stop.fit
         except Exception as failure:  # of any type, and it may not survive the way to the sweep's process
             status, error = "failed", f"{type(failure).__name__}: {reason(failure)}"
         seconds = time.monotonic() - begin
-    result = Result(run.path, run.method, run.training.seed, status, ended.step, ended.best_bound, seconds, error)
+    result = Outcome(run.path, run.method, run.training.seed, status, ended.step, ended.best_bound, seconds, error)
     return result, [str(warning.message) for warning in caught]
 
 
@@ -313,7 +312,7 @@ def _label(option: str, value: Any) -> str:
     return f"z{value}" if option == "latent" else f"{option.replace('_', '-')}={value}"
 
 
-def _earlier(run: _Run) -> Result | None:
+def _earlier(run: _Run) -> Outcome | None:
     """The result of a run that an earlier sweep has finished.
 
     Raises:
@@ -341,7 +340,7 @@ def _earlier(run: _Run) -> Result | None:
         )
     if state["status"] not in ENDED:
         return None
-    return Result(run.path, run.method, run.training.seed, state["status"], state["step"], state["best_bound"])
+    return Outcome(run.path, run.method, run.training.seed, state["status"], state["step"], state["best_bound"])
 
 
 def _options(method: Trainable, schema: Schema, training: Training, fingerprint: str) -> dict[str, Any]:
@@ -415,7 +414,7 @@ class _Progress:
         if self._live is not None:
             self._live.stop()
 
-    def end(self, result: Result) -> None:
+    def end(self, result: Outcome) -> None:
         """Shows a result, unless it is that of a run that has not begun."""
         with self._lock:
             self._look()

@@ -41,7 +41,7 @@ from torch import Tensor, nn
 from ..inference.bounds import SequenceELBO
 from ..program.conditional import evaluating
 
-Array = NDArray[np.float64]
+Floats = NDArray[np.float64]
 
 # Relative error that arithmetic alone may leave in a bound, on another machine or in another order of sums (float32).
 ROUNDING = 1e-6
@@ -60,13 +60,13 @@ class Record:
         data: name to shape, root mean squares and checksums of the data (see `checksums`).
     """
 
-    bound: Array
-    error: Array
-    draws: Array
+    bound: Floats
+    error: Floats
+    draws: Floats
     data: dict[str, Any]
 
     @classmethod
-    def of(cls, bounds: Array, data: dict[str, Any]) -> Record:
+    def of(cls, bounds: Floats, data: dict[str, Any]) -> Record:
         """The record of bounds (K, B)."""
         return cls(bounds.mean(0), bounds.std(0, ddof=1) / math.sqrt(len(bounds)), bounds.mean(1), data)
 
@@ -117,7 +117,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Change:
     """New bounds against old ones of the same sequences, paired by draw.
 
     Args:
@@ -276,18 +276,18 @@ class ElboRegression:
             )
         if other := _other_data(old.data, new.data):
             raise ValueError(f"{_shown(path)} is of other data: {other}; give the same, or run with --update-elbo")
-        comparison = Comparison(old, new, alpha)
-        if comparison.worse:
+        change = Change(old, new, alpha)
+        if change.worse:
             raise AssertionError(
-                f"the evidence bound fell significantly\n{comparison}\n"
+                f"the evidence bound fell significantly\n{change}\n"
                 f"if that is meant, run with --update-elbo and commit {_shown(path)}"
             )
-        if comparison.better:
-            rise = f"by {comparison.difference:.3g} ± {comparison.error:.2g} to {new}"
+        if change.better:
+            rise = f"by {change.difference:.3g} ± {change.error:.2g} to {new}"
             self.note(f"better {rise}; run with --update-elbo to keep it: {_shown(path)}")
 
 
-def measure(model: Callable[..., Any], guide: Callable[..., Any], data: Any, particles: int, seed: int) -> Array:
+def measure(model: Callable[..., Any], guide: Callable[..., Any], data: Any, particles: int, seed: int) -> Floats:
     """Bounds (K, B) of single draws, in evaluation mode; torch's random state is left as it was.
 
     Args:
@@ -313,7 +313,7 @@ def measure(model: Callable[..., Any], guide: Callable[..., Any], data: Any, par
     return bounds
 
 
-def _bound(model: Callable[..., Any], guide: Callable[..., Any], data: Any) -> Array:
+def _bound(model: Callable[..., Any], guide: Callable[..., Any], data: Any) -> Floats:
     terms = SequenceELBO().terms(model, data, guide)
     bound = sum(terms.log_likelihood.values()) - sum(terms.kl.values())
     sizes = {len(value) for _, value in _leaves(data) if value.ndim}
@@ -335,7 +335,7 @@ def checksums(data: Any, sequences: int) -> dict[str, Any]:
         ValueError: data that are no tensors, arrays or numbers, nor mappings or sequences of these.
     """
 
-    def table(values: Array) -> dict[str, Any]:
+    def table(values: Floats) -> dict[str, Any]:
         finite = np.where(np.isfinite(values), values, 0)  # padding and missing entries may be anything
         rows = finite.reshape(sequences if values.shape[:1] == (sequences,) else 1, -1)
         sums = rows @ np.cos(np.arange(rows.shape[1])) / math.sqrt(rows.shape[1])
@@ -349,7 +349,7 @@ def checksums(data: Any, sequences: int) -> dict[str, Any]:
     return {name: table(values) for name, values in _leaves(data)}
 
 
-def _leaves(data: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
+def _leaves(data: Any, prefix: str = "") -> Iterator[tuple[str, Floats]]:
     name = prefix or "data"
     if isinstance(data, Mapping | list | tuple):
         items = data.items() if isinstance(data, Mapping) else enumerate(data)
@@ -378,7 +378,7 @@ def _other_data(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     return ""
 
 
-def _standard_error(draws: Array) -> float:
+def _standard_error(draws: Floats) -> float:
     return float(draws.std(ddof=1)) / math.sqrt(len(draws))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from dvae.motion import WALKER, Clip, MotionSet, is_forecasts, load, read_paths, save
+from dvae.motion import WALKER, Clip, MotionSet, is_forecasts, read_motion, read_paths, save
 from dvae.motion.formats import read_arrays
 from dvae.motion.skeleton import is_name
 
@@ -90,7 +90,7 @@ def test_dictionaries_that_numpy_pickles_are_read(tmp_path, protocol, layout):
     there = [LAYOUTS[layout](array) for array in clips()]
     for content in (nested(there), np.array(nested(there), dtype=object)):
         path = pickled(tmp_path / "a.npz", pickle.dumps(content, protocol), compression=zipfile.ZIP_DEFLATED)
-        read = load(path, skeleton=WALKER)
+        read = read_motion(path, skeleton=WALKER)
         assert [clip.key for clip in read] == [("train", "walk 1"), ("train", "sit"), ("test", "walk 1")]
         for clip, array in zip(read, there, strict=True):
             np.testing.assert_array_equal(clip.positions, array.astype(np.float32))
@@ -99,22 +99,22 @@ def test_dictionaries_that_numpy_pickles_are_read(tmp_path, protocol, layout):
 
 def test_dictionaries_that_python_2_pickles_are_read(tmp_path):
     there = clips()
-    read = load(pickled(tmp_path / "a.npz", python2(nested(there))), skeleton=WALKER)
+    read = read_motion(pickled(tmp_path / "a.npz", python2(nested(there))), skeleton=WALKER)
     for clip, array in zip(read, there, strict=True):
         np.testing.assert_array_equal(clip.positions, array)
     header = "{'descr': '<f4', 'fortran_order': False, 'shape': (5L, 17L, 3L), }"
     npz(tmp_path / "b.npz", [("walk.npy", npy(there[0].tobytes(), header))])
-    np.testing.assert_array_equal(load(tmp_path / "b.npz", skeleton=WALKER).clips[0].positions, there[0])
+    np.testing.assert_array_equal(read_motion(tmp_path / "b.npz", skeleton=WALKER).clips[0].positions, there[0])
 
 
 def test_names_may_be_numpy_strings_and_empty_clips_are_said_to_be_empty(tmp_path):
     content = {np.str_("train"): {np.str_("walk"): clips()[0]}}
     for protocol in range(6):
         path = pickled(tmp_path / "a.npz", pickle.dumps(content, protocol))
-        assert load(path, skeleton=WALKER).clips[0].key == ("train", "walk")
+        assert read_motion(path, skeleton=WALKER).clips[0].key == ("train", "walk")
         empty = {"train": {"walk": clips()[0][:0]}}
         with pytest.raises(ValueError, match="train/walk has no frames"):
-            load(pickled(tmp_path / "a.npz", pickle.dumps(empty, protocol)), skeleton=WALKER)
+            read_motion(pickled(tmp_path / "a.npz", pickle.dumps(empty, protocol)), skeleton=WALKER)
 
 
 @pytest.mark.parametrize(
@@ -303,7 +303,7 @@ HEADERS = {
 def refused(path, directory=None):
     """What is said of a file that cannot be read."""
     sentences = []
-    readers = {"load": lambda p: load(p, skeleton=WALKER), "arrays": read_arrays, "paths": read_paths}
+    readers = {"load": lambda p: read_motion(p, skeleton=WALKER), "arrays": read_arrays, "paths": read_paths}
     for name, read in readers.items():
         try:
             read(path)
@@ -347,7 +347,7 @@ def test_what_an_archive_may_not_be_compressed_or_named_with(tmp_path):
     for method, name in ((zipfile.ZIP_BZIP2, "bzip2"), (zipfile.ZIP_LZMA, "LZMA")):
         path = npz(tmp_path / "a.npz", [("train/walk.npy", plain)], compression=method)
         with pytest.raises(ValueError, match=rf"a\.npz: train/walk is compressed by {name}, expected deflate"):
-            load(path, skeleton=WALKER)
+            read_motion(path, skeleton=WALKER)
     path = npz(tmp_path / "a.npz", [("walk.npy", plain), ("walk.npy", plain)])
     with pytest.raises(ValueError, match=r"a\.npz: walk is there twice"):
         read_arrays(path)
@@ -356,7 +356,7 @@ def test_what_an_archive_may_not_be_compressed_or_named_with(tmp_path):
         content[content.index(signature) + place] |= 1
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"a\.npz: walk is encrypted"):
-        load(path, skeleton=WALKER)
+        read_motion(path, skeleton=WALKER)
 
 
 def test_damaged_bytes_of_a_member_are_told(tmp_path):
@@ -367,7 +367,7 @@ def test_damaged_bytes_of_a_member_are_told(tmp_path):
         damaged[place] ^= 0xFF
         (tmp_path / "a.npz").write_bytes(damaged)
         with pytest.raises(ValueError, match=r"a\.npz: train/walk: (damaged|declares|no npy)"):
-            load(tmp_path / "a.npz", skeleton=WALKER)
+            read_motion(tmp_path / "a.npz", skeleton=WALKER)
 
 
 def test_positions_that_float32_cannot_hold_are_refused_by_the_clips_name(tmp_path):
@@ -377,8 +377,8 @@ def test_positions_that_float32_cannot_hold_are_refused_by_the_clips_name(tmp_pa
         MotionSet([Clip("train", "walk", positions)], WALKER)
     np.savez(tmp_path / "a.npz", **{"train/walk": positions, "train/sit": clips(1)[0]})
     with pytest.raises(ValueError, match=r"a: clip train/walk has NaN or infinite"):
-        load(tmp_path / "a.npz", skeleton=WALKER)
-    kept = load(tmp_path / "a.npz", skeleton=WALKER, skip_bad=True)
+        read_motion(tmp_path / "a.npz", skeleton=WALKER)
+    kept = read_motion(tmp_path / "a.npz", skeleton=WALKER, skip_bad=True)
     assert [clip.name for clip in kept] == ["sit"]
     assert kept.skipped[0][:2] == ("train", "walk")
 
@@ -398,7 +398,7 @@ def test_reading_takes_little_more_than_the_data(tmp_path, kind):
         (np.savez if kind == "plain" else np.savez_compressed)(tmp_path / "a.npz", **arrays)
     tracemalloc.start()
     try:
-        load(tmp_path / "a.npz", skeleton=WALKER)
+        read_motion(tmp_path / "a.npz", skeleton=WALKER)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -412,7 +412,7 @@ def test_zeros_are_not_unpacked_to_a_hundred_times_their_size(isolated, tmp_path
     content = npy(bytes(frames * 204), header)
     npz(path, [("train/walk.npy", content)], compression=zipfile.ZIP_DEFLATED)
     with pytest.raises(ValueError, match=r"a\.npz: it would unpack to 134,[\d,]+ bytes, at most 67,108,864 are read"):
-        load(path, skeleton=WALKER)
+        read_motion(path, skeleton=WALKER)
     lying = bytearray(path.read_bytes())
     for signature, place in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):  # the size that it says it has
         at = lying.rindex(signature) + place
@@ -529,7 +529,7 @@ def read_mutated(example, directory):
 def test_mutations_leave_the_bases_valid(tmp_path):
     for base in [*BASES, "plain"]:
         read_mutated((base, [], [], None, [], zipfile.ZIP_DEFLATED), tmp_path)
-        assert len(load(tmp_path / "mutated.npz", skeleton=WALKER)) > 0
+        assert len(read_motion(tmp_path / "mutated.npz", skeleton=WALKER)) > 0
 
 
 @limited(SHARE)

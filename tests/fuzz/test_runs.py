@@ -224,7 +224,7 @@ def test_runs_go_on_or_are_refused(tmp_path):
     motion.save(tmp_path / "people.npz", motion.simulate(clips=12, frames=76, seed=1))
     method = dvae.method("vrnn", latent=2, width=4, embed=(4,), embed_latent=(4,), warm_up=1)
     training = dvae.Training(steps=4, batch_size=2, validate_every=2, log_every=1, progress=False)
-    runs.fit(method, MotionData.open(tmp_path / "people.npz"), tmp_path / "fitted", training)
+    runs.fit_run(method, MotionData.open(tmp_path / "people.npz"), tmp_path / "fitted", training)
     examples = st.tuples(st.sampled_from(CALLS), st.lists(mutations(), min_size=1, max_size=2))
     with Isolated(check, tmp_path) as isolated:
         fuzz(isolated, examples, seconds=SHARE)

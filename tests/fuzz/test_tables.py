@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from dvae.motion import HUMAN36M, WALKER, Clip, MotionSet, Skeleton, load, read_paths, save
+from dvae.motion import HUMAN36M, WALKER, Clip, MotionSet, Skeleton, read_motion, read_paths, save
 from dvae.motion.skeleton import is_name
 
 from .engine import Isolated, fuzz, limited
@@ -122,7 +122,7 @@ def test_what_is_no_skeleton_is_told_in_a_sentence_that_names_the_file(tmp_path,
     assert told(Skeleton.from_json, path)
     save(tmp_path / "a.npz", MotionSet([Clip("a", "b", np.random.default_rng(0).uniform(-1, 1, (3, 17, 3)))], WALKER))
     path.write_text(json.dumps(changes))
-    assert told(lambda _: load(tmp_path / "a.npz"), path)
+    assert told(lambda _: read_motion(tmp_path / "a.npz"), path)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_files_that_are_no_json_are_told_too(tmp_path, content, message):
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes with names")
 @pytest.mark.timeout(30)
-@pytest.mark.parametrize("read", [Skeleton.from_json, read_paths, load])
+@pytest.mark.parametrize("read", [Skeleton.from_json, read_paths, read_motion])
 def test_what_is_no_file_is_not_waited_for(tmp_path, read):
     for name in ("pipe.csv", "pipe.npz"):
         os.mkfifo(tmp_path / name)
@@ -186,7 +186,7 @@ def labels(path):
     if not archive.exists():
         there = np.random.default_rng(0).uniform(-0.8, 0.8, (3, 17, 3)).astype(np.float32)
         np.savez(archive, **{"train/walk": there, "train/sit": there})
-    return load(archive, WALKER, labels=path)
+    return read_motion(archive, WALKER, labels=path)
 
 
 @pytest.mark.parametrize(
