@@ -23,6 +23,7 @@ pyro.settings.set(module_local_params=True)
 
 from . import laws, motion, networks, views  # noqa: E402
 from .graph import Audit, audit  # noqa: E402
+from .inference import schedules  # noqa: E402
 from .inference.bounds import SequenceELBO, Terms, importance_bound  # noqa: E402
 from .inference.compare import Comparison, compare  # noqa: E402
 from .inference.criticism import calibrate, predictive_checks, traverse  # noqa: E402
@@ -31,7 +32,7 @@ from .inference.fit import Fit, fit  # noqa: E402
 from .inference.objectives import Evidence  # noqa: E402
 from .inference.particles import particle_bound  # noqa: E402
 from .inference.svi import SVI  # noqa: E402
-from .inference.training import Training  # noqa: E402
+from .inference.training import Stage, Training  # noqa: E402
 from .models.registry import method, methods  # noqa: E402
 from .motion import energies  # noqa: E402
 from .notation import Factorization  # noqa: E402
@@ -52,6 +53,7 @@ __all__ = [
     "Oracle",
     "SelfFeeding",
     "SequenceELBO",
+    "Stage",
     "Terms",
     "Training",
     "audit",
@@ -69,6 +71,7 @@ __all__ = [
     "particle_bound",
     "predictive_checks",
     "price",
+    "schedules",
     "traverse",
     "twin",
     "views",

@@ -173,8 +173,13 @@ def fit(
             fitted on training data with another `fingerprint`.
 
     Example:
-        warm_up = Evidence(kl_weight=Ramp(0.0, 1.0, steps=500))
-        result = fit(model, x, validation=y, objective=warm_up, steps=2000, out="runs/first")
+        >>> import torch, dvae
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3})
+        >>> warm_up = dvae.Evidence(kl_weight=dvae.schedules.Ramp(0.0, 1.0, steps=10))
+        >>> x = torch.randn(32, 10, 3)
+        >>> result = dvae.fit(model, x[:24], validation=x[24:], objective=warm_up, steps=20, progress=False)
+        >>> result.status, result.best_step
+        ('finished', 20)
     """
     svi = SVI(model, objective, stages, **options)
     training = svi.training

@@ -10,6 +10,7 @@ import rich.table
 from rich.console import Console, RenderableType
 from rich.progress import Progress, TextColumn
 from rich.text import Text
+from typing_extensions import override
 
 from .. import files
 
@@ -28,12 +29,12 @@ class Table(rich.table.Table):
         self.title = Text(_shown(title), "table.title") if title else None
         self.caption = Text(_shown(caption), "table.caption") if caption else None
 
+    @override
     def add_column(self, header: RenderableType = "", *arguments: Any, **options: Any) -> None:
-        """See rich."""
         super().add_column(_as_it_is(header), *arguments, **options)
 
+    @override
     def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
-        """See rich."""
         super().add_row(*map(_as_it_is, cells), **options)
 
 
@@ -43,8 +44,8 @@ class Plain(Console):
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, **options)
 
+    @override
     def render_str(self, text: str, **options: Any) -> Text:
-        """See rich."""
         return super().render_str(_shown(text), **options)
 
 

@@ -70,12 +70,15 @@ class SVI:
         TypeError, ValueError: an option that does not exist or is out of range, or nothing to fit.
 
     Example:
-        svi = dvae.SVI(model, steps=1000, learning_rate=1e-3)
-        state = svi.init()
-        for batch in loader:
-            svi.step(batch)
-            if state.step % 100 == 0:
-                print(state.step, svi.evaluate(held_out)["bound"])
+        >>> import torch, dvae
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3})
+        >>> x = torch.randn(32, 10, 3)
+        >>> svi = dvae.SVI(model, steps=20, learning_rate=0.01)
+        >>> state = svi.init()
+        >>> for batch in x[:24].split(8):
+        ...     terms = svi.step(batch)
+        >>> state.step, sorted(svi.evaluate(x[24:]))
+        (3, ['bound', 'kl/z', 'log_likelihood/x'])
     """
 
     def __init__(

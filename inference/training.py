@@ -90,6 +90,10 @@ class Stage:
         learning_rate: that of `Training` if None.
         self_feeding: that of `Training` if None.
         frozen: parameters whose names start with one of these stay as they are.
+
+    Example:
+        >>> import dvae
+        >>> stages = [dvae.Stage(500, dvae.Evidence(kl_weight=0.1)), dvae.Stage(1500, frozen=("generator.z.",))]
     """
 
     steps: int

@@ -617,7 +617,7 @@ def test_the_weights_of_another_model_are_refused(finished, tmp_path):
     with pytest.raises(CheckpointError, match=r"holds the weights of another model: \S+ is \(.*\), the model's is"):
         load_weights(build(latent=3), finished)
     with pytest.raises(CheckpointError, match=r"another model: it has .*, which the model lacks"):
-        load_weights(torch.nn.Ramp(2, 2), finished)
+        load_weights(torch.nn.Linear(2, 2), finished)
     with pytest.raises(CheckpointError, match=r"is no run directory: it has no state.json"):
         load_weights(build(), tmp_path / "..")
     with pytest.raises(CheckpointError, match="does not exist; give a run directory or a safetensors file"):

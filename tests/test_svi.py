@@ -1,9 +1,12 @@
 """The loop by hand: steps of one's own are those of `fit`, bit for bit, and leave the caller's random state alone."""
 
+import doctest
+
 import pytest
 import torch
 
 import dvae
+from dvae.inference import fit, svi, training
 from dvae.inference.batches import Sequences
 from dvae.inference.checkpoints import Run, weights
 from dvae.inference.objectives import Evidence
@@ -40,17 +43,17 @@ RUNS = {
 }
 
 
-def by_hand(svi, until=STEPS):
+def by_hand(loop, until=STEPS):
     """Steps up to one, with validations; the rows of the log. What else the caller does changes nothing."""
     source, rows = Sequences({"x": TRAIN}), []
-    while svi.state.step < until:
-        svi.step(source.sample(8, svi.generator))
-        rows.append({"step": svi.state.step, **svi.row()})
+    while loop.state.step < until:
+        loop.step(source.sample(8, loop.generator))
+        rows.append({"step": loop.state.step, **loop.row()})
         torch.rand(3)
-        svi.model.eval()
-        if svi.state.step % 6 == 0:
-            svi.evaluate(TRAIN)
-            rows.append({"step": svi.state.step, **svi.validate(HELD_OUT)})
+        loop.model.eval()
+        if loop.state.step % 6 == 0:
+            loop.evaluate(TRAIN)
+            rows.append({"step": loop.state.step, **loop.validate(HELD_OUT)})
     return rows
 
 
@@ -62,11 +65,11 @@ def same(first, second):
 def test_steps_by_hand_repeat_a_fit_bit_for_bit(options):
     fitted, mine = build(), build()
     result = dvae.fit(fitted, TRAIN, HELD_OUT, **SHARED, **options)
-    svi = dvae.SVI(mine, **SHARED, **options)
-    svi.init()
-    assert by_hand(svi) == result.history
-    assert (svi.state.best_step, svi.state.best_bound) == (result.best_step, result.best_bound)
-    assert same(svi.state.best, weights(fitted))
+    loop = dvae.SVI(mine, **SHARED, **options)
+    loop.init()
+    assert by_hand(loop) == result.history
+    assert (loop.state.best_step, loop.state.best_bound) == (result.best_step, result.best_bound)
+    assert same(loop.state.best, weights(fitted))
 
 
 @pytest.mark.parametrize("options", RUNS.values(), ids=RUNS)
@@ -91,10 +94,10 @@ def test_by_hand_goes_on_from_the_checkpoint_of_a_fit(tmp_path):
     whole = dvae.fit(build(), TRAIN, HELD_OUT, **options)
     with pytest.raises(KeyboardInterrupt):
         dvae.fit(build(), TRAIN, HELD_OUT, out=tmp_path, callbacks=[At(13)], **options)
-    svi = dvae.SVI(build(seed=9), **options)
-    svi.init()
-    restore(svi, Run(tmp_path))
-    assert by_hand(svi) == [row for row in whole.history if row["step"] > 13]
+    loop = dvae.SVI(build(seed=9), **options)
+    loop.init()
+    restore(loop, Run(tmp_path))
+    assert by_hand(loop) == [row for row in whole.history if row["step"] > 13]
 
 
 class At:
@@ -113,44 +116,49 @@ class At:
 
 
 def test_the_callers_random_state_is_left_alone():
-    svi, before = dvae.SVI(build(), steps=STEPS), torch.get_rng_state()
-    svi.init()
-    svi.step(TRAIN)
-    svi.evaluate(HELD_OUT)
+    loop, before = dvae.SVI(build(), steps=STEPS), torch.get_rng_state()
+    loop.init()
+    loop.step(TRAIN)
+    loop.evaluate(HELD_OUT)
     assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_evaluating_keeps_no_weights_and_a_step_trains_again():
-    svi = dvae.SVI(build(), steps=STEPS)
-    state = svi.init()
-    terms = svi.step(TRAIN)
-    assert svi.model.training
+    loop = dvae.SVI(build(), steps=STEPS)
+    state = loop.init()
+    terms = loop.step(TRAIN)
+    assert loop.model.training
     assert terms.bound.shape == (24,)
-    row = svi.evaluate(HELD_OUT)
-    assert svi.evaluate({"x": HELD_OUT}) == row
-    assert not svi.model.training
+    row = loop.evaluate(HELD_OUT)
+    assert loop.evaluate({"x": HELD_OUT}) == row
+    assert not loop.model.training
     assert (state.step, state.best, state.waited) == (1, None, 0)
-    svi.step({"x": TRAIN})
-    assert svi.model.training
+    loop.step({"x": TRAIN})
+    assert loop.model.training
 
 
 def test_beginning_anew_is_beginning():
     """The optimiser and the random numbers, not the weights."""
     model = build()
     start = weights(model)
-    svi = dvae.SVI(model, **SHARED, **RUNS["clipped"])
-    svi.init()
-    rows = by_hand(svi)
+    loop = dvae.SVI(model, **SHARED, **RUNS["clipped"])
+    loop.init()
+    rows = by_hand(loop)
     model.load_state_dict(start)
-    svi.init()
-    assert by_hand(svi) == rows
+    loop.init()
+    assert by_hand(loop) == rows
 
 
 def test_what_comes_too_early_is_refused_in_a_sentence():
-    svi = dvae.SVI(build())
-    for early in (lambda: svi.step(TRAIN), lambda: svi.evaluate(HELD_OUT), lambda: svi.state):
+    loop = dvae.SVI(build())
+    for early in (lambda: loop.step(TRAIN), lambda: loop.evaluate(HELD_OUT), lambda: loop.state):
         with pytest.raises(RuntimeError, match=r"the run has not begun; call init\(\) first"):
             early()
-    svi.init()
+    loop.init()
     with pytest.raises(RuntimeError, match="no step has been taken since init"):
-        svi.row()
+        loop.row()
+
+
+@pytest.mark.parametrize("module", [svi, fit, training])
+def test_examples_in_the_docstrings(module):
+    assert doctest.testmod(module).failed == 0
