@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Callback(Protocol):
-    """Hooks of the loop. Subclass it and define those you need."""
+    """Hooks of `fit`. Subclass it and define those you need."""
 
     def on_step(self, state: State) -> None:
         """Run after each step; `state.terms` holds the terms of its batch."""
@@ -214,7 +214,10 @@ def fit(
         if run is not None:
             stack.enter_context(marking_failure(svi, run))
         signals = stack.enter_context(Signals())
-        _train(svi, source, held_out, run, resume, receivers, callbacks, signals)
+        before, state.status = state.status, _status(state, training)
+        if run is not None and (not resume or state.status not in ("running", before)):
+            store(svi, run)  # also of a run that was interrupted at its last step
+        _train(svi, source, held_out, run, receivers, callbacks, signals)
         if state.best is not None:
             model.load_state_dict(state.best)
     path, per = run.path if run else None, getattr(model, "per", Fit.per)
@@ -249,7 +252,6 @@ def _train(
     source: Source,
     held_out: Sequences | None,
     run: Run | None,
-    resume: bool,
     receivers: Sequence[Tracker],
     callbacks: Sequence[Callback],
     signals: Signals,
@@ -269,9 +271,6 @@ def _train(
         except KeyboardInterrupt:  # the step is complete, so this is as good a place to stop as any
             signals.received = signal.SIGINT
 
-    before, state.status = state.status, _status(state, training)
-    if run is not None and (not resume or state.status not in ("running", before)):
-        store(svi, run)  # also of a run that was interrupted at its last step
     while state.status == "running":
         svi.step(source.sample(training.batch_size, svi.generator))
         if state.step % training.log_every == 0 or state.step == training.steps:
