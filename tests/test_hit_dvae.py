@@ -10,6 +10,7 @@ from pyro import poutine
 import dvae
 from dvae import motion
 from dvae.models.hit_dvae import PRESETS, HiTModel
+from dvae.models.registry import configured
 from dvae.motion import energies
 from dvae.motion.body import body_parts
 from dvae.motion.dataset import MotionData
