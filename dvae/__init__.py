@@ -25,14 +25,18 @@ from . import laws, motion, networks, views  # noqa: E402
 from .graph import Audit, audit  # noqa: E402
 from .inference import schedules  # noqa: E402
 from .inference.bounds import SequenceELBO, Terms, importance_bound  # noqa: E402
-from .inference.compare import Comparison, compare  # noqa: E402
-from .inference.criticism import calibrate, predictive_checks, traverse  # noqa: E402
-from .inference.evaluate import Evaluation, evaluate  # noqa: E402
+from .inference.calibration import calibrate  # noqa: E402
+from .inference.checks import predictive_checks  # noqa: E402
+from .inference.compare import compare  # noqa: E402
+from .inference.comparison import Comparison  # noqa: E402
+from .inference.evaluate import evaluate  # noqa: E402
+from .inference.evaluation import Evaluation  # noqa: E402
 from .inference.fit import Fit, fit  # noqa: E402
 from .inference.objectives import Evidence  # noqa: E402
 from .inference.particles import particle_bound  # noqa: E402
 from .inference.svi import SVI  # noqa: E402
 from .inference.training import Stage, Training  # noqa: E402
+from .inference.traversal import traverse  # noqa: E402
 from .models.registry import method, methods  # noqa: E402
 from .motion import energies  # noqa: E402
 from .notation import Factorization  # noqa: E402

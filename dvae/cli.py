@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, make_dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -25,9 +26,10 @@ from joblib import parallel_config
 
 from . import files, motion
 from .graph import audit
+from .inference.calibration import Calibration, calibrate
 from .inference.checkpoints import Run
+from .inference.checks import PredictiveChecks, predictive_checks
 from .inference.compare import compare as compare_models
-from .inference.criticism import Calibration, PredictiveChecks, calibrate, predictive_checks
 from .inference.evaluate import evaluate as evaluate_models
 from .inference.fit import Fit, Interrupted
 from .inference.recipe import Trainable
@@ -336,6 +338,7 @@ def evaluate(
     data: str | None = None,
     samples: int = 50,
     bound_particles: int = 0,
+    log_score_particles: int = 0,
     pose_prior: Path | None = None,
     classifier: tuple[Path, ...] = (),
     joints: tuple[str, ...] | None = None,
@@ -356,6 +359,7 @@ def evaluate(
         data: where the data lie now, if the path in the runs no longer leads there.
         samples: forecasts of each window, K.
         bound_particles: particles of the importance-weighted bound; 0 leaves it out.
+        log_score_particles: particles of the log density of the future under the forecasts; 0 leaves it out.
         pose_prior: run of a pose-prior, by which to score the poses of the forecasts.
         classifier: runs of action-classifiers of different labels, by which to score what the forecasts show.
         joints: joints whose paths are given to the runs, for methods that take some (trajevae, cvae-rnn).
@@ -370,7 +374,7 @@ def evaluate(
     if not run:
         raise UsageError("give at least one run directory")
     _at_least(1, samples=samples, batch_size=batch_size)
-    _at_least(0, bound_particles=bound_particles)
+    _at_least(0, bound_particles=bound_particles, log_score_particles=log_score_particles)
     _check_file(out, "out", ".json")
     _check_figure(figure, "figure")
     loaded, windows = _on_the_same_windows(run, data)
@@ -384,17 +388,18 @@ def evaluate(
                 f"{each.method.name}"
             )
     classifiers = _classifiers(classifier, data, windows)
+    prior = None if pose_prior is None else _pose_prior(pose_prior, data, windows.skeleton)
     if given is not None:
         windows = windows.given(given)
     result = evaluate_models(
         {name: each.model for name, each in zip(names, loaded, strict=True)},
         windows if exchange is None else motion.Exchanged(windows, exchange),
+        scores=partial(motion.scores, pose_prior=prior, classifiers=classifiers),
         samples=samples,
         seed=seed,
         batch_size=batch_size,
         bound_particles=bound_particles,
-        pose_prior=None if pose_prior is None else _pose_prior(pose_prior, data, windows.skeleton),
-        classifiers=classifiers,
+        log_score_particles=log_score_particles,
         training_windows=loaded[0].data.windows("train+validation"),
         configs={name: Run(each.path).config for name, each in zip(names, loaded, strict=True)},
         options={} if temperature is None else {"temperature": temperature},
@@ -462,7 +467,7 @@ def criticise(
         if figure is not None:
             _save_figure(result.plot(), figure.with_stem(f"{figure.stem}-{figure_part}"))
 
-    if getattr(loaded.model, "context", ()):
+    if loaded.model.context:
         ERROR.print(
             f"no calibration: sequences are simulated from nothing, but {loaded.method.name} starts from a pose"
         )
@@ -472,6 +477,7 @@ def criticise(
     checks = predictive_checks(
         {loaded.method.name: loaded.model},
         windows,
+        motion.statistics(windows),
         samples=samples,
         draw_emission=draw_emission and not isinstance(loaded.model, TrajectoryModel),
         seed=seed,
@@ -531,6 +537,7 @@ def compare(
     result = compare_models(
         {name: [each.model for each in row] for name, row in rows.items()},
         windows,
+        scores=motion.scores,
         particles=particles,
         estimates=estimates,
         contrasts=contrasts,

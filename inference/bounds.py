@@ -244,22 +244,21 @@ def _frames(rollout: Rollout) -> Tensor:
 
 
 def _mean(draws: list[Terms]) -> Terms:
-    def average(table: str) -> dict[str, Tensor]:
-        return {
-            name: torch.stack([getattr(draw, table)[name] for draw in draws]).mean(0)
-            for name in getattr(draws[0], table)
-        }
+    def average(tables: tuple[dict[str, Tensor], ...]) -> dict[str, Tensor]:
+        return {name: torch.stack([table[name] for table in tables]).mean(0) for name in tables[0]}
 
-    return Terms(average("log_likelihood"), average("kl"), average("energies"), draws[0].frames, average("steps"))
+    tables = zip(*((d.log_likelihood, d.kl, d.energies, d.steps) for d in draws), strict=True)
+    likelihood, kl, energies, steps = map(average, tables)
+    return Terms(likelihood, kl, energies, draws[0].frames, steps)
 
 
-def require_likelihood(model: Any) -> None:
+def require_likelihood(model: DynamicalVAE) -> None:
     """Refuse a model whose data are functions of its latents.
 
     Raises:
         ValueError: it has no likelihood, and so no bound.
     """
-    if not getattr(model, "likelihood", True):
+    if not model.likelihood:
         raise ValueError(
             f"{model.generative} has no likelihood: its data are functions of its latents, trained by energies; there "
             "is no bound and nothing to calibrate. Judge its forecasts, with dvae.evaluate"
@@ -312,14 +311,24 @@ def importance_bound(
     require_likelihood(model)
     data = model.read(batch)
     size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
-    weights: list[Tensor] = []
-    at_once = max(1, min(particles, chunk // size))
     with model._evaluating():
-        for first in range(0, particles, at_once):
-            count = min(at_once, particles - first)
-            log_weights = _log_weights(model, repeat(data, count), options)
-            weights.append(log_weights.unflatten(0, (count, size)))
-    log_weights = torch.cat(weights)
+        return importance_mean(lambda count: _log_weights(model, repeat(data, count), options), size, particles, chunk)
+
+
+def importance_mean(
+    log_weights_of: Callable[[int], Tensor], size: int, particles: int, chunk: int = 4096
+) -> ImportanceBound:
+    """The log of the mean weight of every sequence, and the shape of the weights' tail.
+
+    Args:
+        log_weights_of: from a number n of particles to the logs (n B,) of weights, particle by particle.
+        size: B.
+        particles: K.
+        chunk: sequences times particles to hold at once.
+    """
+    at_once = max(1, min(particles, chunk // size))
+    counts = [min(at_once, particles - first) for first in range(0, particles, at_once)]
+    log_weights = torch.cat([log_weights_of(count).unflatten(0, (count, size)) for count in counts])
     return ImportanceBound(
         bound=torch.logsumexp(log_weights, 0) - math.log(particles),
         khat=_khat(log_weights),

@@ -2,578 +2,42 @@
 
 Every model is scored on the same sequences, teacher-forced: evidence lower bound, importance-weighted bound with the
 Pareto diagnosis of its weights, KL of every latent, and what the guide's latents tell of the data. Free-running scores
-come from `evaluate`. Models are ranked by the importance-weighted bound per frame.
-
-A fitted model differs from the next for two reasons, and an estimate here shows both apart: other sequences might have
-been held out, and another seed might have trained it. Sequences and seeds are crossed. Take y_sc, the mean of seed s
-over clip c, as mean + seed_s + clip_c + rest_sc (a two-way random-effects model). Then the mean over S seeds and C
-clips has
-
-    V_sequences   of the mean over seeds, by clips (linearised, as in `evaluate`):  (var clip + var rest / S) / C
-    V_seeds       of the seeds' means, over S:                                      (var seed + var rest / C) / S
-    V_rest        from the interaction's residuals:                                 var rest / (S C)
-    V_total = V_sequences + V_seeds - V_rest,   where the sum would count the rest twice, and at least either of the two
-
-(Cameron, Gelbach and Miller, 2011, have this as two-way clustering.) A difference of two models is paired over
-sequences, and its seeds are independent: V_seeds and V_rest are sums of both models'. With one seed V_seeds and V_total
-are unknown, and what is left speaks of these weights only.
-
-Intervals and p-values are Student's, since few seeds tell little of V_seeds. V_sequences has C - 1 degrees of freedom,
-V_seeds of a row S - 1, and sums of independent variances V_i with f_i have (sum V_i)^2 / sum (V_i^2 / f_i), as in the
-tests of Satterthwaite (1946) and Welch (1947): V_seeds of a difference between S - 1 and 2 (S - 1), and
-
-    f_total = V_total^2 / (V_sequences^2 / (C - 1) + sum over rows V_seeds^2 / (S - 1))
-
-References: Burda et al., 2016, arXiv 1509.00519 (importance-weighted bound, active units); Vehtari et al., 2024, arXiv
-1507.02646 (k-hat); Hoffman and Johnson, 2016, "ELBO surgery", and Poole et al., 2019, arXiv 1905.06922 (information).
+come from `evaluate`. Models are ranked by the importance-weighted bound per frame. What their differences are sure of
+stands in `comparison`.
 """
 
 import dataclasses
 import hashlib
-import json
-import math
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
-import matplotlib.axes
-import matplotlib.figure
 import numpy as np
 import torch
-from pyro import poutine
-from rich.console import Group
-from scipy import special
 from torch import Tensor, nn
 
-from ..networks.base import valid_steps
-from ..options import nearest
-from ..program.batch import repeat
-from ..program.rollout import Sequence as SequenceLaw
+from ..data import Batch, HeldOutWindows, Listed, each, leaves, sequences
+from ..program.model import DynamicalVAE
 from ..turns import alone
-from .batches import Batch, each, leaves, sequences
-from .bounds import KHAT_PARTICLES, SequenceELBO, importance_bound, require_likelihood, site_log_prob, sites_of
-from .evaluate import (
-    METRICS,
-    HeldOutWindows,
-    clustered_variance,
-    evaluate,
-    evaluating,
-    linearised,
-    on_device_of,
-    plain,
-    refuse_non_finite,
-    student_interval,
-)
-from .result import Result, Table, as_they_are, progress_bar
+from .bounds import require_likelihood
+from .comparison import Comparison, Contender
+from .evaluate import evaluate
+from .held import evaluating, plain
+from .result import progress_bar
+from .scores import Measure, Scores, proper
+from .teacher_forced import bounds, information, length_of, variances
 
-__all__ = ["Comparison", "Contender", "Estimate", "compare"]
+__all__ = ["compare"]
 
-ACTIVE = 0.01
-"""Variance over the data above which the posterior mean of a latent's coordinate counts as active (Burda et al.)."""
-
-KHAT = 0.7
-"""Pareto shape above which an importance-weighted bound is unreliable (Vehtari et al.)."""
-
-SHOWN = ("ADE", "FDE", "MMADE", "MMFDE", "energy score")
-"""Free-running scores of the table."""
-
-_ERRORS = ("sequences", "seeds", "total")
-_GUIDE_DRAWS = 8  # over which posterior means are averaged; the noise that this leaves is taken out
 _PAIRS = 4096  # sequences times contrasts to hold at once
-_LOO_DRAWS = 25  # arviz_stats fits a Pareto tail to a fifth of the draws, and needs five
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A mean over sequences and seeds, and its standard errors; NaN where one is unknown (one clip, one seed).
-
-    Args:
-        mean: the weighted mean.
-        sequences: standard error over sequences, clustered by clip.
-        seeds: standard error over training seeds.
-        total: standard error from both.
-        freedom: degrees of freedom of each of the three, in this order.
-    """
-
-    mean: float
-    sequences: float
-    seeds: float
-    total: float
-    freedom: tuple[float, float, float] = (math.nan, math.nan, math.nan)
-
-    def interval(self, level: float = 0.95, error: str = "total") -> tuple[float, float]:
-        """Where the mean lies at this level by Student's t, from one of the errors; NaN where that is unknown.
-
-        Raises:
-            ValueError: a level that is not between 0 and 1, or an error that is none of the three.
-        """
-        return student_interval(self.mean, *self._error(error), level)
-
-    def p_value(self, error: str = "total") -> float:
-        """Of a mean of zero, two-sided, by Student's t from one of the errors; NaN where that is unknown.
-
-        Raises:
-            ValueError: an error that is none of the three.
-        """
-        scale, freedom = self._error(error)
-        if scale == 0:
-            return float(self.mean == 0)
-        return float(2 * special.stdtr(freedom, -abs(self.mean) / scale))
-
-    def _error(self, name: str) -> tuple[float, float]:
-        if name not in _ERRORS:
-            raise ValueError(f"errors are over {', '.join(_ERRORS)}, not {name!r}")
-        return getattr(self, name), self.freedom[_ERRORS.index(name)]
-
-    def __str__(self) -> str:
-        known = [error for error in (self.sequences, self.seeds) if error > 0]
-        decimals = 4 if known and min(known) < 0.001 else 3
-        return " ± ".join(_number(value, decimals) for value in (self.mean, self.sequences, self.seeds))
-
-
-@dataclass(frozen=True, eq=False)
-class Contender:
-    """What was measured of one model, for S seeds, N sequences in C clips, T steps.
-
-    Args:
-        equations: "generative" and "inference".
-        config: what the caller said of it.
-        bounds: "ELBO", "importance bound", "k-hat" and "KL z" for every latent z: (S, N), bounds in nats a sequence.
-        kl_steps: local latent to (S, T), its mean KL over sequences by step, in nats.
-        variances: latent to (S, D), variance over the data of each coordinate's posterior mean.
-        information: latent to (S, T), or (S, 1) of a static one: nats a step, or a sequence.
-        estimates: (E, N) independent importance-weighted bounds in nats a sequence, each the mean over seeds.
-        free_running: metric to (S, C), the means of each clip's windows.
-    """
-
-    equations: dict[str, str]
-    config: dict[str, Any]
-    bounds: dict[str, np.ndarray]
-    kl_steps: dict[str, np.ndarray]
-    variances: dict[str, np.ndarray]
-    information: dict[str, np.ndarray]
-    estimates: np.ndarray
-    free_running: dict[str, np.ndarray]
-
-    @property
-    def seeds(self) -> int:
-        """S."""
-        return len(self.bounds["ELBO"])
-
-    @property
-    def latents(self) -> list[str]:
-        """Names of the latents."""
-        return list(self.variances)
-
-    @property
-    def active_units(self) -> dict[str, np.ndarray]:
-        """Latent to (S,), how many of its coordinates have a posterior mean that varies; NaN of one sequence."""
-        return {
-            name: np.where(np.isnan(variance).any(-1), math.nan, (variance > ACTIVE).sum(-1))
-            for name, variance in self.variances.items()
-        }
-
-    @property
-    def unreliable(self) -> float:
-        """Share of sequences whose k-hat is above 0.7; NaN where it was not estimated."""
-        khat = self.bounds["k-hat"]
-        return float((khat > KHAT)[~np.isnan(khat)].mean()) if not np.isnan(khat).all() else math.nan
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Comparison(Result):
-    """Models side by side on the same sequences, with all that is needed to say what was measured.
-
-    Indexing gives the estimates of a model: `comparison["srnn"]["importance bound"].mean`, in nats per frame.
-
-    Attributes:
-        rows: `{name: Contender}`.
-        keys: (split, clip, first frame) of every sequence.
-        frames: (N,) the number of frames of every sequence.
-        data: fingerprint (of windows), sequences, frames and coordinates.
-        protocol: the fields of the windows' protocol; empty for tensors.
-        particles: K of the importance-weighted bound.
-        contrasts: M, the sequences among which information was measured; its upper limit is log M.
-        samples: forecasts per window, 0 where there are no free-running scores.
-        emission: "mean" or "drawn": what was forecast.
-        seed: of every model's draws.
-    """
-
-    rows: dict[str, Contender]
-    keys: list[tuple[str, str, int]]
-    frames: np.ndarray
-    data: dict[str, Any]
-    protocol: dict[str, Any]
-    particles: int
-    contrasts: int
-    samples: int
-    emission: str
-    seed: int
-
-    def __getitem__(self, name: str) -> dict[str, Estimate]:
-        row = self._row(name)
-        metrics = [metric for metric in row.bounds if metric != "k-hat"]
-        return {metric: self._estimate(self._parts(name, metric)) for metric in (*metrics, *row.free_running)}
-
-    @property
-    def ranking(self) -> list[str]:
-        """Names by importance-weighted bound per frame, the best first."""
-        return sorted(self.rows, key=lambda name: -self[name]["importance bound"].mean)
-
-    def difference(self, first: str, second: str, metric: str = "importance bound") -> Estimate:
-        """Paired difference of two models, first minus second; see the module for its standard errors.
-
-        Raises:
-            KeyError: a model that was not compared, or a metric that one of the two lacks.
-        """
-        parts = [self._parts(name, metric) for name in (first, second)]
-        if first == second:
-            return Estimate(0.0, 0.0, 0.0, 0.0)
-        return self._estimate(*parts)
-
-    def join(self, other: "Comparison") -> "Comparison":
-        """This comparison with the rows of another one, made of other models on the same sequences in the same way.
-
-        Raises:
-            ValueError: sequences or settings that differ, or a name that both have.
-        """
-        settings = [field.name for field in dataclasses.fields(self) if field.name not in ("rows", "frames")]
-        if different := [name for name in settings if getattr(self, name) != getattr(other, name)]:
-            raise ValueError(f"comparisons to join may differ in their models alone, not in {', '.join(different)}")
-        if shared := self.rows.keys() & other.rows.keys():
-            raise ValueError(f"both comparisons have a model {', '.join(sorted(shared))}; name one of them otherwise")
-        return dataclasses.replace(self, rows={**self.rows, **other.rows})
-
-    def table(self) -> Group:
-        """Three tables: bounds in the order of the ranking, use of the latents, free-running scores."""
-        tables = [self._bound_table(), self._latent_table()]
-        return Group(*tables, *([self._free_running_table()] if self.samples else []))
-
-    def plot(self) -> matplotlib.figure.Figure:
-        """Bounds, paired differences to the best, k-hat, and the KL of every local latent over time."""
-        ranking = self.ranking
-        colours = {name: f"C{place % 10}" for place, name in enumerate(self.rows)}
-        latents = list(dict.fromkeys(latent for row in self.rows.values() for latent in row.kl_steps))
-        rows = math.ceil((3 + len(latents)) / 2)
-        labels = {name: textwrap.fill(name, 30) for name in ranking}
-        widest = min(30, max(map(len, ranking)))
-        lines = sum(label.count("\n") + 1 for label in labels.values())
-        heights = [1.4 + 0.25 * lines] + [3.0] * (rows - 1)
-        figure = matplotlib.figure.Figure(figsize=(10, sum(heights) + 0.3), layout="constrained")
-        panels = list(figure.subplots(rows, 2, squeeze=False, gridspec_kw={"height_ratios": heights}).flat)
-        bounds = {name: self[name]["importance bound"] for name in ranking}
-        differences = {name: self.difference(name, ranking[0]) for name in ranking}
-        for panel, estimates in zip(panels, (bounds, differences), strict=False):
-            for place, (name, estimate) in enumerate(estimates.items()):
-                for error, width in (("sequences", 3), ("total", 1)):
-                    reach = estimate.interval(error=error)[1] - estimate.mean
-                    if reach > 0:
-                        panel.errorbar(estimate.mean, place, xerr=reach, color=colours[name], elinewidth=width)
-                if estimate.freedom[-1] > 0:
-                    freedom = f"{estimate.freedom[-1]:.2g} df"
-                    above = {"xytext": (-2, 4), "textcoords": "offset points", "ha": "right", "fontsize": 7}
-                    panel.annotate(freedom, (1, place), xycoords=("axes fraction", "data"), **above)
-                panel.plot(estimate.mean, place, "o", markersize=5, color=colours[name], label=labels[name])
-            panel.set_ylim(len(ranking) - 0.5, -0.5)
-            panel.set_yticks(range(len(ranking)), labels.values(), parse_math=False)
-            panel.set_xlabel("nats a frame (95 %, thick: over sequences, thin: over seeds too)", fontsize=9)
-            panel.grid(axis="x", alpha=0.3)
-        panels[0].set_title(f"importance-weighted bound ↑ (K = {self.particles})")
-        panels[1].set_title(f"difference to {ranking[0]}", parse_math=False)
-        panels[1].axvline(0, color="grey", linewidth=0.8)
-        panels[1].set_yticklabels([])
-        self._khat_panel(panels[2], colours)
-        for panel, latent in zip(panels[3:], latents, strict=False):
-            for name in ranking:
-                if latent in self.rows[name].kl_steps:
-                    steps = self.rows[name].kl_steps[latent].mean(0)
-                    panel.plot(range(1, len(steps) + 1), steps, color=colours[name])
-            panel.set(title=f"KL of {latent} over time", xlabel="step", ylabel="nats a step")
-            drawn = np.concatenate([line.get_ydata() for line in panel.lines])
-            if (top := drawn.max()) > 0:  # the first step may take a hundred times what the others take
-                least = max(drawn[drawn > 0].min(), top / 1e5)
-                panel.set(yscale="log", ylim=(least / 1.5, top * 1.5))
-        for panel in panels[3 + len(latents) :]:
-            panel.set_axis_off()
-        columns = min(5, 100 // (widest + 5))
-        handles = panels[0].get_legend_handles_labels()
-        legend = figure.legend(*handles, loc="outside lower center", ncols=columns, fontsize=9)
-        as_they_are(legend.get_texts())
-        return figure
-
-    def _khat_panel(self, panel: matplotlib.axes.Axes, colours: Mapping[str, str]) -> None:
-        khats = {name: self.rows[name].bounds["k-hat"] for name in self.ranking}
-        khats = {name: khat[~np.isnan(khat)] for name, khat in khats.items() if not np.isnan(khat).all()}
-        known = np.concatenate([np.zeros(1), *khats.values()])
-        left, right = max(-1.0, known.min()), max(1.0, min(3.0, known.max()))
-        for name, khat in khats.items():
-            beyond = (khat > right).mean()
-            label = f"{100 * beyond:.3g} % beyond {right:g}" if beyond else None
-            panel.ecdf(np.minimum(khat, right + 1), color=colours[name], label=label)  # it cannot draw infinity
-        panel.axvline(KHAT, color="grey", linewidth=0.8, linestyle="--")
-        panel.set(title="Pareto k-hat of the weights", xlabel=f"k-hat (unreliable above {KHAT})")
-        panel.set(ylabel="share of sequences", xlim=(left, right), ylim=(0, 1.02))
-        if not khats:
-            missing = f"not estimated with fewer than {KHAT_PARTICLES} particles"
-            panel.text(0.5, 0.5, missing, transform=panel.transAxes, ha="center", fontsize=9)
-        if panel.get_legend_handles_labels()[1]:
-            panel.legend(fontsize=8)
-
-    def to_arviz(self) -> dict[str, Any]:
-        """`{name: DataTree}` for `arviz_stats.compare` and `arviz_stats.loo`.
-
-        The group `log_likelihood` holds independent importance-weighted estimates of every sequence's log evidence, as
-        draws of one chain; a row of several seeds has the mean over its seeds, which is the score of a typical
-        run. (Seeds as draws would be a mixture of runs, and its harmonic mean is ruled by the worst of them.)
-        `constant_data` holds ELBO, importance-weighted bound and k-hat by seed, frames and clip of every sequence.
-
-        What `loo` means here: the sequences were held out, so nothing is left to leave out, and its elpd is the
-        held-out log evidence. Its p ("effective parameters") measures how far the independent estimates differ, in
-        nats, and is Monte Carlo error; as elpd is a harmonic mean over draws, it lies below their mean by about as
-        much. More particles lower both. Its k-hat is that of the harmonic mean's weights: it warns where estimates
-        of a sequence differ by a nat or more, and nearly always with fewer than 200 draws. Its standard errors take
-        sequences for independent and know no seeds; those of `difference` are clustered by clip.
-
-        Raises:
-            ValueError: fewer than 25 estimates, which `loo` cannot smooth.
-        """
-        from arviz_base import from_dict
-
-        trees = {}
-        for name, row in self.rows.items():
-            if len(row.estimates) < _LOO_DRAWS:
-                raise ValueError(
-                    f"arviz fits a Pareto tail to independent estimates of every sequence's log evidence and needs at "
-                    f"least {_LOO_DRAWS}, but this comparison has {len(row.estimates)}; compare again with "
-                    "estimates=200 (and fewer particles, as each estimate costs as much as the bound)"
-                )
-            likelihood = row.estimates[None]
-            by_seed = {"elbo": "ELBO", "importance_bound": "importance bound", "khat": "k-hat"}
-            constant = {key: row.bounds[metric] for key, metric in by_seed.items()}
-            trees[name] = from_dict(
-                {
-                    "posterior": {"log_evidence": likelihood.sum(-1)},
-                    "log_likelihood": {"x": likelihood},
-                    "constant_data": {**constant, "frames": self.frames, "clip": np.array(self._clips)},
-                },
-                dims={
-                    "x": ["sequence"],
-                    "frames": ["sequence"],
-                    "clip": ["sequence"],
-                    **{key: ["seed", "sequence"] for key in by_seed},
-                },
-                attrs={"/": {"particles": self.particles, "data": json.dumps(self.data), "seed": self.seed}},
-            )
-        return trees
-
-    def to_json(self) -> str:
-        """Everything, with the estimates, ranking and differences written out.
-
-        What is not finite becomes null; null as k-hat is infinity, and not estimated with fewer than 25 particles.
-        """
-        document = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        ranking = self.ranking
-        document["rows"] = {
-            name: {
-                **{field.name: getattr(row, field.name) for field in dataclasses.fields(row)},
-                "scores": {metric: _scored(estimate) for metric, estimate in self[name].items()},
-                "difference_to_best": _scored(self.difference(name, ranking[0])),
-                "khat_above_0.7": row.unreliable,
-                "active_units": row.active_units,
-            }
-            for name, row in self.rows.items()
-        }
-        return json.dumps({"ranking": ranking, **plain(_lists(document))}, allow_nan=False)
-
-    @classmethod
-    def from_json(cls, text: str) -> "Comparison":
-        """The comparison that `to_json` wrote.
-
-        Raises:
-            ValueError: text that is not such a document.
-        """
-        try:
-            document = json.loads(text)
-            del document["ranking"]
-            rows = {name: _contender(row, document["particles"]) for name, row in document.pop("rows").items()}
-            keys = [(split, clip, start) for split, clip, start in document.pop("keys")]
-            return cls(rows=rows, keys=keys, frames=np.array(document.pop("frames"), dtype=float), **document)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"this is not a comparison written by Comparison.to_json: {error!r}") from error
-
-    @classmethod
-    def load(cls, path: str | Path) -> "Comparison":
-        """Read the file that `save` wrote; errors as in `from_json`."""
-        return cls.from_json(cls.read(path))
-
-    # Estimates
-
-    def _row(self, name: str) -> Contender:
-        if name not in self.rows:
-            raise KeyError(
-                f"no model {name!r} in this comparison{nearest(name, self.rows)}; it has {', '.join(self.rows)}"
-            )
-        return self.rows[name]
-
-    @property
-    def _clips(self) -> list[str]:
-        return [f"{split}/{clip}" for split, clip, _ in self.keys]
-
-    def _places(self) -> np.ndarray:
-        """(N,) the clip of every sequence, in the order in which `evaluate` lists clips."""
-        order = {clip: place for place, clip in enumerate(dict.fromkeys(self._clips))}
-        return np.array([order[clip] for clip in self._clips])
-
-    def _parts(self, name: str, metric: str) -> "_Parts":
-        row = self._row(name)
-        if metric not in {*row.bounds, *row.free_running} - {"k-hat"}:
-            known = [known for known in (*row.bounds, *row.free_running) if known != "k-hat"]
-            raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, known)}; it has {', '.join(known)}")
-        places = self._places()
-        weights = np.bincount(places, weights=self.frames)
-        if metric in row.free_running:
-            means = row.free_running[metric]
-        else:
-            means = np.stack([np.bincount(places, weights=seed) for seed in row.bounds[metric]]) / weights
-        return _Parts.of(means, weights)
-
-    @staticmethod
-    def _estimate(first: "_Parts", second: "_Parts | None" = None) -> Estimate:
-        mean, deviations, between, rest = first.mean, first.deviations, first.seeds, first.rest
-        of_seeds = [(first.seeds, first.count - 1)]
-        if second is not None:
-            mean, deviations = mean - second.mean, deviations - second.deviations
-            between, rest = between + second.seeds, rest + second.rest
-            of_seeds.append((second.seeds, second.count - 1))
-        over = clustered_variance(deviations)
-        total = max(over + between - rest, over, between) if not math.isnan(over + between) else math.nan
-        of_sequences = (over, len(deviations) - 1)
-        freedom = (
-            _freedom(over, of_sequences),
-            _freedom(between, *of_seeds),
-            _freedom(total, of_sequences, *of_seeds),
-        )
-        return Estimate(mean, math.sqrt(over), math.sqrt(between), math.sqrt(total), freedom)
-
-    # Tables
-
-    def _title(self) -> str:
-        clips = len(set(self._clips))
-        parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} sequences of {clips} clips"]
-        parts += [f"seed {self.seed}"]
-        parts += [f"data {self.data['fingerprint'][:12]}"] if "fingerprint" in self.data else []
-        return " · ".join(part for part in parts if part)
-
-    def _bound_table(self) -> Table:
-        table = Table(
-            title=f"{self._title()}\nteacher-forced, nats a frame",
-            caption="mean ± standard error over sequences (clustered by clip) ± over seeds\n"
-            "95 %: from both, by Student's t, in brackets its degrees of freedom",
-        )
-        table.add_column("", overflow="fold")  # a long name takes no room from the numbers
-        for column in (
-            "seeds",
-            f"importance bound ↑\nK = {self.particles}",
-            "difference to the best",
-            "95 % (df)",
-            "ELBO ↑",
-            f"k-hat\n> {KHAT}",
-        ):
-            table.add_column(column, justify="right", overflow="fold")
-        ranking = self.ranking
-        for name in ranking:
-            row, scores = self.rows[name], self[name]
-            difference = self.difference(name, ranking[0])
-            behind = ["–", "–"] if name == ranking[0] else [str(difference), _interval(difference)]
-            share = "–" if math.isnan(row.unreliable) else f"{100 * row.unreliable:.1f} %"
-            bounds = (str(scores["importance bound"]), *behind, str(scores["ELBO"]))
-            table.add_row(name, str(row.seeds), *bounds, share)
-        return table
-
-    def _latent_table(self) -> Table:
-        limit = f"at most log {self.contrasts} = {math.log(self.contrasts):.2f}" if self.contrasts else "left out"
-        table = Table(
-            title="latents under the guide, teacher-forced",
-            caption=f"active: variance of the posterior mean over data above {ACTIVE}\ninformation {limit}",
-        )
-        table.add_column("", overflow="fold")
-        for column in ("latent", "KL\nnats a frame", "active\nunits", "information\nnats"):
-            table.add_column(column, justify="right", overflow="fold")
-        for name in self.ranking:
-            row, scores = self.rows[name], self[name]
-            for latent in row.latents:
-                active = row.active_units[latent].mean()
-                units = f"{active:g}" if active.is_integer() else f"{active:.1f}"
-                table.add_row(
-                    name if latent == row.latents[0] else "",
-                    latent,
-                    str(scores[f"KL {latent}"]),
-                    "–" if math.isnan(active) else f"{units} of {row.variances[latent].shape[-1]}",
-                    self._told(row, latent),
-                )
-        return table
-
-    def _told(self, row: Contender, latent: str) -> str:
-        if latent not in row.information:
-            return "–"
-        steps = row.information[latent].mean(0)
-        if latent not in row.kl_steps:
-            return f"{_number(steps[0])} a sequence"
-        weights = (self.frames[:, None] > np.arange(len(steps))).sum(0)
-        return f"{_number((weights * steps).sum() / weights.sum())} a step"
-
-    def _free_running_table(self) -> Table:
-        table = Table(
-            title=f"free-running, K = {self.samples}, {self.emission} emission",
-            caption="mean ± standard error over windows (clustered by clip) ± over seeds\n"
-            "MM: over the futures of all windows in almost the same pose, itself included",
-        )
-        table.add_column("", overflow="fold")
-        for metric in SHOWN:
-            table.add_column(f"{metric} ↓ ({METRICS[metric].unit})", justify="right", overflow="fold")
-        for name in self.ranking:
-            table.add_row(name, *(str(self[name][metric]) for metric in SHOWN))
-        return table
-
-
-def _freedom(total: float, *parts: tuple[float, float]) -> float:
-    """Satterthwaite's degrees of freedom of a variance made of parts, each with its own; NaN where one is unknown."""
-    uncertainty = sum(part**2 / freedom if freedom else math.nan for part, freedom in parts)
-    least = min(freedom for _, freedom in parts)  # the total is at most the sum of the parts
-    return max(total**2 / uncertainty, least) if uncertainty else math.nan
-
-
-@dataclass(frozen=True)
-class _Parts:
-    """A model's mean, what each clip adds to its error (C,), the variances of its seeds and of the rest, and S."""
-
-    mean: float
-    deviations: np.ndarray
-    seeds: float
-    rest: float
-    count: int
-
-    @classmethod
-    def of(cls, means: np.ndarray, weights: np.ndarray) -> "_Parts":
-        """From means by seed and clip (S, C) and the clips' weights (C,)."""
-        by_seed, deviations = linearised(means, weights)
-        common = deviations.mean(0)
-        count = len(means)
-        if count < 2:
-            return cls(float(by_seed.mean()), common, math.nan, math.nan, count)
-        # As `clustered_variance`, of the seeds' own deviations from what they have in common.
-        rest = sum(clustered_variance(own) for own in deviations - common) / (count * (count - 1))
-        return cls(float(by_seed.mean()), common, float(by_seed.var(ddof=1)) / count, rest, count)
 
 
 @alone
 def compare(
-    models: Mapping[str, nn.Module | Sequence[nn.Module]],
-    data: HeldOutWindows | Tensor | np.ndarray | Batch,
+    models: Mapping[str, DynamicalVAE | Sequence[DynamicalVAE]],
+    data: HeldOutWindows | Listed | Tensor | np.ndarray | Batch,
     *,
+    scores: Scores = proper,
     particles: int = 64,
     estimates: int = 1,
     contrasts: int = 128,
@@ -587,7 +51,8 @@ def compare(
     """Compare models on held-out sequences: bounds, differences with their errors, use of latents, forecasts.
 
     All models see the same sequences, and each draws from the same seed, so that no score depends on which others are
-    compared; scores do depend on `batch_size`, as draws come batch by batch.
+    compared; scores do depend on `batch_size`, as draws come batch by batch. (Longer than other functions by what its
+    numbers mean.)
 
     *Active units* of a latent (Burda et al., 2016): coordinates whose posterior mean varies over the data with a
     variance above 0.01. For a local latent the variance is that over sequences at the same step, pooled over steps:
@@ -613,6 +78,7 @@ def compare(
     Args:
         models: name to a model, or to several that differ in their training seed only.
         data: windows (`dvae.motion`, `ArrayWindows`), x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
+        scores: of forecasts; see `evaluate`.
         particles: K of the importance-weighted bound. k-hat needs 25, and 100 or more to be read sequence by sequence.
         estimates: independent importance-weighted estimates of every sequence, of K particles each. The bound is
             their mean. `Comparison.to_arviz` needs 25 or more.
@@ -642,58 +108,28 @@ def compare(
         )
     contenders = _contenders(models)
     labelled = {label: model for label, _, model in _each(contenders)}
-    windows: Any = data if hasattr(data, "protocol") else None
+    windows = data if isinstance(data, HeldOutWindows) else None
     batch = sequences(data).batch
-    keys = list(windows.keys) if windows is not None else [("data", str(n), 0) for n in range(_rows(batch))]
+    keys = list(windows.keys) if windows is not None else [("data", str(n), 0) for n in range(length_of(batch))]
     chosen = torch.randperm(len(keys), generator=torch.Generator().manual_seed(seed))[:contrasts]
-    forecasts = samples if windows is not None else 0
-    forecast = {}
-    if forecasts:
-        forecast = evaluate(
-            labelled,
-            windows,
-            samples=forecasts,
-            seed=seed,
-            batch_size=batch_size,
-            draw_emission=draw_emission,
-            references=False,
-            progress=progress,
-        ).rows
-
-    measured: dict[str, dict[str, Any]] = {}
-    with progress_bar(progress) as bar:
-        for label, model in labelled.items():
-
-            def parts(what: str, count: int, size: int, label: str = label) -> Iterator[slice]:
-                for start in bar.track(range(0, count, size), description=f"{label}, {what}"):
-                    yield slice(start, start + size)
-
-            with evaluating(model, seed):
-                pieces = parts("bounds", len(keys), batch_size)
-                found = _bounds(label, model, batch, keys, particles, estimates, pieces)
-            with evaluating(model, seed):
-                found["variances"] = _variances(model, batch, parts("active units", len(keys), batch_size))
-            with evaluating(model, seed):
-                pieces = parts("information", len(chosen), max(1, _PAIRS // max(1, len(chosen))))
-                found["information"] = _information(model, each(batch, itemgetter(chosen)), pieces)
-            found["free_running"] = {
-                metric: np.array(means)
-                for metric, means in (forecast[label].clip_means if forecast else {}).items()
-                if metric in METRICS and METRICS[metric].program == "free-running"
-            }
-            measured[label] = found
-
+    shared: dict[str, Any] = {"seed": seed, "batch_size": batch_size, "progress": progress}
+    free: dict[str, dict[str, Any]] = {label: {} for label in labelled}
+    measures: Sequence[Measure] = ()
+    if windows is not None and samples:
+        drawn: dict[str, Any] = {"samples": samples, "draw_emission": draw_emission, "references": False}
+        measures = scores(windows)
+        made = evaluate(labelled, windows, scores=lambda _: measures, **drawn, **shared).rows
+        free = {label: {m.name: np.array(made[label].clip_means[m.name]) for m in measures} for label in labelled}
+    measured = {
+        label: _measured(label, model, batch, keys, chosen, particles, estimates, **shared)
+        | {"free_running": free[label]}
+        for label, model in labelled.items()
+    }
     rows = {}
     for name, versions in contenders.items():
-        scores = _stack([measured[label] for label, other, _ in _each(contenders) if other == name])
-        rows[name] = Contender(
-            equations={"generative": versions[0].generative.text, "inference": versions[0].inference.text},
-            config=dict((configs or {}).get(name, {})),
-            estimates=scores.pop("estimates").mean(0),
-            **{field.name: scores[field.name] for field in dataclasses.fields(Contender) if field.name in scores},
-        )
-    some = next(iter(labelled.values()))
-    x = batch[some.observed[0]]
+        seeds = [measured[label] for label, other, _ in _each(contenders) if other == name]
+        rows[name] = _contender(versions[0], seeds, dict((configs or {}).get(name, {})))
+    x = batch[next(iter(labelled.values())).observed[0]]
     return Comparison(
         rows=rows,
         keys=keys,
@@ -707,117 +143,53 @@ def compare(
         protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
         particles=particles,
         contrasts=len(chosen),
-        samples=forecasts,
+        samples=samples if windows is not None else 0,
         emission="drawn" if draw_emission else "mean",
         seed=seed,
+        shown={measure.name: measure.unit for measure in measures if measure.headline},
+        notes=list(dict.fromkeys(measure.note for measure in measures if measure.headline and measure.note)),
     )
 
 
-# What is measured of one model
-
-
-def _bounds(
-    name: str,
-    model: Any,
+def _measured(
+    label: str,
+    model: DynamicalVAE,
     batch: Batch,
     keys: Sequence[tuple[str, str, int]],
+    chosen: Tensor,
     particles: int,
     estimates: int,
-    parts: Iterable[slice],
+    *,
+    seed: int,
+    batch_size: int,
+    progress: bool,
 ) -> dict[str, Any]:
-    """Bounds and KL terms in nats a sequence (N,), KL by step (T,), estimates (E, N), frames (N,)."""
-    bounds: list[dict[str, Tensor]] = []
-    steps: dict[str, Tensor] = {}
-    weighted: list[Tensor] = []
-    frames: list[Tensor] = []
-    for part in parts:
-        piece = on_device_of(model, dict(each(batch, itemgetter(part))))
-        terms = SequenceELBO().terms(model, piece)
-        draws = [importance_bound(model, piece, particles=particles) for _ in range(estimates)]
-        values = torch.stack([draw.bound for draw in draws])
-        scores = {"ELBO": terms.bound, "importance bound": values.mean(0)}
-        for bound in scores.values():
-            refuse_non_finite(name, "bound", bound.isfinite(), keys[part])
-        scores["k-hat"] = torch.stack([draw.khat for draw in draws]).mean(0)
-        scores |= {f"KL {latent}": kl for latent, kl in terms.kl.items()}
-        for latent in terms.kl.keys() & terms.steps.keys():
-            steps[latent] = steps.get(latent, 0) + terms.steps[latent].double().sum(0)
-        bounds.append({metric: value.double().cpu() for metric, value in scores.items()})
-        weighted.append(values.double().cpu())
-        frames.append(terms.frames.double().cpu())
-    length = torch.cat(frames)
-    return {
-        "bounds": {metric: torch.cat([piece[metric] for piece in bounds]).numpy() for metric in bounds[0]},
-        "kl_steps": {
-            latent: (total.cpu() / _alive(length, len(total)).clamp(min=1)).numpy() for latent, total in steps.items()
-        },
-        "estimates": torch.cat(weighted, dim=1).numpy(),
-        "frames": length.numpy(),
-    }
+    """Everything teacher-forced of one model, each part with draws from the seed."""
+    with progress_bar(progress) as bar:
 
+        def parts(what: str, count: int, size: int) -> Iterator[slice]:
+            for start in bar.track(range(0, count, size), description=f"{label}, {what}"):
+                yield slice(start, start + size)
 
-def _variances(model: Any, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
-    """Latent to (D,): the variance over sequences of the posterior mean, pooled over steps."""
-    sums: dict[str, Tensor] = {}
-    for part in parts:
-        piece = on_device_of(model, dict(each(batch, itemgetter(part))))
-        draws = [_posterior_means(model, piece) for _ in range(_GUIDE_DRAWS)]
-        for name in draws[0]:
-            means = torch.stack([draw[name] for draw in draws]).double()
-            mean, noise = means.mean(0), means.var(0) / _GUIDE_DRAWS
-            valid = torch.ones_like(mean)
-            if "lengths" in piece and mean.shape[1] > 1:
-                valid = valid * valid_steps(piece["lengths"], mean.shape[1])[..., None]
-            moments = torch.stack([(valid * value).sum(0) for value in (torch.ones_like(mean), mean, mean**2, noise)])
-            sums[name] = sums[name] + moments if name in sums else moments
-    found = {}
-    for name, (count, total, squares, noise) in sums.items():
-        between = (squares - total**2 / count.clamp(min=1)).sum(0) / (count - 1).clamp(min=0).sum(0)
-        found[name] = (between - noise.sum(0) / count.sum(0)).cpu().numpy()
+        with evaluating(model, seed):
+            found = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
+        with evaluating(model, seed):
+            found["variances"] = variances(model, batch, parts("active units", len(keys), batch_size))
+        with evaluating(model, seed):
+            pieces = parts("information", len(chosen), max(1, _PAIRS // max(1, len(chosen))))
+            found["information"] = information(model, each(batch, itemgetter(chosen)), pieces)
     return found
 
 
-def _posterior_means(model: Any, batch: Batch) -> dict[str, Tensor]:
-    """Latent to the means (B, T, D), or (B, 1, D), of its conditionals at a draw from the guide."""
-    means = {}
-    for name, site in sites_of(poutine.trace(model.guide).get_trace(batch)).items():
-        fn, value = site["fn"], site["value"]
-        local = isinstance(fn, SequenceLaw)
-        means[name] = fn.steps(value).mean if local else fn.mean[:, None]
-    return means
+def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: dict[str, Any]) -> Contender:
+    """A row from what was measured of the models of its seeds, of which one is given."""
+    scores = _stack(seeds)
+    del scores["frames"]
+    equations = {"generative": model.generative.text, "inference": model.inference.text}
+    return Contender(equations, config, **{**scores, "estimates": scores["estimates"].mean(0)})
 
 
-def _information(model: Any, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
-    """Latent to (T,), or (1,) of a static one: what it tells of the data, among the M sequences of the batch."""
-    batch = on_device_of(model, dict(batch))
-    size = _rows(batch)
-    drawn = model.guide(batch) if size else {}
-    totals: dict[str, Tensor] = {}
-    counts: dict[str, Tensor] = {}
-    for part in parts:
-        rows = torch.arange(size)[part]
-        values = {name: value[part].repeat_interleave(size, 0) for name, value in drawn.items()}
-        guide = poutine.condition(model.guide, data=values)
-        trace = poutine.trace(guide).get_trace(repeat(batch, len(rows)))
-        for name, site in sites_of(trace).items():
-            density = site_log_prob(site["fn"], site["value"]).unflatten(0, (len(rows), size)).double()
-            density = density[..., None] if density.dim() == 2 else density
-            valid = torch.ones_like(density[0], dtype=torch.bool)
-            if "lengths" in batch and density.shape[2] > 1:
-                valid = valid_steps(batch["lengths"], density.shape[2])
-            density = density.masked_fill(~valid, -math.inf)
-            own = density[torch.arange(len(rows)), rows]
-            mixture = density.logsumexp(1) - valid.sum(0).clamp(min=1).double().log()
-            told = torch.where(valid[part], own - mixture, 0.0).sum(0)
-            totals[name] = totals[name] + told if name in totals else told
-            counts[name] = valid.sum(0).clamp(min=1)
-    return {name: (total / counts[name]).cpu().numpy() for name, total in totals.items()}
-
-
-# Small things
-
-
-def _contenders(models: Mapping[str, Any]) -> dict[str, list[Any]]:
+def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
     """Name to the models of every seed."""
     if not isinstance(models, Mapping):
         raise TypeError(f"models are a mapping such as {{'srnn': model}}, not {type(models).__name__}")
@@ -826,14 +198,16 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[Any]]:
             raise TypeError(
                 f"{name!r} is a {type(value).__name__}; expected a DynamicalVAE, or a list of them, one for each seed"
             )
-    found = {name: [value] if isinstance(value, nn.Module) else list(value) for name, value in models.items()}
+    found: dict[str, list[Any]] = {
+        name: [value] if isinstance(value, nn.Module) else list(value) for name, value in models.items()
+    }
     if not found or not all(found.values()):
         empty = next((name for name, versions in found.items() if not versions), None)
         raise ValueError("there is nothing to compare: " + (f"{empty!r} has no model" if found else "no models"))
     for name, versions in found.items():
-        if wrong := [each for each in versions if not hasattr(each, "guide")]:
-            raise TypeError(f"{name!r} holds a {type(wrong[0]).__name__}; expected a DynamicalVAE for each seed")
         for version in versions:
+            if not isinstance(version, DynamicalVAE):
+                raise TypeError(f"{name!r} holds a {type(version).__name__}; expected a DynamicalVAE for each seed")
             require_likelihood(version)
         first = versions[0]
         for other in versions[1:]:
@@ -857,10 +231,6 @@ def _each(contenders: Mapping[str, list[Any]]) -> Iterator[tuple[str, str, Any]]
             yield (name if len(versions) == 1 else f"{name}, model {place + 1}"), name, model
 
 
-def _rows(batch: Batch) -> int:
-    return len(next(value for value in batch.values() if isinstance(value, Tensor)))
-
-
 def _fingerprint(batch: Batch) -> str:
     """SHA-256 of every tensor of the batch: its name, shape, type and values."""
     digest = hashlib.sha256()
@@ -870,47 +240,7 @@ def _fingerprint(batch: Batch) -> str:
     return digest.hexdigest()
 
 
-def _alive(lengths: Tensor, steps: int) -> Tensor:
-    """(T,) the number of sequences that reach each step."""
-    return (lengths[:, None] > torch.arange(steps)).sum(0)
-
-
 def _stack(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The seeds' arrays, stacked under their names."""
     columns = {key: [one[key] for one in found] for key in found[0]}
     return {key: _stack(own) if isinstance(own[0], Mapping) else np.stack(own) for key, own in columns.items()}
-
-
-def _number(value: float, decimals: int = 3) -> str:
-    return "–" if math.isnan(value) else f"{round(value, decimals) + 0.0:.{decimals}f}"  # no minus before a zero
-
-
-def _interval(estimate: Estimate) -> str:
-    """The interval of 95 % and its degrees of freedom."""
-    low, high = map(_number, estimate.interval())
-    return low if low == "–" else f"{low} to {high} ({estimate.freedom[-1]:.3g})"
-
-
-def _scored(estimate: Estimate) -> dict[str, Any]:
-    return {**dataclasses.asdict(estimate), "interval": estimate.interval(), "p_value": estimate.p_value()}
-
-
-def _lists(value: Any) -> Any:
-    """The value with lists in place of arrays."""
-    if isinstance(value, Mapping):
-        return {key: _lists(item) for key, item in value.items()}
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-def _contender(document: dict[str, Any], particles: int) -> Contender:
-    def arrays(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {key: arrays(item) for key, item in value.items()}
-        return np.array(value, dtype=float)
-
-    names = [field.name for field in dataclasses.fields(Contender)]
-    said = {"equations", "config"}
-    row = Contender(**{name: document[name] if name in said else arrays(document[name]) for name in names})
-    if particles >= KHAT_PARTICLES and "k-hat" in row.bounds:
-        row.bounds["k-hat"][np.isnan(row.bounds["k-hat"])] = math.inf
-    return row

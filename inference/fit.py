@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from torch import nn
 
+from ..data import Sequences, Source, sequences
 from ..turns import alone
-from .batches import Sequences, Source, sequences
 from .checkpoints import CONFIG, CheckpointError, Run
 from .objectives import Objective
 from .result import as_they_are

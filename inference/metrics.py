@@ -3,9 +3,9 @@
 The motion errors follow the evaluation code of DLow (Yuan and Kitani 2020, arXiv:2003.08386) and GSPS (Mao,
 Liu and Salzmann 2021, arXiv:2108.08422); the median versions are those of HiT-DVAE (Bie et al. 2022,
 arXiv:2204.01565). They reward the best (or the median) of K samples and are not proper: a forecaster gains by
-spreading its samples. The energy score (Gneiting and Raftery 2007, section 4.3) and the variogram score
-(Scheuerer and Hamill 2015) stand beside them. The Fréchet distance compares two sets of motions by features
-of them, and has shapes of its own.
+spreading its samples. The energy score (Gneiting and Raftery 2007, section 4.3), the variogram score
+(Scheuerer and Hamill 2015) and the CRPS stand beside them. The Fréchet distance compares two sets of motions by
+features of them, and has shapes of its own.
 
 Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`,
 or `(..., M, T, D)` where M futures are admissible; the result has the leading shape `(...)`. Torch tensors
@@ -24,9 +24,11 @@ from torch import Tensor
 __all__ = [
     "average_displacement_error",
     "average_pairwise_distance",
+    "continuous_ranked_probability_score",
     "energy_score",
     "final_displacement_error",
     "frechet_distance",
+    "frechet_pseudo_values",
     "gaussian_frechet_distance",
     "median_average_displacement_error",
     "median_final_displacement_error",
@@ -133,6 +135,31 @@ def energy_score(samples: Array, truth: Array) -> Tensor:
     return _per_window(score, *_paired(samples, truth))
 
 
+def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
+    """CRPS of each number alone, averaged over frames and coordinates; proper, lower is better (Gneiting and Raftery).
+
+    CRPS = mean_k |X_k - y| - 1/2 mean_{j<k} |X_j - X_k|, the unbiased ("fair") estimate, whose expectation does not
+    depend on K: integral of (P(X <= u) - 1[y <= u])^2 du. It is the energy score of one number, blind to dependence
+    between numbers. With K = 1 the forecast is a point mass and the score is the absolute error.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truth: `(..., T, D)`.
+
+    Returns:
+        `(...)`, in the unit of the data.
+    """
+
+    def score(x: Tensor, y: Tensor) -> Tensor:
+        errors, count = (x - y).flatten(1), len(x)
+        # Sorted, number i is the larger one in i pairs and the smaller one in K - 1 - i.
+        signs = 2 * torch.arange(count, dtype=x.dtype, device=x.device) - (count - 1)
+        apart = (signs @ errors.sort(0).values).mean() / max(1, count * (count - 1) / 2)
+        return errors.abs().mean() - apart / 2
+
+    return _per_window(score, *_paired(samples, truth))
+
+
 def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
     """Variogram score of the coordinates of each frame; proper, lower is better (Scheuerer and Hamill 2015).
 
@@ -217,6 +244,42 @@ def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tens
     distance = (mean - other_mean).square().sum(-1) + traces - 2 * shared
     rounding = 4 * mean.shape[-1] * torch.finfo(mean.dtype).eps * traces
     return torch.where(distance > rounding, distance, 0.0)
+
+
+def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tuple[float, ...]:
+    """The Fréchet distance between features of true and generated windows, as a jackknife pseudo-value of each clip.
+
+    d + (1/w - 1) (d - d'), d' the distance without the clip and w the clip's share of the windows (Busing, Meijer and
+    van der Leeden 1999), moved by one constant so that their mean over windows is the distance as it is defined: the
+    mean of plain pseudo-values is one that is corrected for bias. Of a mean over windows, pseudo-values are the means
+    of the clips, so that the errors of both kinds of scores come from these alike.
+
+    Args:
+        real: `(N, F)`, of the true futures.
+        generated: `(N, K, F)`, of the generated ones.
+        places: `(N,)`, the clip of every window, from 0 to C - 1.
+    """
+    centre = real.mean(0)  # far from 0, second moments would cancel
+    sets = _moments_without_clips(real[:, None] - centre, places), _moments_without_clips(generated - centre, places)
+    distance = gaussian_frechet_distance(*sets[0], *sets[1])
+    shares = places.bincount().double() / len(places)
+    without = distance[1:] if len(shares) > 1 else distance
+    pseudo = distance[0] + (1 / shares - 1) * (distance[0] - without)
+    return tuple((pseudo - (shares * pseudo).sum() + distance[0]).tolist())
+
+
+def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Means (1 + C, F) and covariances (1 + C, F, F) of (N, K, F), of all windows and without each of C > 1 clips."""
+
+    def sums(values: Tensor) -> Tensor:
+        by_clip = values.new_zeros(int(places.max()) + 1, *values.shape[1:]).index_add_(0, places, values)
+        whole = by_clip.sum(0, keepdim=True)
+        return torch.cat([whole, whole - by_clip]) if len(by_clip) > 1 else whole
+
+    count = sums(features.new_full((len(features), 1), features.shape[1]))
+    mean = sums(features.sum(1)) / count
+    squares = sums(features.mT @ features)
+    return mean, (squares - count[..., None] * mean[:, :, None] * mean[:, None]) / (count[..., None] - 1)
 
 
 def _displacement(samples: Tensor, truth: Tensor) -> Tensor:

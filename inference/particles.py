@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..data import each
 from ..laws.base import Parameters
 from ..networks.base import computing_once, valid_steps
 from ..networks.rows import Rows, pick, select
@@ -29,7 +30,6 @@ from ..program.conditional import Conditional
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, like
 from ..turns import alone
-from .batches import each
 from .bounds import require_likelihood
 
 

@@ -9,9 +9,9 @@ from typing import Any, ClassVar, Literal, Self
 
 from torch import nn
 
+from ..data import Source
 from ..options import check
 from ..schema import Schema, SchemaError
-from .batches import Source
 from .fit import Fit, fit
 from .objectives import Objective
 from .schedules import Schedule

@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..data import Batch, Sequences, each, sequences
 from ..turns import alone
-from .batches import Batch, Sequences, each, sequences
 from .bounds import SequenceELBO, Terms
 from .checkpoints import weights
 from .objectives import Objective

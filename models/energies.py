@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor
 
-from ..inference.batches import Source
+from ..data import Source
 from ..laws.priors import VampLaw
 from ..motion import Heading, Skeleton, Windows, energies
 from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits

@@ -17,8 +17,10 @@ from torch import nn
 import dvae
 from dvae import Comparison, DynamicalVAE, Oracle, motion, twin
 from dvae.cli import main
-from dvae.inference.compare import Contender, Estimate, compare
-from dvae.inference.evaluate import ArrayWindows, evaluate
+from dvae.data import ArrayWindows
+from dvae.inference.compare import compare
+from dvae.inference.comparison import Contender, Estimate
+from dvae.inference.evaluate import evaluate
 
 T = 5
 DKF = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})")
@@ -41,7 +43,8 @@ def draws(model, n, seed=1):
 
 
 def run(models, data, **options):
-    return compare(models, data, **({"particles": 32, "contrasts": 16, "samples": 0, "progress": False} | options))
+    usual = {"scores": motion.displacements, "particles": 32, "contrasts": 16, "samples": 0, "progress": False}
+    return compare(models, data, **(usual | options))
 
 
 def scores(result, name):
@@ -88,7 +91,7 @@ def test_scores_are_those_of_an_evaluation_on_the_same_windows():
     windows = ArrayWindows(draws(model, 12), 3, clips=[f"clip {i // 3}" for i in range(12)])
     result = run({"a": model}, windows, samples=4, seed=3, particles=32)
     same = {"samples": 4, "seed": 3, "bound_particles": 32, "references": False, "progress": False}
-    expected = evaluate({"a": model}, windows, **same)["a"]
+    expected = evaluate({"a": model}, windows, scores=motion.displacements, **same)["a"]
     for metric in ("ELBO", "importance bound", "KL z", "ADE", "FDE", "MMADE", "MMFDE", "energy score"):
         ours = result["a"][metric]
         assert (ours.mean, ours.sequences) == pytest.approx((expected[metric].mean, expected[metric].standard_error))

@@ -16,16 +16,10 @@ from scipy import stats
 import dvae
 from dvae import DynamicalVAE, Oracle, motion, twin
 from dvae.cli import main
-from dvae.inference.criticism import (
-    Calibration,
-    Check,
-    Statistic,
-    calibrate,
-    motion_statistics,
-    predictive_checks,
-    traverse,
-)
-from dvae.inference.evaluate import ArrayWindows
+from dvae.data import ArrayWindows
+from dvae.inference.calibration import Calibration, calibrate
+from dvae.inference.checks import STATISTICS, Check, Statistic, predictive_checks
+from dvae.inference.traversal import traverse
 from dvae.models.method import LatentMethod
 from dvae.motion import HUMAN36M, WALKER, Skeleton, rotate_about_up
 
@@ -283,7 +277,8 @@ class Motions(ArrayWindows):
 
 
 def test_statistics_have_their_known_values():
-    measure = {name: statistic.function for name, statistic in motion_statistics(CHAIN).items()}
+    statistics = motion.statistics(Motions(torch.zeros(1, T, 9), 2))
+    measure = {name: lambda p, of=statistic: of.function(p.flatten(-2)) for name, statistic in statistics.items()}
     t = torch.arange(6, dtype=torch.float64)
     still = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.6, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float64).expand(6, 3, 3)
     assert [float(measure[name](still)) for name in measure] == pytest.approx([0, 0, 0.45, 0, 0])
@@ -305,26 +300,28 @@ def test_statistics_do_not_depend_on_where_a_person_stands_nor_on_how_the_root_i
     positions = torch.stack([torch.from_numpy(clip.positions).double() for clip in people])
     elsewhere = rotate_about_up(positions, torch.tensor(0.7, dtype=torch.float64), "y") + torch.tensor([3.0, 0.5, -2.0])
     pelvic = positions - positions[..., :1, :]
-    statistics = motion_statistics(WALKER)
+    statistics = motion.statistics(Motions(positions.flatten(-2), 2, skeleton=WALKER))
     assert list(statistics) == ["speed", "acceleration", "bone length", "bone stretch", "foot height"]
     for name, statistic in statistics.items():
-        value = statistic.function(positions)
+        value = statistic.function(positions.flatten(-2))
         assert value.shape == (3,)
-        torch.testing.assert_close(statistic.function(elsewhere), value, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(statistic.function(elsewhere.flatten(-2)), value, rtol=1e-9, atol=1e-9)
         if name not in ("speed", "acceleration"):
-            torch.testing.assert_close(statistic.function(pelvic), value, rtol=1e-9, atol=1e-9)
-    assert statistics["bone stretch"].function(positions).max() < 1e-3
-    assert (statistics["foot height"].function(positions) < 0.3).all()
+            torch.testing.assert_close(statistic.function(pelvic.flatten(-2)), value, rtol=1e-9, atol=1e-9)
+    assert statistics["bone stretch"].function(positions.flatten(-2)).max() < 1e-3
+    assert (statistics["foot height"].function(positions.flatten(-2)) < 0.3).all()
 
 
 def test_feet_are_found_by_name_and_without_them_there_is_no_foot_height():
     high = torch.ones(2, HUMAN36M.joints, 3)
     high[:, [3, 6], 2] = 0.0  # both feet on the ground
-    assert motion_statistics(HUMAN36M)["foot height"].function(high) == 0
+    frames = high.flatten(-2)  # a view
+    height = motion.statistics(Motions(frames[None], 1, skeleton=HUMAN36M))["foot height"]
+    assert height.function(frames) == 0
     high[:, 6, 2] = 0.5
-    assert motion_statistics(HUMAN36M)["foot height"].function(high) == 0.25
+    assert height.function(frames) == 0.25
     nameless = Skeleton(("a", "b"), (-1, 0))
-    assert "foot height" not in motion_statistics(nameless)
+    assert "foot height" not in motion.statistics(Motions(torch.zeros(1, T, 6), 2, skeleton=nameless))
 
 
 def model_of_motion(**options):
@@ -342,7 +339,8 @@ def true_checks():
         torch.manual_seed(0)
         windows = Motions(model.sample(1500, T)["x"], observed=2)
     options = {"samples": 50, "batch_size": 500, "seed": 1, "progress": False}
-    return [predictive_checks(model, windows, draw_emission=drawn, **options) for drawn in (True, False)]
+    statistics = motion.statistics(windows)
+    return [predictive_checks(model, windows, statistics, draw_emission=drawn, **options) for drawn in (True, False)]
 
 
 @pytest.mark.parametrize("samples", [5, 19, 20, 50])
@@ -392,8 +390,8 @@ def test_a_window_is_checked_against_its_own_forecasts():
     x = model.sample(6, T)["x"]
     windows = Motions(x, observed=2)
     last = {
-        "last": Statistic(lambda positions: positions[..., -1, 0, 0], "m"),
-        "frames": Statistic(lambda p: p[..., 0, 0, 0] * 0 + p.shape[-3]),
+        "last": Statistic(lambda x: x[..., -1, 0], "m"),
+        "frames": Statistic(lambda x: x[..., 0, 0] * 0 + x.shape[-2]),
     }
     options = {"samples": 19, "batch_size": 6, "seed": 3, "progress": False}
     checks = predictive_checks({"a": model}, windows, last, **options)
@@ -417,7 +415,7 @@ def test_posterior_replicates_of_driven_models_read_their_own_past():
             conditional.law.log_scale.fill_(-40.0)  # latents are known: what is left is the mean program
     x = model.sample(3, T)["x"]
     z = model.guide({"x": x})["z"]
-    statistic = {"x": Statistic(lambda p: p[..., -1, 2, 2])}
+    statistic = {"x": Statistic(lambda x: x[..., -1, 8])}
     checks = predictive_checks(model, Motions(x, 2), statistic, draw_emission=False, progress=False)
     network, value = model.generator["x"].network, torch.zeros(3, 9).double()
     for t in range(T):
@@ -439,23 +437,21 @@ def test_tail_area_and_distance_have_their_known_values():
 def test_what_predictive_checks_refuse():
     model, windows = model_of_motion(), Motions(torch.randn(4, T, 9).double(), observed=2)
 
-    def run(statistics=None, **options):
+    def run(statistics=STATISTICS, **options):
         return predictive_checks(model, windows, statistics, progress=False, **options)
 
-    with pytest.raises(ValueError, match="ArrayWindows are no windows of motion"):
-        predictive_checks(model, ArrayWindows(windows.x, 2), progress=False)
     for options in ({"samples": 18}, {"batch_size": 0}):
         with pytest.raises(ValueError, match=r"at least 19 samples.* batch_size of at least 1"):
             run(**options)
     with pytest.raises(ValueError, match="no statistic"):
         run({})
-    with pytest.raises(ValueError, match=r"statistic all maps .* one number for each motion"):
-        run({"all": Statistic(lambda positions: positions.mean())})
+    with pytest.raises(ValueError, match=r"statistic all maps .* one number for each sequence"):
+        run({"all": Statistic(lambda x: x.mean())})
     with pytest.raises(ValueError, match="gap is not finite on real windows of 4 frames"):
-        run({"gap": Statistic(lambda positions: positions[..., 9:, 0, 0].mean(-1))})
+        run({"gap": Statistic(lambda x: x[..., 9:, 0].mean(-1))})
     with torch.no_grad():
         model.generator["x"].network.bias[-1] = math.inf
-    with pytest.raises(FloatingPointError, match=r"speed is not finite on replicates of model \(forecast\)"):
+    with pytest.raises(FloatingPointError, match=r"mean is not finite on replicates of model \(forecast\)"):
         run()
 
 
@@ -562,8 +558,8 @@ def test_every_method_can_be_criticised(name):
         for latent, size in model.sizes.items()
         if latent in model.latents
     )
-    checks = predictive_checks(model, Motions(x, 2), samples=19, progress=False)
-    assert len(checks.checks) == 10
+    checks = predictive_checks(model, ArrayWindows(x, 2), samples=19, progress=False)
+    assert len(checks.checks) == 2 * len(STATISTICS)
     for latent in model.latents:
         assert traverse(model, x, latent, [0], steps=3, draws=2).frames.shape == (1, 3, 3, 6, 9)
 
@@ -580,7 +576,8 @@ def test_checks_and_traversals_of_motion_print_draw_and_write(people):
     windows = motion.windows(clips, motion.PROTOCOLS["simulated"], "test")
     equations = "p(w) p(z_t | z_{t-1}) p(x_t | z_t, w)", "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T})"
     model = DynamicalVAE(*equations, {"w": 2, "z": 2, "x": windows.size})
-    checks = predictive_checks({"one": model, "two": model}, windows, samples=19, progress=False)
+    statistics = motion.statistics(windows)
+    checks = predictive_checks({"one": model, "two": model}, windows, statistics, samples=19, progress=False)
     assert not np.isnan([check.wasserstein for check in checks.checks.values()]).any()
     assert checks["one", "forecast", "bone stretch"].real.max() < 0.1  # real bones are rigid
     text = str(checks)
@@ -588,12 +585,12 @@ def test_checks_and_traversals_of_motion_print_draw_and_write(people):
         assert part in text
     document = json.loads(checks.to_json())
     assert document["data"]["fingerprint"] == windows.fingerprint
-    assert set(document["checks"]["two"]["posterior"]) == set(motion_statistics(WALKER))
+    assert set(document["checks"]["two"]["posterior"]) == set(statistics)
     figure = checks.plot()
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["real", "one", "two"]
     figure.canvas.draw()
     found = traverse(model, {"x": windows.all()["x"][:2]}, "w", steps=3)
-    figure = found.plot(windows)
+    figure = motion.draw_traversal(found, windows)
     labels = [axes.get_title("left").split(",")[0] for axes in figure.axes]
     assert labels == [f"w[{c}]" for c in found.effect.argsort(descending=True).tolist()]
     figure.canvas.draw()
@@ -602,7 +599,7 @@ def test_checks_and_traversals_of_motion_print_draw_and_write(people):
 def test_names_are_no_markup():
     model = model_of_motion()
     windows = Motions(model.sample(2, T)["x"], observed=2)
-    statistics = {"reach [bold]": Statistic(lambda p: p[..., 0, 0, 0], "[m]")}
+    statistics = {"reach [bold]": Statistic(lambda x: x[..., 0, 0], "[m]")}
     text = str(predictive_checks({"q(z) [full]": model, "[/x]": model}, windows, statistics, progress=False))
     for name in ("q(z) [full]", "[/x]", "reach [bold] ([m])"):
         assert name in text

@@ -14,19 +14,12 @@ from hypothesis import strategies as st
 from torch import nn
 
 from dvae import motion
+from dvae.data import ArrayWindows
 from dvae.inference import metrics
 from dvae.inference.bounds import SequenceELBO
-from dvae.inference.evaluate import (
-    METRICS,
-    ArrayWindows,
-    Evaluation,
-    Row,
-    Score,
-    evaluate,
-    multimodal_truths,
-    nearest_neighbours,
-    zero_velocity,
-)
+from dvae.inference.evaluate import evaluate
+from dvae.inference.evaluation import Evaluation, Row, Score
+from dvae.inference.references import multimodal_truths, nearest_neighbours, zero_velocity
 from dvae.program.model import DynamicalVAE
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -54,6 +47,7 @@ def model():
 class Forecaster(nn.Module):
     """A model that forecasts what it is told, and has no uncertainty to speak of."""
 
+    likelihood = True
     generative = SimpleNamespace(text="p(x_t)")
     inference = SimpleNamespace(text="q(z)")
 
@@ -67,7 +61,7 @@ class Forecaster(nn.Module):
 
 
 def run(model, windows, **options):
-    return evaluate(model, windows, **({"samples": 5, "progress": False} | options))
+    return evaluate(model, windows, **({"scores": motion.displacements, "samples": 5, "progress": False} | options))
 
 
 def free_running(forecaster, windows, **options):
@@ -184,7 +178,7 @@ def test_multimodal_errors_average_over_every_window_in_the_same_pose():
     x = draw(6, FRAMES, SIZE)
     x[:3, OBSERVED - 1] = x[0, OBSERVED - 1]
     windows = ArrayWindows(x, OBSERVED, multimodal_threshold=1e-6)
-    still = evaluate({}, windows, progress=False)["zero velocity"]
+    still = run({}, windows)["zero velocity"]
     forecast = zero_velocity(x[:, :OBSERVED], FRAMES - OBSERVED)[0]
     errors = (forecast[:, None] - x[None, :, OBSERVED:]).norm(dim=-1).mean(-1)
     expected = (3 * errors[:3, :3].mean() + errors.diagonal()[3:].sum()) / 6
@@ -223,17 +217,6 @@ def test_multimodal_truths_are_those_of_all_pairs():
     assert [found.tolist() for found in multimodal_truths(windows, 0.9)] == expected
 
 
-def test_multimodal_truths_are_remembered_by_data_and_options_and_belong_to_the_caller(monkeypatch):
-    x = draw(5, FRAMES, SIZE)
-    first = multimodal_truths(ArrayWindows(x, OBSERVED))
-    others = multimodal_truths(ArrayWindows(x, OBSERVED + 1), 1.0), multimodal_truths(ArrayWindows(x + x[:1], OBSERVED))
-    first.clear()
-    monkeypatch.setattr(ArrayWindows, "all", None)  # what is asked again needs no data
-    again = multimodal_truths(ArrayWindows(x.clone(), OBSERVED), 0.5)
-    assert len(again) == 5
-    assert all(len(found) == 5 for found in others)
-
-
 def test_a_threshold_is_a_distance():
     with pytest.raises(ValueError, match="must be positive, but is 0"):
         multimodal_truths(array_windows(), 0)
@@ -246,7 +229,7 @@ def evaluation(values, clips):
     """Zero velocity on windows whose final error is `values`, of the given clips."""
     x = torch.zeros(len(values), 2, 1, dtype=torch.float64)
     x[:, 1, 0] = torch.as_tensor(values)
-    return evaluate({}, ArrayWindows(x, 1, clips=clips), progress=False)
+    return run({}, ArrayWindows(x, 1, clips=clips))
 
 
 def test_independent_windows_have_the_standard_error_of_a_mean():
@@ -315,7 +298,7 @@ def test_the_record_says_what_was_measured_and_comes_back_from_json(model, tmp_p
     assert (document["samples"], document["seed"], document["bound_particles"]) == (5, 5, 3)
     assert document["protocol"] == {"observed": OBSERVED, "multimodal_threshold": 0.5}
     alone = sum(len(found) == 1 for found in multimodal_truths(windows))
-    assert document["multimodal"] == {"threshold": 0.5, "itself": True, "alone": alone}
+    assert document["basis"] == {"multimodal": {"threshold": 0.5, "itself": True, "alone": alone}}
     assert f"{alone} of 12 have no other" in str(result)
     row = document["rows"]["dkf"]
     assert row["config"] == {"width": 8}
@@ -356,7 +339,7 @@ def test_table_and_plot_show_every_method_and_metric(model):
     assert str(result["dkf"]["ADE"]) in text
     panels = [axes.get_title() for axes in result.plot().axes if axes.axison]
     arrows = {"lower": " ↓", "higher": " ↑", "": ""}
-    better = [arrows[METRICS.get(name, METRICS["KL"]).better] for name in result.metrics]
+    better = [arrows[metric.better] for metric in result.metrics.values()]
     assert [title.split(" (")[0] for title in panels] == [n + b for n, b in zip(result.metrics, better, strict=True)]
     assert all(title.split(" (")[0] in text for title in panels)
     assert len([axes for axes in result.plot(["ADE", "FDE"]).axes if axes.axison]) == 2
@@ -438,8 +421,8 @@ def people():
 def test_bone_lengths_tell_stretched_people(people):
     test, training = people
     tall = Forecaster(lambda x, horizon, samples: 1.1 * zero_velocity(x, horizon).expand(samples, -1, -1, -1))
-    assert free_running(tall, test)["bone-length error"].mean == pytest.approx(0.1, abs=1e-3)
-    result = evaluate({}, test, training_windows=training, samples=2, progress=False)
+    assert free_running(tall, test, scores=motion.scores)["bone-length error"].mean == pytest.approx(0.1, abs=1e-3)
+    result = run({}, test, scores=motion.scores, training_windows=training, samples=2)
     assert result["zero velocity"]["bone-length error"].mean < 1e-3
     assert result.data["joints"] == list(test.skeleton.names)
     assert result.protocol["name"] == "simulated"

@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 from safetensors.torch import load_file
 
+from dvae.data import Sequences
 from dvae.inference import checkpoints
-from dvae.inference.batches import Sequences
 from dvae.inference.bounds import SequenceELBO, Terms
 from dvae.inference.checkpoints import CheckpointError, Run, load_weights, save_weights, weights
 from dvae.inference.fit import Callback, Interrupted, fit

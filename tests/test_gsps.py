@@ -1,6 +1,7 @@
 """GSPS: the factorization, futures drawn together, energies in the shared loop, control, presets."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ import dvae
 from dvae import motion
 from dvae.inference.metrics import average_pairwise_distance
 from dvae.models.gsps import PRESETS, GSPSModel, part_by_part
-from dvae.models.registry import judge
+from dvae.models.registry import configured, judge
 from dvae.motion import energies
 from dvae.motion.body import LIMBS, body_parts
 from dvae.motion.dataset import MotionData
@@ -382,7 +383,8 @@ def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, people, prior_run):
     assert (loaded.model.angle_low > -1).any()
     test = people.windows("test")
     prior = runs.load(prior_run).model
-    scores = dvae.evaluate({"gsps": loaded.model}, test, samples=3, pose_prior=prior, progress=False)
+    judged = partial(motion.scores, pose_prior=prior)
+    scores = dvae.evaluate({"gsps": loaded.model}, test, scores=judged, samples=3, progress=False)
     score = scores["gsps"]
     assert {"APD", "ADE", "MMADE", "pose NLL"} <= score.keys()
     last = motion.Heading(test.skeleton, 15).face(test.all()["x"])[:, 14:15]

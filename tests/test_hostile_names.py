@@ -3,7 +3,6 @@
 import html
 import io
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import plotly.io
@@ -14,8 +13,10 @@ from rich.console import Console
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.inference.criticism import Calibration, Statistic, predictive_checks
-from dvae.inference.evaluate import ArrayWindows, evaluate
+from dvae.data import ArrayWindows
+from dvae.inference.calibration import Calibration
+from dvae.inference.checks import Statistic, predictive_checks
+from dvae.inference.evaluate import evaluate
 from dvae.inference.fit import Fit
 from dvae.inference.result import progress_bar
 from dvae.inference.trackers import Terminal
@@ -86,12 +87,12 @@ def test_models_in_an_evaluation(models, windows):
     is_drawn_as_it_is(result.plot(["ADE", "ELBO"]))
 
 
-def test_classifiers_and_protocols_in_an_evaluation(models, windows):
+def test_notes_and_protocols_in_an_evaluation(models, windows):
     result = evaluate(models[LINES], windows, samples=2, references=False, progress=False)
     result.protocol["name"] = "[/p] <b>"
-    result.data["given"] = ["[/j]"]
+    result.data["title"] = ["given [/j]"]
     result.options["[/o]"] = "[/v]"
-    result.classifiers.update({name: {"weights": "0" * 64, "unknown": 0} for name in NAMES})
+    result.notes.extend(NAMES)
     is_shown_as_it_is(result, (*NAMES, "[/p] <b>", "[/j]", "[/o] [/v]"))
 
 
@@ -102,11 +103,9 @@ def test_models_in_a_comparison(models, windows):
 
 
 def test_models_and_statistics_in_predictive_checks(models, windows):
-    statistics = {name: Statistic(lambda x: x.mean((-1, -2, -3)), name) for name in NAMES[2:6]}
+    statistics = {name: Statistic(lambda x: x.mean((-1, -2)), name) for name in NAMES[2:6]}
     few = {name: models[name] for name in NAMES[:2]}
-    bodies = SimpleNamespace(**{name: getattr(windows, name) for name in ("protocol", "keys", "fingerprint", "all")})
-    bodies.positions = lambda x: x.unflatten(-1, (-1, 3))
-    checks = predictive_checks(few, bodies, statistics=statistics, samples=19)
+    checks = predictive_checks(few, windows, statistics, samples=19)
     is_shown_as_it_is(checks, NAMES[:6])
     is_drawn_as_it_is(checks.plot(), NAMES[:6])
 

@@ -13,7 +13,7 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.inference.batches import Sequences
+from dvae.data import Sequences
 from dvae.models import registry
 from dvae.models.dkf import Gated
 from dvae.models.method import LatentMethod

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import dvae
+from dvae.data import Sequences
 from dvae.inference import fit, svi, training
-from dvae.inference.batches import Sequences
 from dvae.inference.checkpoints import Run, weights
 from dvae.inference.objectives import Evidence
 from dvae.inference.resuming import restore, store

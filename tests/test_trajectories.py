@@ -56,6 +56,10 @@ def build(windows, name="trajevae", **options):
     return small(name, **options).build(windows).double().eval()
 
 
+def evaluate(model, windows, **options):
+    return dvae.evaluate(model, windows, scores=motion.scores, progress=False, **options)
+
+
 def double(batch):
     return {name: value.double() for name, value in batch.items()}
 
@@ -715,26 +719,26 @@ def test_scores_are_of_poses_relative_to_the_root_and_of_the_world(people):
             moved = x[rows, 1:].unflatten(-1, (-1, 3)) + torch.tensor([0.3, 0.0, 0.4])
             return {"x": moved.flatten(-2).expand(samples, *moved.flatten(-2).shape)}
 
-    plain = dvae.evaluate(Moved(), windows, samples=3, references=False, progress=False)
+    plain = evaluate(Moved(), windows, samples=3, references=False)
     scores = plain["model"]
     assert scores["ADE"].mean == pytest.approx(0, abs=1e-5)
     assert scores["APD"].mean == pytest.approx(0, abs=1e-5)
     assert scores["global ADE"].mean == pytest.approx(0.5 * math.sqrt(17), rel=1e-5)
     assert scores["global FDE"].mean == pytest.approx(0.5 * math.sqrt(17), rel=1e-5)
     assert "path error" not in scores
-    given = dvae.evaluate(Moved(), windows.given(["LWrist"]), samples=3, references=False, progress=False)
+    given = evaluate(Moved(), windows.given(["LWrist"]), samples=3, references=False)
     assert given["model"]["path error"].mean == pytest.approx(0.5, rel=1e-5)
     assert given.data["given"] == ["LWrist"]
-    assert "path error" not in dvae.evaluate(Moved(), windows.given([]), samples=3, progress=False)["model"]
+    assert "path error" not in evaluate(Moved(), windows.given([]), samples=3)["model"]
 
 
 def test_scores_of_a_body_are_those_of_the_protocol_that_drops_its_root(people):
     """Zero velocity in both: the same windows, the same scores."""
     ours, dropped = (motion.windows(people, replace(PROTOCOL, root=root), "test") for root in ("relative", "drop"))
     model = build(ours).float()
-    first = dvae.evaluate(model, ours, samples=2, progress=False)["zero velocity"]
+    first = evaluate(model, ours, samples=2)["zero velocity"]
     other = dvae.DynamicalVAE("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": dropped.size})
-    second = dvae.evaluate(other, dropped, samples=2, progress=False)["zero velocity"]
+    second = evaluate(other, dropped, samples=2)["zero velocity"]
     for name in ("ADE", "FDE", "MMADE", "energy score"):
         assert first[name].mean == pytest.approx(second[name].mean, rel=1e-5), name
 
@@ -742,7 +746,7 @@ def test_scores_of_a_body_are_those_of_the_protocol_that_drops_its_root(people):
 def test_temperature_is_an_option_of_an_evaluation(people):
     windows = motion.windows(people, PROTOCOL, "test").given(["LWrist"])
     model = build(windows).float()
-    found = dvae.evaluate(model, windows, samples=2, options={"temperature": 0.0}, references=False, progress=False)
+    found = evaluate(model, windows, samples=2, options={"temperature": 0.0}, references=False)
     assert found["model"]["APD"].mean == 0
     assert found.options == {"temperature": 0.0}
     assert dvae.Evaluation.from_json(found.to_json()).options == {"temperature": 0.0}
@@ -766,7 +770,7 @@ def test_poses_are_exchanged_among_windows_whose_given_joints_agree(people):
         apart = (whole["x"][partner, 0] - whole["x"][own, 0]).unflatten(-1, (-1, 3))[feet].norm(dim=-1)
         assert (apart < 0.4).all()
     assert found.fingerprint != motion.Exchanged(windows, threshold=0.4, seed=5).fingerprint != windows.fingerprint
-    scores = dvae.evaluate(build(windows).float(), found, samples=2, references=False, progress=False)
+    scores = evaluate(build(windows).float(), found, samples=2, references=False)
     assert math.isfinite(scores["model"]["path error"].mean)
     assert "MMADE" not in scores["model"]  # the windows that begin with that pose have other paths
     assert scores.data["exchanged"] == {"threshold": 0.4, "seed": 0, "partners": len(partners)}

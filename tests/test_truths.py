@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dvae import motion
-from dvae.inference.batches import Source
+from dvae.data import Source
 from dvae.motion import PROTOCOLS, PseudoTruths, WithPseudoTruths, rotate_about_up
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -1,12 +1,14 @@
 """Motion capture: skeletons, files, windows and protocols, and a simulator of people."""
 
 from .angles import AngleLimits, estimate_angle_limits
+from .criticism import draw_traversal, statistics
 from .data import Clip, MotionSet
 from .dataset import MotionData
 from .exchange import Exchanged
 from .forecasts import Forecasts, is_forecasts
 from .formats import read_motion, read_paths, save
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
+from .scoring import displacements, scores
 from .simulator import simulate
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
 from .truths import PseudoTruths, WithPseudoTruths
@@ -31,12 +33,16 @@ __all__ = [
     "Skeleton",
     "Windows",
     "WithPseudoTruths",
+    "displacements",
+    "draw_traversal",
     "estimate_angle_limits",
     "is_forecasts",
     "read_motion",
     "read_paths",
     "rotate_about_up",
     "save",
+    "scores",
     "simulate",
+    "statistics",
     "windows",
 ]

@@ -71,10 +71,12 @@ class Exchanged:
         return torch.tensor(kept), torch.tensor(partners)
 
     @property
-    def exchanged(self) -> dict[str, Any]:
-        """How, for the record of an evaluation."""
-        partners = len(self._partners.unique())
-        return {"threshold": self.threshold, "seed": self.seed, "partners": partners}
+    def description(self) -> dict[str, Any]:
+        """What a record says of these windows, and how poses were exchanged."""
+        said, partners = self.windows.description, len(self._partners.unique())
+        exchanged = {"threshold": self.threshold, "seed": self.seed, "partners": partners}
+        title = [*said["title"], f"first poses of {partners} other windows"]
+        return {**said, "exchanged": exchanged, "title": title}
 
     def __len__(self) -> int:
         return len(self._kept)

@@ -426,6 +426,14 @@ class Windows:
             return None
         return tuple(name for name, given in zip(self.joints, self._given.tolist(), strict=True) if given)
 
+    @property
+    def description(self) -> dict[str, Any]:
+        """What a record says of these windows: joints, and those whose paths are given."""
+        said = {"joints": list(self.skeleton.names), "title": []}
+        if (given := self.given_joints) is not None:
+            said |= {"given": list(given), "title": [f"given {', '.join(given) or 'no paths'}"]}
+        return said
+
     def with_protocol(self, protocol: Protocol) -> Windows:
         """These windows, drawn and cut as another protocol says, which divides clips and frames alike."""
         windows = copy(self)

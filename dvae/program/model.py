@@ -64,6 +64,8 @@ class DynamicalVAE(nn.Module):
 
     extras: ClassVar[tuple[str, ...]] = ()
     """What a batch may hold that is no variable, for `penalties`."""
+    per: ClassVar[str] = "frame"
+    """What there is one log-likelihood of."""
 
     @alone
     def __init__(

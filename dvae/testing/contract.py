@@ -25,7 +25,6 @@ from ..graph import audit
 from ..inference.bounds import SequenceELBO
 from ..inference.checkpoints import load_weights, save_weights
 from ..inference.fit import fit
-from ..motion import PROTOCOLS, simulate, windows
 from ..oracle import Oracle, twin
 from ..program.batch import Batch
 from ..program.conditional import Conditional
@@ -61,7 +60,7 @@ class FactorizationContract:
         raise NotImplementedError("a FactorizationContract is subclassed: def build(self, size) returns the model")
 
     def data(self, size: int) -> Batch:
-        """Sequences to train on: those that the model is made for, if not simulated people in metres.
+        """Sequences to train on: those that the model is made for, if not sine waves.
 
         Args:
             size: D. Of wider data, take the first coordinates.
@@ -69,8 +68,8 @@ class FactorizationContract:
         Returns:
             x (N, T, D), or a batch.
         """
-        people = windows(simulate(clips=8, frames=30), PROTOCOLS["simulated"], "train", length=10)
-        return people.all()["x"][..., :size]
+        start, speed = 6 * torch.rand(2, 24, 1, size)
+        return (start + speed * torch.arange(10)[:, None] / 10).sin()
 
     @pytest.fixture(autouse=True)
     def _seeded(self) -> Iterator[None]:

@@ -6,8 +6,8 @@ A GRU reads the predicted part of a window, its last state gives the *features*,
 
     features = tanh(W GRU(x_{O+1:T})_T + b)        p(c | x_{1:T}) = Categorical(logits = V features + a)
 
-It is fitted to real training motion and then judges forecasts (`dvae.evaluate(..., classifiers=...)`): ACC is the share
-of futures that it gives the true class, FID a distance between the features of real and of generated futures.
+It is fitted to real training motion and then judges forecasts (`dvae.motion.scores(..., classifiers=...)`): ACC is the
+share of futures that it gives the true class, FID a distance between the features of real and of generated futures.
 
 Bie, Guo, Leglaive, Girin, Moreno-Noguer and Alameda-Pineda, 2022, arXiv 2204.01565, say "GRU of 2 layers, 128 units"
 and no more; the features are those of public code of this family (BeLFusion). That code starts the GRU from normal
@@ -24,7 +24,7 @@ import torch
 from pyro import distributions
 from torch import Tensor, nn
 
-from ...inference.batches import Batch
+from ...data import Batch
 from ...inference.recipe import Recipe, Trainable
 from ...inference.training import Stage
 from ...options import Layers, Size
@@ -101,7 +101,7 @@ class ActionClassifierModel(nn.Module):
         protocol: of the windows, whose predicted frames are judged.
     """
 
-    per = "window"  # what there is one log-likelihood of
+    likelihood, per = True, "window"  # see `dvae.program.protocols.Program`
 
     def __init__(self, method: ActionClassifier, skeleton: Skeleton, size: int, protocol: Protocol):
         super().__init__()

@@ -29,7 +29,7 @@ import pyro
 import torch
 from torch import Tensor, nn
 
-from ...inference.batches import Batch
+from ...data import Batch
 from ...inference.checkpoints import Run, load_weights
 from ...inference.recipe import Recipe, Trainable
 from ...inference.result import progress_bar
@@ -126,6 +126,8 @@ class PosePriorModel(nn.Module):
         layers: of the flow.
         forward_at: frame of heading zero in windows, which are turned so; None to take them as they are.
     """
+
+    likelihood, per = True, "frame"  # see `dvae.program.protocols.Program`
 
     def __init__(self, skeleton: Skeleton, layers: int = 3, forward_at: int | None = None):
         super().__init__()

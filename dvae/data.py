@@ -1,11 +1,20 @@
-"""Batches: dicts of tensors with one sequence in each row, and where the loop draws them from.
+"""Data: what the loop, evaluation, comparison and criticism need of them, as protocols, and sequences in memory.
 
-Local variables are (B, T, D), static ones (B, D); "lengths" (B,) counts the valid frames of right-padded
-sequences, and "mask" (B, T, D) is True where an entry of the observed variable was observed (or maps several
-such names to masks).
+A batch is a dict of tensors with one sequence in each row. Local variables are (B, T, D), static ones (B, D); "lengths"
+(B,) counts the valid frames of right-padded sequences, and "mask" (B, T, D) is True where an entry of the observed
+variable was observed (or maps several such names to masks).
+
+| who | asks for |
+|---|---|
+| the loop, to train | `Source`: draws batches |
+| the loop, to validate, and comparison | `Listed`: all sequences at once; or arrays, or a batch |
+| evaluation and criticism | `HeldOutWindows`: listed windows with a past, names and a fingerprint |
+
+`ArrayWindows` and `Sequences` make them of arrays; windows of motion are in `dvae.motion`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, Protocol, runtime_checkable
@@ -23,6 +32,40 @@ class Source(Protocol):
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Return a batch, drawn with the generator alone."""
+
+
+@runtime_checkable
+class Fingerprinted(Protocol):
+    """Data that can be told from others: a run that resumes, and a record, say on which it rests."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of the sequences, in their order."""
+
+
+@runtime_checkable
+class Listed(Protocol):
+    """Data that can be had whole."""
+
+    def all(self) -> Batch:
+        """All sequences, one in each row, always in the same order."""
+
+
+@runtime_checkable
+class HeldOutWindows(Fingerprinted, Listed, Protocol):
+    """Windows to be judged on: their first frames are observed, the others are to be predicted."""
+
+    @property
+    def protocol(self) -> Any:
+        """A dataclass with `observed` (frames), and for multimodal truths `multimodal_threshold`."""
+
+    @property
+    def keys(self) -> Sequence[tuple[str, str, int]]:
+        """(split, clip, first frame) of every window."""
+
+    @property
+    def description(self) -> Mapping[str, Any]:
+        """What else a record is to say of the data, in JSON's types; "title", if there, lists phrases for titles."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +142,7 @@ def sequences(data: Any) -> Sequences:
     """Return data as `Sequences`.
 
     Args:
-        data: x as a tensor or array (N, T, D), a batch, or an object whose `all()` returns a batch.
+        data: x as a tensor or array (N, T, D), a batch, or `Listed` data.
 
     Raises:
         TypeError, ValueError: when it is none of these.
@@ -112,9 +155,69 @@ def sequences(data: Any) -> Sequences:
                 f"x has shape {tuple(data.shape)}, expected (sequences, frames, features); a single sequence is x[None]"
             )
         return Sequences({"x": torch.as_tensor(data)})
-    if callable(getattr(data, "all", None)):
+    if isinstance(data, Listed):
         return Sequences(data.all())
     raise TypeError(
         "expected x as a tensor (N, T, D), a dict of tensors, or an object with sample() or all(), "
         f"got {type(data).__name__}"
     )
+
+
+@dataclass(frozen=True)
+class ArrayProtocol:
+    """How plain arrays are split into observed and predicted frames."""
+
+    observed: int
+    multimodal_threshold: float
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayWindows:
+    """Plain arrays as windows to evaluate on.
+
+    Args:
+        x: `(N, T, D)`, tensor or numpy array.
+        observed: frames the model sees; the other T - observed are predicted.
+        multimodal_threshold: distance below which two last observed frames are alike, in the unit of x.
+        clips: name of the clip each window was cut from; without it the windows count as independent.
+
+    Raises:
+        ValueError: x that is not `(N, T, D)`, or as many clip names as windows are not given.
+    """
+
+    x: Tensor | np.ndarray
+    observed: int
+    multimodal_threshold: float = 0.5
+    clips: Sequence[str] | None = None
+
+    def __post_init__(self) -> None:
+        if self.x.ndim != 3:
+            raise ValueError(f"windows must be (N, T, D), but x has shape {tuple(self.x.shape)}")
+        if self.clips is not None and len(self.clips) != len(self.x):
+            raise ValueError(f"{len(self.x)} windows need as many clip names, not {len(self.clips)}")
+
+    @property
+    def protocol(self) -> ArrayProtocol:
+        """Observed frames and multimodal threshold."""
+        return ArrayProtocol(self.observed, self.multimodal_threshold)
+
+    @property
+    def keys(self) -> list[tuple[str, str, int]]:
+        """(split, clip, first frame) of every window; the first frame is unknown here and 0."""
+        clips = self.clips if self.clips is not None else range(len(self.x))
+        return [("array", str(clip), 0) for clip in clips]
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Nothing: arrays are all there is."""
+        return {}
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the values, their shape and type."""
+        values = np.ascontiguousarray(np.asarray(self.x))
+        return hashlib.sha256(f"{values.shape} {values.dtype}".encode() + values.tobytes()).hexdigest()
+
+    def all(self) -> Batch:
+        """All windows, x `(N, T, D)`."""
+        return {"x": torch.as_tensor(self.x)}

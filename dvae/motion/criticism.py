@@ -1,0 +1,119 @@
+"""Criticism of models of motion: statistics for `dvae.predictive_checks`, and pictures of a `dvae.traverse`."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Protocol
+
+import matplotlib.figure
+import numpy as np
+from torch import Tensor
+
+from ..inference.checks import Statistic
+from ..inference.traversal import Traversal
+from .skeleton import Skeleton
+
+__all__ = ["draw_traversal", "statistics"]
+
+
+class Posed(Protocol):
+    """Windows of a skeleton, such as `Windows`."""
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The joints."""
+
+    def positions(self, x: Tensor) -> Tensor:
+        """(..., T, J, 3) in metres from frames (..., T, D)."""
+
+
+def statistics(windows: Posed) -> dict[str, Statistic]:
+    """What predictive checks compare of motion.
+
+    * speed: mean over frames and joints, by first differences.
+    * acceleration: the same by second differences.
+    * bone length: mean over frames and bones.
+    * bone stretch: standard deviation of a bone's length over time by its mean, mean over bones; 0 for real bones.
+    * foot height: of the feet above the lowest joint in the same frame, mean over frames and feet. Where one foot
+      stands it is the height above the ground; it needs no ground, so that it means the same with and without the
+      pelvis's own motion. Feet are the ends of the chains whose names say foot, toe, ankle or heel; a skeleton without
+      such names has no foot height.
+    """
+    skeleton = windows.skeleton
+    up, fps = skeleton.vertical, skeleton.fps
+    ends = set(range(skeleton.joints)) - set(skeleton.parents)
+    feet = [j for j in sorted(ends) if re.search("foot|toe|ankle|heel", skeleton.names[j], re.IGNORECASE)]
+
+    def speed(positions: Tensor) -> Tensor:
+        return fps * positions.diff(dim=-3).norm(dim=-1).mean((-2, -1))
+
+    def acceleration(positions: Tensor) -> Tensor:
+        return fps**2 * positions.diff(n=2, dim=-3).norm(dim=-1).mean((-2, -1))
+
+    def bone_length(positions: Tensor) -> Tensor:
+        return skeleton.bone_lengths(positions).mean((-2, -1))
+
+    def bone_stretch(positions: Tensor) -> Tensor:
+        lengths = skeleton.bone_lengths(positions)
+        return 100 * (lengths.std(-2, correction=0) / lengths.mean(-2)).mean(-1)
+
+    def foot_height(positions: Tensor) -> Tensor:
+        heights = positions[..., up]
+        return (heights[..., feet] - heights.amin(-1, keepdim=True)).mean((-2, -1))
+
+    def of(function: Callable[[Tensor], Tensor], unit: str) -> Statistic:
+        return Statistic(lambda x: function(windows.positions(x)), unit)
+
+    return {
+        "speed": of(speed, "m/s"),
+        "acceleration": of(acceleration, "m/s²"),
+        "bone length": of(bone_length, "m"),
+        "bone stretch": of(bone_stretch, "%"),
+        **({"foot height": of(foot_height, "m")} if feet else {}),
+    }
+
+
+def draw_traversal(
+    found: Traversal, windows: Posed, frame: int = -1, sequence: int = 0, rows: int = 6
+) -> matplotlib.figure.Figure:
+    """Poses of one sequence at one frame: a row for each coordinate, that of most effect first.
+
+    Args:
+        found: by `dvae.traverse`.
+        windows: of the skeleton, whose `positions` turn x into poses.
+        frame: which frame of the sequence, the last by default.
+        sequence: which sequence of the batch.
+        rows: how many coordinates to draw.
+    """
+    from .plot import SPACING, pose
+
+    order = found.effect.argsort(descending=True, stable=True)[:rows]
+    skeleton = windows.skeleton
+    poses = windows.positions(found.frames[order, :, sequence])[:, :, frame].double().cpu()
+    poses = poses - poses[..., skeleton.root : skeleton.root + 1, :]
+    middle = int(found.offsets.abs().argmin())
+    sided = bool(skeleton.left and skeleton.right)
+    azimuth = math.pi / 5 - (float(skeleton.heading(poses[0, middle])) if sided else 0.0)
+    size = (0.5 + 0.95 * len(found.offsets), 0.6 + 1.9 * len(order))
+    figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(len(order), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+    for panel, chosen, row in zip(panels, order.tolist(), poses, strict=True):
+        for column, drawn in enumerate(row):
+            at = (column * SPACING, 0.0)
+            pose(panel, row[middle], skeleton, at=at, azimuth=azimuth, colors="0.8", linewidths=1.6)
+            pose(panel, drawn, skeleton, at=at, azimuth=azimuth, colors="C0", linewidths=1.4)
+        panel.autoscale_view()
+        panel.set_aspect("equal")
+        moved = f"{found.latent}[{found.coordinates[chosen]}], which moves x by {float(found.effect[chosen]):.2g} m"
+        panel.set_title(moved, loc="left", fontsize=8)
+        panel.set_yticks([])
+        panel.tick_params(length=0, labelsize=8)
+        for spine in panel.spines.values():
+            spine.set_visible(False)
+    panels[-1].set_xticks(
+        SPACING * np.arange(len(found.offsets)), [f"{o:+.2g}" if o else "0" for o in found.offsets.tolist()]
+    )
+    panels[-1].set_xlabel(f"offset of {found.latent}, {found.unit} standard deviations", fontsize=9)
+    return figure

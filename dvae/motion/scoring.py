@@ -1,0 +1,248 @@
+"""Scores of forecast motion, for `dvae.evaluate(models, windows, scores=dvae.motion.scores)`.
+
+The motion papers compare K futures with the true one in metres (`displacements`; definitions in
+`dvae.inference.metrics`). Where windows move through space (a protocol with root="relative"), these are of poses
+relative to their own root, as in TrajeVAE's evaluation; "global ADE" and "global FDE" are of all joints where they are
+in the world. Where the same joints' paths are given in all windows, "path error" is the mean distance of these joints
+from their paths, over all K futures.
+
+A classifier adds two scores under its name (Bie et al. 2022, arXiv:2204.01565). *ACC* is the share of the K futures
+that it gives the window's true class. *FID* is the Fréchet distance between its features of the true futures and of all
+K generated ones of all windows together, a number of the whole set, whose standard error is a jackknife over clips
+(`metrics.frechet_pseudo_values`).
+"""
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..data import Batch, HeldOutWindows
+from ..inference import metrics
+from ..inference.held import clip_places, evaluating, on_device_of
+from ..inference.references import multimodal_note, multimodal_truths
+from ..inference.scores import ENERGY, VARIOGRAM, Measure, paired
+from .energies import pose_prior_energy
+from .exchange import Exchanged
+from .protocols import Windows
+
+__all__ = ["displacements", "scores"]
+
+
+def scores(
+    windows: HeldOutWindows, pose_prior: Any = None, classifiers: Mapping[str, Any] | None = None
+) -> list[Measure]:
+    """The scores of the motion papers, for these windows alone.
+
+    What they rest on (the ground truth of the multimodal errors, the features of the true futures) is found here, once
+    for all models.
+
+    Args:
+        windows: those that are evaluated on.
+        pose_prior: a fitted pose prior, to score single poses of the forecasts: minus the mean log density of the
+            flow's z, without the log-determinant (the NLL of GSPS, arXiv:2108.08422).
+        classifiers: `{name: fitted action classifier}`, to score futures by what they show: "ACC name" and "FID name",
+            and a reference row of real motion. Fitted under the same protocol, they saw no test clip.
+
+    Raises:
+        TypeError: windows of no skeleton.
+        ValueError: windows whose skeleton, frames or labels are not those of a classifier, or too few for normal fits
+            to its features; or whose observed frames are not those of the pose prior.
+    """
+    if not isinstance(windows, Windows | Exchanged):
+        raise TypeError(
+            f"scores of motion need windows of dvae.motion, which have a skeleton, not {type(windows).__name__}; for "
+            "errors in metres alone take dvae.motion.displacements"
+        )
+    moves = windows.protocol.root == "relative"
+    found = displacements(windows, _body(windows.skeleton.root) if moves else lambda x: x)
+    if moves:
+        found += [replace(measure, name=f"global {measure.name}", headline=False) for measure in (_ADE, _FDE)]
+    if windows.given_joints:
+        found.append(_path_error(windows))
+    found.append(_bone_length_error(windows))
+    if pose_prior is not None:
+        found.append(_pose_nll(pose_prior, windows.protocol.observed))
+    judged = [_judged(name, classifier, windows) for name, classifier in sorted((classifiers or {}).items())]
+    return [*found, *(accuracy for accuracy, _ in judged if accuracy), *(distance for _, distance in judged)]
+
+
+def _diversity(forecasts: Tensor, *_: Any) -> Tensor:
+    return metrics.average_pairwise_distance(forecasts)
+
+
+_ADE = Measure("ADE", paired(metrics.average_displacement_error), "m", headline=True)
+_FDE = Measure("FDE", paired(metrics.final_displacement_error), "m", headline=True)
+_BEST = (Measure("APD", _diversity, "m", "higher"), _ADE, _FDE)
+_MEDIAN = (
+    Measure("ADEm", paired(metrics.median_average_displacement_error), "m"),
+    Measure("FDEm", paired(metrics.median_final_displacement_error), "m"),
+)
+_MULTIMODAL = {
+    "MMADE": metrics.multimodal_average_displacement_error,
+    "MMFDE": metrics.multimodal_final_displacement_error,
+    "MMADEm": metrics.median_multimodal_average_displacement_error,
+    "MMFDEm": metrics.median_multimodal_final_displacement_error,
+}
+
+
+def displacements(windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = lambda x: x) -> list[Measure]:
+    """Diversity, errors of the best and of the median future, and proper scores, in metres; of arrays, too.
+
+    Args:
+        windows: among which multimodal ground truth is found, unless poses were exchanged: windows that begin like
+            such a pose go on from others.
+        body: what of frames (..., T, D) is compared.
+    """
+
+    def of_body(measure: Measure) -> Measure:
+        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+            return measure.function(body(forecasts), body(truth), past, index)
+
+        return replace(measure, function=function, unit="m")
+
+    several = [] if isinstance(windows, Exchanged) else _multimodal(windows, body)
+    return list(map(of_body, [*_BEST, *several[:2], *_MEDIAN, *several[2:], ENERGY, VARIOGRAM]))
+
+
+def _multimodal(windows: HeldOutWindows, body: Callable[[Tensor], Tensor]) -> list[Measure]:
+    """Errors averaged over the futures of all windows in almost the same pose."""
+    truths = multimodal_truths(windows)
+    futures = body(windows.all()["x"][:, windows.protocol.observed :])
+    lonely = sum(len(found) == 1 for found in truths)
+    said = {"threshold": windows.protocol.multimodal_threshold, "itself": True, "alone": lonely}
+    shared: Any = {"unit": "m", "note": multimodal_note(**said, windows=len(truths)), "basis": {"multimodal": said}}
+
+    def over(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
+        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+            pairs = zip(forecasts, index.tolist(), strict=True)
+            return torch.stack([score(window, futures[truths[n]]) for window, n in pairs])
+
+        return function
+
+    shown = "MMADE", "MMFDE"
+    return [Measure(name, over(score), headline=name in shown, **shared) for name, score in _MULTIMODAL.items()]
+
+
+def _body(root: int) -> Callable[[Tensor], Tensor]:
+    """Frames (..., T, D) relative to their own root, which is left out."""
+
+    @lru_cache(maxsize=2)  # of forecasts and futures, for all scores of a batch
+    def body(x: Tensor) -> Tensor:
+        joints = x.unflatten(-1, (-1, 3))
+        joints = joints - joints[..., root : root + 1, :]
+        return torch.cat([joints[..., :root, :], joints[..., root + 1 :, :]], -2).flatten(-2)
+
+    return body
+
+
+def _path_error(windows: Windows | Exchanged) -> Measure:
+    places = [windows.joints.index(name) for name in windows.given_joints or ()]
+
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        paths = past["y"][:, None, windows.protocol.observed :]
+        distances = (forecasts - paths).unflatten(-1, (-1, 3)).norm(dim=-1)
+        return distances[..., places].mean((1, 2, 3))
+
+    return Measure("path error", function, "m")
+
+
+def _bone_length_error(windows: Windows | Exchanged) -> Measure:
+    """Mean of |length / observed length - 1| over samples, frames and bones."""
+
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        both = forecasts, past["x"]
+        lengths, reference = (windows.skeleton.bone_lengths(windows.positions(poses)) for poses in both)
+        return (lengths / reference.mean(1)[:, None, None] - 1).abs().mean((1, 2, 3))
+
+    return Measure("bone-length error", function, "relative")
+
+
+def _pose_nll(prior: Any, observed: int) -> Measure:
+    if prior.forward_at not in (None, observed - 1):
+        raise ValueError(
+            f"the pose prior reads windows turned at their frame {prior.forward_at + 1}, but here "
+            f"{observed} frames are observed; fit one under this protocol"
+        )
+
+    @torch.no_grad()
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        seen = past["x"][:, None].expand(-1, forecasts.shape[1], -1, -1)
+        motion = prior.facing(torch.cat([seen, forecasts], 2))[:, :, observed:]
+        return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)
+
+    return Measure("pose NLL", function, "nats", basis={"pose prior": _hash(prior)})
+
+
+def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[Measure | None, Measure]:
+    """ACC, where a class of some window is known, and FID."""
+    labels = _labels(name, classifier, windows)
+    classes = torch.tensor([classifier.classes.index(label) if label in classifier.classes else -1 for label in labels])
+    unknown = int((classes < 0).sum())
+    described = {"label": classifier.label, "classes": list(classifier.classes)}
+    basis = {f"classifier {name}": {**described, "weights": _hash(classifier), "unknown": unknown}}
+    note = f"ACC, FID {name}: classifier {_hash(classifier)[:12]}"
+    note += f"; {unknown} of {len(labels)} windows are of no class it knows" if unknown else ""
+    shared: Any = {"truth": "real motion", "note": note, "basis": basis}
+
+    @lru_cache(maxsize=1)  # for both scores of a batch
+    def features(futures: Tensor) -> Tensor:
+        with evaluating(classifier, 0):
+            return classifier.features(on_device_of(classifier, {"x": futures})["x"])
+
+    def accuracy(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        right = (classifier.logits(features(forecasts)).cpu().argmax(-1) == classes[index, None]).double().mean(1)
+        return right.masked_fill(classes[index] < 0, math.nan)
+
+    x = windows.all()["x"][:, windows.protocol.observed :]
+    real = torch.cat([features(futures) for futures in x.split(32)]).double().cpu()
+    distance = Measure(
+        f"FID {name}",
+        lambda forecasts, *_: features(forecasts).double().cpu(),
+        pool=lambda generated, clips: metrics.frechet_pseudo_values(real, generated, clips),
+        **shared,
+    )
+    known = unknown < len(labels)
+    return Measure(f"ACC {name}", accuracy, "share", "higher", partial=True, **shared) if known else None, distance
+
+
+def _labels(name: str, classifier: Any, windows: Windows | Exchanged) -> list[str]:
+    """The true labels of windows that suit a classifier.
+
+    Raises:
+        ValueError: windows that do not.
+    """
+    size = 3 * len(windows.joints)
+    if windows.skeleton != classifier.skeleton or size != classifier.size:
+        raise ValueError(
+            f"the classifier {name} was fitted to the skeleton {classifier.skeleton.name!r} and frames of "
+            f"{classifier.size} numbers; these windows have the skeleton {windows.skeleton.name!r} and {size}"
+        )
+    fitted, asked = ((p.predicted, p.fps) for p in (classifier.protocol, windows.protocol))
+    if fitted != asked:
+        raise ValueError(
+            f"the classifier {name} was fitted to {fitted[0]} predicted frames at {fitted[1]:g} fps; these windows "
+            f"have {asked[0]} at {asked[1]:g}"
+        )
+    clips = clip_places(windows.keys).bincount()
+    if len(windows.keys) - (int(clips.max()) if len(clips) > 1 else 0) < 2:
+        raise ValueError(
+            f"FID {name} needs normal fits to the features of at least two windows, also without any one clip; these "
+            f"are {len(windows.keys)} windows of {len(clips)} clips"
+        )
+    try:
+        return windows.labels(classifier.label)
+    except KeyError as error:
+        raise ValueError(f"the classifier {name} tells {classifier.label}s apart, but {error.args[0]}") from error
+
+
+def _hash(module: nn.Module) -> str:
+    digest = hashlib.sha256()
+    for name, value in module.state_dict().items():
+        digest.update(name.encode() + value.cpu().numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,268 @@
+"""Evaluations: scores of several methods on the same windows, with all that is needed to say what was measured."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import matplotlib.figure
+import numpy as np
+from rich.text import Text
+
+from ..options import nearest
+from .held import plain
+from .references import multimodal_note
+from .result import Result, Table
+from .scores import Metric
+from .uncertainty import clustered_variance, linearised, student_interval
+
+__all__ = ["Evaluation", "Row", "Score"]
+
+ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
+"""By the direction that is better."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Mean over windows, or a score of the whole set, and its standard error, clustered by clip (NaN of a single one).
+
+    Args:
+        mean: the mean.
+        standard_error: its standard error.
+        freedom: degrees of freedom of that, one less than there are clips.
+    """
+
+    mean: float
+    standard_error: float
+    freedom: float = field(default=math.nan, compare=False)
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Where the mean lies at this level, by Student's t; NaN where the error is unknown."""
+        return student_interval(self.mean, self.standard_error, self.freedom, level)
+
+    def __str__(self) -> str:
+        # Three decimals as in the papers, a fourth where the error needs it.
+        if math.isnan(self.mean):
+            return "–"
+        if not self.standard_error > 0:
+            return f"{self.mean:.3f}"
+        decimals = 4 if self.standard_error < 0.001 else 3
+        return f"{self.mean:.{decimals}f} ± {self.standard_error:.{decimals}f}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method: its number of samples, what it is, and each score's value for each clip (see `Measure.pool`)."""
+
+    samples: int
+    clip_means: dict[str, tuple[float, ...]]
+    equations: dict[str, str] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, repr=False)
+class Evaluation(Result):
+    """Scores of several methods on the same windows, with all that is needed to say what was measured.
+
+    Indexing gives the scores of a method: `evaluation["srnn"]["ADE"].mean`.
+
+    Attributes:
+        rows: `{method: Row}`.
+        metrics: name to how it is to be read, of all scores that at least one method has, in the order of the table.
+        clips: `{"split/clip": number of its windows}`, in the order of `Row.clip_means`.
+        data: fingerprint, windows, frames and coordinates of a window, and what the windows say of themselves.
+        protocol: the fields of the windows' protocol.
+        samples: K, the number of forecasts asked of every method.
+        emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it.
+        bound_particles: particles of the importance bound, 0 where it was not computed.
+        seed: the seed of every method's draws.
+        log_score_particles: particles of the log score, 0 where it was not computed.
+        basis: what scores rest on, by name, such as a judge's weights or a ground truth.
+        notes: lines below the table on how scores are to be read.
+        options: further arguments of the models' `forecast`.
+    """
+
+    rows: dict[str, Row]
+    metrics: dict[str, Metric]
+    clips: dict[str, int]
+    data: dict[str, Any]
+    protocol: dict[str, Any]
+    samples: int
+    emission: str
+    bound_particles: int
+    seed: int
+    log_score_particles: int = 0
+    basis: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def __getitem__(self, method: str) -> dict[str, Score]:
+        return {name: self._score(name, np.array(means)) for name, means in self._row(method).clip_means.items()}
+
+    def difference(self, first: str, second: str, metric: str) -> Score:
+        """Paired difference of two methods in a metric, first minus second, with its standard error.
+
+        Raises:
+            KeyError: a method that was not evaluated, or a metric that one of the two lacks.
+        """
+        means = []
+        for method in (first, second):
+            row = self._row(method)
+            if metric not in row.clip_means:
+                meant = nearest(metric, row.clip_means)
+                raise KeyError(f"{method!r} has no score {metric!r}{meant}; it has {', '.join(row.clip_means)}")
+            means.append(np.array(row.clip_means[metric]))
+        return self._score(metric, means[0] - means[1])
+
+    def table(self) -> Table:
+        """Metrics down, methods across: mean ± standard error, the two programs apart."""
+        table = Table(title=self._title(), caption=self._caption())
+        table.add_column("", no_wrap=True)  # on a narrow terminal the numbers wrap, never the names
+        for method, row in self.rows.items():
+            table.add_column(f"{method}\nK = {row.samples}", justify="right")
+        scores = {method: self[method] for method in self.rows}
+        for program in ("free-running", "teacher-forced"):
+            found = {name: metric for name, metric in self.metrics.items() if metric.program == program}
+            if found:
+                table.add_section()
+                table.add_row(Text(program, "bold"))
+            for name, metric in found.items():
+                unit = f" ({metric.unit})" if metric.unit else ""
+                values = (str(row[name]) if name in row else "–" for row in scores.values())
+                table.add_row(Text.assemble(name + ARROWS[metric.better], (unit, "dim")), *values)
+        return table
+
+    def plot(self, metrics: Sequence[str] | None = None) -> matplotlib.figure.Figure:
+        """One panel per metric, with an arrow for what is better; a dot per method with a bar of one standard error."""
+        names = list(self.metrics if metrics is None else metrics)
+        columns = min(4, len(names))
+        rows = math.ceil(len(names) / columns)
+        height = 0.7 + 0.22 * len(self.rows)
+        figure = matplotlib.figure.Figure(figsize=(2 + 2.2 * columns, height * rows), layout="constrained")
+        panels = list(figure.subplots(rows, columns, sharey=True, squeeze=False).flat)
+        scores = {method: self[method] for method in self.rows}
+        for panel, name in zip(panels, names, strict=False):
+            for place, row in enumerate(scores.values()):
+                if name in row:
+                    error = np.nan_to_num(row[name].standard_error)
+                    panel.errorbar(row[name].mean, place, xerr=error, fmt="o", markersize=4, color=f"C{place}")
+            metric = self.metrics[name]
+            unit = f" ({metric.unit})" if metric.unit else ""
+            panel.set_title(name + ARROWS[metric.better] + unit, fontsize=9, parse_math=False)
+            panel.set_yticks(range(len(scores)), list(scores), parse_math=False)
+            panel.set_ylim(len(scores) - 0.5, -0.5)
+            panel.tick_params(labelsize=8)
+            panel.locator_params(axis="x", nbins=4)  # more would overlap where values agree in many digits
+            panel.grid(axis="x", alpha=0.3)
+        for panel in panels[len(names) :]:
+            panel.set_axis_off()
+        return figure
+
+    def to_json(self) -> str:
+        """Everything, with means and standard errors written out; numbers that are not finite become null."""
+        metrics = {name: dataclasses.asdict(metric) for name, metric in self.metrics.items()}
+        rows = {method: self._document(method) for method in self.rows}
+        return json.dumps({**vars(self), "rows": rows, "metrics": metrics}, indent=1, allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> "Evaluation":
+        """The evaluation that `to_json` wrote.
+
+        Raises:
+            ValueError: text that is not such a document.
+        """
+        try:
+            document = json.loads(text)
+            if "metrics" not in document:
+                _migrate(document)
+            metrics = {name: Metric(**metric) for name, metric in document.pop("metrics").items()}
+            rows = {method: _row(row) for method, row in document.pop("rows").items()}
+            return cls(rows=rows, metrics=metrics, **document)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"this is not an evaluation written by Evaluation.to_json: {error!r}") from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Evaluation":
+        """Read the file that `save` wrote; errors as in `from_json`."""
+        return cls.from_json(cls.read(path))
+
+    def _row(self, method: str) -> Row:
+        if method not in self.rows:
+            raise KeyError(
+                f"no method {method!r} in this evaluation{nearest(method, self.rows)}; it has {', '.join(self.rows)}"
+            )
+        return self.rows[method]
+
+    def _score(self, metric: str, clip_means: np.ndarray) -> Score:
+        known = ~np.isnan(clip_means) if self.metrics[metric].partial else slice(None)
+        mean, deviations = linearised(clip_means[known], np.array(list(self.clips.values()))[known])
+        return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
+
+    def _document(self, method: str) -> dict[str, Any]:
+        row = dataclasses.asdict(self.rows[method])
+        clip_means = row.pop("clip_means")
+        row["scores"] = {
+            name: {
+                **dataclasses.asdict(self.metrics[name]),
+                **dataclasses.asdict(score),
+                "clip_means": clip_means[name],
+            }
+            for name, score in self[method].items()
+        }
+        return plain(row)
+
+    def _caption(self) -> str:
+        freedom = f"{len(self.clips) - 1} degrees of freedom"
+        return "\n".join([f"mean ± standard error over windows, clustered by clip ({freedom})", *self.notes])
+
+    def _title(self) -> str:
+        name = str(self.protocol.get("name", ""))
+        parts = [name, f"{self.data['windows']} windows of {len(self.clips)} clips"]
+        parts += self.data.get("title", [])
+        parts += [f"{name} {value}" for name, value in self.options.items()]
+        parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]
+        return " · ".join(part for part in parts if part)
+
+
+def _row(document: dict[str, Any]) -> Row:
+    scores = document.pop("scores")
+    means = {
+        name: tuple(math.nan if mean is None else mean for mean in score["clip_means"])
+        for name, score in scores.items()
+    }
+    return Row(clip_means=means, **document)
+
+
+# The order of the table's scores where files do not tell: "ACC way" stands in it as ACC.
+_FORMER = (
+    *("APD", "ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm", "energy score", "variogram score"),
+    *("global ADE", "global FDE", "path error", "bone-length error", "pose NLL", "ACC", "FID"),
+    *("ELBO", "importance bound", "k-hat", "KL"),
+)
+
+
+def _migrate(document: dict[str, Any]) -> None:
+    """Brings a document of version 0.1, when every evaluation had the same scores, to what is written now."""
+    found = {name: score for row in document["rows"].values() for name, score in row["scores"].items()}
+
+    def place(name: str) -> tuple[int, str]:
+        return _FORMER.index(name if name in _FORMER else name.partition(" ")[0]), name
+
+    document["metrics"] = {
+        name: {key: found[name][key] for key in ("unit", "program", "better")} | {"partial": name.startswith("ACC ")}
+        for name in sorted(found, key=place)
+    }
+    data, multimodal = document["data"], document.pop("multimodal")
+    document["basis"] = {"multimodal": multimodal}
+    document["notes"] = [multimodal_note(**multimodal, windows=data["windows"])]
+    if prior := document.pop("pose_prior", None):
+        document["basis"]["pose prior"] = prior
+    for name, used in document.pop("classifiers", {}).items():
+        document["basis"][f"classifier {name}"] = used
+        document["notes"].append(f"ACC, FID {name}: classifier {used['weights'][:12]}")
+    data["title"] = [f"given {', '.join(data['given']) or 'no paths'}"] if "given" in data else []
+    if exchanged := data.get("exchanged"):
+        data["title"].append(f"first poses of {exchanged['partners']} other windows")

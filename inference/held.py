@@ -1,0 +1,135 @@
+"""Models on held-out windows: windows prepared once for all models, and each model run under the same conditions."""
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..data import Batch, HeldOutWindows, each
+from ..program.protocols import Module
+
+
+@dataclass(frozen=True)
+class Held:
+    """The windows of one evaluation.
+
+    Args:
+        windows: where they come from.
+        batch: all of them.
+        observed: frames that are seen, O.
+        keys: (split, clip, first frame) of each.
+    """
+
+    windows: HeldOutWindows
+    batch: Batch
+    observed: int
+    keys: list[tuple[str, str, int]]
+
+    @property
+    def x(self) -> Tensor:
+        """Whole windows `(N, T, D)`."""
+        return self.batch["x"]
+
+    @property
+    def futures(self) -> Tensor:
+        """The frames to predict `(N, H, D)`."""
+        return self.x[:, self.observed :]
+
+    def part(self, part: slice) -> dict[str, Any]:
+        """Some windows, whole."""
+        return {name: value[part] for name, value in self.batch.items()}
+
+    def past(self, part: slice) -> dict[str, Any]:
+        """Some windows as forecasts see them: x `(B, O, D)`, and context."""
+        return {**self.part(part), "x": self.x[part, : self.observed]}
+
+    @property
+    def clips(self) -> dict[str, int]:
+        """{"split/clip": number of its windows}."""
+        return dict(Counter(f"{split}/{clip}" for split, clip, _ in self.keys))
+
+    @property
+    def places(self) -> Tensor:
+        """`(N,)`, the clip of every window, as its place in `clips`."""
+        return clip_places(self.keys)
+
+    def description(self) -> dict[str, Any]:
+        """Of the data, for the record."""
+        count, frames, coordinates = self.x.shape
+        found = {"fingerprint": self.windows.fingerprint, "windows": count, "frames": frames}
+        return {**found, "coordinates": coordinates, **self.windows.description}
+
+
+def hold(windows: HeldOutWindows) -> Held:
+    """Windows prepared.
+
+    Raises:
+        ValueError: windows that are ragged, masked, or leave nothing to observe or to predict.
+    """
+    batch = windows.all()
+    observed = windows.protocol.observed
+    if partial := {"lengths", "mask"} & batch.keys():
+        raise ValueError(f"evaluation needs complete windows, but these have {', '.join(sorted(partial))}")
+    if not 1 <= observed < batch["x"].shape[1]:
+        raise ValueError(
+            f"windows of {batch['x'].shape[1]} frames, {observed} of them observed, leave nothing to "
+            "observe or nothing to predict"
+        )
+    return Held(windows, batch, observed, list(windows.keys))
+
+
+def clip_places(keys: Sequence[tuple[str, str, int]]) -> Tensor:
+    """`(N,)`, the clip of every window, clips numbered as they come."""
+    order: dict[str, int] = {}
+    return torch.tensor([order.setdefault(f"{split}/{clip}", len(order)) for split, clip, _ in keys])
+
+
+@contextmanager
+def evaluating(model: Module, seed: int) -> Iterator[None]:
+    """Evaluation mode, no gradients and draws from `seed`; mode and random state are restored."""
+    device = next(model.parameters()).device
+    training = model.training
+    model.eval()
+    try:
+        with torch.no_grad(), torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(seed)
+            yield
+    finally:
+        model.train(training)
+
+
+def on_device_of(model: Module, batch: Batch) -> dict[str, Any]:
+    """The batch on the device and in the floating type of the model's parameters."""
+    parameter = next(model.parameters())
+
+    def moved(value: Tensor) -> Tensor:
+        return value.to(parameter) if value.is_floating_point() else value.to(parameter.device)
+
+    return dict(each(batch, moved))
+
+
+def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:
+    """Raise for the first window whose entry in `finite` (B,) is False."""
+    if not finite.all():
+        split, clip, start = keys[int(finite.logical_not().nonzero()[0])]
+        raise FloatingPointError(
+            f"the {what} of {name} is not finite for the window at frame {start} of clip {clip!r} ({split}); "
+            "it cannot be left out, since all methods are scored on the same ones"
+        )
+
+
+def plain(value: Any) -> Any:
+    """The value as JSON holds it: tuples and arrays become lists, and numbers that are not finite None."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,88 @@
+"""The log score: how probable a forecast holds what happened, as a bound per sequence.
+
+A forecast draws the latents of the past from the guide, given the past alone, and lets the model run free. What it says
+of the future x_{O+1:T} is therefore the density
+
+    F = E_{q(w, z_{1:O} | x_{1:O})} p(x_{O+1:T} | w, z_{1:O}, x_{1:O})
+
+which is p(x_{O+1:T} | x_{1:O}) where the guide is the posterior. Its logarithm is a proper score (Gneiting and Raftery
+2007), which draws from F estimate badly: few of them come near a given future. So the latents are proposed by the
+guide that has seen the future too, and weighted:
+
+    F = E_q [ q(w, z_{1:O} | x_{1:O}) prod_{t > O} p(z_t | .) p(x_t | .) / q ],    q = q(w, z_{1:T} | x_{1:T})
+
+The mean of K weights is unbiased for F, so that its logarithm is on average at most log F: it errs to the side of a
+worse score, by the less the more particles there are, and not at all where both guides are posteriors.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from ..program.batch import Batch, repeat
+from ..program.model import DynamicalVAE
+from ..turns import alone
+from .bounds import ImportanceBound, importance_mean, require_likelihood, site_log_prob, sites_of
+
+
+@alone
+@torch.no_grad()
+def predictive_bound(
+    model: DynamicalVAE, batch: Batch, observed: int, particles: int = 100, *, chunk: int = 4096
+) -> ImportanceBound:
+    """Log density of what follows the observed frames under the model's own forecasts; see the module.
+
+    Args:
+        model: the model with its guide.
+        batch: whole sequences (B, T, D), or a mapping with context over all T steps.
+        observed: O, the frames that are given.
+        particles: K.
+        chunk: sequences times particles to hold at once.
+
+    Returns:
+        The bound in nats a sequence, and the shape of the weights' tail, (B,) each.
+
+    Raises:
+        ValueError: a model without likelihood or with forecasts of its own, a ragged batch, missing entries, or nothing
+            observed or to predict.
+    """
+    require_likelihood(model)
+    if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
+        raise ValueError(
+            f"{type(model).__name__} forecasts in a way of its own, whose density is not known; leave the log score out"
+        )
+    data = model.read(batch)
+    size, length = data[model.observed[0]].shape[:2]
+    if partial := {"lengths", "mask"} & data.keys():
+        raise ValueError(f"a log score needs complete sequences, but these have {', '.join(sorted(partial))}")
+    if particles < 1 or not 0 < observed < length:
+        raise ValueError(
+            f"expected at least 1 particle, and observed frames from 1 to {length - 1}; got {particles} and {observed}"
+        )
+    past = {n: v[:, :observed] if v.dim() == 3 else v for n, v in data.items()}
+
+    def log_weights(count: int) -> Tensor:
+        whole = repeat(data, count)
+        proposed = poutine.trace(model.guide).get_trace(whole)
+        joint = poutine.trace(poutine.replay(model.model, trace=proposed)).get_trace(whole)
+        drawn = {n: s["value"] for n, s in sites_of(proposed).items()}
+        known = {n: v[:, :observed] if model.generative.local(n) else v for n, v in drawn.items()}
+        seen = poutine.trace(poutine.condition(model.guide, data=known)).get_trace(repeat(past, count))
+        local = [n for n in model.generative.variables if model.generative.local(n)]
+        future = {n: log[:, observed:] for n, log in _logs(joint).items() if n in local}
+        return _total(future) + _total(_logs(seen)) - _total(_logs(proposed))
+
+    with model._evaluating():
+        return importance_mean(log_weights, size, particles, chunk)
+
+
+def _logs(trace: Any) -> dict[str, Tensor]:
+    return {name: site_log_prob(site["fn"], site["value"]) for name, site in sites_of(trace).items()}
+
+
+def _total(logs: dict[str, Tensor]) -> Tensor:
+    return torch.stack([log.sum(-1) if log.dim() == 2 else log for log in logs.values()]).sum(0)
