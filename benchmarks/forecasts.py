@@ -38,7 +38,8 @@ def scores(file: Path, steps: int, batch_size: int) -> dict[str, tuple[float, st
         model = runs.load(Path(folder) / "run").model
         minutes = (time.perf_counter() - start) / 60
     test = data.windows("test")
-    evaluation = dvae.evaluate(model, test, batch_size=64, training_windows=data.windows("train+validation"))
+    training = data.windows("train+validation")
+    evaluation = dvae.evaluate(model, test, scores=dvae.motion.scores, batch_size=64, training_windows=training)
     print(evaluation)
     ours, still = evaluation["model"], evaluation["zero velocity"]
     rows = {"minutes": (minutes, "at most 15", minutes <= 15)}

@@ -33,7 +33,7 @@ for name, steps in STEPS.items():
     print(f"best validation bound: {result.best_bound:.2f} nats a frame at step {result.best_step}")
 
 training = dvae.motion.windows(people, protocol, "train+validation")
-evaluation = dvae.evaluate(models, test, samples=20, training_windows=training)
+evaluation = dvae.evaluate(models, test, scores=dvae.motion.scores, samples=20, training_windows=training)
 print(evaluation)
 
 OUT.mkdir(exist_ok=True)

@@ -22,12 +22,12 @@ def joined(files: Sequence[str]) -> dvae.Evaluation:
     for name, each in found.items():
         (own,) = (row for row in each.rows.values() if row.config)
         rows[name.replace("-", " ")] = own
-    return replace(first, rows=rows)
+    return replace(first, rows=rows, metrics={name: m for each in found.values() for name, m in each.metrics.items()})
 
 
 def _same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
     drawn = evaluation.samples, evaluation.seed, evaluation.emission, evaluation.bound_particles
-    return evaluation.data, *drawn, evaluation.multimodal, evaluation.pose_prior, evaluation.classifiers
+    return evaluation.data, *drawn, evaluation.basis
 
 
 def scores(evaluation: dvae.Evaluation, metrics: Sequence[str]) -> str:

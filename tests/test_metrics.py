@@ -13,9 +13,11 @@ from dvae.inference import metrics
 from dvae.inference.metrics import (
     average_displacement_error,
     average_pairwise_distance,
+    continuous_ranked_probability_score,
     energy_score,
     final_displacement_error,
     frechet_distance,
+    frechet_pseudo_values,
     gaussian_frechet_distance,
     median_average_displacement_error,
     median_final_displacement_error,
@@ -31,6 +33,7 @@ PAIRED = (
     final_displacement_error,
     median_average_displacement_error,
     median_final_displacement_error,
+    continuous_ranked_probability_score,
     energy_score,
     variogram_score,
 )
@@ -56,6 +59,7 @@ def by_the_letter(samples, truths):
     fde = [[norm(s[-1] - y[-1]) for s in samples] for y in truths]
     pairs = [(t, i, j) for t in range(frames) for i in range(size) for j in range(i)]
     truth = truths[0]
+    numbers = [abs(samples[j] - samples[k]).mean() for j in range(count) for k in range(j)]
     variogram = [
         (abs(truth[t, i] - truth[t, j]) ** 0.5 - np.mean(abs(samples[:, t, i] - samples[:, t, j]) ** 0.5)) ** 2
         for t, i, j in pairs
@@ -70,6 +74,7 @@ def by_the_letter(samples, truths):
         multimodal_final_displacement_error: np.mean([min(errors) for errors in fde]),
         median_multimodal_average_displacement_error: np.mean([np.median(errors) for errors in ade]),
         median_multimodal_final_displacement_error: np.mean([np.median(errors) for errors in fde]),
+        continuous_ranked_probability_score: abs(samples - truth).mean() - (np.mean(numbers) if numbers else 0.0) / 2,
         energy_score: np.mean([norm(s - truth) for s in samples]) - (np.mean(apart) if apart else 0.0) / 2,
         variogram_score: np.mean(variogram) if variogram else 0.0,
     }
@@ -215,6 +220,20 @@ def test_what_does_not_fit_is_refused(call, message):
         call()
 
 
+@pytest.mark.parametrize("count", [2, 5, 40])
+def test_crps_of_normal_draws_is_the_closed_form_at_every_number_of_them(count):
+    """s (z (2 Phi(z) - 1) + 2 phi(z) - 1 / sqrt(pi)), z = (y - m) / s (Gneiting et al. 2005)."""
+    location, scale, repeats = 0.3, 1.7, 4000
+    truth = torch.linspace(-4, 5, 7, dtype=torch.float64)[None]  # (T, D) = (1, 7)
+    samples = location + scale * draw(repeats, count, 1, 7)
+    found = continuous_ranked_probability_score(samples, truth.expand(repeats, 1, 7))
+    z = (truth - location) / scale
+    normal = torch.distributions.Normal(0.0, 1.0)
+    exact = scale * (z * (2 * normal.cdf(z) - 1) + 2 * normal.log_prob(z).exp() - 1 / math.sqrt(math.pi))
+    assert abs(found.mean() - exact.mean()) < 4 * found.std() / math.sqrt(repeats)
+
+
 def test_all_scores_are_public():
-    public = {average_pairwise_distance, frechet_distance, gaussian_frechet_distance, *PAIRED, *MULTIMODAL}
+    of_features = {frechet_distance, frechet_pseudo_values, gaussian_frechet_distance}
+    public = {average_pairwise_distance, *of_features, *PAIRED, *MULTIMODAL}
     assert {getattr(metrics, name) for name in metrics.__all__} == public
