@@ -26,7 +26,7 @@ def wide(pair):
     Oracle(model, T).fit_guide(15)
     with torch.no_grad():
         for conditional in model.encoder.values():
-            conditional.head.log_scale += 0.25
+            conditional.law.log_scale += 0.25
     return model
 
 
