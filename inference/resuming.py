@@ -16,9 +16,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
+from ..laws.base import renamed
 from .checkpoints import BEST, LAST, OPTIMISER, CheckpointError, Run, read_weights, state_bytes, weights
 from .svi import SVI, NonFiniteError
 
@@ -60,8 +62,9 @@ def restore(svi: SVI, run: Run) -> None:
             f"counts all of a run, so give more than {stored['step']} to go on"
         )
     content = run.optimiser_state(state_bytes(model, 4) + 2**20)
-    held = read_weights(model, run.read(LAST, state_bytes(model)), run.path / LAST)
-    model.load_state_dict(held)
+    last = run.read(LAST, state_bytes(model))
+    model.load_state_dict(read_weights(model, last, run.path / LAST))
+    _reorder(svi, content, last)
     _check_state(svi, run, content)
     if content["name"] != training.optimizer:
         raise CheckpointError(
@@ -150,6 +153,16 @@ def _check_state(svi: SVI, run: Run, content: Any) -> None:
         raise _damaged(run, f"random has no {' and no '.join(sorted(missing))}")
     if len(set(rows.values())) > 1:
         raise _damaged(run, f"random has states of {' and '.join(map(str, rows.values()))} processes")
+
+
+def _reorder(svi: SVI, content: Any, last: bytes) -> None:
+    """Has moments lie where their parameters do: of runs from before laws, those of priors came last."""
+    late = {renamed(name) for name in load_tensors(last) if name.startswith("priors.")}
+    if late and isinstance(content, dict) and isinstance(moments := content.get("optimizer", {}).get("state"), dict):
+        names = [name for name, value in svi.model.named_parameters() if value.requires_grad]
+        former = sorted(names, key=lambda name: name in late)
+        places = {i: names.index(name) for i, name in enumerate(former)}
+        content["optimizer"]["state"] = {places.get(i, i): kept for i, kept in moments.items()}
 
 
 def _sound(key: Any, value: Any, parameter: Tensor, step: int) -> bool:
