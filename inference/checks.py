@@ -220,7 +220,7 @@ class PredictiveChecks(Result):
         nested: dict[str, Any] = {}
         for (model, program, name), check in self.checks.items():
             nested.setdefault(model, {}).setdefault(program, {})[name] = check.document()
-        rest = {name: getattr(self, name) for name in ("data", "protocol", "samples", "emission", "seed")}
+        rest = {name: value for name, value in vars(self).items() if name != "checks"}
         return {**rest, "programs": PROGRAMS, "checks": nested}
 
     def to_json(self) -> str:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..data import HeldOutWindows
 from ..program.protocols import Forecasting
@@ -38,7 +38,7 @@ Forecaster = Callable[[slice], Tensor]  # which windows -> (K, B, H, D)
 
 @alone
 def evaluate(
-    model: Forecasting | Mapping[str, Forecasting],
+    model: nn.Module | Mapping[str, nn.Module],
     windows: HeldOutWindows,
     *,
     scores: Scores = proper,
@@ -61,7 +61,7 @@ def evaluate(
     are restored. (Longer than other functions by what its options mean.)
 
     Args:
-        model: a model, or `{name: model}`.
+        model: a model (`Forecasting`), or `{name: model}`.
         windows: `ArrayWindows`, windows of `dvae.motion`, or any `HeldOutWindows`.
         scores: of the forecasts, as a function of the windows: `proper` scoring rules, or `dvae.motion.scores`, with
             judges as `functools.partial(dvae.motion.scores, pose_prior=..., classifiers=...)`.
@@ -88,7 +88,7 @@ def evaluate(
             shape; a model with the name of a reference row; fewer than one sample; two scores of one name.
         FloatingPointError: a forecast or bound that is not finite, naming method and window.
     """
-    models = dict(model) if isinstance(model, Mapping) else {"model": model}
+    models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
     _check(models, samples, batch_size, bound_particles, log_score_particles)
     held = hold(windows)
     measures = _measures(scores, windows)

@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..data import Batch, HeldOutWindows, each
-from ..program.protocols import Module
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ def clip_places(keys: Sequence[tuple[str, str, int]]) -> Tensor:
 
 
 @contextmanager
-def evaluating(model: Module, seed: int) -> Iterator[None]:
+def evaluating(model: nn.Module, seed: int) -> Iterator[None]:
     """Evaluation mode, no gradients and draws from `seed`; mode and random state are restored."""
     device = next(model.parameters()).device
     training = model.training
@@ -104,7 +103,7 @@ def evaluating(model: Module, seed: int) -> Iterator[None]:
         model.train(training)
 
 
-def on_device_of(model: Module, batch: Batch) -> dict[str, Any]:
+def on_device_of(model: nn.Module, batch: Batch) -> dict[str, Any]:
     """The batch on the device and in the floating type of the model's parameters."""
     parameter = next(model.parameters())
 

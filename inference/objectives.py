@@ -85,7 +85,7 @@ class Evidence:
 
     def to_config(self) -> dict[str, Any]:
         """Return the objective as a JSON object; `from_config` reads it."""
-        return {"objective": "Evidence"} | {f.name: to_config(getattr(self, f.name)) for f in fields(self)}
+        return {"objective": "Evidence"} | {name: to_config(value) for name, value in vars(self).items()}
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> "Evidence":

@@ -84,7 +84,7 @@ def is_drawn_as_it_is(figure, names=NAMES):
 def test_models_in_an_evaluation(models, windows):
     result = evaluate(models, windows, samples=2, references=False, options={}, progress=True)
     is_shown_as_it_is(result)
-    is_drawn_as_it_is(result.plot(["ADE", "ELBO"]))
+    is_drawn_as_it_is(result.plot(["CRPS", "ELBO"]))
 
 
 def test_notes_and_protocols_in_an_evaluation(models, windows):

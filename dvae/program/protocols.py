@@ -1,4 +1,4 @@
-"""What inference needs of a model, as protocols.
+"""What inference needs of a model beyond torch's modules, as protocols.
 
 `DynamicalVAE` has it all. A density or a classifier, which forecasts nothing, is a `Program`; a forecaster of one's
 own, whatever it is made of, is `Forecasting`.
@@ -6,7 +6,7 @@ own, whatever it is made of, is `Forecasting`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
@@ -14,23 +14,8 @@ from torch import Tensor
 from ..notation import Factorization
 
 
-class Module(Protocol):
-    """What torch's modules have."""
-
-    training: bool
-
-    def parameters(self) -> Iterator[Any]:
-        """At least one, which says device and precision."""
-
-    def train(self, mode: bool = True) -> Any:
-        """Training mode."""
-
-    def eval(self) -> Any:
-        """Evaluation mode."""
-
-
 @runtime_checkable
-class Program(Module, Protocol):
+class Program(Protocol):
     """A Pyro model and its guide, for bounds and the loop."""
 
     @property
@@ -49,7 +34,7 @@ class Program(Module, Protocol):
 
 
 @runtime_checkable
-class Forecasting(Module, Protocol):
+class Forecasting(Protocol):
     """A model that forecasts, for evaluation; with a likelihood it is a `Program` too, and has a bound."""
 
     @property
