@@ -518,6 +518,7 @@ def test_ragged_windows_are_refused_before_any_bound_is_computed():
         protocol=windows.protocol,
         keys=windows.keys,
         fingerprint="",
+        description={},
         all=lambda: {**windows.all(), "lengths": torch.full((4,), T)},
     )
     with pytest.raises(ValueError, match="complete windows, but these have lengths"):
