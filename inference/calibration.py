@@ -238,7 +238,7 @@ def calibrate(
     """Simulation-based calibration: draws latents and data from the model, and asks the guide for the latents.
 
     Says whether the guide is the model's posterior on the model's own data; it knows nothing of real data, nor
-    of whether the model is a good one.
+    of whether the model is a good one. (Longer than other functions by what its options mean.)
 
     Args:
         model: the generative model; its own guide is examined where no other is given.
@@ -268,39 +268,13 @@ def calibrate(
     if missing := [name for name in model.context if name not in contexts]:
         raise ValueError(f"the model reads the context {', '.join(missing)}; pass context={{name: values}}")
     infer = guide or model.guide
-    index = torch.tensor(kept) - 1
-
-    def quantities(batch: Batch, latents: Mapping[str, Tensor]) -> Tensor:
-        """(B, Q)."""
-        local = model.generative.local
-        ranked = [latents[name][:, index] if local(name) else latents[name] for name in model.latents]
-        joint = torch.stack(list(model.log_joint(batch, latents).values())).sum(0)
-        return torch.cat([*(value.flatten(1) for value in ranked), joint[:, None]], 1)
-
     at_once = max(1, chunk // draws)
-    bar = progress_bar(progress)
     ranks = []
-    with evaluating(model, seed), bar:
-        parts = range(0, simulations, at_once)
-        for start in bar.track(parts, description="simulations"):
-            count = min(at_once, simulations - start)
-            turn = torch.arange(start, start + count)
+    with evaluating(model, seed), progress_bar(progress) as bar:
+        for start in bar.track(range(0, simulations, at_once), description="simulations"):
+            turn = torch.arange(start, min(start + at_once, simulations))
             given = on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
-            truth = model.sample(count, length, given or None)
-            if wrong := [name for name in (*model.latents, *model.observed) if not truth[name].isfinite().all()]:
-                raise FloatingPointError(
-                    f"a free run of {length} steps gave {', '.join(wrong)} that are not finite; simulate fewer steps, "
-                    "or see whether the model has been fitted"
-                )
-            batch = {**given, **{name: truth[name] for name in model.observed}}
-            repeated = repeat(batch, draws)
-            sites = poutine.trace(infer).get_trace(repeated).nodes
-            if missing := [name for name in model.latents if name not in sites]:
-                raise ValueError(f"the guide draws no {', '.join(missing)}; it needs one site for each latent")
-            found: dict[str, Any] = {name: sites[name]["value"] for name in model.latents}
-            drawn = quantities(repeated, found)
-            true = quantities(batch, {name: truth[name] for name in model.latents})
-            ranks.append((drawn.unflatten(0, (draws, count)) < true).sum(0).cpu())
+            ranks.append(_ranks(model, infer, given, len(turn), length, draws, torch.tensor(kept) - 1))
     names = [
         f"{name}{step}[{d}]"
         for name in model.latents
@@ -309,6 +283,41 @@ def calibrate(
     ]
     equations = {"generative": model.generative.text} | ({} if guide else {"inference": model.inference.text})
     return Calibration(torch.cat(ranks).numpy(), (*names, LOG_JOINT), draws, length, seed, equations)
+
+
+def _ranks(
+    model: DynamicalVAE,
+    infer: Callable[..., Any],
+    given: Mapping[str, Tensor],
+    count: int,
+    length: int,
+    draws: int,
+    steps: Tensor,
+) -> Tensor:
+    """Ranks (B, Q) of B simulations, latents and data, among the guide's draws of their latents."""
+
+    def quantities(batch: Batch, latents: Mapping[str, Tensor]) -> Tensor:
+        """(B, Q)."""
+        local = model.generative.local
+        ranked = [latents[name][:, steps] if local(name) else latents[name] for name in model.latents]
+        joint = torch.stack(list(model.log_joint(batch, latents).values())).sum(0)
+        return torch.cat([*(value.flatten(1) for value in ranked), joint[:, None]], 1)
+
+    truth = model.sample(count, length, given or None)
+    if wrong := [name for name in (*model.latents, *model.observed) if not truth[name].isfinite().all()]:
+        raise FloatingPointError(
+            f"a free run of {length} steps gave {', '.join(wrong)} that are not finite; simulate fewer steps, "
+            "or see whether the model has been fitted"
+        )
+    batch = {**given, **{name: truth[name] for name in model.observed}}
+    repeated = repeat(batch, draws)
+    sites = poutine.trace(infer).get_trace(repeated).nodes
+    if missing := [name for name in model.latents if name not in sites]:
+        raise ValueError(f"the guide draws no {', '.join(missing)}; it needs one site for each latent")
+    found: dict[str, Any] = {name: sites[name]["value"] for name in model.latents}
+    drawn = quantities(repeated, found)
+    true = quantities(batch, {name: truth[name] for name in model.latents})
+    return (drawn.unflatten(0, (draws, count)) < true).sum(0).cpu()
 
 
 @lru_cache(maxsize=8)
