@@ -29,7 +29,7 @@ venv: .venv/installed
 	touch $@
 
 demo: venv
-	$(BIN)/python docs/demo.py
+	$(BIN)/python -m benchmarks.tables.demo
 
 test: venv
 	$(BIN)/ruff check .
@@ -48,7 +48,7 @@ bench: venv
 	set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file; done
 
 notebooks: venv
-	$(BIN)/python docs/notebooks.py notebooks/*.ipynb
+	$(BIN)/python -m benchmarks.tables.notebooks notebooks/*.ipynb
 
 clean:
 	rm -rf .venv build dist *.egg-info demo runs .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,23 +1,22 @@
 """The notebooks are stored with what they show, and a run from top to bottom shows the same."""
 
 import copy
-import runpy
 from pathlib import Path
 
 import nbformat
 import pytest
 from rich import console
 
+from benchmarks.tables import notebooks
 from dvae.inference import result
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-TOOL = runpy.run_path(str(ROOT / "docs" / "notebooks.py"))
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
 def shown(notebook):
-    return [TOOL["shown"](cell) for cell in notebook.cells if cell.cell_type == "code"]
+    return [notebooks.shown(cell) for cell in notebook.cells if cell.cell_type == "code"]
 
 
 @each_notebook
@@ -25,7 +24,7 @@ def shown(notebook):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.timeout(1200)
 def test_a_run_shows_what_is_stored(path):
-    stored, run = nbformat.read(path, as_version=4), TOOL["execute"](path, share=0.1)
+    stored, run = nbformat.read(path, as_version=4), notebooks.execute(path, share=0.1)
     for cell, before, now in zip(
         (cell for cell in run.cells if cell.cell_type == "code"), shown(stored), shown(run), strict=True
     ):
@@ -82,7 +81,7 @@ def test_what_a_run_must_show_is_all_but_what_arithmetic_decides():
 
 
 def test_words_of_a_table_are_held_in_any_order_of_its_rows():
-    stable = TOOL["_stable"]
+    stable = notebooks._stable
     table = "<pre>┃ name ┃ bound ┃\n│ first │ 1.5 ± 0.1 │\n│ second │ 1 % │</pre>"
     assert stable(table) == stable("<pre>┃ name ┃ bound ┃\n│ second │ 2 % │\n│ first │ 11.5 ± 0.1 │</pre>")
     assert stable(table) != stable(table.replace("second", "third"))

@@ -1,7 +1,5 @@
 """Runs notebooks and stores them with what they show; `make notebooks` does so for all.
 
-    python docs/notebooks.py notebooks/01_factorizations.ipynb ...
-
 What is stored depends on the run alone: no times, no versions, no progress. An animation is stored as a still of its
 last frame, as figures that move are large and hosts that show notebooks do not play them.
 """
@@ -11,17 +9,17 @@ import html
 import io
 import os
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
 import nbformat
 import numpy as np
+import tyro
 from matplotlib.figure import Figure
 from nbclient import NotebookClient
 from PIL import Image
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PLOTLY = "application/vnd.plotly.v1+json"
 STEPS = re.compile(r"(\"(?:steps|warm_up)\": |Stage\(|method\.feeding\()(\d+)")
 TEXTS = ("text/plain", "text/html", "text/latex")
@@ -129,7 +127,16 @@ def _stable(text: str) -> str:
     return " ".join(re.sub(r"[-+]?(\d*\.\d+|\d+(?=e[-+]\d|%))(e[-+]?\d+)?", "#", text).split())
 
 
+def main(files: tyro.conf.Positional[tuple[Path, ...]]) -> None:
+    """Run notebooks and store them.
+
+    Args:
+        files: the notebooks.
+    """
+    for file in files:
+        nbformat.write(execute(file), file)
+        print(f"stored {file}, {file.stat().st_size / 1000:.0f} kB")
+
+
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        nbformat.write(execute(Path(name)), name)
-        print(f"stored {name}, {Path(name).stat().st_size / 1000:.0f} kB")
+    tyro.cli(main, description=__doc__)

@@ -1,24 +1,17 @@
-"""Writes the tables of docs/results/family.md from comparisons: `python docs/family.py comparison.json ...`.
+"""Writes the tables of docs/results/family.md from comparisons.
 
-The page says how a comparison is made; several of other models on the same windows are joined. The tables stand
-between two marks; the text around them is written by hand.
+The page says how a comparison is made; several of other models on the same windows are joined.
 """
 
-import sys
 from functools import reduce
 from pathlib import Path
+
+import tyro
 
 import dvae
 from dvae.inference.compare import Estimate
 
-PAGE = Path(__file__).parent / "results" / "family.md"
-BEGIN, END = "<!-- tables -->\n", "<!-- end of tables -->\n"
-
-
-def table(header: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table, numbers to the right."""
-    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+from .pages import DOCS, table, write
 
 
 def with_errors(estimate: Estimate, decimals: int) -> str:
@@ -26,7 +19,7 @@ def with_errors(estimate: Estimate, decimals: int) -> str:
     return " ± ".join(f"{v:.{decimals}f}" for v in (estimate.mean, estimate.sequences, estimate.seeds))
 
 
-def tables(comparison: dvae.Comparison) -> str:
+def tables(comparison: dvae.Comparison) -> list[str]:
     """Teacher-forced scores in the order of the ranking, then free-running ones in that of the energy score."""
     ranking = comparison.ranking
     forced, free = [], []
@@ -53,18 +46,23 @@ def tables(comparison: dvae.Comparison) -> str:
         free.append([name, *(with_errors(scores[metric], decimals) for metric, decimals in metrics.items())])
     bound = f"importance bound, K = {comparison.particles}"
     latents = "KL in nats a frame, active units"
-    return "\n".join(
-        [
-            f"Teacher-forced, nats a frame ({len(comparison.keys)} windows):\n",
-            table(["", bound, "difference to the best", "ELBO", "k-hat > 0.7", latents], forced),
-            f"Free-running, {comparison.samples} forecasts a window, metres:\n",
-            table(["", "ADE ↓", "FDE ↓", "MMADE ↓", "MMFDE ↓", "APD", "energy score ↓"], free),
-        ]
-    )
+    return [
+        f"Teacher-forced, nats a frame ({len(comparison.keys)} windows):\n",
+        table(["", bound, "difference to the best", "ELBO", "k-hat > 0.7", latents], forced),
+        f"Free-running, {comparison.samples} forecasts a window, metres:\n",
+        table(["", "ADE ↓", "FDE ↓", "MMADE ↓", "MMFDE ↓", "APD", "energy score ↓"], free),
+    ]
+
+
+def main(files: tyro.conf.Positional[tuple[Path, ...]], page: Path = DOCS / "results" / "family.md") -> None:
+    """Write the tables.
+
+    Args:
+        files: what `dvae compare --out` wrote.
+        page: where.
+    """
+    write(page, *tables(reduce(dvae.Comparison.join, map(dvae.Comparison.load, files))))
 
 
 if __name__ == "__main__":
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    after = rest.split(END)[1]
-    found = tables(reduce(dvae.Comparison.join, map(dvae.Comparison.load, sys.argv[1:])))
-    PAGE.write_text(before + BEGIN + "\n" + found + "\n" + END + after, encoding="utf-8")
+    tyro.cli(main, description=__doc__)

@@ -1,10 +1,12 @@
-"""Writes docs/audits.md: what each guide of the family misses, and what that costs in nats."""
+"""Writes the table of docs/audits.md: what each guide of the family misses, and what that costs in nats."""
 
 from pathlib import Path
 
+import tyro
+
 import dvae
 
-STEPS, SEEDS = 5, 5
+from .pages import DOCS, code, write
 
 HIT_DVAE = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
 KVAE = "p(z_t | z_{t-1}, a_{<t}) p(a_t | z_t, a_{<t}) p(x_t | a_t)"
@@ -44,12 +46,7 @@ FAMILY = {
 }
 
 
-def code(text: str) -> str:
-    """Text as Markdown code within a table."""
-    return "`" + text.replace("|", "\\|") + "`"
-
-
-def row(name: str, generative: str, inference: str) -> str:
+def row(name: str, generative: str, inference: str, steps: int, seeds: int) -> str:
     """A line of the table."""
     audit = dvae.audit(generative, inference)
     missing, redundant = (
@@ -57,26 +54,28 @@ def row(name: str, generative: str, inference: str) -> str:
         for found in (audit.missing, audit.redundant)
     )
     sizes = dict.fromkeys((*audit.generative.variables,), 1)
-    price = dvae.price(generative, inference, sizes, steps=STEPS, seeds=SEEDS)
+    price = dvae.price(generative, inference, sizes, steps=steps, seeds=seeds)
     cost = f"{price.mean():.3f} ({price.min():.3f} to {price.max():.3f})"
     cells = (name, code(generative), code(inference), missing, redundant, cost)
     return f"| {' | '.join(cells)} |"
 
 
-TEXT = f"""# What guides miss, and what it costs
-
-Written by `docs/audits.py`. *Missing*: what the exact posterior depends on and the guide does not read, by
-d-separation in the unrolled graph; such a guide cannot make the bound tight, however large its networks.
-*Redundant*: what it reads though nothing depends on it. *Price*: the smallest gap between evidence and bound
-that this factorization allows in a linear-Gaussian model with random weights ({STEPS} steps, every variable
-of size 1), in nats a sequence: mean, least and largest of {SEEDS} models. It is computed, not sampled, and
-zero up to rounding where nothing is missing. It is the price of an arrow in those models, not a prediction
-for neural networks on data.
-
-| | model | guide | missing | redundant | price |
+HEADER = """| | model | guide | missing | redundant | price |
 |---|---|---|---|---|---|
 """
 
+
+def main(page: Path = DOCS / "audits.md", steps: int = 5, seeds: int = 5) -> None:
+    """Write the table.
+
+    Args:
+        page: where.
+        steps: of the sequences whose price is computed.
+        seeds: models of random weights.
+    """
+    rows = [row(name, *equations, steps, seeds) for name, equations in FAMILY.items()]
+    write(page, HEADER + "\n".join(rows) + "\n")
+
+
 if __name__ == "__main__":
-    rows = [row(name, *equations) for name, equations in FAMILY.items()]
-    Path(__file__).with_suffix(".md").write_text(TEXT + "\n".join(rows) + "\n", encoding="utf-8")
+    tyro.cli(main, description=__doc__)

@@ -1,8 +1,8 @@
-"""Writes the tables of docs/results/trajevae.md: `python docs/trajevae.py 0.json 1.json ... mean-0.json ...`.
+"""Writes the tables of docs/results/trajevae.md from evaluations.
 
 The page says how the runs were fitted, and scored together: `dvae evaluate RUN ... --joints ... --out FILE` for each
 number of given joints, for motion at the prior's mean as well, and from other windows' poses. A file is known by what
-it holds, whatever its name. The tables stand between two marks; the text around them is written by hand.
+it holds, whatever its name.
 """
 
 import sys
@@ -10,12 +10,12 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from evaluations import write
-from family import table
+import tyro
 
 import dvae
 
-PAGE = Path(__file__).parent / "results" / "trajevae.md"
+from .pages import DOCS, table, write
+
 METRICS = ("APD", "ADE", "FDE", "MMADE", "MMFDE", "path error", "global ADE", "bone-length error")
 SINGLE = ("ADE", "FDE", "path error", "global ADE")
 STEPS = (
@@ -29,7 +29,7 @@ STEPS = (
 Counts = dict[int, dvae.Evaluation]
 
 
-def read(files: Sequence[str]) -> tuple[Counts, Counts, Counts]:
+def read(files: Sequence[Path]) -> tuple[Counts, Counts, Counts]:
     """Number of given joints to the evaluation: of draws, of means and from other windows' poses."""
     groups: dict[str, Counts] = defaultdict(dict)
     for file in files:
@@ -91,13 +91,23 @@ def changes(found: Counts, metrics: Sequence[str] = ("ADE", "APD")) -> str:
     return table(["", "", *(f"{count} given" for count in found)], rows)
 
 
-if __name__ == "__main__":
-    draws, means, exchanged = read(sys.argv[1:])
+def main(files: tyro.conf.Positional[tuple[Path, ...]], page: Path = DOCS / "results" / "trajevae.md") -> None:
+    """Write the tables.
+
+    Args:
+        files: what `dvae evaluate --out` wrote.
+        page: where.
+    """
+    draws, means, exchanged = read(files)
     write(
-        PAGE,
+        page,
         scores(draws, METRICS),
         more_joints(draws),
         changes(draws),
         scores(means, SINGLE, references=False),
         scores(exchanged, METRICS, references=False),
     )
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

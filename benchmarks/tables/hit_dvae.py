@@ -1,27 +1,25 @@
-"""Writes the tables of docs/results/hit_dvae.md: `python docs/hit_dvae.py runs/full full.json no-w.json ...`.
+"""Writes the tables of docs/results/hit_dvae.md from evaluations.
 
 The page says how the runs were fitted and scored, each by `dvae evaluate RUN --out NAME.json` on the same windows; the
-first run is that of the full method, whose long forecasts are measured here. The text around the tables is written by
-hand.
+full method's long forecasts are measured here.
 """
 
-import sys
 from pathlib import Path
 
 import torch
-from evaluations import differences, joined, scores, write
-from family import table
+import tyro
 
 import dvae
 
-PAGE = Path(__file__).parent / "results" / "hit_dvae.md"
+from .pages import DOCS, differences, joined, scores, table, write
+
 QUALITY = ("ACC content", "FID content", "FID style", "APD", "energy score", "pose NLL", "bone-length error", "ELBO")
 BEST = ("ADE", "FDE", "MMADE", "MMFDE")
 ERRORS = (*BEST, *(f"{name}m" for name in BEST))
 
 
 @torch.no_grad()
-def long_run(path: str, count: int = 200, seconds: float = 10.0) -> str:
+def long_run(path: Path, count: int, seconds: float) -> str:
     """Bones and speed of forecasts that run on far past the horizon of training, second by second."""
     run = dvae.load(path)
     test = run.data.windows("test")
@@ -63,9 +61,27 @@ def long_run(path: str, count: int = 200, seconds: float = 10.0) -> str:
     return table(header, rows)
 
 
-if __name__ == "__main__":
-    run, *files = sys.argv[1:]
-    evaluation = joined(files)
-    first = next(name for name, row in evaluation.rows.items() if row.config)
+def main(
+    run: tyro.conf.Positional[Path],
+    files: tyro.conf.Positional[tuple[Path, ...]],
+    page: Path = DOCS / "results" / "hit_dvae.md",
+    count: int = 200,
+    seconds: float = 10.0,
+) -> None:
+    """Write the tables.
+
+    Args:
+        run: the directory of the full method's.
+        files: what `dvae evaluate RUN --out` wrote, of that run first.
+        page: where.
+        count: windows from which forecasts run on.
+        seconds: for so long.
+    """
+    evaluation, first = joined(files)
     compared = differences(evaluation, first, (*QUALITY[:4], *ERRORS))
-    write(PAGE, scores(evaluation, QUALITY), scores(evaluation, ERRORS), compared, long_run(run))
+    forecasts = long_run(run, count, seconds)
+    write(page, scores(evaluation, QUALITY), scores(evaluation, ERRORS), compared, forecasts)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

@@ -1,4 +1,4 @@
-"""Tables of evaluations for the pages under docs/results, between two marks in a page whose text is written by hand."""
+"""Tables of evaluations for the pages, put between two marks in a page whose text is written by hand."""
 
 from __future__ import annotations
 
@@ -7,22 +7,43 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from family import BEGIN, END, table
-
 import dvae
 
+DOCS = Path(__file__).parents[2] / "docs"
+BEGIN, END = "<!-- tables -->\n", "<!-- end of tables -->\n"
 
-def joined(files: Sequence[str]) -> dvae.Evaluation:
-    """Evaluations of single runs on the same windows as one, named by their files, beside the first's references."""
-    found = {Path(file).stem: dvae.Evaluation.load(file) for file in files}
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table, numbers to the right."""
+    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def code(text: str) -> str:
+    """Text as Markdown code within a table."""
+    return "`" + text.replace("|", "\\|") + "`"
+
+
+def write(page: Path, *tables: str) -> None:
+    """Puts tables between the marks of a page."""
+    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
+    page.write_text(before + BEGIN + "\n" + "\n".join(tables) + "\n" + END + rest.split(END)[1], encoding="utf-8")
+
+
+def joined(files: Sequence[Path]) -> tuple[dvae.Evaluation, str]:
+    """Evaluations of single runs on the same windows as one, named by their files, beside the first's references.
+
+    And the name of the first run.
+    """
+    found = {file.stem.replace("-", " "): dvae.Evaluation.load(file) for file in files}
     first = next(iter(found.values()))
     if any(_same(each) != _same(first) for each in found.values()):
         sys.exit("these evaluations differ in windows, samples, seed, emission, multimodal threshold or judges")
     rows = {name: row for name, row in first.rows.items() if not row.config}
     for name, each in found.items():
-        (own,) = (row for row in each.rows.values() if row.config)
-        rows[name.replace("-", " ")] = own
-    return replace(first, rows=rows, metrics={name: m for each in found.values() for name, m in each.metrics.items()})
+        (rows[name],) = (row for row in each.rows.values() if row.config)
+    metrics = {name: metric for each in found.values() for name, metric in each.metrics.items()}
+    return replace(first, rows=rows, metrics=metrics), next(iter(found))
 
 
 def _same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
@@ -45,9 +66,3 @@ def differences(evaluation: dvae.Evaluation, first: str, metrics: Sequence[str])
 
     others = [name for name, row in evaluation.rows.items() if name != first and row.samples > 1]
     return table([f"minus {first}", *metrics], [[name, *(cell(name, m) for m in metrics)] for name in others])
-
-
-def write(page: Path, *tables: str) -> None:
-    """Puts tables between the marks of a page."""
-    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    page.write_text(before + BEGIN + "\n" + "\n".join(tables) + "\n" + END + rest.split(END)[1], encoding="utf-8")

@@ -1,26 +1,24 @@
-"""Writes the tables of docs/results/gsps.md: `python docs/gsps.py runs/full full.json no-diversity.json ...`.
+"""Writes the tables of docs/results/gsps.md from evaluations.
 
 The page says how the runs were fitted and scored, each by `dvae evaluate RUN --out NAME.json` on the same windows; the
-first run is that of the full method, whose control is measured here. The tables stand between two marks; the text
-around them is written by hand.
+control that the full method has over parts is measured here.
 """
 
-import sys
 from pathlib import Path
 
 import torch
-from evaluations import differences, joined, scores, write
-from family import table
+import tyro
 
 import dvae
 from dvae.inference.metrics import average_pairwise_distance
 
-PAGE = Path(__file__).parent / "results" / "gsps.md"
+from .pages import DOCS, differences, joined, scores, table, write
+
 METRICS = ("APD", "ADE", "FDE", "MMADE", "MMFDE", "energy score", "pose NLL", "bone-length error")
 
 
 @torch.no_grad()
-def control(path: str, samples: int = 50) -> str:
+def control(path: Path, samples: int) -> str:
     """Diversity of the parts, in free futures and with one draw of the lower body held."""
     run = dvae.load(path)
     past = run.data.windows("test").all()["x"][:, : run.data.protocol.observed]
@@ -40,8 +38,23 @@ def control(path: str, samples: int = 50) -> str:
     return table(["", "APD lower", "APD upper"], rows)
 
 
+def main(
+    run: tyro.conf.Positional[Path],
+    files: tyro.conf.Positional[tuple[Path, ...]],
+    page: Path = DOCS / "results" / "gsps.md",
+    samples: int = 50,
+) -> None:
+    """Write the tables.
+
+    Args:
+        run: the directory of the full method's.
+        files: what `dvae evaluate RUN --out` wrote, of that run first.
+        page: where.
+        samples: futures of a window whose control is measured.
+    """
+    evaluation, first = joined(files)
+    write(page, scores(evaluation, METRICS), differences(evaluation, first, METRICS[:-1]), control(run, samples))
+
+
 if __name__ == "__main__":
-    run, *files = sys.argv[1:]
-    evaluation = joined(files)
-    first = next(name for name, row in evaluation.rows.items() if row.config)
-    write(PAGE, scores(evaluation, METRICS), differences(evaluation, first, METRICS[:-1]), control(run))
+    tyro.cli(main, description=__doc__)

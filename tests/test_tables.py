@@ -1,0 +1,136 @@
+"""What makes the tables of the pages, each on little: tables stand between the marks, and all else stays."""
+
+import re
+import shutil
+
+import pytest
+
+from benchmarks.tables import audits, bounds, demo, family, gsps, hit_dvae, overview, pages, trajevae
+from dvae import Evaluation, motion
+from dvae.cli import main as command
+
+SMALL = ["--steps", "2", "--batch-size", "4", "--validate-every", "2"]
+
+
+def dvae(*arguments):
+    assert command([str(argument) for argument in arguments]) == 0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Of people, of whom few windows are scored."""
+    folder = tmp_path_factory.mktemp("tables")
+    motion.save(folder / "people.npz", motion.simulate(clips=8, frames=80, seed=1))
+    return folder
+
+
+def fitted(folder, name, method, *options):
+    dvae("fit", method, "--data", folder / "people.npz", "--out", folder / name, *SMALL, *options)
+    return folder / name
+
+
+def evaluated(folder, name, *options, runs):
+    dvae("evaluate", *runs, "--samples", 3, "--out", folder / f"{name}.json", *options)
+    return folder / f"{name}.json"
+
+
+@pytest.fixture
+def page(tmp_path):
+    """A page with old tables between the marks."""
+    page = tmp_path / "page.md"
+    page.write_text(f"# Before\n{pages.BEGIN}\n| old |\n{pages.END}After\n", encoding="utf-8")
+    return page
+
+
+def tables(page):
+    """The tables of a page, by their first column, and by row and column; what is around them is as it was."""
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith(f"# Before\n{pages.BEGIN}\n")
+    assert text.endswith(f"\n{pages.END}After\n")
+    assert "old" not in text
+    found = []
+    for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        header, _, *rows = [re.split(r"(?<!\\)\|", line.strip())[1:-1] for line in block.splitlines()]
+        assert all(len(row) == len(header) for row in rows)
+        found.append([[cell.strip() for cell in row] for row in [header, *rows]])
+    return found
+
+
+def test_audits(page, monkeypatch):
+    monkeypatch.setattr(audits, "FAMILY", {name: audits.FAMILY[name] for name in ("VAE", "DKF", "HiT-DVAE")})
+    audits.main(page, steps=2, seeds=1)
+    (table,) = tables(page)
+    prices = {row[0]: (row[3], float(row[5].split()[0])) for row in table[1:]}
+    assert [missing for missing, _ in prices.values()] == ["–", "–", "`z_{<t}`"]
+    assert prices["VAE"][1] == prices["DKF"][1] == 0 < prices["HiT-DVAE"][1]
+
+
+def test_bounds(page):
+    bounds.main(page, steps=3, sequences=4, particles=2, fitting=20)
+    (table,) = tables(page)
+    gaps = [float(row[1]) for row in table[1:]]
+    assert len(gaps) == len(bounds.GUIDES)
+    assert gaps[0] == max(gaps)
+    assert min(gaps) >= 0
+
+
+def test_family(folder, page):
+    files = []
+    for name in ("vae", "dkf"):
+        run, out = fitted(folder, name, name, "--warm-up", 1), folder / f"{name}.json"
+        dvae("compare", run, "--particles", 2, "--samples", 2, "--out", out)
+        files.append(out)
+    family.main(tuple(files), page)
+    forced, free = tables(page)
+    assert {row[0] for row in forced[1:]} == {row[0] for row in free[1:]} == {"vae", "dkf"}
+    assert forced[1][2] == "–"
+
+
+def test_gsps(folder, page):
+    run = fitted(folder, "gsps", "gsps", "--pose-prior", "0", "--draws", "2", "2")
+    again = shutil.copytree(run, folder / "the-same")
+    files = tuple(evaluated(folder, each.name, runs=[each]) for each in (run, again))
+    gsps.main(run, files, page, samples=2)
+    scores, differences, control = tables(page)
+    assert [row[0] for row in scores[1:]] == ["zero velocity", "nearest neighbours", "gsps", "the same"]
+    assert differences[2][:3] == ["the same", "0.000", "0.000"]
+    assert float(control[2][1]) == 0 < float(control[2][2])
+
+
+def test_hit_dvae(folder, page):
+    run = fitted(folder, "hit-dvae", "hit-dvae", "--pose-prior", "0")
+    hit_dvae.main(run, (evaluated(folder, "full", runs=[run]),), page, count=2, seconds=2.0)
+    *_, seconds = tables(page)
+    assert [row[0] for row in seconds[1:]] == ["1", "2"]
+
+
+def test_trajevae(folder, page):
+    paths = ("--protocol", "simulated-trajectories")
+    run = fitted(folder, "full", "trajevae", *paths)
+    runs = [run, fitted(folder, "cvae-rnn", "cvae-rnn", *paths)]
+    runs += [shutil.copytree(run, folder / name) for name in ("whole-poses", "in-time", "standard-prior")]
+    files = (
+        evaluated(folder, "1", "--joints", "RFoot", runs=runs),
+        evaluated(folder, "0", "--joints", runs=runs),
+        evaluated(folder, "mean-0", "--temperature", 0, runs=runs),
+        evaluated(folder, "exchanged-1", "--joints", "RFoot", "--exchange", 9.0, runs=runs),
+    )
+    trajevae.main(files, page)
+    draws, more, changes, means, exchanged = tables(page)
+    assert [row[1] for row in draws[1:] if row[0] == "full"] == ["0", "1"]
+    assert more[0][2:] == ["0 to 1: RFoot"]
+    assert {cell for row in changes[1:7] for cell in row[2:]} == {"0.000"}
+    assert {row[1] for row in means[1:]} == {"0"}
+    assert {row[1] for row in exchanged[1:]} == {"1"}
+
+
+def test_demo(tmp_path):
+    demo.main(tmp_path / "demo", share=0.002, samples=2, clips=10)
+    rows = Evaluation.load(tmp_path / "demo" / "evaluation.json").rows
+    assert rows.keys() == {"zero velocity", "nearest neighbours", *demo.STEPS}
+    assert {file.name for file in (tmp_path / "demo").iterdir()} == {"evaluation.json", "futures.png"}
+
+
+def test_overview(tmp_path):
+    overview.main(tmp_path / "overview.png", steps=1, clips=40)
+    assert (tmp_path / "overview.png").read_bytes().startswith(b"\x89PNG")
