@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Literal, NoReturn
 
 import networkx as nx
 import numpy as np
@@ -176,7 +176,8 @@ class Relation:
         """`mask`, or its one row (1, T) where a custom function gives the same for every t."""
         if self.intervals is not None:
             offset = np.arange(T)[None, :] - np.arange(T)[:, None]
-            return np.any([(low <= offset) & (offset <= high) for low, high in self.intervals or [(1, 0)]], axis=0)
+            allowed = [(low <= offset) & (offset <= high) for low, high in self.intervals or [(1, 0)]]
+            return np.asarray(np.any(allowed, axis=0))
         assert self.function is not None
         mask = np.asarray(self.function(T))
         if mask.dtype != bool or mask.shape not in ((T, T), (1, T)):
@@ -213,7 +214,7 @@ class Relation:
 class _Composed:
     """Custom masks under a logical operation; a value, so that relations built the same way are equal."""
 
-    operation: Any
+    operation: Callable[..., np.ndarray]
     operands: tuple[Relation, ...]
 
     def __call__(self, T: int) -> np.ndarray:

@@ -44,7 +44,7 @@ class Range:
 
     def __contains__(self, value: Any) -> bool:
         low = value > self.least if self.above or self.least == -inf else value >= self.least
-        return low and (value < self.most if self.below or self.most == inf else value <= self.most)
+        return bool(low and (value < self.most if self.below or self.most == inf else value <= self.most))
 
     def __str__(self) -> str:
         if (self.least, self.most, self.above, self.below) == (0, 1, False, False):

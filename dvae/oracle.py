@@ -89,7 +89,7 @@ class Oracle:
             network = conditionals[child].network
             if network is None or parent not in network.weights:
                 return torch.zeros(self._size(child), self._size(parent), dtype=torch.float64)
-            weight = network.weight(parent, self.steps)
+            weight: Tensor = network.weight(parent, self.steps)
             return weight.transpose(1, 2).reshape(self._size(child), self._size(parent))
 
         def stack(parents: tuple[str, ...]) -> Tensor:
@@ -147,7 +147,8 @@ class Oracle:
         mean, precision = self._joint()
         start = len(mean) - data.shape[1]
         covariance = torch.linalg.inv(precision)[start:, start:]
-        return torch.distributions.MultivariateNormal(mean[start:], covariance).log_prob(data)
+        evidence: Tensor = torch.distributions.MultivariateNormal(mean[start:], covariance).log_prob(data)
+        return evidence
 
     def posterior(self, x: Tensor | Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Mean (B, N) and covariance (N, N) of the latents, stacked in the guide's order, given data (B, T, D)."""
@@ -168,7 +169,8 @@ class Oracle:
         spread = (root.t() @ precision * root.t()).sum()
         log_volume = torch.linalg.slogdet(precision)[1] + 2 * torch.linalg.slogdet(root)[1]
         distance = torch.einsum("bi,ij,bj->b", difference, precision, difference)
-        return self.evidence(x) - 0.5 * (spread + distance - n - log_volume)
+        divergence: Tensor = 0.5 * (spread + distance - n - log_volume)
+        return self.evidence(x) - divergence
 
     def gap(self) -> Tensor:
         """The expected evidence minus bound, in nats a sequence, over data drawn from the model."""
@@ -183,7 +185,8 @@ class Oracle:
         spread = (root.t() @ within * root.t()).sum()
         log_volume = torch.linalg.slogdet(within)[1] + 2 * torch.linalg.slogdet(root)[1]
         distance = shift @ within @ shift + (slope.t() @ within @ slope * covariance).sum()
-        return 0.5 * (spread + distance - n - log_volume)
+        gap: Tensor = 0.5 * (spread + distance - n - log_volume)
+        return gap
 
     def fit_guide(self, iterations: int = 2000) -> float:
         """Fits the guide to the model's exact gap by L-BFGS and returns what is left of it, in nats a sequence."""

@@ -66,7 +66,7 @@ class Units(nn.Module):
         """`forward` of (B, T, D) or (B, D), zero at padding; once for all that read the same values."""
 
         def found() -> Tensor:
-            standard = self(values)
+            standard: Tensor = self(values)
             if lengths is None or values.dim() == 2:
                 return standard
             return standard * valid_steps(lengths, values.shape[1])[..., None]

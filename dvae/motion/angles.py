@@ -200,7 +200,8 @@ def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
     """
     plan = _plan(skeleton, poses.device)
     matrix = differences(skeleton, plan.differences, poses.shape[-1], poses.dtype, poses.device)
-    return _Cosines.apply(poses.reshape(-1, poses.shape[-1]), matrix, plan).reshape(*poses.shape[:-1], len(plan.first))
+    cosines: Tensor = _Cosines.apply(poses.reshape(-1, poses.shape[-1]), matrix, plan)
+    return cosines.reshape(*poses.shape[:-1], len(plan.first))
 
 
 class _Cosines(Function):

@@ -96,7 +96,7 @@ def bend(
             moves, max_iter=steps, history_size=50, tolerance_change=ENOUGH, line_search_fn="strong_wolfe"
         )
         with torch.enable_grad():
-            optimiser.step(loss)  # type: ignore[no-untyped-call]
+            optimiser.step(loss)
         with torch.no_grad():
             return motion()
 

@@ -110,7 +110,8 @@ def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
             apart = (differences @ x.flatten(1)).view(len(pairs), *x.shape[1:])
         return (-apart.abs().sum((2, 3)) / scale).exp().sum(0) / max(len(pairs), 1)
 
-    return _InBlocks.apply(energy, samples)
+    diversity: Tensor = _InBlocks.apply(energy, samples)
+    return diversity
 
 
 def history_error(samples: Tensor, history: Tensor) -> Tensor:
@@ -148,7 +149,8 @@ def limb_length(samples: Tensor, reference: Tensor, skeleton: Skeleton) -> Tenso
     def energy(poses: Tensor, expected: Tensor) -> Tensor:
         return (lengths(poses) - expected[:, None]).square().sum(3).mean((0, 2))
 
-    return _InBlocks.apply(energy, samples, lengths(reference.detach()))
+    error: Tensor = _InBlocks.apply(energy, samples, lengths(reference.detach()))
+    return error
 
 
 class _InBlocks(Function):
@@ -208,7 +210,8 @@ def joint_angles(samples: Tensor, limits: AngleLimits, skeleton: Skeleton) -> Te
     low, high = limits.low.to(samples), limits.high.to(samples)
     low, high = low.masked_fill(low < -0.98, -torch.inf), high.masked_fill(high > 0.98, torch.inf)
     same = torch.tensor([[name == other for other in names] for name in names]).to(samples)
-    return _JointAngles.apply(samples, low, high, same, skeleton)
+    excess: Tensor = _JointAngles.apply(samples, low, high, same, skeleton)
+    return excess
 
 
 class _JointAngles(Function):

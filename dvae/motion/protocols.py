@@ -383,7 +383,7 @@ class Windows:
                 f"frames have {x.shape[-1]} numbers, expected {self.size}: {self.skeleton.joints} joints, "
                 f"root {self.protocol.root}"
             )
-        joints = x.unflatten(-1, (-1, 3))
+        joints: Tensor = x.unflatten(-1, (-1, 3))
         if self.protocol.root == "relative":
             return joints
         root = self.skeleton.root

@@ -235,7 +235,8 @@ class Skeleton:
         """
         incidence = differences(self, tuple(self.edges), poses.shape[-1], poses.dtype, poses.device)
         with torch.autocast(poses.device.type, enabled=False):  # differences of positions need all their digits
-            return (poses @ incidence).unflatten(-1, (-1, 3))
+            bones: Tensor = (poses @ incidence).unflatten(-1, (-1, 3))
+        return bones
 
     def directions(self, poses: Tensor) -> Tensor:
         """Unit vectors along the limbs: poses (..., D) -> (..., 3 (J - 1)), zero for a limb without length.

@@ -157,11 +157,13 @@ class PseudoTruths:
         products = future.transpose(0, 1).flatten(2) @ self._futures.flatten(2).mT  # (n, B, N)
         distances = (squares.T[:, :, None] + self._squares[:, None] - 2 * products).clamp_(min=0).sqrt_()
         slack = off + _ROUNDING * (squares / frames).sqrt()
-        return close & (distances.mean(0) / frames**0.5 + slack.mean(1, keepdim=True) >= self.minimum)
+        far = distances.mean(0) / frames**0.5 + slack.mean(1, keepdim=True) >= self.minimum
+        possible: Tensor = close & far
+        return possible
 
     def _lengths(self, joints: Tensor) -> Tensor:
         """Limb lengths (..., n) of poses (..., n, 3); one for a root, which keeps its place."""
-        lengths = (self._limbs @ joints).norm(dim=-1)
+        lengths: Tensor = (self._limbs @ joints).norm(dim=-1)
         if self._root is not None:
             lengths[..., self._root] = 1
         return lengths

@@ -100,7 +100,8 @@ class Layer(nn.Module):
 
     def queries(self, stream: Tensor) -> Tensor:
         """(B, heads, T, W / heads) from the stream (B, T, W)."""
-        return self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        query: Tensor = self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1))
+        return query.transpose(1, 2)
 
     def weights(self, stream: Tensor, keys: Tensor, bias: Tensor) -> Tensor:
         """The shares (B, heads, T, S) in which a query mixes the values."""
@@ -114,7 +115,8 @@ class Layer(nn.Module):
         else:
             seen = functional.scaled_dot_product_attention(self.queries(stream), keys, values, attn_mask=bias)
         stream = stream + self.out(seen.transpose(1, 2).flatten(2))
-        return stream + self.perceptron(stream)
+        update: Tensor = self.perceptron(stream)
+        return stream + update
 
 
 class AttentionNetwork(Network):
@@ -172,8 +174,8 @@ class AttentionNetwork(Network):
             tokens, bias = self.tokens(self.ranged, parents, batch, length, lengths)
             for layer in self.layers:
                 stream = layer(stream, *layer.project(tokens), bias)
-        stream = self.norm(stream)
-        return stream if self.local else stream[:, 0]
+        features: Tensor = self.norm(stream)
+        return features if self.local else features[:, 0]
 
     @torch.no_grad()
     def attention(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> list[Tensor]:
@@ -200,7 +202,7 @@ class AttentionNetwork(Network):
         stream = self.origin.expand(batch, length if self.local else 1, -1)
         if self.point is None:
             return stream
-        joined = self.point([part(parents[parent.name], lag) for parent, lag in self.points])
+        joined: Tensor = self.point([part(parents[parent.name], lag) for parent, lag in self.points])
         return stream + (joined if joined.dim() == 3 else joined[:, None])
 
     def tokens(
@@ -321,7 +323,8 @@ class SelfAttentionNetwork(Network):
     def encode(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None) -> Tensor:
         """The frames' tokens (B, T, W) after the encoder."""
         values = self.extractors.of(parents, lengths)
-        stream = self.embed(torch.cat(aligned([values[p.name] for p in (*self.encoded, *self.statics)]), dim=-1))
+        frames = torch.cat(aligned([values[p.name] for p in (*self.encoded, *self.statics)]), dim=-1)
+        stream: Tensor = self.embed(frames)
         bias = self.bias(length)
         if lengths is not None:
             bias = bias.masked_fill(~valid_steps(lengths, length)[:, None, None], -math.inf)
@@ -329,7 +332,8 @@ class SelfAttentionNetwork(Network):
             bias = bias.masked_fill(own, 0.0)  # padding sees itself: softmax over nothing is NaN
         for layer in self.layers:
             stream = layer(stream, *layer.project(layer.norm_query(stream)), bias)
-        return self.norm(stream)
+        stream = self.norm(stream)
+        return stream
 
     def bias(self, length: int) -> Tensor:
         """(1, heads, T, T): minus slope times distance where visible, else -inf."""

@@ -77,7 +77,8 @@ def once(module: nn.Module, inputs: Sequence[Tensor | None], compute: Callable[[
     key = _key(module, inputs)
     if key not in kept:
         kept[key] = (inputs, compute())  # the inputs are held, so that their ids stay theirs
-    return kept[key][1]
+    result: Tensor = kept[key][1]
+    return result
 
 
 def keep(module: nn.Module, inputs: Sequence[Tensor | None], result: Tensor) -> None:
@@ -325,7 +326,8 @@ class Join(nn.Module):
             return self._join([seen[i] if i in seen else next(coming) for i in range(len(self.sizes))])
         for part, weight in zip(live, hoisted.weights, strict=True):
             first = torch.addmm(first, part, weight.t())
-        return self.rest(first)
+        features: Tensor = self.rest(first)
+        return features
 
 
 def perceptron(widths: Sequence[int], activation: str) -> nn.Sequential:

@@ -173,7 +173,8 @@ class MotionDecoderNetwork(AtOnce):
         joined = [body[:, None].expand(-1, length, -1), values, *(parents[name] for name in self.others)]
         hidden = self.into(torch.cat(joined, dim=-1))
         hidden = self.transformer(self.dropout(hidden + positions(length, hidden.shape[-1], hidden)))
-        return first[:, None] + self.offsets(hidden).cumsum(1)
+        offsets: Tensor = self.offsets(hidden)
+        return first[:, None] + offsets.cumsum(1)
 
 
 class Dropout(nn.Dropout):
@@ -213,8 +214,9 @@ class TransformerLayer(nn.TransformerEncoderLayer):
         )
         weights = (query @ key.mT / math.sqrt(query.shape[-1])).softmax(-1)
         read = attention.out_proj((self.unseen(weights) @ value).transpose(1, 2).flatten(2))
-        hidden = self.norm1(src + self.dropout1(read))
-        return self.norm2(hidden + self.dropout2(self.linear2(self.dropout(self.linear1(hidden).relu()))))
+        hidden: Tensor = self.norm1(src + self.dropout1(read))
+        hidden = self.norm2(hidden + self.dropout2(self.linear2(self.dropout(self.linear1(hidden).relu()))))
+        return hidden
 
 
 def two_layers(size: int, width: int) -> nn.Sequential:

@@ -49,7 +49,7 @@ class DenseNetwork(Network):
 
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """See `Network.forward`."""
-        features = self.join([part(parents[parent.name], lag) for parent, lag in self.parts])
+        features: Tensor = self.join([part(parents[parent.name], lag) for parent, lag in self.parts])
         return features[:, None].expand(-1, length, -1) if self.local and features.dim() == 2 else features
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:

@@ -53,7 +53,7 @@ class Extractors(nn.ModuleDict):
         """What the network reads of its parents (B, T, D) or (B, D)."""
 
         def features(name: str) -> Tensor:
-            found = self[name](parents[name])
+            found: Tensor = self[name](parents[name])
             if lengths is None or found.dim() == 2:
                 return found
             return found * valid_steps(lengths, found.shape[1])[..., None]

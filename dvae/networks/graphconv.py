@@ -113,14 +113,14 @@ class GraphConvNetwork(AtOnce):
         hidden = self.first(joined)
         for block in self.rest:
             hidden = hidden + block(hidden)
-        made = (self.last(hidden) + joined)[:, self.own, : self.inner]  # (B, own joints, 3 C)
+        made: Tensor = (self.last(hidden) + joined)[:, self.own, : self.inner]  # (B, own joints, 3 C)
         made = made.unflatten(-1, (3, -1)).flatten(1, 2).to(known.dtype)
         with torch.autocast(made.device.type, enabled=False):
             return (made @ self._transform(length, made)).transpose(1, 2)
 
     def _coefficients(self, parents: Mapping[str, Tensor]) -> Tensor:
         """(B, joints, 3 C): coefficients of x, then of y, then of z."""
-        known = None
+        known: Tensor | None = None
         for name, joints, seen in self.trajectories:
             values = parents[name][:, :seen]
             found = (self._transform(seen, values) @ values).transpose(1, 2)  # (B, 3 joints, C)

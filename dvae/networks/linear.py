@@ -56,7 +56,7 @@ class LinearNetwork(Network):
         """Masked weights (T or 1, S or 1, H, D) for sequences of `length` steps."""
         if length > self.steps:
             raise ValueError(f"Linear(steps={self.steps}) was given {length} steps; build it with steps={length}")
-        weight = self.weights[name][:length, :length]
+        weight: Tensor = self.weights[name][:length, :length]
         return weight * self.mask(name, length)[:, :, None, None].to(weight.device)
 
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:

@@ -146,7 +146,7 @@ class FrameGraphNetwork(Network):
             room = (last + 2 - self.frames).clamp_min(1)  # of starts whose window ends with the sequence
             first = (torch.rand(len(motion), device=motion.device) * room).long()
         window = (first[:, None] + torch.arange(self.frames, device=motion.device)).minimum(last[:, None])
-        features = self.first(motion.gather(1, window[..., None].expand(-1, -1, motion.shape[-1])))
+        features: Tensor = self.first(motion.gather(1, window[..., None].expand(-1, -1, motion.shape[-1])))
         for block in self.blocks:
             features = features + block(features)
         return features.flatten(1)

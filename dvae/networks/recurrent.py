@@ -283,7 +283,7 @@ class RecurrentNetwork(Network):
                 summary(state, memory.direction, lengths)
                 for state, memory in zip(states, self._memories(), strict=True)
             ]
-        features = self.join([*states, *(part(values[parent.name], lag) for parent, lag in self.points)])
+        features: Tensor = self.join([*states, *(part(values[parent.name], lag) for parent, lag in self.points)])
         return features[:, None].expand(-1, length, -1) if self.local and features.dim() == 2 else features
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
