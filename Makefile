@@ -1,8 +1,11 @@
 # make demo    simulated people: fit two methods, print the table, save demo/futures.png
 # make test    lint, types, tests, and some of these once more as on another processor
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
+# make coverage   the tests, and which lines none of them runs
 # make bench   the benchmarks
 # make notebooks   runs the notebooks and stores them with what they show
+# make docs    the site, in docs/_build/html
+# make dist    sdist, and from it the wheel, in dist; installed and started where there is nothing else
 # Each makes the environment in .venv when it is missing or out of date.
 
 PYTHON := python3
@@ -14,7 +17,7 @@ export OMP_NUM_THREADS := 1
 # Numerical tests, for the second run: other instructions round otherwise.
 NUMERICAL := bounds compare control forecasts graphconv laws metrics model networks oracle particles trajectories
 
-.PHONY: venv demo test fuzz bench notebooks clean
+.PHONY: venv demo test fuzz coverage bench notebooks docs dist clean
 
 venv: .venv/installed
 
@@ -44,11 +47,30 @@ SEED := $(shell date +%s)
 fuzz: venv
 	DVAE_FUZZ_SECONDS=$(SECONDS) DVAE_FUZZ_SEED=$(SEED) $(BIN)/pytest tests/fuzz -s
 
+coverage: venv
+	$(BIN)/pytest -n 2 --cov --cov-report=term-missing:skip-covered
+
 bench: venv
 	set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file; done
 
 notebooks: venv
 	$(BIN)/python -m benchmarks.tables.notebooks notebooks/*.ipynb
 
+docs: venv
+	$(BIN)/python -c 'import furo, myst_nb' 2>/dev/null || $(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
+	$(BIN)/sphinx-build -W --keep-going -q docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
+CLEAN := build/clean/bin
+
+dist: venv
+	rm -rf build dist
+	$(BIN)/python -m build
+	$(PYTHON) -m venv build/clean
+	$(CLEAN)/python -m pip install -q -c constraints.txt torch==2.13.0
+	$(CLEAN)/python -m pip install -q -c constraints.txt dist/*.whl
+	cd build && clean/bin/dvae --help > /dev/null && clean/bin/dvae list > /dev/null
+	cd build && clean/bin/python -c 'import dvae, dvae.models.srnn, dvae.inference.fit; print(dvae.__version__, dvae.__file__)'
+
 clean:
-	rm -rf .venv build dist *.egg-info demo runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist *.egg-info demo runs docs/_build .pytest_cache .mypy_cache .ruff_cache .hypothesis

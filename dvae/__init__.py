@@ -13,6 +13,8 @@
 
 import sys
 
+__version__ = "0.1.0"
+
 if sys.flags.optimize > 1:  # Pyro fills in its docstrings as it is imported
     raise ImportError("dvae needs Pyro, which needs docstrings: run python without -OO (PYTHONOPTIMIZE=2); -O is fine")
 
