@@ -58,6 +58,7 @@ notebooks: venv
 
 docs: venv
 	$(BIN)/python -c 'import furo, myst_nb' 2>/dev/null || $(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
+	rm -rf docs/_reference
 	$(BIN)/sphinx-build -W --keep-going -q docs docs/_build/html
 	@echo "docs/_build/html/index.html"
 
@@ -73,4 +74,4 @@ dist: venv
 	cd build && clean/bin/python -c 'import dvae, dvae.models.srnn, dvae.inference.fit; print(dvae.__version__, dvae.__file__)'
 
 clean:
-	rm -rf .venv build dist *.egg-info demo runs docs/_build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist *.egg-info demo runs docs/_build docs/_reference docs/notebooks .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -28,7 +28,7 @@ def draw_dag(
     """Draws an unrolled graph: time left to right, latents open, data shaded, context squares.
 
     Args:
-        dag: nodes (name, t), (name, None) with attribute ``kind``, as :meth:`Factorization.dag` makes them.
+        dag: nodes (name, t), (name, None) with attribute `kind`, as `Factorization.dag` makes them.
         ax: matplotlib axes; a new figure if None.
         missing: arrows to add, dashed red.
         redundant: arrows of the graph to show dotted grey.

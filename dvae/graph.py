@@ -33,7 +33,7 @@ __all__ = ["Audit", "analytic_kl", "audit", "markov_boundary"]
 
 
 def markov_boundary(dag: nx.DiGraph, node: Node, given: AbstractSet[Node]) -> set[Node]:
-    """The smallest part of ``given`` that makes ``node`` independent of the rest of ``given``.
+    """The smallest part of `given` that makes `node` independent of the rest of `given`.
 
     u is in it exactly when node and u are not d-separated by the others. What is not given is integrated out.
 
@@ -137,7 +137,7 @@ class Audit:
 
     @property
     def missing(self) -> dict[str, tuple[str, ...]]:
-        """{latent: relations as text}, such as ``{"z": ("z_{<t}",)}``; only latents that miss something."""
+        """{latent: relations as text}, such as `{"z": ("z_{<t}",)}`; only latents that miss something."""
         return _terms(self.missing_parents)
 
     @property
@@ -227,13 +227,13 @@ def audit(
     """Compares what each factor of a guide reads with what the exact posterior factor depends on.
 
     The exact factor is p(latent | latents the guide has drawn before, all data and context); a variable that
-    the guide draws at all steps at once counts as drawn forward in time. Relations are read off ``steps``
+    the guide draws at all steps at once counts as drawn forward in time. Relations are read off `steps`
     inner steps of the unrolled graphs, away from the first and the last, where there is no past or no future
     to depend on; steps is widened where a relation reaches further. A pattern that is periodic in time (a lag
     of 2 without one of 1) is listed as far as seen.
 
     A mask of the user's own is known at one length at a time, and may single out some steps: the graphs are then
-    compared at all of exactly ``steps`` steps, and the audit says so.
+    compared at all of exactly `steps` steps, and the audit says so.
 
     Args:
         generative: p, a factorization or its text.
@@ -243,7 +243,7 @@ def audit(
         observed: names of the observed variables.
 
     Raises:
-        ValueError: the two do not fit each other (see :func:`dvae.notation.check_pair`).
+        ValueError: the two do not fit each other (see `dvae.notation.check_pair`).
 
     >>> audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})").missing
     {'z': ('z_{t-1}',)}

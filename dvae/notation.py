@@ -62,12 +62,12 @@ class NotationError(ValueError):
 class Relation:
     """Which steps s of a parent the child at step t may read: offsets s - t, or a mask of the user's own.
 
-    Relations compose: ``a | b`` (either), ``a & b`` (both), ``~a`` (the other steps).
+    Relations compose: `a | b` (either), `a & b` (both), `~a` (the other steps).
 
     Args:
-        name: as it stands in an equation, such as ``"{<t}"``.
+        name: as it stands in an equation, such as `"{<t}"`.
         intervals: sorted disjoint intervals of offsets s - t, both ends included and possibly infinite:
-            ``{t-1}`` is ``((-1, -1),)``, ``{<t}`` is ``((-inf, -1),)``. None for a mask of the user's own.
+            `{t-1}` is `((-1, -1),)`, `{<t}` is `((-inf, -1),)`. None for a mask of the user's own.
         function: for a mask of the user's own, T -> bool array (T, T), rows t, columns s. (1, T) means the
             same row for every t, and is the only shape a static child can have.
 
@@ -92,7 +92,7 @@ class Relation:
 
     @classmethod
     def custom(cls, name: str, function: MaskFunction) -> Relation:
-        """A mask of the user's own: function(T) -> bool array (T, T), shown as ``{name}``."""
+        """A mask of the user's own: function(T) -> bool array (T, T), shown as `{name}`."""
         return cls("{" + name + "}", None, function)
 
     @classmethod
@@ -251,14 +251,14 @@ class Parent:
 
     @property
     def pieces(self) -> tuple[tuple[str, str | None], ...]:
-        """(name, subscript) as written, such as ``(("x", "<t"), ("x", ">t"))``; None if static."""
+        """(name, subscript) as written, such as `(("x", "<t"), ("x", ">t"))`; None if static."""
         if self.relation is None:
             return ((self.name, None),)
         return tuple((self.name, part.name[1:-1]) for part in self.relation.parts)
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """The pieces as text: ``("x_{<t}", "x_{>t}")``."""
+        """The pieces as text: `("x_{<t}", "x_{>t}")`."""
         return tuple(_plain(*piece) for piece in self.pieces)
 
     def __str__(self) -> str:
@@ -267,7 +267,7 @@ class Parent:
 
 @dataclass(frozen=True)
 class Factor:
-    """One conditional distribution of a factorization; prints as ``p(z_t | z_{t-1}, w)``."""
+    """One conditional distribution of a factorization; prints as `p(z_t | z_{t-1}, w)`."""
 
     kind: Literal["p", "q"]
     child: str
@@ -279,7 +279,7 @@ class Factor:
         return next((parent for parent in self.parents if parent.name == name), None)
 
     def mask(self, parent: str, T: int) -> np.ndarray:
-        """Which steps of a parent each step reads, (T or 1, T or 1); see :meth:`Factorization.mask`."""
+        """Which steps of a parent each step reads, (T or 1, T or 1); see `Factorization.mask`."""
         reads = self.parent(parent)
         if reads is None:
             raise ValueError(f"{self} does not read {parent}")
@@ -295,7 +295,7 @@ class Factor:
         return mask
 
     def edges(self, T: int) -> list[tuple[Node, Node]]:
-        """The arrows (parent, child) of the graph unrolled over T steps; see :meth:`Factorization.dag`."""
+        """The arrows (parent, child) of the graph unrolled over T steps; see `Factorization.dag`."""
         return [
             (unrolled(parent.name, parent.local, T)[s], unrolled(self.child, self.local, T)[t])
             for parent in self.parents
@@ -303,7 +303,7 @@ class Factor:
         ]
 
     def render(self, variable: Callable[[str, str | None], str], bar: str = " | ") -> str:
-        """The factor as text, each variable written by ``variable(name, subscript)``."""
+        """The factor as text, each variable written by `variable(name, subscript)`."""
         child = variable(self.child, "t" if self.local else None)
         given = ", ".join(variable(*piece) for parent in self.parents for piece in parent.pieces)
         return f"{self.kind}({child}{bar + given if given else ''})"
@@ -354,7 +354,7 @@ def _html(name: str, subscript: str | None) -> str:
 class Factorization:
     """A joint distribution over sequences, as a product of conditional distributions.
 
-    Made by :meth:`parse`. Construction checks that it can be drawn: a variable that reads what is drawn after
+    Made by `parse`. Construction checks that it can be drawn: a variable that reads what is drawn after
     it is refused, with the cycle. The order in which factors are written matters only as a tie-break.
 
     >>> print(Factorization.parse("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)"))
@@ -375,11 +375,11 @@ class Factorization:
 
     @classmethod
     def parse(cls, text: str, masks: Mapping[str, Relation | MaskFunction] | None = None) -> Factorization:
-        """Reads equations such as ``"p(z_t | z_{t-1}) p(x_t | z_t)"``.
+        """Reads equations such as `"p(z_t | z_{t-1}) p(x_t | z_t)"`.
 
         Args:
             text: the factors, all p or all q.
-            masks: relations of the user's own: ``masks={"band": function}`` gives ``z_{band}`` its meaning,
+            masks: relations of the user's own: `masks={"band": function}` gives `z_{band}` its meaning,
                 where function(T) is a bool array (T, T), rows t, columns s; or a Relation.
 
         Raises:
@@ -429,7 +429,7 @@ class Factorization:
 
     @property
     def masks(self) -> dict[str, MaskFunction]:
-        """The custom masks in use: ``Factorization.parse(f.text, masks=f.masks) == f``."""
+        """The custom masks in use: `Factorization.parse(f.text, masks=f.masks) == f`."""
         relations = (parent.relation for factor in self.factors for parent in factor.parents)
         parts = (part for relation in relations if relation is not None for part in relation.parts)
         return {part.name[1:-1]: part.function for part in parts if part.function is not None}
@@ -529,7 +529,7 @@ class Factorization:
 
         Returns:
             networkx.DiGraph with nodes (name, t), t = 1, ..., T, and (name, None) for static variables. The
-            node attribute ``kind`` is "data" for observed variables, "latent" for others with a factor, else
+            node attribute `kind` is "data" for observed variables, "latent" for others with a factor, else
             "context".
         """
         dag, observed = nx.DiGraph(), tuple(observed)
@@ -544,7 +544,7 @@ class Factorization:
 
     @property
     def text(self) -> str:
-        """The factors in written order and canonical spelling; :meth:`parse` reads it back."""
+        """The factors in written order and canonical spelling; `parse` reads it back."""
         return " ".join(map(str, self.factors))
 
     def _joint(self, variable: Callable[[str, str | None], str], bar: str, product: str) -> str:

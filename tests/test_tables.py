@@ -3,9 +3,10 @@
 import re
 import shutil
 
+import networkx as nx
 import pytest
 
-from benchmarks.tables import audits, bounds, demo, family, gsps, hit_dvae, overview, pages, trajevae
+from benchmarks.tables import audits, bounds, demo, family, gsps, hit_dvae, house, overview, pages, trajevae
 from dvae import Evaluation, motion
 from dvae.cli import main as command
 
@@ -134,3 +135,17 @@ def test_demo(tmp_path):
 def test_overview(tmp_path):
     overview.main(tmp_path / "overview.png", steps=1, clips=40)
     assert (tmp_path / "overview.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_house(tmp_path):
+    house.main(tmp_path / "house.png")
+    assert (tmp_path / "house.png").read_bytes().startswith(b"\x89PNG")
+    graph = house.imports()
+    assert {"notation", "networks", "laws", "program", "inference", "models", "motion", "runs"} <= set(graph)
+    assert graph.has_edge("models", "inference")  # behind links, and by a relative import
+    assert graph.has_edge("inference", "program")
+
+
+def test_a_house_stands_on_what_it_imports():
+    house_of = nx.DiGraph([("roof", "walls"), ("walls", "ground"), ("roof", "ground"), ("shed", "ground")])
+    assert house.storeys(house_of) == [["ground"], ["shed", "walls"], ["roof"]]

@@ -1,0 +1,46 @@
+"""Pages: what they show runs as it stands, from the first block to the last; what they name is there."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import dvae  # noqa: F401  its settings are Pyro's from here on, and not from an example's first line
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+EXAMPLES = ("new_method", "own_data", "walk")
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_examples_of_a_page_run(name):
+    page = ROOT / "docs" / f"{name}.md"
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    assert blocks
+    variables = {}
+    for block in blocks:
+        exec(compile(block, page.name, "exec", dont_inherit=True), variables)
+
+
+def test_what_a_comment_of_the_notation_says_is_printed(capsys):
+    page = (ROOT / "docs" / "notation.md").read_text(encoding="utf-8")
+    test_the_examples_of_a_page_run("notation")
+    said = re.findall(r"^print\(.*\)  # (.*[)}])$", page, re.MULTILINE)
+    assert said
+    assert not set(said) - set(capsys.readouterr().out.splitlines())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_links_to_what_is_there(page):
+    for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), target
+
+
+def test_every_page_is_on_the_site():
+    trees = re.findall(r"```\{toctree\}\n(.*?)```", (ROOT / "docs" / "index.md").read_text(encoding="utf-8"), re.DOTALL)
+    listed = {line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")} - {
+        "Start <self>"
+    }
+    pages = {str(page.relative_to(ROOT / "docs").with_suffix("")) for page in PAGES} - {"index"}
+    notebooks = {f"notebooks/{path.stem}" for path in (ROOT / "notebooks").glob("*.ipynb")}
+    assert listed == pages | notebooks
