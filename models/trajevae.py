@@ -12,7 +12,7 @@ Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, with the layers of its pu
 share the perceptrons of poses and two of three transformers, and the decoder the perceptron of s. Ours: scales of z are
 softplus where that has log-variances; and without the learned prior, of which the paper says little, the decoder reads
 the trajectories beside z, in time and as they are. Off the paper's data, options left open stand for small networks,
-few coefficients, a cheaper z and windows turned to one heading (docs/decisions.md).
+few coefficients, a cheaper z and windows turned to one heading (docs/results/trajevae.md).
 """
 
 from __future__ import annotations
