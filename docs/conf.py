@@ -22,6 +22,8 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = f"dvae {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_theme_options = {"navigation_with_keys": True}
 templates_path = ["_templates"]
 
@@ -65,12 +67,12 @@ def _mark(found: re.Match[str]) -> str:
 
 
 def _as_text(_app: object, _what: str, _name: str, _object: object, _options: object, lines: list[str]) -> None:
-    parts = re.split(r"(^>>>(?:.+\n?)+|(?<=\S\n\n)(?:    .*\n+)+)", "\n".join(lines) + "\n", flags=re.MULTILINE)
+    parts = re.split(r"(^ *>>>(?:.+\n?)+|(?<=\S\n\n)(?:    .*\n+)+)", "\n".join(lines) + "\n", flags=re.MULTILINE)
     for place, part in enumerate(parts):
-        before = parts[place - 1] if place else ""
-        if place % 2 == 0 or (re.search(r"(?:^|\n)(?:[A-Z]\w+:|    .*)\n*\Z", before) and not part.startswith(">>>")):
+        before, example = parts[place - 1] if place else "", part.lstrip().startswith(">>>")
+        if place % 2 == 0 or (re.search(r"(?:^|\n)(?:[A-Z]\w+:|    .*)\n*\Z", before) and not example):
             parts[place] = _MARKS.sub(_mark, part)  # text, and what a section such as Args holds
-        elif not part.startswith(">>>") and not before.rstrip().endswith("::"):
+        elif not example and not before.rstrip().endswith("::"):
             parts[place] = f"::\n\n{part}\n"
     lines[:] = "".join(parts).split("\n")
 
