@@ -45,7 +45,7 @@ autosummary_context = {  # of the page of dvae itself
     "names": [name for name in dvae.__all__ if not inspect.ismodule(getattr(dvae, name))],
     "packages": [found.name for found in pkgutil.iter_modules(dvae.__path__) if found.name not in {"command", "cli"}],
 }
-autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}
+autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints_format = "short"
 autodoc_class_signature = "mixed"
 python_maximum_signature_line_length = 100

@@ -1,5 +1,6 @@
 """Pages: what they show runs as it stands, from the first block to the last; what they name is there."""
 
+import pkgutil
 import re
 from pathlib import Path
 
@@ -34,6 +35,15 @@ def test_what_a_comment_of_the_notation_says_is_printed(capsys):
 def test_a_page_links_to_what_is_there(page):
     for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_what_a_page_names_is_there(page):
+    for name in re.findall(r"\bdvae(?:\.[A-Za-z_]\w*)+", page.read_text(encoding="utf-8")):
+        try:
+            pkgutil.resolve_name(name)
+        except (AttributeError, ImportError):
+            pytest.fail(f"{page.name} speaks of {name}")
 
 
 def test_every_page_is_on_the_site():
