@@ -1091,7 +1091,8 @@ def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
 def _windows_of(loaded: runs.Loaded, clip: str | None) -> motion.Windows:
     """The test windows of a run's data, or all windows of one clip, of any split."""
     if clip is None:
-        return loaded.data.windows("test")
+        found: motion.Windows = loaded.data.windows("test")
+        return found
     chosen = motion.MotionSet([_clip(loaded.data.motion, clip)], loaded.data.motion.skeleton, loaded.config.data.path)
     anywhere = replace(loaded.schema.protocol, split_by="split", test=tuple(chosen.splits), train=())
     return motion.windows(chosen, anywhere, "test")

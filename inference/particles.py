@@ -26,9 +26,9 @@ from ..networks.base import computing_once, valid_steps
 from ..networks.rows import Rows, pick, select
 from ..notation import Factor, Parent
 from ..program.batch import Batch
-from ..program.conditional import Conditional
+from ..program.conditional import Conditional, like
 from ..program.model import DynamicalVAE
-from ..program.rollout import Rollout, like
+from ..program.rollout import Rollout
 from ..turns import alone
 from .bounds import require_likelihood
 

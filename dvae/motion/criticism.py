@@ -47,17 +47,21 @@ def statistics(windows: Posed) -> dict[str, Statistic]:
     feet = [j for j in sorted(ends) if re.search("foot|toe|ankle|heel", skeleton.names[j], re.IGNORECASE)]
 
     def speed(positions: Tensor) -> Tensor:
-        return fps * positions.diff(dim=-3).norm(dim=-1).mean((-2, -1))
+        found: Tensor = fps * positions.diff(dim=-3).norm(dim=-1).mean((-2, -1))
+        return found
 
     def acceleration(positions: Tensor) -> Tensor:
-        return fps**2 * positions.diff(n=2, dim=-3).norm(dim=-1).mean((-2, -1))
+        found: Tensor = fps**2 * positions.diff(n=2, dim=-3).norm(dim=-1).mean((-2, -1))
+        return found
 
     def bone_length(positions: Tensor) -> Tensor:
-        return skeleton.bone_lengths(positions).mean((-2, -1))
+        found: Tensor = skeleton.bone_lengths(positions).mean((-2, -1))
+        return found
 
     def bone_stretch(positions: Tensor) -> Tensor:
         lengths = skeleton.bone_lengths(positions)
-        return 100 * (lengths.std(-2, correction=0) / lengths.mean(-2)).mean(-1)
+        found: Tensor = 100 * (lengths.std(-2, correction=0) / lengths.mean(-2)).mean(-1)
+        return found
 
     def foot_height(positions: Tensor) -> Tensor:
         heights = positions[..., up]

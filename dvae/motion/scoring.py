@@ -147,7 +147,8 @@ def _path_error(windows: Windows | Exchanged) -> Measure:
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         paths = past["y"][:, None, windows.protocol.observed :]
         distances = (forecasts - paths).unflatten(-1, (-1, 3)).norm(dim=-1)
-        return distances[..., places].mean((1, 2, 3))
+        found: Tensor = distances[..., places].mean((1, 2, 3))
+        return found
 
     return Measure("path error", function, "m")
 
@@ -158,7 +159,8 @@ def _bone_length_error(windows: Windows | Exchanged) -> Measure:
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         both = forecasts, past["x"]
         lengths, reference = (windows.skeleton.bone_lengths(windows.positions(poses)) for poses in both)
-        return (lengths / reference.mean(1)[:, None, None] - 1).abs().mean((1, 2, 3))
+        found: Tensor = (lengths / reference.mean(1)[:, None, None] - 1).abs().mean((1, 2, 3))
+        return found
 
     return Measure("bone-length error", function, "relative")
 
@@ -193,11 +195,13 @@ def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[M
     @lru_cache(maxsize=1)  # for both scores of a batch
     def features(futures: Tensor) -> Tensor:
         with evaluating(classifier, 0):
-            return classifier.features(on_device_of(classifier, {"x": futures})["x"])
+            found: Tensor = classifier.features(on_device_of(classifier, {"x": futures})["x"])
+            return found
 
     def accuracy(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         right = (classifier.logits(features(forecasts)).cpu().argmax(-1) == classes[index, None]).double().mean(1)
-        return right.masked_fill(classes[index] < 0, math.nan)
+        found: Tensor = right.masked_fill(classes[index] < 0, math.nan)
+        return found
 
     x = windows.all()["x"][:, windows.protocol.observed :]
     real = torch.cat([features(futures) for futures in x.split(32)]).double().cpu()

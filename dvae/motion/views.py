@@ -88,7 +88,8 @@ class Heading(View):
             )
         pose, at = pose.unflatten(-1, (-1, 3)), self.skeleton.root
         if pose.shape[-2] == self.skeleton.joints:
-            return pose
+            found: Tensor = pose
+            return found
         return torch.cat([pose[..., :at, :], torch.full_like(pose[..., :1, :], root), pose[..., at:, :]], -2)
 
     def _check_lengths(self, lengths: Tensor, steps: int) -> None:

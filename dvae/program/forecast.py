@@ -13,7 +13,7 @@ from pyro import poutine
 from torch import Tensor
 
 from .batch import Batch, in_chunks, repeat, rows
-from .rollout import like
+from .conditional import like
 
 
 def forecast(

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .batch import Batch
-from .rollout import like
+from .conditional import like
 
 
 def reference(model: Any, batch: Batch) -> None:

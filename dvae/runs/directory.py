@@ -176,7 +176,8 @@ def resume(
     train, validation = run.data.windows("train"), run.data.windows("validation")
     recipe = run.method.train(train, validation, training.steps)
     more: dict[str, Any] = {"out": path, "trackers": trackers, "callbacks": callbacks, **vars(training)}
-    return recipe.fit(run.model, resume=True, **more)
+    found: Fit = recipe.fit(run.model, resume=True, **more)
+    return found
 
 
 @alone

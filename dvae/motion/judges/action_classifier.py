@@ -152,4 +152,5 @@ class ActionClassifierModel(nn.Module):
                 f"frames have {futures.shape[-1]} numbers; this classifier was fitted to frames of {self.size}"
             )
         outputs, _ = self.gru(futures.reshape(-1, *futures.shape[-2:]))
-        return torch.tanh(self.project(outputs[:, -1])).unflatten(0, futures.shape[:-2])
+        found: Tensor = torch.tanh(self.project(outputs[:, -1])).unflatten(0, futures.shape[:-2])
+        return found
