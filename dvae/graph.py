@@ -21,7 +21,8 @@ import networkx as nx
 import numpy as np
 
 from .drawing import Edge, Node, draw_dag
-from .notation import ALL, Factor, Factorization, Parent, Relation, check_pair, unrolled
+from .notation import Factor, Factorization, Parent, check_pair, unrolled
+from .relations import ALL, Relation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

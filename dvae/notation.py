@@ -18,10 +18,8 @@ factor of its own is *context*: given, never drawn.
 from __future__ import annotations
 
 import html
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, NoReturn
@@ -30,212 +28,18 @@ import networkx as nx
 import numpy as np
 
 from .drawing import Node, draw_dag
+from .relations import ALL, FUTURE, NOW, PAST, MaskFunction, NotationError, Relation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-__all__ = ["Block", "Factor", "Factorization", "NotationError", "Parent", "Relation", "check_pair"]
-
-Interval = tuple[float, float]
-MaskFunction = Callable[[int], np.ndarray]
-
-KNOWN_RELATIONS = "t, {t-1}, {t+1}, {t-k}, {t-a:t+b}, {<t}, {<=t}, {>t}, {>=t}, {1:t}, {t:T}, {1:T}"
 RESERVED = {
     "lengths": "the batch's entry for the number of valid steps",
     "mask": "the batch's entry for which entries are observed",
     "sequences": "the name of the plate over the batch",
 }
-FARTHER = (16, 32, 64)
-"""Lengths at which the direction of a custom mask is looked up, after 2 to 8; every run checks it at its own."""
 FONT = r"\\(?:math(?:bf|rm|it|sf)|boldsymbol|bm)(?![a-z])\s*"
-
-
-class NotationError(ValueError):
-    """An equation that cannot be read; the message shows the text with a caret under the column."""
-
-
-# -------------------------------------------------------------------------------------------------- relations
-
-
-@dataclass(frozen=True)
-class Relation:
-    """Which steps s of a parent the child at step t may read: offsets s - t, or a mask of the user's own.
-
-    Relations compose: `a | b` (either), `a & b` (both), `~a` (the other steps).
-
-    Args:
-        name: as it stands in an equation, such as `"{<t}"`.
-        intervals: sorted disjoint intervals of offsets s - t, both ends included and possibly infinite:
-            `{t-1}` is `((-1, -1),)`, `{<t}` is `((-inf, -1),)`. None for a mask of the user's own.
-        function: for a mask of the user's own, T -> bool array (T, T), rows t, columns s. (1, T) means the
-            same row for every t, and is the only shape a static child can have.
-
-    >>> str(Relation.parse("<t") | Relation.parse("t"))
-    '{<=t}'
-    """
-
-    name: str
-    intervals: tuple[Interval, ...] | None
-    function: MaskFunction | None = None
-
-    @classmethod
-    def of(cls, intervals: Iterable[Interval]) -> Relation:
-        """The relation with these offset intervals, merged, sorted and named."""
-        merged: list[Interval] = []
-        for low, high in sorted(intervals):
-            if merged and low <= merged[-1][1] + 1:
-                merged[-1] = (merged[-1][0], max(merged[-1][1], high))
-            else:
-                merged.append((low, high))
-        return cls(" | ".join(_interval_name(*i) for i in merged) or "{}", tuple(merged))
-
-    @classmethod
-    def custom(cls, name: str, function: MaskFunction) -> Relation:
-        """A mask of the user's own: function(T) -> bool array (T, T), shown as `{name}`."""
-        return cls("{" + name + "}", None, function)
-
-    @classmethod
-    def parse(cls, text: str) -> Relation:
-        """The relation of a subscript, given without braces; ValueError for one the grammar lacks."""
-        for sign, spelling in {"<=": r"\\leq?", ">=": r"\\geq?", "<": r"\\lt", ">": r"\\gt"}.items():
-            text = re.sub(rf"(?:{spelling})(?![a-z])", sign, text)
-        for sign, spelling in {"<=": "≤", ">=": "≥", "-": "\N{MINUS SIGN}"}.items():
-            text = text.replace(spelling, sign)
-        text = re.sub(r"\s|\\[,;:! ]", "", text)
-        if single := re.fullmatch(r"t([+-]\d+)?", text):
-            offset = int(single[1] or 0)
-            return cls.of([(offset, offset)])
-        if side := re.fullmatch(r"(<=?|>=?)t([+-]\d+)?", text):
-            offset, strict = int(side[2] or 0), len(side[1]) == 1
-            past = side[1][0] == "<"
-            return cls.of([(-math.inf, offset - strict) if past else (offset + strict, math.inf)])
-        if span := re.fullmatch(r"(?:1|t([+-]\d+)?):(?:T|t([+-]\d+)?)", text):
-            low, high = text.split(":")
-            interval = (
-                -math.inf if low == "1" else int(span[1] or 0),
-                math.inf if high == "T" else int(span[2] or 0),
-            )
-            if interval[0] > interval[1]:
-                raise ValueError(f"the range {{{text}}} is empty; write the earlier step first: {{{high}:{low}}}")
-            return cls.of([interval])
-        raise ValueError(f"unknown relation {{{text}}}; known are {KNOWN_RELATIONS}, and any name given in masks=")
-
-    @property
-    def parts(self) -> tuple[Relation, ...]:
-        """The relations, each writable as one subscript, whose union this is."""
-        if self.intervals is not None:
-            return tuple(Relation.of([interval]) for interval in self.intervals)
-        if isinstance(self.function, _Composed) and self.function.operation is np.logical_or:
-            return tuple(part for operand in self.function.operands for part in operand.parts)
-        return (self,)
-
-    @property
-    def pointwise(self) -> bool:
-        """True where it reads a fixed number of steps, as t, {t-1} and {t-2:t} do; False for custom masks."""
-        ends = [end for interval in self.intervals or [(0, math.inf)] for end in interval]
-        return all(map(math.isfinite, ends))
-
-    @property
-    def lag(self) -> int:
-        """The largest finite distance in its definition: 1 for {<t} and {t+1}, 3 for {t-3:t}, 0 for {1:T}.
-
-        Raises:
-            ValueError: a custom mask, whose reach may depend on T.
-        """
-        if self.intervals is None:
-            raise ValueError(f"the custom mask {self} has no lag: what it reads is known at a given length only")
-        return max((int(abs(end)) for i in self.intervals for end in i if math.isfinite(end)), default=0)
-
-    @property
-    def directions(self) -> frozenset[int]:
-        """Where it reads: -1 the past, 0 the same step, +1 the future; custom masks are tried at some lengths."""
-        if self.intervals is not None:
-            reads = {-1: (-math.inf, -1), 0: (0, 0), 1: (1, math.inf)}
-            return frozenset(k for k, side in reads.items() if (self & Relation.of([side])).intervals)
-        offsets = [np.subtract(*np.nonzero(self.mask(T).T)) for T in range(2, 9)]
-        with suppress(Exception):  # a mask may be made for short sequences alone
-            offsets += [np.subtract(*np.nonzero(self.mask(T).T)) for T in FARTHER]
-        return frozenset(int(sign) for sign in np.sign(np.concatenate(offsets)))
-
-    def reads(self, offset: int, T: int) -> bool:
-        """Whether the child reads the parent so many steps away wherever there is such a step of T."""
-        if self.intervals is not None:
-            return any(low <= offset <= high for low, high in self.intervals)
-        return bool(self.mask(T).diagonal(offset).all())
-
-    def mask(self, T: int) -> np.ndarray:
-        """Bool array (T, T): M[t, s] is True where the child at t may read the parent at s (counted from 0).
-
-        Raises:
-            ValueError: a custom function returns anything but a bool array (T, T) or (1, T).
-        """
-        return np.broadcast_to(self.rows(T), (T, T)).copy()
-
-    def rows(self, T: int) -> np.ndarray:
-        """`mask`, or its one row (1, T) where a custom function gives the same for every t."""
-        if self.intervals is not None:
-            offset = np.arange(T)[None, :] - np.arange(T)[:, None]
-            allowed = [(low <= offset) & (offset <= high) for low, high in self.intervals or [(1, 0)]]
-            return np.asarray(np.any(allowed, axis=0))
-        assert self.function is not None
-        mask = np.asarray(self.function(T))
-        if mask.dtype != bool or mask.shape not in ((T, T), (1, T)):
-            raise ValueError(
-                f"the mask {self.name} at T={T} is {mask.dtype} {mask.shape}; expected a bool array "
-                f"({T}, {T}) with rows t and columns s (or (1, {T}): the same row for every t)"
-            )
-        return mask
-
-    def __or__(self, other: Relation) -> Relation:
-        if self.intervals is not None and other.intervals is not None:
-            return Relation.of(self.intervals + other.intervals)
-        return Relation(f"{self.name} | {other.name}", None, _Composed(np.logical_or, (self, other)))
-
-    def __and__(self, other: Relation) -> Relation:
-        if self.intervals is not None and other.intervals is not None:
-            pairs = [(max(a, c), min(b, d)) for a, b in self.intervals for c, d in other.intervals]
-            return Relation.of((low, high) for low, high in pairs if low <= high)
-        return Relation(f"{{{self.name} & {other.name}}}", None, _Composed(np.logical_and, (self, other)))
-
-    def __invert__(self) -> Relation:
-        if self.intervals is not None:
-            starts = [-math.inf, *(high + 1 for _, high in self.intervals)]
-            ends = [*(low - 1 for low, _ in self.intervals), math.inf]
-            gaps = zip(starts, ends, strict=True)
-            return Relation.of((low, high) for low, high in gaps if low <= high and math.inf not in (low, -high))
-        return Relation(f"{{~{self.name}}}", None, _Composed(np.logical_not, (self,)))
-
-    def __str__(self) -> str:
-        return self.name
-
-
-@dataclass(frozen=True)
-class _Composed:
-    """Custom masks under a logical operation; a value, so that relations built the same way are equal."""
-
-    operation: Callable[..., np.ndarray]
-    operands: tuple[Relation, ...]
-
-    def __call__(self, T: int) -> np.ndarray:
-        return self.operation(*(operand.rows(T) for operand in self.operands))
-
-
-def _interval_name(low: float, high: float) -> str:
-    def step(offset: float) -> str:
-        return f"t{int(offset):+d}" if offset else "t"
-
-    if low == -math.inf and high == math.inf:
-        return "{1:T}"
-    if low == -math.inf:
-        return "{<t}" if high == -1 else "{<=" + step(high) + "}"
-    if high == math.inf:
-        return "{>t}" if low == 1 else "{>=" + step(low) + "}"
-    return "{" + (step(low) if low == high else f"{step(low)}:{step(high)}") + "}"
-
-
-PAST, NOW, FUTURE = Relation.parse("<t"), Relation.parse("t"), Relation.parse(">t")
-ALL = Relation.parse("1:T")
 
 
 # ---------------------------------------------------------------------------------------- parents and factors

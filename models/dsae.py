@@ -22,8 +22,8 @@ from torch.nn import functional
 from ..networks import Dense, Input, NetworkSpec, Recurrent
 from ..networks.base import Network
 from ..networks.recurrent import Memory
-from ..notation import ALL
 from ..options import Size
+from ..relations import ALL
 from .method import LatentMethod
 
 

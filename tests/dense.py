@@ -15,8 +15,9 @@ import torch
 
 from dvae.inference.bounds import SequenceELBO
 from dvae.laws import Law
-from dvae.notation import Factorization, Relation
+from dvae.notation import Factorization
 from dvae.program.conditional import CONSTANT
+from dvae.relations import Relation
 
 
 def exact_bound(model, x, *, length=None, seen=None, fed=None, detach=False):

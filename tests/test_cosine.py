@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 from dvae.networks import CosineEncoder, MotionDecoder
 from dvae.networks.base import Input, share_modules
 from dvae.networks.cosine import Dropout, TransformerLayer, positions
-from dvae.notation import Relation
+from dvae.relations import Relation
 
 ALL, LENGTH = Relation.parse("1:T"), 7
 SMALL = {"width": 6, "feedforward": 10, "heads": 2, "layers": 2}

@@ -16,7 +16,8 @@ import dvae.graph
 import dvae.notation
 from dvae.graph import analytic_kl, audit, markov_boundary
 from dvae.models.method import LatentMethod
-from dvae.notation import Factorization, Relation
+from dvae.notation import Factorization
+from dvae.relations import Relation
 from dvae.testing.strategies import factorizations
 
 DKF = "p(z_t | z_{t-1}) p(x_t | z_t)"

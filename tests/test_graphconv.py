@@ -9,7 +9,7 @@ import dvae
 from dvae.networks import GraphConv
 from dvae.networks.base import Input
 from dvae.networks.dct import cosine_basis
-from dvae.notation import Relation
+from dvae.relations import Relation
 from dvae.views import History, Parts, Views
 
 OBSERVED, LENGTH, JOINTS = 4, 9, 5

@@ -15,7 +15,7 @@ from dvae.laws.kalman import LinearGaussianChain
 from dvae.laws.triangular import InverseCholesky, TriangularNormal
 from dvae.models.kvae import KVAE, Kalman, KalmanNetwork, Triangular, smooth
 from dvae.networks import Input
-from dvae.notation import Relation
+from dvae.relations import Relation
 
 
 def chain(steps=5, batch=2, size=3, data=2):

@@ -192,7 +192,7 @@ class Peeking(dvae.networks.Dense):
     """Reads every parent at t, whatever its relation."""
 
     def build(self, inputs, local, size):
-        now = dvae.notation.Relation.parse("t")
+        now = dvae.relations.Relation.parse("t")
         return super().build([dvae.networks.Input(p.name, p.size, p.relation and now) for p in inputs], local, size)
 
 

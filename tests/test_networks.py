@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dvae.networks import Attention, Dense, FrameGraph, Input, Linear, PoseGraph, Recurrent, SelfAttention
 from dvae.networks.base import computing_once, shift
 from dvae.networks.recurrent import tie
-from dvae.notation import Relation
+from dvae.relations import Relation
 
 T = 6
 NETWORKS = {

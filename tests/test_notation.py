@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dvae.notation import Block, Factorization, NotationError, Parent, Relation, check_pair
+from dvae.notation import Block, Factorization, Parent, check_pair
+from dvae.relations import NotationError, Relation
 from dvae.testing.strategies import factorizations
 
 HIT_DVAE = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"

@@ -11,8 +11,9 @@ from dvae import DynamicalVAE, Oracle, SequenceELBO, importance_bound, laws, par
 from dvae.inference.particles import Filter, ancestors, effective_size
 from dvae.networks import Attention, Dense, Input, Linear, Recurrent
 from dvae.networks.rows import Rows, select
-from dvae.notation import Factorization, Relation
+from dvae.notation import Factorization
 from dvae.program.batch import repeat
+from dvae.relations import Relation
 
 T = 5
 PAIRS = {

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..notation import Relation
+from ..relations import Relation
 from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, at, valid_steps
 from .dense import part
 from .extract import Extract, Extractors

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..notation import ALL
+from ..relations import ALL
 from .base import AtOnce, Input, Network, once
 from .dct import cosine_basis
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..notation import ALL
+from ..relations import ALL
 from .base import Input, Network
 from .extract import Extract, Extractors
 
