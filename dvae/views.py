@@ -18,26 +18,26 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from .data import Batch
 from .notation import Factorization
 
 WHOLE = "x"
 """Name of the data where a view makes several variables of them."""
 
-Data = Mapping[str, Any]
 """Values by name, with "lengths" and, by name, "mask"."""
 
 
 class View:
     """What a model sees of the data; this view, all as it is.
 
-    What a view finds in the data and needs for the way back, as a heading, it adds under a name of its own. Data that
+    What a view finds in the data and needs for the way back, as a heading, it adds under a name of its own. Batch that
     were seen are seen as they are.
     """
 
     names: tuple[str, ...] = ()
     """Names in batches, beside those of the variables: what the view reads, and what it adds."""
     parts: Mapping[str, Sequence[int]] | None = None
-    """Data variables that are coordinates of x, in place of it."""
+    """Batch variables that are coordinates of x, in place of it."""
     history: str | None = None
     """Name of the context that is the data themselves."""
 
@@ -48,7 +48,7 @@ class View:
             ValueError: saying why.
         """
 
-    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
         """The data as they are seen.
 
         Args:
@@ -60,11 +60,11 @@ class View:
         """
         return dict(data)
 
-    def inverse(self, seen: Data) -> dict[str, Any]:
+    def inverse(self, seen: Batch) -> dict[str, Any]:
         """The data that are seen so; values (..., B, T, D) of these and of what the view added, (B, ...)."""
         return dict(seen)
 
-    def log_det(self, data: Data) -> Tensor:
+    def log_det(self, data: Batch) -> Tensor:
         """(B,) log of the absolute determinant of the Jacobian: 0, as views keep volume."""
         some = next(iter(data.values()))
         found: Tensor = some.new_zeros(len(some))
@@ -93,13 +93,13 @@ class Views(View):
             view.check(sizes, context, generative)
 
     @override
-    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
         for view in self.views:
             data = view(data, beside)
         return dict(data)
 
     @override
-    def inverse(self, seen: Data) -> dict[str, Any]:
+    def inverse(self, seen: Batch) -> dict[str, Any]:
         for view in reversed(self.views):
             seen = view.inverse(seen)
         return dict(seen)
@@ -107,7 +107,7 @@ class Views(View):
 
 @dataclass(frozen=True)
 class Parts(View):
-    """Data variables that are coordinates of one array x, which stands for all of them in batches and forecasts.
+    """Batch variables that are coordinates of one array x, which stands for all of them in batches and forecasts.
 
     Args:
         parts: variable to its coordinates. Every coordinate belongs to one of them.
@@ -133,7 +133,7 @@ class Parts(View):
             raise ValueError(f"with parts, {WHOLE!r} is the name of the whole; no variable can have it")
 
     @override
-    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
         if WHOLE not in data:
             return dict(data)
         seen, masks = dict(data), dict(data.get("mask", {}))
@@ -148,7 +148,7 @@ class Parts(View):
         return {**seen, "mask": masks} if mask is not None else seen
 
     @override
-    def inverse(self, seen: Data) -> dict[str, Any]:
+    def inverse(self, seen: Batch) -> dict[str, Any]:
         if not self.parts.keys() <= seen.keys():
             return dict(seen)
         places = torch.tensor([place for part in self.parts.values() for place in part])
@@ -185,7 +185,7 @@ class History(View):
                 )
 
     @override
-    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
         if self.of not in data or self.history in data or beside is not None:
             return dict(data)
         masks = data.get("mask", {})
@@ -210,7 +210,7 @@ class FirstFrame(View):
     also: tuple[str, ...] = ()
 
     @override
-    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
         if WHOLE not in data or self.name in data or beside is not None:
             return dict(data)
         if "lengths" in data:
@@ -232,7 +232,7 @@ class FirstFrame(View):
         return seen
 
     @override
-    def inverse(self, seen: Data) -> dict[str, Any]:
+    def inverse(self, seen: Batch) -> dict[str, Any]:
         if self.name not in seen:
             return dict(seen)
         first = seen[self.name][..., None, :]

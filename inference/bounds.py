@@ -23,7 +23,7 @@ from torch.distributions import kl_divergence
 
 from ..graph import analytic_kl
 from ..networks.base import computing_once
-from ..program.batch import Batch, repeat
+from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, Sequence
 from ..turns import alone
@@ -85,7 +85,7 @@ class SequenceELBO(ELBO):
 
     @alone
     def terms(
-        self, model: Callable[..., Any], batch: Batch, guide: Callable[..., Any] | None = None, **options: Any
+        self, model: Callable[..., Any], batch: AnyBatch, guide: Callable[..., Any] | None = None, **options: Any
     ) -> Terms:
         """The bound's terms, averaged over the particles.
 
@@ -289,7 +289,7 @@ class ImportanceBound:
 @alone
 @torch.no_grad()
 def importance_bound(
-    model: DynamicalVAE, batch: Batch, particles: int = 100, *, chunk: int = 4096, **options: Any
+    model: DynamicalVAE, batch: AnyBatch, particles: int = 100, *, chunk: int = 4096, **options: Any
 ) -> ImportanceBound:
     """The importance-weighted bound: log of the mean over particles of p(x, z) / q(z | x), per sequence.
 
@@ -336,7 +336,7 @@ def importance_mean(
     )
 
 
-def _log_weights(model: DynamicalVAE, batch: Batch, options: Mapping[str, Any]) -> Tensor:
+def _log_weights(model: DynamicalVAE, batch: AnyBatch, options: Mapping[str, Any]) -> Tensor:
     joint, sites = map(sites_of, _traces(model, model.guide, (batch,), options))
 
     def total(table: Mapping[str, Mapping[str, Any]]) -> Tensor:

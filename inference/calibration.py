@@ -20,11 +20,11 @@ from pyro import poutine
 from scipy import fft, special
 from torch import Tensor
 
-from ..program.batch import Batch, repeat
+from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import require_likelihood
-from .held import evaluating, on_device_of
+from .held import on_device_of, reproducibly
 from .result import Result, Table, progress_bar
 
 __all__ = ["Calibration", "calibrate"]
@@ -270,7 +270,7 @@ def calibrate(
     infer = guide or model.guide
     at_once = max(1, chunk // draws)
     ranks = []
-    with evaluating(model, seed), progress_bar(progress) as bar:
+    with reproducibly(model, seed), progress_bar(progress) as bar:
         for start in bar.track(range(0, simulations, at_once), description="simulations"):
             turn = torch.arange(start, min(start + at_once, simulations))
             given = on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
@@ -296,7 +296,7 @@ def _ranks(
 ) -> Tensor:
     """Ranks (B, Q) of B simulations, latents and data, among the guide's draws of their latents."""
 
-    def quantities(batch: Batch, latents: Mapping[str, Tensor]) -> Tensor:
+    def quantities(batch: AnyBatch, latents: Mapping[str, Tensor]) -> Tensor:
         """(B, Q)."""
         local = model.generative.local
         ranked = [latents[name][:, steps] if local(name) else latents[name] for name in model.latents]

@@ -23,7 +23,7 @@ from ..program.batch import repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import require_likelihood
-from .held import evaluating, hold, on_device_of, plain
+from .held import hold, on_device_of, plain, reproducibly
 from .result import Result, Table, as_they_are, progress_bar
 
 __all__ = ["STATISTICS", "Check", "PredictiveChecks", "Statistic", "predictive_checks"]
@@ -286,7 +286,7 @@ def predictive_checks(
             real = _measure(statistics, held.x[:, first:], "real windows")
             for label, each in models.items():
                 parts: list[dict[str, Tensor]] = []
-                with evaluating(each, seed):
+                with reproducibly(each, seed):
                     starts = range(0, len(held.x), batch_size)
                     for start in bar.track(starts, description=f"{label}, {program}"):
                         part = on_device_of(each, held.part(slice(start, start + batch_size)))

@@ -22,7 +22,7 @@ from ..turns import alone
 from .bounds import require_likelihood
 from .comparison import Comparison, Contender
 from .evaluate import evaluate
-from .held import evaluating, plain
+from .held import plain, reproducibly
 from .result import progress_bar
 from .scores import Measure, Scores, proper
 from .teacher_forced import bounds, information, length_of, variances
@@ -171,11 +171,11 @@ def _measured(
             for start in bar.track(range(0, count, size), description=f"{label}, {what}"):
                 yield slice(start, start + size)
 
-        with evaluating(model, seed):
+        with reproducibly(model, seed):
             found = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
-        with evaluating(model, seed):
+        with reproducibly(model, seed):
             found["variances"] = variances(model, batch, parts("active units", len(keys), batch_size))
-        with evaluating(model, seed):
+        with reproducibly(model, seed):
             pieces = parts("information", len(chosen), max(1, _PAIRS // max(1, len(chosen))))
             found["information"] = information(model, each(batch, itemgetter(chosen)), pieces)
     return found

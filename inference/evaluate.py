@@ -25,7 +25,7 @@ from ..program.protocols import Forecasting
 from ..turns import alone
 from .bounds import SequenceELBO, importance_bound
 from .evaluation import Evaluation, Row
-from .held import Held, evaluating, hold, on_device_of, plain, refuse_non_finite
+from .held import Held, hold, on_device_of, plain, refuse_non_finite, reproducibly
 from .predictive import predictive_bound
 from .references import nearest_neighbours, zero_velocity
 from .result import progress_bar
@@ -107,13 +107,13 @@ def evaluate(
         for name, (count, forecaster) in baselines.items():
             rows[name] = Row(count, judge.forecasts(name, forecaster, count, parts(name)))
         for name, each in models.items():
-            with evaluating(each, seed):
+            with reproducibly(each, seed):
                 forecaster = _forecaster(each, held, samples, {"draw_emission": draw_emission, **(options or {})})
                 means = judge.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
             if each.likelihood:
-                with evaluating(each, seed):
+                with reproducibly(each, seed):
                     means |= judge.bounds(name, each, parts(f"{name}, bound"))
-                with evaluating(each, seed):
+                with reproducibly(each, seed):
                     means |= judge.log_score(name, each, parts(f"{name}, log score"))
             equations = {"generative": each.generative.text, "inference": each.inference.text}
             rows[name] = Row(samples, means, equations, dict((configs or {}).get(name, {})))

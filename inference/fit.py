@@ -23,7 +23,7 @@ from .result import as_they_are
 from .resuming import marking_failure, restore, store
 from .signals import Signals
 from .svi import SVI, State
-from .trackers import History, JSONLines, Terminal, Tracker
+from .trackers import InMemory, JSONLines, Terminal, Tracker
 from .training import Stage, Training, recorded
 
 if TYPE_CHECKING:
@@ -200,12 +200,12 @@ def fit(
         if run is not None and resume:
             restore(svi, run)
             svi.fabric.barrier()  # every process has read the checkpoint before the first one writes
-        history, receivers = History(), list[Tracker]()
+        history, receivers = InMemory(), list[Tracker]()
         if first:
             if run is not None:
                 run.write_config((run.config if resume else {}) | record | dict(config or {}))
                 log = JSONLines(run.path / "log.jsonl")
-                history = History(log.read() if resume else [])
+                history = InMemory(log.read() if resume else [])
                 receivers = [log]
             receivers += [history, *trackers, *([Terminal(training.steps)] if training.progress else [])]
         for tracker in receivers:

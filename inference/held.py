@@ -90,7 +90,7 @@ def clip_places(keys: Sequence[tuple[str, str, int]]) -> Tensor:
 
 
 @contextmanager
-def evaluating(model: nn.Module, seed: int) -> Iterator[None]:
+def reproducibly(model: nn.Module, seed: int) -> Iterator[None]:
     """Evaluation mode, no gradients and draws from `seed`; mode and random state are restored."""
     device = next(model.parameters()).device
     training = model.training

@@ -25,7 +25,7 @@ from ..laws.base import Parameters
 from ..networks.base import computing_once, valid_steps
 from ..networks.rows import Rows, pick, select
 from ..notation import Factor, Parent
-from ..program.batch import Batch
+from ..program.batch import AnyBatch
 from ..program.conditional import Conditional, like
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout
@@ -53,7 +53,7 @@ class ParticleBound:
 @alone
 @torch.no_grad()
 def particle_bound(
-    model: DynamicalVAE, batch: Batch, particles: int = 16, *, resample_below: float = 0.5, chunk: int = 4096
+    model: DynamicalVAE, batch: AnyBatch, particles: int = 16, *, resample_below: float = 0.5, chunk: int = 4096
 ) -> ParticleBound:
     """The log of a particle filter's estimate of p(x), per sequence, with the guide as proposal.
 
@@ -114,7 +114,7 @@ class Filter:
         particles: K.
     """
 
-    def __init__(self, model: DynamicalVAE, batch: Batch, particles: int):
+    def __init__(self, model: DynamicalVAE, batch: AnyBatch, particles: int):
         self.model = model
         self.particles = particles
         self.known = model._rollout(model.generative, model.generator, batch, None, 1)

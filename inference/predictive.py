@@ -23,7 +23,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from ..program.batch import Batch, repeat
+from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import ImportanceBound, importance_mean, require_likelihood, site_log_prob, sites_of
@@ -32,7 +32,7 @@ from .bounds import ImportanceBound, importance_mean, require_likelihood, site_l
 @alone
 @torch.no_grad()
 def predictive_bound(
-    model: DynamicalVAE, batch: Batch, observed: int, particles: int = 100, *, chunk: int = 4096
+    model: DynamicalVAE, batch: AnyBatch, observed: int, particles: int = 100, *, chunk: int = 4096
 ) -> ImportanceBound:
     """Log density of what follows the observed frames under the model's own forecasts; see the module.
 

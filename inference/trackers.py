@@ -40,7 +40,7 @@ class Tracker(Protocol):
         """Release files and screen; called once, also when the run fails."""
 
 
-class History:
+class InMemory:
     """Keeps the rows in `rows`, a list of dicts with the key "step".
 
     Args:

@@ -9,11 +9,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ..program.batch import Batch, repeat
+from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
 from .checks import decode
-from .held import evaluating, on_device_of
+from .held import on_device_of, reproducibly
 
 __all__ = ["Traversal", "traverse"]
 
@@ -48,7 +48,7 @@ class Traversal:
 @torch.no_grad()
 def traverse(
     model: DynamicalVAE,
-    batch: Batch,
+    batch: AnyBatch,
     latent: str,
     coordinates: Sequence[int] | None = None,
     span: tuple[float, float] = (-3.0, 3.0),
@@ -105,7 +105,7 @@ def traverse(
     data = on_device_of(model, model.read(batch))
     if partial := {"lengths", "mask"} & data.keys():
         raise ValueError(f"a traversal needs complete sequences, but these have {', '.join(sorted(partial))}")
-    with evaluating(model, seed):
+    with reproducibly(model, seed):
         scale = _scale(model, data, latent, unit, draws)[list(chosen)]
         torch.manual_seed(seed)
         inferred = model.guide(data)

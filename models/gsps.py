@@ -41,7 +41,7 @@ from ..motion.body import body_parts
 from ..networks import GraphConv
 from ..notation import Factorization
 from ..options import Amount, Layers, Size
-from ..program.batch import CHUNK, Batch
+from ..program.batch import CHUNK, AnyBatch
 from ..program.rollout import Rollout
 from ..views import WHOLE, History, Parts
 from .energies import EnergyMethod, EnergyModel
@@ -228,19 +228,19 @@ class GSPSModel(EnergyModel):
         self.length = length
         self.draws = dict(zip(codes, _each(method.draws, method.parts), strict=True))
 
-    def model(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
+    def model(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
         """See `DynamicalVAE.model`; of whole windows, with energies. Values are as the networks see them, turned."""
         return super().model(batch, **self._drawing(batch, options))
 
-    def guide(self, batch: Batch, **options: Any) -> dict[str, Tensor]:
+    def guide(self, batch: AnyBatch, **options: Any) -> dict[str, Tensor]:
         """See `DynamicalVAE.guide`."""
         return super().guide(batch, **self._drawing(batch, options))
 
-    def _drawing(self, batch: Batch | None, options: Mapping[str, Any]) -> dict[str, Any]:
+    def _drawing(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> dict[str, Any]:
         """The options, with several draws where there is a truth to score futures by."""
         return {**({"draws": self.draws} if self._whole(batch, options) else {}), **options}
 
-    def _whole(self, batch: Batch | None, options: Mapping[str, Any]) -> bool:
+    def _whole(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> bool:
         """Whether the program is asked for no more than what the batch holds."""
         given = batch[WHOLE] if isinstance(batch, Mapping) and WHOLE in batch else None
         return given is not None and given.shape[1] == self.length and options.get("length") is None
@@ -281,7 +281,7 @@ class GSPSModel(EnergyModel):
     @torch.no_grad()
     def forecast(
         self,
-        batch: Batch,
+        batch: AnyBatch,
         horizon: int,
         samples: int = 1,
         *,
@@ -307,7 +307,7 @@ class GSPSModel(EnergyModel):
         }
 
     @torch.no_grad()
-    def sample(self, n: int = 1, length: int | None = None, batch: Batch | None = None) -> dict[str, Tensor]:
+    def sample(self, n: int = 1, length: int | None = None, batch: AnyBatch | None = None) -> dict[str, Tensor]:
         """See `DynamicalVAE.sample`; the batch holds what was observed."""
         return super().sample(n, self.length if length is None else length, batch)
 

@@ -41,7 +41,7 @@ from ..networks import Dense, Input, Network, NetworkSpec
 from ..networks.base import valid_steps
 from ..networks.recurrent import lstm_cell
 from ..options import Range, Size
-from ..program.batch import Batch, repeat
+from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
 from .method import LatentMethod
 
@@ -297,7 +297,7 @@ class SmoothedLatents:
     weights: Tensor
 
 
-def smooth(model: DynamicalVAE, batch: Batch, samples: int = 1) -> SmoothedLatents:
+def smooth(model: DynamicalVAE, batch: AnyBatch, samples: int = 1) -> SmoothedLatents:
     """The exact posterior of z given draws of a; reparameterised, so that gradients flow.
 
     Padded steps of a ragged batch are 0, and leave the others as they are alone.

@@ -23,6 +23,7 @@ from pyro import poutine
 from torch import Tensor
 from typing_extensions import override
 
+from ..data import Batch
 from ..inference.objectives import Evidence
 from ..inference.recipe import Recipe
 from ..inference.training import Stage
@@ -33,11 +34,11 @@ from ..motion.data import defect
 from ..motion.protocols import Poses
 from ..networks import NetworkSpec
 from ..options import Amount, Share, Size
-from ..program.batch import CHUNK, Batch, in_chunks, repeat, rows
+from ..program.batch import CHUNK, AnyBatch, in_chunks, repeat, rows
 from ..program.model import DynamicalVAE
 from ..schema import Schema
 from ..turns import alone
-from ..views import WHOLE, Data, FirstFrame, View, Views
+from ..views import WHOLE, FirstFrame, View, Views
 from .poses import PoseMethod
 
 FIRST, GIVEN, REST = "s", "y", "r"
@@ -146,7 +147,7 @@ class Rest(View):
     complement: bool
 
     @override
-    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
         if WHOLE not in data:
             return dict(data)
         x = data[WHOLE]
@@ -180,7 +181,7 @@ class TrajectoryModel(DynamicalVAE):
         super().__init__(*arguments, view=Views(*seen), **options)
         self.method, self.skeleton, self.frames = method, skeleton, frames
 
-    def model(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
+    def model(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
         """See `DynamicalVAE.model`; without trajectories in the batch, none are given.
 
         Raises:
@@ -198,7 +199,7 @@ class TrajectoryModel(DynamicalVAE):
     @torch.no_grad()
     def forecast(
         self,
-        batch: Batch,
+        batch: AnyBatch,
         horizon: int,
         samples: int = 1,
         *,

@@ -27,7 +27,7 @@ from dvae.inference.fit import Callback, Interrupted, fit
 from dvae.inference.objectives import Evidence
 from dvae.inference.schedules import Piecewise, Ramp
 from dvae.inference.svi import NonFiniteError
-from dvae.inference.trackers import History, JSONLines, TensorBoard, Terminal
+from dvae.inference.trackers import InMemory, JSONLines, TensorBoard, Terminal
 from dvae.inference.training import Stage, Training
 from dvae.networks import Dense
 from dvae.program.model import DynamicalVAE
@@ -692,7 +692,7 @@ def test_a_process_killed_at_any_moment_leaves_a_whole_checkpoint(tmp_path_facto
 
 
 def test_every_tracker_receives_every_row(tmp_path):
-    memory, board = History(), TensorBoard(tmp_path / "board")
+    memory, board = InMemory(), TensorBoard(tmp_path / "board")
     result = run(trackers=[memory, board], out=tmp_path / "run", steps=10)
     assert memory.rows == result.history == JSONLines(tmp_path / "run" / "log.jsonl").read()
     assert list((tmp_path / "board").glob("events.*"))

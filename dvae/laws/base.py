@@ -71,7 +71,7 @@ class Law(nn.Module):
     def projection(self, features: int, out: int, locations: int) -> Any:
         """Features to `out` parameters, of which the first so many are locations; without features, learned ones."""
         if not features:
-            return Constant(out)
+            return Unconditional(out)
         layer = nn.Linear(features, out)
         if self.residual:
             with torch.no_grad():
@@ -131,7 +131,7 @@ class LawSpec(Protocol):
         ...
 
 
-class Constant(nn.Module):
+class Unconditional(nn.Module):
     """Parameters (..., P) that are the same whatever the features; 0 at first."""
 
     def __init__(self, out: int):

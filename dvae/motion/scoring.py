@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from ..data import Batch, HeldOutWindows
 from ..inference import metrics
-from ..inference.held import clip_places, evaluating, on_device_of
+from ..inference.held import clip_places, on_device_of, reproducibly
 from ..inference.references import multimodal_note, multimodal_truths
 from ..inference.scores import ENERGY, VARIOGRAM, Measure, paired
 from .energies import pose_prior_energy
@@ -194,7 +194,7 @@ def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[M
 
     @lru_cache(maxsize=1)  # for both scores of a batch
     def features(futures: Tensor) -> Tensor:
-        with evaluating(classifier, 0):
+        with reproducibly(classifier, 0):
             found: Tensor = classifier.features(on_device_of(classifier, {"x": futures})["x"])
             return found
 

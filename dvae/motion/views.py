@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ..views import WHOLE, Data, View
+from ..data import Batch
+from ..views import WHOLE, View
 from .skeleton import Skeleton, rotate_about_up
 
 HEADING = "heading"
@@ -41,7 +42,7 @@ class Heading(View):
     names = (HEADING,)
 
     @override
-    def __call__(self, data: Data, beside: Data | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
         source = self.pose or WHOLE
         found = (beside or {}).get(HEADING)
         if HEADING in data or (source not in data if beside is None else found is None):
@@ -57,7 +58,7 @@ class Heading(View):
         return self._turn(seen, -found) | {HEADING: found}
 
     @override
-    def inverse(self, seen: Data) -> dict[str, Any]:
+    def inverse(self, seen: Batch) -> dict[str, Any]:
         data = dict(seen)
         heading = data.pop(HEADING, None)
         return data if heading is None else self._turn(data, heading)
@@ -70,7 +71,7 @@ class Heading(View):
         """Windows (..., T, D) turned each by its own heading."""
         return self._rotated(x, -self.of(x), 2)
 
-    def _turn(self, values: Data, angle: Tensor) -> dict[str, Any]:
+    def _turn(self, values: Batch, angle: Tensor) -> dict[str, Any]:
         found = {n: self._rotated(values[n], angle, 2 - (n == self.pose)) for n in self.turned if n in values}
         return {**values, **found}
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ..data import Batch
 from ..networks.base import valid_steps
 from ..notation import Factorization
 from ..views import WHOLE, View
@@ -18,7 +19,7 @@ from .rollout import Rollout
 CHUNK = 2048
 """Sequences times samples that a forecast holds at once."""
 
-Batch = Tensor | Mapping[str, Tensor]
+AnyBatch = Tensor | Batch
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Reader:
     made: frozenset[str]
     whole: Collection[str]
 
-    def read(self, batch: Batch | None, dtype: torch.dtype, means: Mapping[str, Tensor]) -> dict[str, Any]:
+    def read(self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor]) -> dict[str, Any]:
         """The batch by name, in this precision, as the model sees it; what was read stays as it is.
 
         Args:

@@ -12,13 +12,13 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from .batch import Batch, in_chunks, repeat, rows
+from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like
 
 
 def forecast(
     model: Any,
-    batch: Batch,
+    batch: AnyBatch,
     horizon: int,
     samples: int,
     draw_emission: bool | None,
@@ -78,7 +78,7 @@ def _fixed(
     return fixed
 
 
-def reconstruct(model: Any, batch: Batch, samples: int, chunk: int) -> dict[str, Tensor]:
+def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
     """Means of the data given latents from the guide, teacher-forced."""
     data = model.read(batch)
     whole = model._rollout(model.inference, model.encoder, data, None, 1)  # refuses what cannot be read

@@ -8,7 +8,7 @@ with different things known.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from itertools import accumulate
@@ -25,16 +25,16 @@ from ..laws.base import LawSpec
 from ..laws.families import Normal, StandardNormal
 from ..networks import NetworkSpec, Recurrent
 from ..notation import Factor, Factorization, check_pair
+from ..relations import MaskFunction
 from ..turns import alone
 from ..units import Units
 from ..views import View
-from .batch import CHUNK, Batch, Reader
+from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
 from .forecast import forecast, reconstruct
 from .rollout import Rollout, SelfFeeding
 
 _COUNT = itertools.count()
-MaskFunction = Callable[[int], Any]
 
 
 class DynamicalVAE(nn.Module):
@@ -182,7 +182,7 @@ class DynamicalVAE(nn.Module):
 
     def model(
         self,
-        batch: Batch | None = None,
+        batch: AnyBatch | None = None,
         *,
         length: int | None = None,
         size: int = 1,
@@ -259,7 +259,7 @@ class DynamicalVAE(nn.Module):
             return pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 1).mask(False), obs=value, infer=infer)
         return pyro.sample(name, rollout.law(name), obs=data, infer=_note(self.generative, rollout))
 
-    def guide(self, batch: Batch, *, draws: Mapping[str, int] | None = None, **_: Any) -> dict[str, Tensor]:
+    def guide(self, batch: AnyBatch, *, draws: Mapping[str, int] | None = None, **_: Any) -> dict[str, Tensor]:
         """The inference program q, with the arguments of `model`.
 
         Returns:
@@ -283,7 +283,7 @@ class DynamicalVAE(nn.Module):
                 rollout.know(name, values[name])
         return values
 
-    def forward(self, batch: Batch | None = None, **options: Any) -> dict[str, Tensor]:
+    def forward(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
         """`model`, so that the module itself is the Pyro model of `elbo(model, model.guide)`."""
         return self.model(batch, **options)
 
@@ -302,7 +302,7 @@ class DynamicalVAE(nn.Module):
 
     @alone
     @torch.no_grad()
-    def sample(self, n: int = 1, length: int | None = None, batch: Batch | None = None) -> dict[str, Tensor]:
+    def sample(self, n: int = 1, length: int | None = None, batch: AnyBatch | None = None) -> dict[str, Tensor]:
         """Free runs from the prior.
 
         Args:
@@ -321,7 +321,7 @@ class DynamicalVAE(nn.Module):
     @torch.no_grad()
     def forecast(
         self,
-        batch: Batch,
+        batch: AnyBatch,
         horizon: int,
         samples: int = 1,
         *,
@@ -354,7 +354,7 @@ class DynamicalVAE(nn.Module):
 
     @alone
     @torch.no_grad()
-    def reconstruct(self, batch: Batch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
+    def reconstruct(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
         """Means of the data given latents from the guide, teacher-forced; missing entries are filled in so.
 
         Args:
@@ -369,7 +369,7 @@ class DynamicalVAE(nn.Module):
 
     @alone
     @torch.no_grad()
-    def log_joint(self, batch: Batch, latents: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def log_joint(self, batch: AnyBatch, latents: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint.
 
         Raises:
@@ -393,7 +393,7 @@ class DynamicalVAE(nn.Module):
     def _evaluating(self) -> Any:
         return evaluating(self) if self.training else nullcontext()
 
-    def read(self, batch: Batch | None) -> dict[str, Any]:
+    def read(self, batch: AnyBatch | None) -> dict[str, Any]:
         """A batch as programs read it: by name, in the model's precision, as the view shows it, missing entries filled.
 
         What was read is read as it is.
@@ -418,7 +418,7 @@ class DynamicalVAE(nn.Module):
         return {**values, **self.view.inverse(added | {n: v for n, v in values.items() if n in self.observed})}
 
     def _rollout(
-        self, factorization: Factorization, conditionals: Any, batch: Batch | None, length: int | None, size: int
+        self, factorization: Factorization, conditionals: Any, batch: AnyBatch | None, length: int | None, size: int
     ) -> Rollout:
         return self.reader.rollout(factorization, conditionals, self.read(batch), length, size)
 

@@ -9,11 +9,11 @@ import pyro
 import torch
 from torch import Tensor
 
-from .batch import Batch
+from .batch import AnyBatch
 from .conditional import like
 
 
-def reference(model: Any, batch: Batch) -> None:
+def reference(model: Any, batch: AnyBatch) -> None:
     """The generative program of a `DynamicalVAE` as a loop over time with one site per variable and step.
 
     Sites are "z_1", "x_1", "z_2", ... as in the equations. Each factor is given noise in place of every value that is

@@ -25,7 +25,7 @@ from ..inference.training import Training
 from ..models.registry import configured
 from ..schema import Schema
 from ..turns import alone
-from .kinds import DATA, SCHEMAS, Data, opened
+from .kinds import DATA, SCHEMAS, Dataset, opened
 from .migrations import FORMAT, upgraded
 
 
@@ -63,7 +63,7 @@ class Loaded:
     config: Config
     model: Any
     where: str | None = None
-    _data: Data | None = field(default=None, repr=False)
+    _data: Dataset | None = field(default=None, repr=False)
 
     @property
     def method(self) -> Any:
@@ -110,7 +110,7 @@ class Loaded:
 @alone
 def fit_run(
     method: Trainable,
-    data: Data,
+    data: Dataset,
     out: str | os.PathLike[str],
     training: Training | None = None,
     callbacks: Sequence[Callback] = (),

@@ -21,7 +21,7 @@ class Recorded(Protocol):
     fingerprint: str
 
 
-class Data(Protocol):
+class Dataset(Protocol):
     """Data that runs are fitted on, such as `dvae.motion.MotionData`."""
 
     kind: ClassVar[str]

@@ -45,7 +45,7 @@ from ..options import flat
 from ..schema import Schema
 from ..turns import alone
 from .directory import fit_run, read_config, resume
-from .kinds import Data
+from .kinds import Dataset
 
 ENDED = ("finished", "stopped early")
 
@@ -102,7 +102,7 @@ class SweepInterrupted(KeyboardInterrupt):
 
 def sweep(
     methods: Mapping[str, Method] | Sequence[Method],
-    data: Data,
+    data: Dataset,
     out: str | os.PathLike[str],
     seeds: Sequence[int] = (0, 1, 2),
     training: Training | None = None,
@@ -192,7 +192,7 @@ class _Run:
 
     path: Path
     method: Method
-    data: Data
+    data: Dataset
     source: str
     training: Training
     lease: Path

@@ -26,7 +26,7 @@ from ..inference.bounds import SequenceELBO
 from ..inference.checkpoints import load_weights, save_weights
 from ..inference.fit import fit
 from ..oracle import Oracle, twin
-from ..program.batch import Batch
+from ..program.batch import AnyBatch
 from ..program.conditional import Conditional
 from ..program.model import DynamicalVAE
 from ..program.reference import reference
@@ -59,7 +59,7 @@ class FactorizationContract:
         """
         raise NotImplementedError("a FactorizationContract is subclassed: def build(self, size) returns the model")
 
-    def data(self, size: int) -> Batch:
+    def data(self, size: int) -> AnyBatch:
         """Sequences to train on: those that the model is made for, if not sine waves.
 
         Args:
