@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from ..inference.recipe import Recipe
 from ..motion import Windows
@@ -100,7 +101,7 @@ class Summaries:
 
 
 class SummariesNetwork(Network):
-    """See `Summaries`."""
+    """What `Summaries` describes."""
 
     def __init__(self, spec: Summaries, inputs: Sequence[Input]):
         super().__init__(inputs, False, spec.hidden[-1])
@@ -108,8 +109,9 @@ class SummariesNetwork(Network):
         self.summaries = nn.ModuleDict({name: Summary(size, spec.width) for name, size in sizes.items()})
         self.join = perceptron((2 * spec.width * len(sizes), *spec.hidden), "tanh")
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`; no sequence is padded."""
+        """No sequence is padded."""
         self.refuse_ragged(lengths)
         return self.join(torch.cat([each(parents[FIRST], parents[n]) for n, each in self.summaries.items()], dim=-1))
 
@@ -149,7 +151,7 @@ class Decoder:
 
 
 class DecoderNetwork(Network):
-    """See `Decoder`."""
+    """What `Decoder` describes."""
 
     def __init__(self, spec: Decoder, inputs: Sequence[Input], size: int):
         behind = (spec.width, *spec.hidden[:-1])
@@ -163,8 +165,9 @@ class DecoderNetwork(Network):
         self.cell: Any = nn.GRU(self.known + size, spec.width, batch_first=True)
         self.behind = perceptron(behind, "tanh")
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`; no sequence is padded."""
+        """No sequence is padded."""
         self.refuse_ragged(lengths)
         known, state = self._known(parents)
         previous = torch.cat([parents[FIRST][:, None], parents["x"][:, : length - 1]], 1)
@@ -177,15 +180,15 @@ class DecoderNetwork(Network):
         static = torch.cat([self.before(summary), parents[self.latent]], -1)
         return torch.cat([static[:, None].expand(-1, given.shape[1], -1), given], -1), self.first(summary)
 
+    @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
         self.refuse_ragged(lengths)
         known, state = self._known(given)
         weight, bias = self.cell.weight_ih_l0[:, : self.known], self.cell.bias_ih_l0
         return functional.linear(known, weight, bias).unbind(1), given[FIRST], given.get("x"), state
 
+    @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
         shares, first, given, hidden = state
         previous = first if t == 0 else drawn["x"][t - 1] if given is None else given[:, t - 1]
         gates = torch.addmm(shares[t], previous, self.cell.weight_ih_l0[:, self.known :].t())

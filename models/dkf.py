@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from ..laws.base import LawSpec, Parameters, Shape
 from ..laws.families import Gaussian
@@ -43,7 +44,7 @@ class Gated:
 
 
 class GatedTransition(Network):
-    """See `Gated`."""
+    """What `Gated` describes."""
 
     def __init__(self, inputs: Sequence[Input], size: int):
         super().__init__(inputs, True, 2 * size)
@@ -58,16 +59,16 @@ class GatedTransition(Network):
         mean = torch.lerp(self.linear(previous), proposal, torch.sigmoid(self.gate(previous)))
         return torch.cat([mean, functional.relu(proposal)], dim=-1)
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`."""
         return self._features(shift(parents[self.name], -1))
 
+    @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
         return self(given, length).unbind(1) if self.name in given else self.linear.weight.new_empty(batch, 0)
 
+    @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
         if isinstance(state, tuple):
             return state[t], state
         return self._features(at(drawn[self.name], t - 1, state, self.size)), state
@@ -89,15 +90,15 @@ class GatedNormal:
 
 
 class GatedLaw(Gaussian):
-    """See `GatedNormal`."""
+    """What `GatedNormal` describes."""
 
     def __init__(self, spec: GatedNormal, size: int):
         super().__init__()
         self.min_variance = spec.min_scale**2
         self.variance = nn.Linear(size, size)
 
+    @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
         mean, proposal = features.chunk(2, dim=-1)
         return mean, torch.sqrt(functional.softplus(self.variance(proposal)) + self.min_variance)
 

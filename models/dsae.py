@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
+from typing_extensions import override
 
 from ..networks import Dense, Input, NetworkSpec, Recurrent
 from ..networks.base import Network
@@ -43,7 +44,7 @@ class Layered:
 
 
 class LayeredNetwork(Network):
-    """See `Layered`."""
+    """What `Layered` describes."""
 
     def __init__(self, spec: Layered, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, spec.width)
@@ -55,20 +56,21 @@ class LayeredNetwork(Network):
         self.future = Memory(recurrent, [(p, 0) for p in inputs], -1)
         self.top: Any = nn.RNN(2 * spec.width, spec.width, batch_first=True)
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`."""
         values = {n: v if v.dim() == 3 else v[:, None].expand(-1, length, -1) for n, v in parents.items()}
         states = [memory(values, parents, lengths).transpose(0, 1) for memory in (self.past, self.future)]
         top = self.top
         base = functional.linear(torch.cat(states, dim=-1), top.weight_ih_l0, top.bias_ih_l0 + top.bias_hh_l0)
         return Recurrence.apply(base.to(top.weight_hh_l0.dtype), top.weight_hh_l0).transpose(0, 1)
 
+    @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`; a parent over {1:T} is never drawn in the same loop."""
+        """A parent over {1:T} is never drawn in the same loop."""
         return self(given, length, lengths).unbind(1)
 
+    @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
         return state[t], state
 
 

@@ -31,6 +31,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
@@ -138,8 +139,9 @@ class GSPS(EnergyMethod):
         """Names of the parts."""
         return [part.partition("=")[0] for part in self.parts]
 
+    @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """See `Method.preset`; for these parts."""
+        """For these parts."""
         return {name: self._spread(name, value) for name, value in super().preset(skeleton).items()}
 
     def _spread(self, name: str, value: Any) -> Any:
@@ -228,12 +230,13 @@ class GSPSModel(EnergyModel):
         self.length = length
         self.draws = dict(zip(codes, _each(method.draws, method.parts), strict=True))
 
+    @override
     def model(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
-        """See `DynamicalVAE.model`; of whole windows, with energies. Values are as the networks see them, turned."""
+        """Of whole windows, with energies. Values are as the networks see them, turned."""
         return super().model(batch, **self._drawing(batch, options))
 
+    @override
     def guide(self, batch: AnyBatch, **options: Any) -> dict[str, Tensor]:
-        """See `DynamicalVAE.guide`."""
         return super().guide(batch, **self._drawing(batch, options))
 
     def _drawing(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -245,8 +248,9 @@ class GSPSModel(EnergyModel):
         given = batch[WHOLE] if isinstance(batch, Mapping) and WHOLE in batch else None
         return given is not None and given.shape[1] == self.length and options.get("length") is None
 
+    @override
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """See `DynamicalVAE.penalties`: those of whole windows."""
+        """Those of whole windows."""
         if not draws:
             return {}
         if "mask" in data:
@@ -279,6 +283,7 @@ class GSPSModel(EnergyModel):
         return found
 
     @torch.no_grad()
+    @override
     def forecast(
         self,
         batch: AnyBatch,
@@ -289,7 +294,7 @@ class GSPSModel(EnergyModel):
         fix: Mapping[str, Tensor] | None = None,
         chunk: int = CHUNK,
     ) -> dict[str, Tensor]:
-        """See `DynamicalVAE.forecast`; at most as far as the networks' T frames, all of which a fixed part has.
+        """At most as far as the networks' T frames, all of which a fixed part has.
 
         Raises:
             ValueError: other observed frames than the networks see, or a horizon beyond what they make.
@@ -307,8 +312,9 @@ class GSPSModel(EnergyModel):
         }
 
     @torch.no_grad()
+    @override
     def sample(self, n: int = 1, length: int | None = None, batch: AnyBatch | None = None) -> dict[str, Tensor]:
-        """See `DynamicalVAE.sample`; the batch holds what was observed."""
+        """The batch holds what was observed."""
         return super().sample(n, self.length if length is None else length, batch)
 
 

@@ -41,6 +41,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
@@ -184,8 +185,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
                 raise ValueError(f"{name} is {values}; expected one number for each of {', '.join(PARTS)}")
 
     @property
+    @override
     def selects(self) -> Literal["bound", "loss"]:
-        """See `Method.selects`."""
         return "bound" if self.loss == "evidence" else "loss"
 
     def equations(self) -> tuple[Factorization, Factorization]:
@@ -253,8 +254,9 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         )
         return model
 
+    @override
     def suited(self, data: Any) -> HiTDVAE:
-        """See `PoseMethod.suited`; with loss="evidence" windows are turned only if `heading` says so, as bounds of
+        """With loss="evidence" windows are turned only if `heading` says so, as bounds of
         turned windows are of no other model.
         """
         schema = Poses.of(data, self.name)
@@ -280,8 +282,9 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             return 0.0
         return Ramp(0.0, self.self_feeding, steps=max(round(0.16 * steps), 1), delay=round(0.04 * steps))
 
+    @override
     def start(self, model: Any, windows: Any) -> None:
-        """See `EnergyMethod.start`; and mean and spread of 1024 windows' poses, where a learned scale of x starts."""
+        """With mean and spread of 1024 windows' poses, where a learned scale of x starts."""
         if isinstance(model, EnergyModel):
             super().start(model, windows)
         else:
@@ -292,8 +295,9 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             if self.emission == "fixed":
                 nn.init.zeros_(model.generator[WHOLE].law.log_scale)
 
+    @override
     def objective(self) -> Objective:
-        """See `Method.objective`.
+        """The paper's weighted energies, or the evidence.
 
         Raises:
             ValueError: weights that are still open, which the skeleton decides.
@@ -331,8 +335,8 @@ class HiTModel(EnergyModel):
         joints = body_parts(skeleton, PARTS) if method.diversity else {}
         self.coordinates = {part: [3 * j + axis for j in held for axis in range(3)] for part, held in joints.items()}
 
+    @override
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """See `DynamicalVAE.penalties`."""
         if not draws or WHOLE not in rollout.values:
             return {}
         if rollout.lengths is not None or rollout.observed:

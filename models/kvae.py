@@ -31,6 +31,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from ..inference.recipe import Recipe
 from ..inference.training import Stage
@@ -90,8 +91,9 @@ class KVAE(LatentMethod):
         """The filter's prediction has a full covariance."""
         return {**super().laws(), "p(a)": Triangular()}
 
+    @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """See `phases`. In a run of fewer than three steps there is one."""
+        """In `phases`; in a run of fewer than three steps there is one."""
         recipe = super().train(train, validation, steps)
         if not self.phases or steps < 3:
             return recipe
@@ -121,17 +123,17 @@ class TriangularLaw(Law):
         super().__init__()
         self.size = size
 
+    @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
         return features.split([self.size, self.size**2], dim=-1)
 
+    @override
     def distribution(self, parameters: Parameters) -> TriangularNormal:
-        """See `Law.distribution`."""
         loc, whitening = parameters
         return TriangularNormal(loc, whitening.unflatten(-1, (self.size, self.size)), validate_args=False)
 
+    @override
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """See `Law.draw`."""
         return self.distribution(parameters).color(noise)
 
 
@@ -192,8 +194,8 @@ class KalmanNetwork(Network):
             else:
                 self.register_buffer(name, value)
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`."""
         a = parents[self.inputs[0].name].to(self.A.dtype).transpose(0, 1)
         with torch.autocast(a.device.type, enabled=False):
             chain, emission, _ = self.chain_of(a)
@@ -253,14 +255,14 @@ class KalmanNetwork(Network):
         spread = emission @ covariance @ emission.mT + self.log_emission.exp().diag()
         return loc, InverseCholesky.apply(spread).flatten(-2)
 
+    @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
         known = given.get(self.inputs[0].name)
         zero = self.first.new_zeros(batch, self.spec.width)
         return None if known is None else known.unbind(1), (zero, zero), self.start_of(batch)[:2], None
 
+    @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
         known, hidden, (mean, covariance), emission = state
         values = drawn[self.inputs[0].name] if known is None else known
         before = values[t - 1].to(self.A.dtype) if t else self.first.expand(len(mean), -1)

@@ -78,14 +78,16 @@ class TrajectoryMethod(PoseMethod):
         """Networks by factor."""
         raise NotImplementedError(f"{type(self).__name__} says nothing of its networks")
 
+    @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """See `PoseMethod.preset`; where left and right are unknown, so are headings."""
+        """Where left and right are unknown, so are headings."""
         found = super().preset(skeleton)
         return found if skeleton.left and skeleton.right else {**found, "heading": False}
 
     @property
+    @override
     def selects(self) -> Literal["bound", "loss"]:
-        """See `Method.selects`: beta is part of the model, which the bound does not know."""
+        """Beta is part of the model, which the bound does not know."""
         return "loss"
 
     def laws(self) -> Mapping[str, LawSpec]:
@@ -181,8 +183,9 @@ class TrajectoryModel(DynamicalVAE):
         super().__init__(*arguments, view=Views(*seen), **options)
         self.method, self.skeleton, self.frames = method, skeleton, frames
 
+    @override
     def model(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
-        """See `DynamicalVAE.model`; without trajectories in the batch, none are given.
+        """Without trajectories in the batch, none are given.
 
         Raises:
             ValueError: no pose to start from.

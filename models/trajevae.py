@@ -26,6 +26,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from ..laws.base import Law, LawSpec, Parameters, Shape
 from ..laws.families import FixedNormal, Normal, NormalLaw
@@ -103,8 +104,9 @@ class TrajeVAE(TrajectoryMethod):
         if self.components and not self.cosine:
             raise ValueError("components are of the cosine transform; leave them at 0 without it")
 
+    @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """See `PoseMethod.preset`; without the cosine transform there are no coefficients."""
+        """Without the cosine transform there are no coefficients."""
         return {**super().preset(skeleton), **({} if self.cosine else {"components": 0})}
 
     def equations(self) -> tuple[Factorization, Factorization]:
@@ -165,20 +167,20 @@ class SlowNormal(Normal):
 
     steps: int = 0
 
+    @override
     def build(self, shape: Shape) -> Law:
-        """See `Normal.build`."""
         return SlowNormalLaw(self, shape)
 
 
 class SlowNormalLaw(NormalLaw):
-    """See `SlowNormal`."""
+    """What `SlowNormal` describes."""
 
     def __init__(self, spec: SlowNormal, shape: Shape):
         super().__init__(spec, shape)
         self.steps = spec.steps
 
+    @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
         loc, scale = super().forward(features, previous, t)
         if t is not None:
             return (loc, scale) if t < self.steps else (torch.zeros_like(loc), torch.ones_like(scale))

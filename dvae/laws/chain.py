@@ -59,7 +59,7 @@ def gaussian_chain(
 
 
 class GaussianChain(torch.autograd.Function):
-    """See `gaussian_chain`."""
+    """What `gaussian_chain` describes."""
 
     @staticmethod
     def forward(

@@ -12,6 +12,7 @@ import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from .base import Law, Parameters, Shape
 
@@ -50,15 +51,15 @@ class Normal:
 
 
 class NormalLaw(Gaussian):
-    """See `Normal`."""
+    """What `Normal` describes."""
 
     def __init__(self, spec: Normal, shape: Shape):
         super().__init__(spec.residual)
         self.min_scale = spec.min_scale
         self.out = self.projection(shape.features, 2 * shape.size, shape.size)
 
+    @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
         loc, raw = self.out(features).chunk(2, dim=-1)
         # contiguous: on a slice, softplus is not vectorised and takes nine times as long
         scale = functional.softplus(raw.contiguous()) + self.min_scale
@@ -103,7 +104,7 @@ class FixedNormal:
 
 
 class FixedNormalLaw(Gaussian):
-    """See `FixedNormal`."""
+    """What `FixedNormal` describes."""
 
     def __init__(self, spec: FixedNormal, shape: Shape):
         super().__init__(spec.residual)
@@ -117,18 +118,19 @@ class FixedNormalLaw(Gaussian):
         self.steps = spec.steps
         self.fitted, self.learned = spec.fitted, spec.learned
 
+    @override
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """See `Law.in_units`; a scale that is given is in the variable's own unit."""
+        """A scale that is given is in the variable's own unit."""
         loc, own = super().in_units(parameters, mean, scale)
         return loc, own if self.learned else parameters[1]
 
+    @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """See `Law.distribution`."""
         loc, scale = parameters
         return super().distribution((loc.detach() if self.fitted == "scale" else loc, scale))
 
+    @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
         loc = self.out(features)
         scale = self.log_scale.exp()
         if self.steps:
@@ -163,7 +165,7 @@ class StudentT:
 
 
 class StudentTLaw(Law):
-    """See `StudentT`."""
+    """What `StudentT` describes."""
 
     location_scale = True
 
@@ -173,15 +175,15 @@ class StudentTLaw(Law):
         self.out = self.projection(shape.features, 2 * shape.size, shape.size)
         self.raw_df = nn.Parameter(torch.full((shape.size,), math.log(math.expm1(spec.df - 2))))
 
+    @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
         loc, raw = self.out(features).chunk(2, dim=-1)
         loc = self.moved(loc, previous)
         df = functional.softplus(self.raw_df) + 2
         return loc, functional.softplus(raw.contiguous()) + self.min_scale, df.expand_as(loc)
 
+    @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """See `Law.distribution`."""
         loc, scale, df = parameters
         return dist.StudentT(df, loc, scale, validate_args=False)
 
@@ -210,25 +212,26 @@ class Delta:
 
 
 class DeltaLaw(Law):
-    """See `Delta`."""
+    """What `Delta` describes."""
 
     deterministic = True
     location_scale = True
 
+    @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
         return (features,)
 
+    @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """See `Law.distribution`."""
         return dist.Delta(parameters[0])
 
+    @override
     def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
-        """See `Law.noise`; there is none."""
+        """There is none."""
         return like.new_empty(()).expand(*shape)
 
+    @override
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """See `Law.draw`."""
         return parameters[0]
 
 
@@ -242,7 +245,7 @@ class StandardNormal:
 
 
 class StandardNormalLaw(Gaussian):
-    """See `StandardNormal`."""
+    """What `StandardNormal` describes."""
 
     zero: Tensor
 
@@ -250,7 +253,7 @@ class StandardNormalLaw(Gaussian):
         super().__init__()
         self.register_buffer("zero", torch.zeros(size), persistent=False)
 
+    @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """See `Law.forward`."""
         loc = self.zero.expand(*features.shape[:-1], -1)
         return loc, torch.ones_like(loc)

@@ -21,6 +21,7 @@ import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
 from torch.distributions import constraints
+from typing_extensions import override
 
 from .base import Shape
 from .priors import Prior
@@ -50,7 +51,7 @@ class QRFlow:
 
 
 class QRFlowLaw(Prior):
-    """See `QRFlow`."""
+    """What `QRFlow` describes."""
 
     def __init__(self, spec: QRFlow, shape: Shape):
         super().__init__(spec, shape)
@@ -88,8 +89,8 @@ class QRFlowLaw(Prior):
         diagonal = self.triangular.diagonal(dim1=1, dim2=2)
         return q, self.triangular.triu(1) + torch.diag_embed(diagonal.exp())
 
+    @override
     def prior(self) -> FlowDistribution:
-        """See `Prior.prior`."""
         return FlowDistribution(self)
 
     def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ import torch
 from pyro.distributions import transforms
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
+from typing_extensions import override
 
 from .base import Law, Parameters, Shape
 
@@ -46,8 +47,8 @@ class Prior(Law):
         """The features themselves, which say how many sequences there are."""
         return (features,)
 
+    @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """See `Law.distribution`."""
         return self.prior().expand(parameters[0].shape[:-1])
 
 
@@ -67,7 +68,7 @@ class Mixture:
 
 
 class MixtureLaw(Prior):
-    """See `Mixture`."""
+    """What `Mixture` describes."""
 
     def __init__(self, spec: Mixture, shape: Shape):
         super().__init__(spec, shape)
@@ -75,8 +76,8 @@ class MixtureLaw(Prior):
         self.loc = nn.Parameter(torch.randn(spec.components, shape.size) / math.sqrt(shape.size))
         self.log_scale = nn.Parameter(torch.zeros(spec.components, shape.size))
 
+    @override
     def prior(self) -> Any:
-        """See `Prior.prior`."""
         parts = dist.Normal(self.loc, self.log_scale.exp()).to_event(1)
         return dist.MixtureSameFamily(dist.Categorical(logits=self.logits), parts)
 
@@ -101,7 +102,7 @@ class Vamp:
 
 
 class VampLaw(Prior):
-    """See `Vamp`."""
+    """What `Vamp` describes."""
 
     guide: Any
 
@@ -138,8 +139,8 @@ class VampLaw(Prior):
                 )
             pseudo.copy_(data[name][:, : self.steps])
 
+    @override
     def prior(self) -> Any:
-        """See `Prior.prior`."""
         posteriors = self.guide.law.joint(self.guide(dict(self.pseudo.items()), self.components, self.steps))
         weights = dist.Categorical(logits=next(self.pseudo.parameters()).new_zeros(self.components))
         return dist.MixtureSameFamily(weights, posteriors)
@@ -168,7 +169,7 @@ class Flow:
 
 
 class FlowLaw(Prior):
-    """See `Flow`."""
+    """What `Flow` describes."""
 
     def __init__(self, spec: Flow, shape: Shape):
         super().__init__(spec, shape)
@@ -188,8 +189,9 @@ class FlowLaw(Prior):
         self.loc = nn.Parameter(torch.zeros(size))
         self.log_scale = nn.Parameter(torch.zeros(size))
 
+    @override
     def prior(self) -> Any:
-        """See `Prior.prior`.
+        """The density, by splines and affine couplings.
 
         Raises:
             ValueError: parameters in half precision, which Pyro's splines do not take.

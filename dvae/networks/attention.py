@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from ..relations import Relation
 from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, at, valid_steps
@@ -120,7 +121,7 @@ class Layer(nn.Module):
 
 
 class AttentionNetwork(Network):
-    """See `Attention`."""
+    """What `Attention` describes."""
 
     slopes: Tensor
     layers: Any
@@ -165,8 +166,8 @@ class AttentionNetwork(Network):
         distance = (steps[:, None] - steps[None, :]).abs()
         return (-self.slopes[:, None, None] * distance).masked_fill(~mask, -math.inf)
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`."""
         batch = next(iter(parents.values())).shape[0]
         parents = self.extractors.of(parents, lengths)
         stream = self.queries(parents, batch, length)
@@ -228,8 +229,8 @@ class AttentionNetwork(Network):
             bias = bias.masked_fill(hidden[:, None, None, :], -math.inf)
         return torch.cat(tokens, dim=1), bias
 
+    @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
         given = self.extractors.of(given, lengths)
         known = {i: part(given[p.name], lag) for i, (p, lag) in enumerate(self.points) if p.name in given}
         queries = self.point.hoist(known, batch, length) if self.point is not None else None
@@ -262,8 +263,8 @@ class AttentionNetwork(Network):
             lengths=lengths,
         )
 
+    @override
     def step(self, state: Attending, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
         drawn = self.extractors.drawn(state.extracted, drawn, state.lengths)
         stream = self.origin.expand(state.batch, -1)
         parts = [at(drawn[p.name], t + lag, stream, p.size) for p, lag in state.points if lag is not None]
@@ -287,7 +288,7 @@ class AttentionNetwork(Network):
 
 
 class SelfAttentionNetwork(Network):
-    """See `SelfAttention`."""
+    """What `SelfAttention` describes."""
 
     slopes: Tensor
     layers: Any
@@ -315,8 +316,8 @@ class SelfAttentionNetwork(Network):
         self.after = AttentionNetwork(then, [token, *rest], local) if rest else None
         self.features = spec.width if self.after is None else self.after.features
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`."""
         encoded = self.encode(parents, length, lengths)
         return encoded if self.after is None else self.after({ENCODED: encoded, **parents}, length, lengths)
 
@@ -347,8 +348,8 @@ class SelfAttentionNetwork(Network):
         distance = ahead.abs() * torch.where(away, 4, 1)
         return (-self.slopes[:, None, None] * distance).masked_fill(~mask, -math.inf)[None]
 
+    @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
         if missing := [p.name for p in (*self.encoded, *self.statics) if p.name not in given]:
             raise ValueError(f"SelfAttention encodes all frames at once; it cannot be in a loop with {missing[0]}")
         encoded = self.encode(given, length, lengths)
@@ -356,8 +357,8 @@ class SelfAttentionNetwork(Network):
             return encoded.unbind(1)
         return self.after.start({ENCODED: encoded, **given}, batch, length, lengths)
 
+    @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
         return (state[t], state) if self.after is None else self.after.step(state, t, drawn)
 
 

@@ -19,6 +19,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from ..relations import Relation
 from .rows import select
@@ -152,15 +153,15 @@ class Network(nn.Module):
 class AtOnce(Network):
     """A network that makes all steps together, of sequences of one length."""
 
+    @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
         if missing := [parent.name for parent in self.inputs if parent.name not in given]:
             name = type(self).__name__.removesuffix("Network")
             raise ValueError(f"{name} makes all steps at once; it cannot be in a loop with {', '.join(missing)}")
         return self(given, length, lengths).unbind(1)
 
+    @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
         return state[t], state
 
 

@@ -24,6 +24,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from ..relations import ALL
 from .base import AtOnce, Input, Network, once
@@ -123,8 +124,9 @@ class CosineEncoderNetwork(AtOnce):
         self.after: Any = transformer(self.features, spec)
         self.dropout = Dropout(spec.dropout)
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`; no sequence is padded."""
+        """No sequence is padded."""
         self.refuse_ragged(lengths)
         source, static = (parents[name] for name in self.names)
         body = once(self.static, [static], partial(self.static, static))
@@ -161,8 +163,9 @@ class MotionDecoderNetwork(AtOnce):
         self.offsets = nn.Sequential(*_layer(spec.hidden, spec.hidden), last)
         self.dropout = Dropout(spec.dropout)
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`; no sequence is padded."""
+        """No sequence is padded."""
         self.refuse_ragged(lengths)
         first, values = parents[self.first], parents[self.spec.latent]
         components = min(self.spec.components or length, length)
@@ -182,8 +185,8 @@ class Dropout(nn.Dropout):
     step. The probability is a multiple of 2^-16.
     """
 
+    @override
     def forward(self, input: Tensor) -> Tensor:
-        """See `nn.Dropout`."""
         if not (self.training and 0 < self.p < 1 and input.device.type == "cpu"):
             return super().forward(input)
         kept = round((1 - self.p) * 2**16)
@@ -203,8 +206,9 @@ class TransformerLayer(nn.TransformerEncoderLayer):
         super().__init__(size, heads, feedforward, dropout, **options)
         self.dropout, self.dropout1, self.dropout2, self.unseen = (Dropout(dropout) for _ in range(4))
 
+    @override
     def forward(self, src: Tensor, *masks: Any, **options: Any) -> Tensor:
-        """See `nn.TransformerEncoderLayer`; masks are not for training."""
+        """Masks are not for training."""
         if not self.training:
             return super().forward(src, *masks, **options)
         attention = self.self_attn

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
+from typing_extensions import override
 
 from .base import Chain, Input, Join, Network, at, shift
 
@@ -29,7 +30,7 @@ class Dense:
 
 
 class DenseNetwork(Network):
-    """See `Dense`."""
+    """What `Dense` describes."""
 
     def __init__(self, inputs: Sequence[Input], local: bool, widths: Sequence[int], activation: str):
         super().__init__(inputs, local, 0)
@@ -47,25 +48,25 @@ class DenseNetwork(Network):
         self.join = Join([parent.size for parent, _ in self.parts], widths, activation)
         self.features = self.join.features
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`."""
         features: Tensor = self.join([part(parents[parent.name], lag) for parent, lag in self.parts])
         return features[:, None].expand(-1, length, -1) if self.local and features.dim() == 2 else features
 
+    @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
         known = {i: part(given[p.name], lag) for i, (p, lag) in enumerate(self.parts) if p.name in given}
         live = [entry for i, entry in enumerate(self.parts) if i not in known]
         return self.join.hoist(known, batch, length), live
 
+    @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
         hoisted, live = state
         parts = [at(drawn[parent.name], t + lag, hoisted.like, parent.size) for parent, lag in live]
         return self.join.add(hoisted, t, parts), state
 
+    @override
     def chain(self, state: Any) -> Chain | None:
-        """See `Network.chain`."""
         hoisted, live = state
         return Chain(live[0][1], self.join, hoisted) if len(live) == 1 else None
 

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
+from typing_extensions import override
 
 from .base import AtOnce, Input
 from .dct import cosine_basis
@@ -94,8 +95,9 @@ class GraphConvNetwork(AtOnce):
         )
         self.last = _Convolution(nodes, spec.width, into)
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`; T is that of the description, and no sequence is padded."""
+        """T is that of the description, and no sequence is padded."""
         self.refuse_ragged(lengths)
         if length != self.spec.length:
             raise ValueError(

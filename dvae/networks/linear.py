@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from .base import Input, Network, at
 from .rows import select
@@ -59,8 +60,8 @@ class LinearNetwork(Network):
         weight: Tensor = self.weights[name][:length, :length]
         return weight * self.mask(name, length)[:, :, None, None].to(weight.device)
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`."""
         features: Tensor = self.bias[:length]
         for parent in self.inputs:
             values = parents[parent.name]
@@ -70,8 +71,8 @@ class LinearNetwork(Network):
             raise ValueError("Linear needs at least one parent; leave a factor without parents to its prior")
         return features if self.local else features[:, 0]
 
+    @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
         base: Tensor = self.bias[:length].expand(batch, -1, -1)
         live = {}
         for parent in self.inputs:
@@ -84,8 +85,8 @@ class LinearNetwork(Network):
                 live[parent.name] = (weight, self.mask(parent.name, length).tolist())
         return base.unbind(1), live
 
+    @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
         base, live = state
         features = base[t]
         for name, (weight, mask) in live.items():
@@ -94,7 +95,7 @@ class LinearNetwork(Network):
                     features = features + at(drawn[name], s, features, weight.shape[-1]) @ weight[t, s].t()
         return features, state
 
+    @override
     def select(self, state: Any, rows: Tensor) -> Any:
-        """See `Network.select`."""
         base, live = state
         return select(base, rows), live

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from ..relations import ALL
 from .base import Input, Network
@@ -136,8 +137,9 @@ class FrameGraphNetwork(Network):
             for _ in range(spec.blocks)
         )
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`; (B, frames * width)."""
+        """(B, frames * width)."""
         values = self.extractors.of(parents, lengths)
         motion = torch.cat([values[parent.name] for parent in self.inputs], dim=-1)
         last = motion.new_full((len(motion),), length - 1, dtype=torch.long) if lengths is None else lengths - 1

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from .base import (
     Chain,
@@ -222,7 +223,7 @@ def lstm_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple
 
 
 class RecurrentNetwork(Network):
-    """See `Recurrent`."""
+    """What `Recurrent` describes."""
 
     def __init__(self, spec: Recurrent, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, 0)
@@ -274,8 +275,8 @@ class RecurrentNetwork(Network):
     def _memories(self) -> list[Memory]:
         return list(self.memories)  # type: ignore[arg-type]
 
+    @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """See `Network.forward`."""
         values = self.extractors.of(parents, lengths)
         states = [memory(values, parents, lengths) for memory in self._memories()]
         if not self.local:
@@ -286,8 +287,8 @@ class RecurrentNetwork(Network):
         features: Tensor = self.join([*states, *(part(values[parent.name], lag) for parent, lag in self.points)])
         return features[:, None].expand(-1, length, -1) if self.local and features.dim() == 2 else features
 
+    @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """See `Network.start`."""
         values = self.extractors.of(given, lengths)
         known: dict[int, Tensor] = {}
         memories: list[tuple[Memory, MemoryState]] = []
@@ -305,16 +306,16 @@ class RecurrentNetwork(Network):
         hoisted = self.join.hoist(known, batch, length)
         return RecurrentState(hoisted, memories, live, self.extractors.start(length), dict(given), lengths)
 
+    @override
     def step(self, state: RecurrentState, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """See `Network.step`."""
         values = self.extractors.drawn(state.extracted, drawn, state.lengths)
         parts = [memory.step(memory_state, t, values) for memory, memory_state in state.memories]
         like = parts[0] if parts else state.hoisted.like
         parts += [at(values[parent.name], t + lag, like, parent.size) for parent, lag in state.live]
         return self.join.add(state.hoisted, t, parts), state
 
+    @override
     def chain(self, state: RecurrentState) -> Chain | None:
-        """See `Network.chain`."""
         if len(state.memories) + len(state.live) != 1 or not all(map(_is_perceptron, self.extractors.values())):
             return None
         before: tuple[tuple[Tensor, Tensor], ...] = ()
