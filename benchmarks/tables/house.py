@@ -19,7 +19,7 @@ from matplotlib.patches import FancyBboxPatch
 from .pages import DOCS
 
 ROOT = DOCS.parent / "dvae"
-EVERYWHERE = {"command", "files", "options", "turns", "units"}
+EVERYWHERE = {"command", "files", "options", "turns", "units", "schema", "relations"}
 """Small modules that many use and nobody looks for."""
 
 WALK = {
