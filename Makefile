@@ -15,7 +15,8 @@ BIN := .venv/bin
 export OMP_NUM_THREADS := 1
 
 # Numerical tests, for the second run: other instructions round otherwise.
-NUMERICAL := bounds compare control forecasts graphconv laws metrics model networks oracle particles trajectories
+NUMERICAL := laws networks test_oracle.py program/test_model.py models/test_trajectories.py motion/test_control.py \
+	motion/test_forecasts.py $(addprefix inference/test_,bounds.py compare.py metrics.py particles.py)
 
 .PHONY: venv demo test fuzz coverage bench notebooks docs dist clean
 
@@ -39,7 +40,7 @@ test: venv
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p dvae
 	$(BIN)/pytest -n 2
-	ATEN_CPU_CAPABILITY=default $(BIN)/pytest -n 2 $(NUMERICAL:%=tests/test_%.py)
+	ATEN_CPU_CAPABILITY=default $(BIN)/pytest -n 2 $(addprefix tests/,$(NUMERICAL))
 
 SECONDS := 600
 SEED := $(shell date +%s)

@@ -1,8 +1,11 @@
 """What every test starts from: the same seeds, an empty parameter store; and what it must leave as it was."""
 
+import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pyro
@@ -10,12 +13,32 @@ import pytest
 import torch
 from hypothesis import settings
 
+import dvae
+
 # A shell has what it starts in the background ignore Ctrl-C, and so would all that is started from there.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Examples are the same in every run, so that a failure is one for everybody.
 settings.register_profile("dvae", derandomize=True, deadline=None)
 settings.load_profile("dvae")
+
+
+ROOT = Path(__file__).parents[1]
+REAL = Path(os.environ.get("DVAE_SHARED_DATA", ROOT.parent / "shared" / "data"))
+"""Where the real motion capture is, which is not part of the project."""
+
+
+@pytest.fixture(scope="session")
+def real() -> Callable[[str], Any]:
+    """Real motion by its file, read once; a test that asks for some is skipped where it is absent."""
+
+    @cache
+    def read(file: str) -> Any:
+        if not (REAL / file).is_file():
+            pytest.skip(f"{file} of the real motion capture is not beside the project")
+        return dvae.motion.read_motion(REAL / file)
+
+    return read
 
 
 def global_state() -> dict[str, Any]:

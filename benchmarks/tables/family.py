@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 
 import dvae
-from dvae.inference.compare import Estimate
+from dvae.inference.uncertainty import Estimate
 
 from .pages import DOCS, table, write
 

@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +21,6 @@ from dvae.inference.evaluation import Evaluation, Row, Score
 from dvae.inference.references import multimodal_truths, nearest_neighbours, zero_velocity
 from dvae.program.model import DynamicalVAE
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 OBSERVED, FRAMES, SIZE = 4, 9, 3
 
 
@@ -479,10 +477,8 @@ def test_bone_lengths_tell_stretched_people(people):
         ("cmu/cmu8.npz", "cmu8", (0.755, 0.906), (0.503, 0.457, 5.60)),
     ],
 )
-def test_reference_rows_of_real_data_are_those_published_with_it(file, protocol, still, neighbours):
-    if not (DATA / file).exists():
-        pytest.skip(f"{file} is not beside the project")
-    clips = motion.read_motion(DATA / file)
+def test_reference_rows_of_real_data_are_those_published_with_it(real, file, protocol, still, neighbours):
+    clips = real(file)
     test = motion.windows(clips, motion.PROTOCOLS[protocol], "test")
     x = test.all()["x"]
     training = motion.windows(clips, motion.PROTOCOLS[protocol], "train+validation").all()["x"]

@@ -20,7 +20,7 @@ from dvae.testing.regression import Change, ElboRegression, Record, measure
 
 pytest_plugins = ["pytester"]
 
-DOCS = Path(__file__).parent.parent / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 PAIR = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_t)")
 
 

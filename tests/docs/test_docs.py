@@ -8,7 +8,7 @@ import pytest
 
 import dvae  # noqa: F401  its settings are Pyro's from here on, and not from an example's first line
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 EXAMPLES = ("new_method", "own_data", "walk")
 

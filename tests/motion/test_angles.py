@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -12,14 +10,10 @@ from dvae.motion import (
     AngleLimits,
     Skeleton,
     estimate_angle_limits,
-    load,
     simulate,
     windows,
 )
 from dvae.motion.angles import angle_names, cosines
-
-DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real motion capture is not beside the project")
 
 # A person facing +z with y up and left towards +x, arms hanging, legs straight, metres.
 STANDING = {
@@ -299,10 +293,9 @@ class TestLimits:
         name = limits.names.index("Leg2HipPlane")
         assert limits.low[name] > 0  # knees bend backwards
 
-    @needs_data
     @pytest.mark.data
-    def test_of_real_people_contain_their_poses(self):
-        motion = load(DATA / "cmu/cmu8.npz")
+    def test_of_real_people_contain_their_poses(self, real):
+        motion = real("cmu/cmu8.npz")
         poses = windows(motion, PROTOCOLS["cmu8"], "train").all(100)["x"].double()
         limits = estimate_angle_limits(poses, motion.skeleton)
         values = cosines(poses, motion.skeleton)

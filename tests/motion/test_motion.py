@@ -32,11 +32,6 @@ from dvae.motion import (
     windows,
 )
 
-DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
-needs_data = [
-    pytest.mark.data,
-    pytest.mark.skipif(not DATA.is_dir(), reason="the real motion capture is not beside the project"),
-]
 TINY = Protocol("tiny", observed=3, predicted=4, fps=30, train_stride=2, test_stride=3, validation=0.25)
 
 
@@ -629,18 +624,18 @@ class TestWindows:
         assert found["bandai2-by-style"] == found["cmu8"] == found["simulated"] == (15, 60, 30)
 
 
-@pytest.fixture(scope="module")
-def bandai():
-    return read_motion(DATA / "bandai" / "bandai2.npz")
+@pytest.fixture
+def bandai(real):
+    return real("bandai/bandai2.npz")
 
 
-@pytest.fixture(scope="module")
-def cmu():
-    return read_motion(DATA / "cmu" / "cmu8.npz")
+@pytest.fixture
+def cmu(real):
+    return real("cmu/cmu8.npz")
 
 
 class TestRealData:
-    pytestmark = needs_data
+    pytestmark = pytest.mark.data
 
     def test_counts_are_those_of_the_readme(self, bandai, cmu):
         rows = [(r["split"], r["clips"], r["frames"], r["minutes"]) for m in (cmu, bandai) for r in m.summary()]

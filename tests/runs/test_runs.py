@@ -32,7 +32,7 @@ from dvae.options import Range
 from dvae.runs import directory as runs
 from dvae.runs.sweep import sweep
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 METHOD = dvae.method("vrnn", latent=2, width=4, embed=(4,), embed_latent=(4,), warm_up=1)
 TRAINING = dvae.Training(steps=4, batch_size=2, validate_every=2, log_every=1, progress=False)
 

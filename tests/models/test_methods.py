@@ -20,8 +20,7 @@ from dvae.models.method import LatentMethod
 from dvae.models.registry import configured
 from dvae.testing import FactorizationContract
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 SMALL = {
     "vae": {"hidden": (5, 4)},
     "dkf": {"width": 4, "embed": 3, "embed_latent": (3,), "hidden": (4,), "decoder": (4, 5)},
@@ -560,11 +559,8 @@ def test_entry_points_add_methods_and_cannot_replace_any(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def people():
-    file = DATA / "bandai" / "bandai2.npz"
-    if not file.exists():
-        pytest.skip("the real motion capture is not beside the project")
-    return motion.windows(motion.read_motion(file), motion.PROTOCOLS["bandai2-by-style"], "train", length=10)
+def people(real):
+    return motion.windows(real("bandai/bandai2.npz"), motion.PROTOCOLS["bandai2-by-style"], "train", length=10)
 
 
 @pytest.mark.data

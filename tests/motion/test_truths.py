@@ -1,7 +1,6 @@
 """Pseudo ground truth: the same as by comparing all pairs, a fair draw, and people of the right size."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from dvae import motion
 from dvae.data import Source
 from dvae.motion import PROTOCOLS, PseudoTruths, WithPseudoTruths, rotate_about_up
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 OBSERVED, STRIDE, NEAR, APART = 4, 7, 0.8, 0.15
 SMALL = replace(PROTOCOLS["simulated"], observed=OBSERVED, predicted=8)
 
@@ -188,9 +186,9 @@ def test_batches_are_those_of_the_windows_and_what_belongs_to_them(windows, head
         assert batch["valid"].shape == (5, truths.most)
 
 
-@pytest.mark.skipif(not (DATA / "cmu").exists(), reason="needs the motion files in ../shared/data")
-def test_where_people_have_the_same_limbs_futures_are_recorded_ones():
-    windows = motion.windows(motion.read_motion(DATA / "cmu" / "cmu8.npz"), PROTOCOLS["cmu8"], "train")
+@pytest.mark.data
+def test_where_people_have_the_same_limbs_futures_are_recorded_ones(real):
+    windows = motion.windows(real("cmu/cmu8.npz"), PROTOCOLS["cmu8"], "train")
     pseudo, valid = PseudoTruths(windows).of(drawn(windows, 32), generator())
     assert len(PseudoTruths(windows)) == len(windows.index(20))
     recorded, future = windows.all(20)["x"][:, 15:], pseudo[valid][:, 15:]

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from dvae.models.pose_prior import PosePriorModel
 from torch import nn
 
 import dvae
@@ -14,6 +13,7 @@ from dvae.data import ArrayWindows, Fingerprinted, HeldOutWindows, Listed, Seque
 from dvae.inference.evaluate import evaluate
 from dvae.inference.references import zero_velocity
 from dvae.inference.scores import ENERGY, Measure, paired, proper
+from dvae.motion.judges.pose_prior import PosePriorModel
 from dvae.program.protocols import Forecasting, Program
 
 

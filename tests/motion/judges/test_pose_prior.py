@@ -3,7 +3,6 @@
 import copy
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,7 +16,6 @@ from dvae.motion.dataset import MotionData
 from dvae.motion.judges.pose_prior import PosePrior, PosePriorModel, fit_pose_prior
 from dvae.runs import directory as runs
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 CHAIN = motion.Skeleton(("root", "middle", "end"), (-1, 0, 1), name="chain")
 SHORT = replace(motion.PROTOCOLS["simulated"], observed=4, predicted=6)
 
@@ -217,9 +215,6 @@ def gain(windows, steps):
 
 
 @pytest.mark.data
-def test_on_real_poses_it_is_at_least_the_normal_in_closed_form():
-    file = DATA / "bandai" / "bandai2.npz"
-    if not file.exists():
-        pytest.skip("the real motion capture is not beside the project")
-    windows = motion.windows(motion.read_motion(file), motion.PROTOCOLS["bandai2-by-style"], "train")
+def test_on_real_poses_it_is_at_least_the_normal_in_closed_form(real):
+    windows = motion.windows(real("bandai/bandai2.npz"), motion.PROTOCOLS["bandai2-by-style"], "train")
     assert gain(windows, steps=200) > 0
