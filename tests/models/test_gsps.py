@@ -339,8 +339,8 @@ def test_forecasts_that_cannot_be(windows, call, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"emission": "student"}, "gsps has no emission"),
-        ({"self_feeding": 0.5}, "gsps has no self_feeding"),
+        ({"emission": "student"}, "gsps has no option 'emission'"),
+        ({"self_feeding": 0.5}, "gsps has no option 'self_feeding'"),
         ({"draws": (1, 2, 3)}, "one for each of the parts lower, upper"),
         ({"draws": (0, 2)}, "draws.* is 0; it must be at least 1"),
         ({"limb": -1.0}, "limb is -1.0; it must be finite and at least 0"),
@@ -361,7 +361,7 @@ def test_presets_by_skeleton(windows):
     assert None not in vars(chosen).values()
     assert configured(chosen.config()) == chosen
     for skeleton in (motion.HUMAN36M, motion.HUMANEVA):
-        published = dvae.method("gsps", width=64).suited(type("Windows", (), {"skeleton": skeleton}))
+        published = dvae.method("gsps", width=64).suited(motion.Poses.under(windows.protocol, skeleton))
         assert published == replace(dvae.method("gsps", **PRESETS[skeleton.name]), width=64)
     five = dvae.method("gsps", parts=FIVE).suited(windows)
     assert [len(five.draws), len(five.diversity), len(five.diversity_scale)] == [5, 5, 5]
@@ -401,7 +401,8 @@ def test_a_fitted_pose_prior_is_taken_along(windows, prior_run):
     assert isinstance(fitted, PosePriorModel)
     assert torch.equal(model.pose_prior.log_prob(poses), fitted.log_prob(poses))
     with pytest.raises(ValueError, match=r"fitted with heading=True .* sees poses with heading=False"):
-        method.prepare(replace(method, heading=False).build(windows), windows)
+        other = replace(method, heading=False)
+        other.train(windows).prepare(other.build(windows))
 
 
 def test_a_model_without_a_likelihood_is_not_compared_by_bounds(windows):
@@ -424,7 +425,8 @@ def test_training_brings_the_best_future_nearer(windows):
     model = build(windows, width=16, coefficients=12, diversity=(0.0,)).float()
     method = model.method
     options = {"steps": 80, "batch_size": 8, "learning_rate": 5e-3, "progress": False}
-    result = method.train(windows, steps=options.pop("steps")).fit(model, **options)
+    recipe = method.train(windows, steps=options.pop("steps"))
+    result = dvae.fit(model, recipe.batches, stages=recipe.stages, steps=recipe.stages[0].steps, **options)
     errors = result.series("energy/reconstruction")[1]
     assert errors[-1] < 0.75 * errors[0]
 

@@ -198,8 +198,8 @@ def test_cvae_rnn_reads_its_own_means_alone(windows):
 @pytest.mark.parametrize(
     ("run", "message"),
     [
-        (lambda: small(emission="normal"), "trajevae has no emission"),
-        (lambda: small("cvae-rnn", self_feeding=0.5), "cvae-rnn has no self_feeding"),
+        (lambda: small(emission="normal"), "trajevae has no option 'emission'"),
+        (lambda: small("cvae-rnn", self_feeding=0.5), "cvae-rnn has no option 'self_feeding'"),
         (lambda: small(keep=1.5), "keep is 1.5; it must be between 0 and 1"),
         (lambda: small(beta=-1.0), "beta is -1.0"),
         (lambda: small(dropout=1.0), "dropout is 1.0"),
@@ -300,7 +300,7 @@ def test_joints_are_found_by_their_usual_names(windows):
 
 def test_training_windows_are_turned_and_validation_windows_are_not(windows):
     still = small(rotate=False).train(windows).batches
-    turned = small().batches(motion.Windows.with_protocol(windows, replace(PROTOCOL, rotate=False)))
+    turned = small().train(motion.Windows.with_protocol(windows, replace(PROTOCOL, rotate=False))).batches
     first, second = (w.sample(5, torch.Generator().manual_seed(3))["x"] for w in (still, turned))
     assert torch.allclose(first[..., 1], second[..., 1], atol=1e-6)  # heights of the pelvis
     assert not torch.allclose(first, second, atol=1e-3)

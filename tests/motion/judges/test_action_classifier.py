@@ -155,7 +155,6 @@ def test_the_classes_are_those_of_the_training_clips_and_kept():
     assert method.classes == ("down", "up")
     assert configured(json.loads(json.dumps(method.config()))) == method
     assert method.suited(windows("test", people(ways=("left", "right")))) == method
-    assert method.equations()[0].text == "p(c | x_{1:T})"
     recipe = method.train(train)
     assert (recipe.objective, recipe.feeding) == (dvae.Evidence(), 0)
 
@@ -197,18 +196,18 @@ def without_label(clips):
     ("call", "message"),
     [
         (lambda: ActionClassifier(hidden=0), "hidden is 0; it must be at least 1"),
-        (lambda: ActionClassifier().build({"x": 48}), r"needs to know the classes; use build_for\(windows\)"),
+        (lambda: ActionClassifier().build({"x": 48}), "needs to know what poses are, and was given sequences"),
         (lambda: ActionClassifier().suited(windows("train")), "have nothing for the label 'content'.* are way, who"),
         (
             lambda: ActionClassifier(**SMALL).suited(windows("train", people(ways=("up", "up")))),
             "nothing to tell apart: training clips have up for",
         ),
         (
-            lambda: ActionClassifier(**SMALL).batches(windows("train", without_label(people()))),
+            lambda: ActionClassifier(**SMALL).train(windows("train", without_label(people()))),
             "clip train/person_0003 .* has no label 'way', expected one of down, up",
         ),
         (
-            lambda: ActionClassifier(**SMALL, classes=("up", "left")).batches(windows("test")),
+            lambda: ActionClassifier(**SMALL, classes=("up", "left")).train(windows("test")),
             "clip test/person_.* has 'down' for 'way', expected one of up, left",
         ),
         (lambda: classifier().model({"x": draw(2, 10, 48)}), "the batch lacks 'c'"),
