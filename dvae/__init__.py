@@ -9,43 +9,43 @@
 ... )
 >>> dvae.audit(model.generative, model.inference).missing
 {'z': ('z_{<t}',)}
+
+Torch takes seconds to import, so that what is named here, and every subpackage, is imported when it is first used.
 """
 
 import sys
+from typing import TYPE_CHECKING
+
+from .lazy import importing
 
 __version__ = "0.1.0"
 
 if sys.flags.optimize > 1:  # Pyro fills in its docstrings as it is imported
     raise ImportError("dvae needs Pyro, which needs docstrings: run python without -OO (PYTHONOPTIMIZE=2); -O is fine")
 
-import pyro
-
-# Without it a second model silently receives the first one's parameters from Pyro's global store.
-pyro.settings.set(module_local_params=True)
-
-from . import laws, motion, networks, views  # noqa: E402
-from .graph import Audit, audit  # noqa: E402
-from .inference import schedules  # noqa: E402
-from .inference.bounds import SequenceELBO, Terms, importance_bound  # noqa: E402
-from .inference.calibration import calibrate  # noqa: E402
-from .inference.checks import predictive_checks  # noqa: E402
-from .inference.compare import compare  # noqa: E402
-from .inference.comparison import Comparison  # noqa: E402
-from .inference.evaluate import evaluate  # noqa: E402
-from .inference.evaluation import Evaluation  # noqa: E402
-from .inference.fit import Fit, fit  # noqa: E402
-from .inference.objectives import Evidence  # noqa: E402
-from .inference.particles import particle_bound  # noqa: E402
-from .inference.svi import SVI  # noqa: E402
-from .inference.training import Stage, Training  # noqa: E402
-from .inference.traversal import traverse  # noqa: E402
-from .models.registry import method, methods  # noqa: E402
-from .motion import energies  # noqa: E402
-from .notation import Factorization  # noqa: E402
-from .oracle import Oracle, price, twin  # noqa: E402
-from .program.model import DynamicalVAE  # noqa: E402
-from .program.rollout import SelfFeeding  # noqa: E402
-from .runs.directory import load  # noqa: E402
+if TYPE_CHECKING:
+    from . import laws, motion, networks, views
+    from .graph import Audit, audit
+    from .inference import schedules
+    from .inference.bounds import SequenceELBO, Terms, importance_bound
+    from .inference.calibration import calibrate
+    from .inference.checks import predictive_checks
+    from .inference.compare import compare
+    from .inference.comparison import Comparison
+    from .inference.evaluate import evaluate
+    from .inference.evaluation import Evaluation
+    from .inference.fit import Fit, fit
+    from .inference.objectives import Evidence
+    from .inference.particles import particle_bound
+    from .inference.svi import SVI
+    from .inference.training import Stage, Training
+    from .inference.traversal import traverse
+    from .models.registry import method, methods
+    from .notation import Factorization
+    from .oracle import Oracle, price, twin
+    from .program.model import DynamicalVAE
+    from .program.rollout import SelfFeeding
+    from .runs.directory import load
 
 __all__ = [
     "SVI",
@@ -82,3 +82,39 @@ __all__ = [
     "twin",
     "views",
 ]
+
+_PLACES = {
+    name: module
+    for module, names in {
+        "graph": "Audit audit",
+        "inference": "schedules",
+        "inference.bounds": "SequenceELBO Terms importance_bound",
+        "inference.calibration": "calibrate",
+        "inference.checks": "predictive_checks",
+        "inference.compare": "compare",
+        "inference.comparison": "Comparison",
+        "inference.evaluate": "evaluate",
+        "inference.evaluation": "Evaluation",
+        "inference.fit": "Fit fit",
+        "inference.objectives": "Evidence",
+        "inference.particles": "particle_bound",
+        "inference.svi": "SVI",
+        "inference.training": "Stage Training",
+        "inference.traversal": "traverse",
+        "models.registry": "method methods",
+        "notation": "Factorization",
+        "oracle": "Oracle price twin",
+        "program.model": "DynamicalVAE",
+        "program.rollout": "SelfFeeding",
+        "runs.directory": "load",
+    }.items()
+    for name in names.split()
+}
+
+
+if not TYPE_CHECKING:  # which knows them all
+    __getattr__ = importing(__name__, _PLACES)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,6 +1,7 @@
 """What every result is: a table on a terminal, in print and in a notebook, and a file. And the bar while one waits."""
 
 import io
+import re
 from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
@@ -56,6 +57,11 @@ def _as_it_is(cell: Any) -> Any:
 def _shown(text: str) -> str:
     """The text, which cannot command the terminal: rich drops the other control characters."""
     return text.replace("\x1b", r"\x1b")
+
+
+def reason(error: BaseException) -> str:
+    """What an error says, without the table of shapes that Pyro appends where it passes a program."""
+    return re.split(r"\n\s*Trace Shapes:", str(error))[0]
 
 
 def as_they_are(texts: "Iterable[matplotlib.text.Text]") -> None:

@@ -7,7 +7,6 @@ changes nothing, nor the reverse.
 """
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from ..turns import alone
 from .bounds import SequenceELBO, Terms
 from .checkpoints import weights
 from .objectives import Objective
+from .result import reason
 from .schedules import schedule
 from .training import Stage, lay_out, stage_at
 
@@ -30,11 +30,6 @@ OPTIMISERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch
 
 class NonFiniteError(FloatingPointError):
     """A loss or its gradient is NaN or infinite; the step was not taken."""
-
-
-def reason(error: BaseException) -> str:
-    """What an error says, without the table of shapes that Pyro appends where it passes a program."""
-    return re.split(r"\n\s*Trace Shapes:", str(error))[0]
 
 
 @dataclass

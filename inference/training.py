@@ -17,7 +17,7 @@ class Training:
     Args:
         steps: optimiser steps in all.
         batch_size: sequences in a batch, in each process.
-        learning_rate: a number or a schedule.
+        learning_rate: step size of the optimiser, a number or a schedule.
         decay: last share of the run over which a learning rate that is a number falls linearly to 0; a resumed run
             with more steps falls later.
         optimizer: "adam", "adamw" or "sgd".

@@ -1,12 +1,13 @@
-"""The program `dvae`: its imports, in which Ctrl-C and a missing piece end it in a sentence, and then `dvae.cli`.
+"""The program `dvae`: what its command imports, in which Ctrl-C and a missing piece end it in a sentence, and then it.
 
-Torch takes seconds to import, and whatever imports a part of dvae imports torch. So this package is installed under a
+Torch takes seconds to import, and dvae itself may be what cannot be imported. So this package is installed under a
 second name, `dvae_command`, beside dvae and not within it.
 """
 
 import os
 import signal
 import sys
+from contextlib import suppress
 from types import FrameType
 
 
@@ -16,7 +17,10 @@ def main() -> int:
     if handled:
         signal.signal(signal.SIGINT, _interrupted)  # a KeyboardInterrupt amid an import can come out as anything
     try:
-        from dvae.cli import main
+        from dvae.cli import command, main
+
+        with suppress(ValueError):  # no command, of which main tells
+            command(sys.argv[1:])
     except ImportError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -10,8 +10,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from reprlib import repr as brief
 from typing import Any
 
 import torch
@@ -23,6 +25,7 @@ from ..inference.schedules import from_config as option_from_config
 from ..inference.trackers import Tracker
 from ..inference.training import Training
 from ..models.registry import configured
+from ..options import flat
 from ..schema import Schema
 from ..turns import alone
 from .kinds import DATA, SCHEMAS, Dataset, opened
@@ -63,7 +66,6 @@ class Loaded:
     config: Config
     model: Any
     where: str | None = None
-    _data: Dataset | None = field(default=None, repr=False)
 
     @property
     def method(self) -> Any:
@@ -75,23 +77,18 @@ class Loaded:
         """Of the data that it was fitted on."""
         return self.config.schema
 
-    @property
+    @cached_property
     def data(self) -> Any:
         """The data that it was fitted on, opened when they are first asked for.
 
         Raises:
             CheckpointError: they are not here, or have changed.
         """
-        if self._data is None:
-            self._data = opened(self.path, self.config.kind, self.config.data, self.schema, self.where)
-        return self._data
+        return opened(self.path, self.config.kind, self.config.data, self.schema, self.where)
 
-    def share(self, other: Loaded) -> bool:
-        """Takes over the data of another run, in place of opening them again, and says whether they are the same."""
-        same = (self.config.data.fingerprint, self.schema) == (other.config.data.fingerprint, other.schema)
-        if same:
-            self._data = other.data
-        return same
+    def alike(self, other: Loaded) -> bool:
+        """Whether another run was fitted on the same data, under the same schema."""
+        return (self.config.data.fingerprint, self.schema) == (other.config.data.fingerprint, other.schema)
 
     def on(self, path: str | os.PathLike[str]) -> Any:
         """Other data of the same kind, under the run's schema.
@@ -100,10 +97,10 @@ class Loaded:
             ValueError: data with another schema, such as other joints.
         """
         other = DATA[self.config.kind].reopened(self.config.data, self.schema, path)
-        if other.schema != self.schema:
-            raise ValueError(
-                f"{path} holds other variables than {self.path} was fitted on: {other.schema} in place of {self.schema}"
-            )
+        here, there = (dict(flat(schema.config())) for schema in (self.schema, other.schema))
+        if differing := [name for name in here | there if here.get(name) != there.get(name)]:
+            values = (f"{name} is {brief(there.get(name))}, not {brief(here.get(name))}" for name in differing)
+            raise ValueError(f"{os.fspath(path)} does not fit {self.path}: {'; '.join(values)}")
         return other
 
 

@@ -71,8 +71,8 @@ def opened(
         found = DATA[kind].reopened(source, schema, where)
     except FileNotFoundError as error:
         raise CheckpointError(
-            f"{run} was fitted on {source.path}, but {where} is not here; relative paths count from the "
-            "working directory, so change to where it was fitted, or tell where the data lie now (--data)"
+            f"{run} was fitted on {source.path}, but {where} is not here; relative paths count from the working "
+            "directory, so change to where it was fitted, or tell where the data lie now, or other data (--data)"
         ) from error
     if found.fingerprint != source.fingerprint:
         raise CheckpointError(

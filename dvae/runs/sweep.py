@@ -34,10 +34,10 @@ from .. import files
 from ..inference.checkpoints import Run
 from ..inference.fit import Fit, Interrupted
 from ..inference.recipe import Trainable
-from ..inference.result import Plain, Table
+from ..inference.result import Plain, Table, reason
 from ..inference.schedules import clamp
 from ..inference.signals import Signals
-from ..inference.svi import State, reason
+from ..inference.svi import State
 from ..inference.trackers import LARGEST_LOG, row_of
 from ..inference.training import Training
 from ..models.method import Method

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -79,7 +79,7 @@ def test_wrong_arguments_exit_with_2(capsys, tmp_path):
     assert "did you mean 'hit-dvae'" in failure(capsys, "show", "hitdvae", code=2)
     assert "both --generative and --inference" in failure(capsys, "show", code=2)
     assert "not both" in failure(capsys, "show", "srnn", "--generative", "p(z_t) p(x_t | z_t)", code=2)
-    assert "hit-dvae, gsps, trajevae, cvae-rnn, pose-prior" in failure(capsys, "fit", "hitdvae", *out, code=2)
+    assert "hit-dvae, gsps, trajevae, cvae-rnn, equations" in failure(capsys, "fit", "hitdvae", *out, code=2)
     assert "--steps" in failure(capsys, "fit", "vae", *out, "--step", "3", code=2)
     assert "emission" in failure(capsys, "fit", "vae", *out, "--emission", "loud", code=2)
     assert "batch_size is 0" in failure(capsys, "fit", "vae", *out, "--batch-size", "0", code=2)
@@ -396,7 +396,8 @@ def test_a_method_with_an_objective_of_its_own_resumes(people, tmp_path, monkeyp
         def objective(self):
             return lambda terms, step: (seen.append(step), -terms.bound.sum() / terms.frames.sum())[1]
 
-    monkeypatch.setitem(dvae.methods(), "plain", Plain)
+    known = {**dvae.methods(), "plain": Plain}
+    monkeypatch.setattr("dvae.models.registry.methods", lambda: known)
     training = dvae.Training(steps=3, batch_size=4, progress=False)
     runs.fit_run(Plain(latent=3), MotionData.open(people), tmp_path / "run", training)
     runs.resume(tmp_path / "run", steps=5)
@@ -444,9 +445,9 @@ def test_a_damaged_run_is_refused(capsys, run):
         (["data"], 3),
         (["data", "path"], 3),
         (["data", "fingerprint"], None),
-        (["protocol", "observed"], "many"),
-        (["protocol", "train"], 3),
-        (["protocol", "unknown"], 3),
+        (["schema", "protocol", "observed"], "many"),
+        (["schema", "protocol", "train"], 3),
+        (["schema", "protocol", "unknown"], 3),
         (["training"], []),
         (["training", "steps"], "many"),
         (["training", "learning_rate"], "fast"),
@@ -479,7 +480,51 @@ def test_changed_or_moved_data_are_noticed(capsys, people, tmp_path, monkeypatch
     assert main(["evaluate", "../run", "--data", "../people.npz", "--samples", "2"]) == 0
     motion.save(tmp_path / "people.npz", motion.simulate(clips=14, frames=90, seed=5))
     capsys.readouterr()
-    assert "has changed since ../run was fitted" in failure(capsys, "evaluate", "../run", "--data", "../people.npz")
+    assert "has changed since ../run was fitted" in failure(capsys, "resume", "../run", "--data", "../people.npz")
+    monkeypatch.chdir(tmp_path)
+    assert "has changed since run was fitted" in failure(capsys, "evaluate", "run")
+
+
+def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for seed, name in enumerate(("own", "other")):
+        motion.save(tmp_path / name / "people.npz", motion.simulate(clips=14, frames=90, seed=seed))
+    for name in ("run", "second"):
+        fit = ["fit", "vae", "--data", "own/people.npz", "--out", name, "--seed", str(len(name))]
+        assert main([*fit, "--steps", "4", *SMALL]) == 0
+    shutil.rmtree("own")
+    other = ["--data", "other/people.npz"]
+    assert dvae.load("run").model.sizes["x"] == 48
+    capsys.readouterr()
+    for command in ("forecast run --out f.npz", "evaluate run", "compare run", "criticise run", "resume run --steps 6"):
+        assert "or other data (--data)" in failure(capsys, *command.split())
+    assert "own/people.npz is not here" in failure(capsys, "resume", "run", "--data", "own/people.npz")
+    assert "has changed since" in failure(capsys, "resume", "run", *other)
+    for command in (
+        "forecast run --out f.npz --samples 2",
+        "evaluate run second --samples 2",
+        "compare run second --samples 2 --particles 4 --contrasts 0",
+        "criticise run --simulations 20 --draws 9 --samples 19",
+        "animate run --out f.html",
+    ):
+        capsys.readouterr()
+        assert main([*command.split(), *other]) == 0
+        assert "note: other/people.npz is not the data that run was fitted on" in capsys.readouterr().err
+    windows = MotionData.open("other/people.npz").windows("test")
+    assert motion.Forecasts.load("f.npz").keys == windows.keys
+    found = dvae.Evaluation.load("run/evaluation-people.json")
+    assert found.data["fingerprint"] == windows.fingerprint
+    assert set(found.rows) == {"zero velocity", "run", "second"}  # the neighbours went with the training data
+
+
+def test_data_of_other_joints_are_refused(capsys, run, tmp_path):
+    clips = motion.simulate(clips=14, frames=90, seed=1)
+    skeleton = replace(clips.skeleton, name="stranger", fps=60.0)
+    motion.save(tmp_path / "far" / "people.npz", motion.MotionSet(list(clips), skeleton, "people"))
+    error = failure(capsys, "evaluate", str(run), "--data", str(tmp_path / "far" / "people.npz"))
+    assert f"people.npz does not fit {run}: " in error
+    assert "skeleton.name is 'stranger', not 'walker'" in error
+    assert "skeleton.fps is 60.0, not 30.0" in error
 
 
 def test_debug_shows_where_it_failed(capsys, tmp_path):

@@ -640,7 +640,7 @@ def test_the_command_criticises_a_run(people, tmp_path, capsys, monkeypatch):
     def fail(*_, **options):
         raise FloatingPointError(f"draw_emission={options['draw_emission']}")
 
-    monkeypatch.setattr("dvae.cli.predictive_checks", fail)
+    monkeypatch.setattr("dvae.cli.judging.predictive_checks", fail)
     assert main(["criticise", str(run), *options, "--no-draw-emission"]) == 1
     assert "draw_emission=False" in capsys.readouterr().err
     assert list(json.loads((run / "criticism.json").read_text())) == ["calibration"]  # and not the checks of old

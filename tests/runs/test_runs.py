@@ -25,7 +25,7 @@ from dvae import files, motion
 from dvae.cli import main
 from dvae.inference import trackers
 from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE, CheckpointError, Run, at_most
-from dvae.inference.svi import reason
+from dvae.inference.result import reason
 from dvae.inference.trackers import JSONLines
 from dvae.motion.dataset import MotionData
 from dvae.options import Range

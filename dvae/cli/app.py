@@ -1,0 +1,141 @@
+"""The program: which command is meant, what it leaves, and how it fails.
+
+Exit codes: 0 done, 1 failed, 2 wrong arguments, 130 after Ctrl-C, 143 after SIGTERM. A fit that a signal
+stopped can be resumed.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from itertools import pairwise
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+import tyro
+
+from ..inference.result import reason
+from ..options import nearest
+from .console import ERROR, UsageError, note
+
+COMMANDS = {
+    "list": ("methods:list_methods", "List the methods: their equations and where they come from."),
+    "show": ("methods:show", "Show two equations: the joint distributions, the audit of the guide, and the graph."),
+    "fit": ("fitting:fit", "Fit a method, or equations of your own, to motion data."),
+    "resume": ("fitting:resume", "Continue a run from its last checkpoint."),
+    "sweep": ("fitting:sweep", "Fit methods with several seeds and sizes, several runs at a time."),
+    "evaluate": ("judging:evaluate", "Score runs on test windows."),
+    "criticise": ("judging:criticise", "Is a run's guide calibrated, and do its motions look like real ones?"),
+    "compare": (
+        "judging:compare",
+        "Compare runs on test windows: bounds, paired differences with their errors, use of latents.",
+    ),
+    "forecast": ("futures:forecast", "Forecast the test windows, or those of one clip, many times each."),
+    "complete": ("futures:complete", "Complete motion along paths of some joints, from a clip or from a file."),
+    "animate": ("futures:animate", "Play forecasts beside what happened, or a clip, as moving skeletons."),
+    "data": ("data:data", "Look into motion files."),
+}
+"""Name to "module:function", imported when it is meant, and what `dvae --help` says of it."""
+
+
+def command(given: Sequence[str]) -> Callable[..., None] | None:
+    """The command that the arguments name, imported; None if they name none.
+
+    Raises:
+        UsageError: an unknown one.
+    """
+    if not given or given[0].startswith("-"):
+        return None
+    if given[0] not in COMMANDS:
+        raise UsageError(f"unknown command {given[0]!r}{nearest(given[0], COMMANDS)}; known: {', '.join(COMMANDS)}")
+    module, _, name = COMMANDS[given[0]][0].partition(":")
+    return getattr(import_module(f"{__package__}.{module}"), name)  # type: ignore[no-any-return]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    Args:
+        arguments: those of the process by default.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in given
+    given = [argument for argument in given if argument != "--debug"]
+    warnings.showwarning = note
+    try:
+        _run(given)
+        return 0
+    except SystemExit as stop:  # tyro, after --help or wrong arguments
+        if stop.code:
+            for meant in _meant(given):
+                ERROR.print(meant, markup=False)
+        return stop.code if isinstance(stop.code, int) else 2
+    except KeyboardInterrupt as stop:
+        ERROR.print(str(stop) or "interrupted")
+        return 128 + getattr(stop, "signal", signal.SIGINT)
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        expected = isinstance(error, ValueError | OSError | RuntimeError | FloatingPointError)
+        hint = "" if expected or debug else " (this looks like a bug: --debug shows the traceback)"
+        ERROR.print("error: ", style="bold red", end="")
+        ERROR.print((reason(error) or type(error).__name__) + hint)
+        return 2 if isinstance(error, UsageError) else 1
+
+
+def _run(given: list[str]) -> None:
+    """Runs the command with its arguments; without one, tyro says which there are."""
+    meant = command(given)
+    if meant is not None:
+        config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitArgPrefixes)
+        tyro.cli(meant, prog=f"dvae {given[0]}", args=given[1:], config=config)
+        return
+    app = tyro.extras.SubcommandApp()
+    for name, (_, about) in COMMANDS.items():
+        app.command(name=name, help=about)(lambda: None)
+    app.cli(
+        prog="dvae",
+        description="Dynamical variational autoencoders from their factorizations. "
+        "With --debug, a failure shows its traceback.",
+        args=given,
+    )
+
+
+def _meant(given: Sequence[str]) -> Iterator[str]:
+    """Sentences on names that are none, but near to one: of methods, and the choices of options."""
+    if (called := command(given)) is None:
+        return
+    from ..models.registry import judges, methods
+
+    name, *rest = given
+    loose = [
+        word
+        for before, word in zip(["", *rest[:-1]], rest, strict=True)
+        if not word.startswith("-") and (name == "sweep" or not before.startswith("-"))
+    ]
+    hints = [get_type_hints(called)]
+    hints += [
+        get_type_hints(kind) for kind in (hints[0].get("training"), *methods().values()) if name in ("fit", "sweep")
+    ]
+    choices = {option: _choices(hint) for each in reversed(hints) for option, hint in each.items() if _choices(hint)}
+    names = {"fit": [*methods(), *judges()], "data": choices.get("action", [])}.get(name, [])
+    for word in loose[:1] if not set(names) & set(rest) else []:
+        if meant := nearest(word, names):
+            yield f"{word!r} is unknown{meant}"
+    for option, word in pairwise(rest):
+        known = choices.get(option.removeprefix("--").replace("-", "_"), []) if option.startswith("--") else []
+        if known and word not in known and (meant := nearest(word, known)):
+            yield f"{option} {word!r} is unknown{meant}"
+    for word in loose if name == "sweep" else []:
+        if word not in choices["method"] and (meant := nearest(word, choices["method"])):
+            yield f"{word!r} is unknown{meant}"
+
+
+def _choices(hint: Any) -> list[str]:
+    """The names that a type allows, wherever in it they are."""
+    if get_origin(hint) is Literal:
+        return [name for name in get_args(hint) if isinstance(name, str)]
+    return [name for part in get_args(hint) for name in _choices(part)]

@@ -1,0 +1,232 @@
+"""Commands that fit: fit, resume, sweep. Their options are the fields of methods and of `Training`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, make_dataclass
+from functools import reduce
+from operator import or_
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+
+import tyro
+from joblib import parallel_config
+
+from .. import motion
+from ..inference.checkpoints import Run
+from ..inference.fit import Fit, Interrupted
+from ..inference.recipe import Trainable
+from ..inference.schedules import Schedule
+from ..inference.trackers import TensorBoard
+from ..inference.training import Training
+from ..models.method import LatentMethod
+from ..models.registry import judges, methods
+from ..models.registry import method as method_by_name
+from ..models.trajectories import TrajectoryMethod
+from ..motion.dataset import SIMULATED, MotionData
+from ..runs import directory as runs
+from ..runs.sweep import sweep as sweep_methods
+from .console import OUT, UsageError, arguments, at_least
+
+DEFAULT = Training(decay=0.5)
+"""How the command line trains, where it is not told."""
+
+
+def _options(name: str, kind: type[Any], default: Any, *aside: str) -> Any:
+    """A dataclass of the options of another that can be written as words, but those that are left aside.
+
+    Args:
+        name: of the class.
+        kind: whose options.
+        default: with the values that they have by default; None for options that are None where they are not given.
+        aside: names of options.
+    """
+    hints = get_type_hints(kind, include_extras=True)
+    found, schedules = [], {*get_args(Schedule)}
+    for option in fields(kind):
+        hint = hints[option.name]
+        if schedules & {*get_args(hint)}:
+            hint = reduce(or_, [part for part in get_args(hint) if part not in schedules])
+        value = None if default is None else getattr(default, option.name)
+        found.append((option.name, hint | None if default is None else hint, value))
+    kept = [option for option in found if option[0] not in aside]
+    return make_dataclass(name, kept, frozen=True, namespace={"__doc__": kind.__doc__})
+
+
+if TYPE_CHECKING:
+    MethodChoice = Trainable
+    ProtocolName = str
+    SweptMethod = str
+    MethodOptions = Any
+    TrainingOptions = Any
+    SweepOptions = Any
+else:
+    KNOWN = {**methods(), **judges()}
+    MethodChoice = tyro.extras.subcommand_type_from_defaults(
+        {name: kind() for name, kind in KNOWN.items()},
+        descriptions={name: kind.source for name, kind in KNOWN.items()},
+        prefix_names=False,
+    )
+    ProtocolName = tyro.extras.literal_type_from_choices(motion.PROTOCOLS)
+    SweptMethod = tyro.extras.literal_type_from_choices([name for name in methods() if name != "equations"])
+    MethodOptions = _options("MethodOptions", LatentMethod, None, "latent")
+    TrainingOptions = _options("TrainingOptions", Training, DEFAULT, "self_feeding", "progress")
+    SweepOptions = _options("SweepOptions", Training, DEFAULT, "self_feeding", "progress", "seed", "devices")
+
+
+def fit(
+    method: MethodChoice,
+    out: Path,
+    training: TrainingOptions,
+    data: str = SIMULATED,
+    protocol: ProtocolName | None = None,
+    skip_bad: bool = False,
+    tensorboard: bool = False,
+) -> None:
+    """Fit a method, or equations of your own, to motion data.
+
+    Options may stand before or after the method; `dvae fit METHOD --help` lists those of a method.
+
+    Args:
+        method: what to fit.
+        out: the run directory.
+        training: options of the run.
+        data: a motion file, or "simulated".
+        protocol: how windows are cut, by default as suits the skeleton.
+        skip_bad: leave out clips that cannot be used instead of refusing the file.
+        tensorboard: write TensorBoard files to the run directory too.
+    """
+    if out.is_file():
+        raise UsageError(f"--out {out} is a file; name a directory for the run")
+    if Run(out).exists:
+        raise ValueError(f"{out} already holds a run; continue it with: dvae resume {out}, or choose another directory")
+    with arguments():
+        method.check()  # wrong equations and options are found before the data are read
+        how = Training(**vars(training))
+    opened = MotionData.open(data, protocol, skip_bad)
+    with _reported():
+        _report(runs.fit_run(method, opened, out, how, trackers=[TensorBoard(out)] if tensorboard else []))
+
+
+def resume(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str | None = None,
+    steps: int | None = None,
+    learning_rate: float | None = None,
+    tensorboard: bool = False,
+) -> None:
+    """Continue a run from its last checkpoint.
+
+    The learning rate falls, and self-feeding rises, over the same shares of the run when it is made longer.
+
+    Args:
+        run: the run directory.
+        data: where the data lie now, if the path in the run no longer leads there.
+        steps: optimiser steps in all, to make the run longer.
+        learning_rate: step size of the optimiser from here on.
+        tensorboard: write TensorBoard files to the run directory too.
+    """
+    given = {"steps": steps, "learning_rate": learning_rate}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    with arguments():
+        Training(**options)
+    with _reported():
+        _report(runs.resume(run, data, [TensorBoard(run)] if tensorboard else [], progress=True, **options))
+
+
+def sweep(
+    method: Annotated[tuple[SweptMethod, ...], tyro.conf.Positional],
+    out: Path,
+    options: MethodOptions,
+    training: SweepOptions,
+    seeds: tuple[int, ...] = (0, 1, 2),
+    latent: tuple[int, ...] = (),
+    data: str = SIMULATED,
+    protocol: ProtocolName | None = None,
+    skip_bad: bool = False,
+    jobs: int = 2,
+    scheduler: str | None = None,
+) -> None:
+    """Fit methods with several seeds and sizes, several runs at a time, each on one thread.
+
+    The same command continues a sweep that was stopped: finished runs are left as they are.
+
+    Args:
+        method: names of methods.
+        out: directory of the run directories, such as srnn-seed0, or srnn-z8-seed0 where sizes differ.
+        options: of all methods, in place of their defaults.
+        training: options of the runs.
+        seeds: of initial weights, batches and draws; a run for each.
+        latent: sizes of z; a run for each.
+        data: a motion file, or "simulated".
+        protocol: how windows are cut, by default as suits the skeleton.
+        skip_bad: leave out clips that cannot be used instead of refusing the file.
+        jobs: runs at a time.
+        scheduler: address of a dask scheduler, such as tcp://host:8786, whose workers fit the runs in place of --jobs.
+    """
+    if not method or not seeds:
+        raise UsageError("give at least one method and one seed")
+    at_least(1, jobs=jobs)
+    if out.is_file():
+        raise UsageError(f"--out {out} is a file; name a directory for the runs")
+    given = {name: value for name, value in vars(options).items() if value is not None}
+    with arguments():
+        sizes: list[dict[str, int]] = [{"latent": size} for size in latent] or [{}]
+        chosen = [method_by_name(name, **given, **size) for name in method for size in sizes]
+        for each in chosen:
+            each.check()
+        how = Training(**vars(training))
+    opened = MotionData.open(data, protocol, skip_bad)
+    with _cluster(scheduler):
+        results = sweep_methods(chosen, opened, out, seeds, how, jobs)
+    if failed := [result for result in results if result.status == "failed"]:
+        raise RuntimeError(
+            f"{len(failed)} of {len(results)} runs failed, the same command tries them again\n"
+            + "\n".join(map(str, failed))
+        )
+    then = "compare" if all(each.selects == "bound" for each in chosen) else "evaluate"
+    OUT.print(f"all {len(results)} runs have ended; {then} them with: dvae {then} {out}/*", soft_wrap=True)
+
+
+@contextmanager
+def _reported() -> Iterator[None]:
+    """Within it, an interrupted fit says how the command line goes on."""
+    try:
+        yield
+    except Interrupted as stop:
+        stop.args = (f"interrupted after step {stop.fit.step}; resume with: dvae resume {stop.fit.run}",)
+        raise
+
+
+@contextmanager
+def _cluster(scheduler: str | None) -> Iterator[None]:
+    """Within it, joblib runs on the workers of a dask scheduler, if there is one."""
+    if scheduler is None:
+        yield
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise UsageError("--scheduler needs dask: pip install 'pyro-dvae[dask]'") from error
+    with Client(scheduler) as client, parallel_config(backend="dask", client=client):
+        yield
+
+
+def _report(result: Fit) -> None:
+    found = ", ".join(filter(None, [f"{result.status} at step {result.step}", result.best]))
+    OUT.print(found, highlight=False, soft_wrap=True)
+    assert result.run is not None
+    OUT.print(_use(Run(result.run).config["method"]["method"], result.run), highlight=False, soft_wrap=True)
+
+
+def _use(name: str, run: Path) -> str:
+    """What to do with a fitted run."""
+    if name in judges():
+        what = "the poses of forecasts" if name == "pose-prior" else "forecasts"
+        option = "--pose-prior" if name == "pose-prior" else "--classifier"
+        return f"score {what} with: dvae evaluate RUN {option} {run}"
+    if issubclass(methods()[name], TrajectoryMethod):
+        joints = f"{run} --joints JOINT …"
+        return f"score it with: dvae evaluate {joints}, move it with: dvae complete {joints}"
+    return f"score it with: dvae evaluate {run}"

@@ -1,0 +1,315 @@
+"""Commands that make motion and show it: forecast, complete, animate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import tyro
+
+from .. import motion
+from ..models.trajectories import TrajectoryModel
+from ..motion.dataset import SIMULATED
+from ..options import nearest
+from ..runs import directory as runs
+from .console import ERROR, OUT, UsageError, at_least, check_figure, check_file, save_figure
+from .opening import data_of, load_run
+
+
+def forecast(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    clip: str | None = None,
+    horizon: int | None = None,
+    samples: int = 10,
+    fix: tuple[str, ...] = (),
+    seed: int = 0,
+    data: str | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Forecast the test windows, or those of one clip, many times each.
+
+    The npz holds, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
+    (windows, frames, joints, 3), `split`, `clip` and `start` of each window, and the skeleton. `dvae animate` plays
+    it, `dvae.motion.Forecasts.load` reads it.
+
+    Args:
+        run: the run directory.
+        out: the npz file to write.
+        clip: name of a clip, or split/name where the name is not unique; of any split.
+        horizon: frames to forecast; by default those of the protocol.
+        samples: forecasts of each window.
+        fix: parts of the body, such as lower, or static latents, of which all forecasts of a window share one draw.
+        seed: of the draws.
+        data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
+        figure: save a figure of the first window's futures.
+    """
+    at_least(1, samples=samples, horizon=horizon)
+    check_file(out, "out", ".npz")
+    check_figure(figure, "figure")
+    loaded = load_run(run, data)
+    windows = _windows_of(loaded, data, clip)
+    futures = _forecasts(loaded, windows, range(len(windows)), samples, seed, horizon, fix)
+    futures.save(out)
+    frames = futures.forecasts.shape[2]
+    ERROR.print(f"wrote {out}: {samples} futures of {frames} frames for each of {len(windows)} windows")
+    if figure is not None:
+        _save_futures(futures, figure)
+
+
+def complete(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    joints: tuple[str, ...] = (),
+    paths: Path | None = None,
+    clip: str | None = None,
+    window: int | None = None,
+    samples: int = 5,
+    exact: bool = False,
+    temperature: float = 1.0,
+    seed: int = 0,
+    data: str | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Complete motion along paths of some joints, from a clip or from a file.
+
+    The motions start at the first pose of a window, and follow its own `--joints`, or the paths of a file. That is an
+    npz of one array (frames, 3) for each joint, or a csv with a header such as LWrist_x,LWrist_y,LWrist_z and one row
+    for each frame: metres, with the pelvis of the first pose at the origin; empty or nan where a path is not known.
+    What is written is what `dvae forecast` writes.
+
+    Args:
+        run: the run directory of a trajevae or cvae-rnn.
+        out: the npz file to write.
+        joints: joints whose way in the window is given.
+        paths: file of other paths.
+        clip: name of a clip, or split/name where the name is not unique; by default any test window.
+        window: which of its windows, from 0; by default the one that moves most.
+        samples: motions.
+        exact: have the given joints on their paths, with bones at their lengths, by moving the motions' latents and, by
+            what that leaves, their poses.
+        temperature: of the latents' scale; 0 for the motion of the prior's mean.
+        seed: of the draws.
+        data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
+        figure: save a figure of the motions; crosses are the given paths.
+    """
+    at_least(1, samples=samples)
+    at_least(0, window=window)
+    check_file(out, "out", ".npz")
+    check_figure(figure, "figure")
+    loaded = load_run(run, data)
+    if not isinstance(loaded.model, TrajectoryModel):
+        raise UsageError(f"{run} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
+    if exact and not (joints or paths):
+        raise UsageError("--exact has motions follow paths; say which, by --joints or --paths")
+    windows = _windows_of(loaded, data, clip)
+    positions = windows.positions(windows.all()["x"]).numpy()
+    chosen = _liveliest(positions, window)
+    pose, truth = positions[chosen, 0], positions[chosen, 1:]
+    given = {joint: truth[:, windows.skeleton.find(joint)] for joint in joint_names(joints)}
+    if paths is not None:
+        given |= _drawn(paths, windows.skeleton, given)
+    length = None if given else len(truth)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        done = loaded.model.complete(pose, given, length, samples, exact=exact, temperature=temperature, progress=True)
+    truth = truth[: done.positions.shape[1]]
+    motions = motion.Forecasts(
+        windows.skeleton, [windows.keys[chosen]], done.positions[:, None], pose[None, None], truth[None]
+    )
+    motions.save(out)
+    OUT.print(str(done))
+    ERROR.print(f"wrote {out}: window {chosen}, {_title(motions)}")
+    if figure is not None:
+        _save_futures(motions, figure, given)
+
+
+def _drawn(paths: Path, skeleton: motion.Skeleton, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The paths of a file, of joints that are not given already."""
+    drawn = motion.read_paths(paths)
+    if twice := set(map(skeleton.find, given)) & set(map(skeleton.find, drawn)):
+        names = ", ".join(skeleton.names[joint] for joint in twice)
+        raise UsageError(f"{names} is named by --joints, and {paths} has a path of it; say which by leaving one out")
+    return drawn
+
+
+def animate(
+    source: Annotated[str, tyro.conf.Positional],
+    out: Path,
+    clip: str | None = None,
+    window: int | None = None,
+    samples: int | None = None,
+    fix: tuple[str, ...] = (),
+    seed: int = 0,
+    data: str | None = None,
+    every: int | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Play forecasts beside what happened, or a clip, as moving skeletons.
+
+    The page is one file that any browser shows, without a network: to play, to scrub, to turn with the mouse.
+
+    Args:
+        source: a run directory, a file that `dvae forecast` wrote, a motion file, or "simulated".
+        out: the html file to write.
+        clip: name of a clip, or split/name where the name is not unique. Without it, futures are those of any test
+            window, and a motion file shows its first clip.
+        window: which of the windows of futures, from 0; by default the one that moves most.
+        samples: futures side by side; by default 5, or as many as the file has.
+        fix: parts of the body, such as lower, or static latents, of which all of a run's futures share one draw.
+        seed: of a run's draws.
+        data: where a run's data lie now, if its path no longer leads there; or other data of the same joints.
+        every: frames from one that is shown to the next; by default about 25 a second are shown.
+        figure: save a figure of the futures, too.
+    """
+    at_least(1, samples=samples, every=every)
+    at_least(0, window=window)
+    check_file(out, "out", ".html", ".htm")
+    check_figure(figure, "figure")
+    if Path(source).is_dir():
+        loaded = load_run(Path(source), data)
+        windows = _windows_of(loaded, data, clip)
+        chosen = _liveliest(windows.positions(windows.all()["x"]).numpy(), window)
+        futures = _forecasts(loaded, windows, [chosen], samples or 5, seed, fix=fix)
+    elif fix:
+        raise UsageError(f"--fix is about the futures that a run draws; {source} is no run directory")
+    elif data is not None:
+        raise UsageError(f"--data tells where the data of a run lie; {source} is no run directory")
+    elif source != SIMULATED and motion.is_forecasts(source):
+        chosen, futures = _stored(source, clip, window, samples)
+    elif window is not None or samples is not None or figure is not None:
+        raise UsageError(f"--window, --samples and --figure are about futures; {source} has none")
+    else:
+        _play_clip(source, clip, every, out)
+        return
+    now = futures.observed[0], futures.forecasts[:, 0], futures.truth[0]
+    _play(out, futures.skeleton, *now, fixed=_alike(futures), every=every, title=_title(futures))
+    ERROR.print(f"wrote {out}: window {chosen}, {_title(futures)}")
+    if figure is not None:
+        _save_futures(futures, figure)
+
+
+def _stored(source: str, clip: str | None, window: int | None, samples: int | None) -> tuple[int, motion.Forecasts]:
+    """A window of a file of forecasts, and which of those of the clip it is."""
+    stored = motion.Forecasts.load(source)
+    known = [n for n, key in enumerate(stored.keys) if clip in (None, key[1], f"{key[0]}/{key[1]}")]
+    if not known:
+        raise ValueError(f"{source} has no window of a clip {clip!r}")
+    if samples is not None and samples > len(stored.forecasts):
+        raise UsageError(f"--samples {samples}: {source} has {len(stored.forecasts)} of each window")
+    chosen = _liveliest(np.concatenate([stored.observed, stored.truth], 1)[known], window)
+    return chosen, stored.window(known[chosen], samples or 5)
+
+
+def _play_clip(source: str, name: str | None, every: int | None, out: Path) -> None:
+    clips = motion.simulate() if source == SIMULATED else motion.read_motion(source)
+    clip = clips.clips[0] if name is None else _clip(clips, name)
+    _play(out, clips.skeleton, clip.positions, every=every, title="/".join(clip.key))
+    ERROR.print(f"wrote {out}: {'/'.join(clip.key)}, {clip.frames} frames")
+
+
+def _play(out: Path, *motions: Any, **options: Any) -> None:
+    from ..motion.plot import animate, save_html
+
+    save_html(animate(*motions, **options), out)
+
+
+def joint_names(given: Sequence[str]) -> list[str]:
+    """Names of joints, with commas or blanks between them."""
+    return [name for text in given for name in text.replace(",", " ").split()]
+
+
+def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
+    found = [clip for clip in clips if name in (clip.name, f"{clip.split}/{clip.name}")]
+    if not found:
+        meant = nearest(name, [known for clip in clips for known in (clip.name, f"{clip.split}/{clip.name}")])
+        raise ValueError(f"no clip {name!r}{meant} in {clips.name}; `dvae data info` tells what is there")
+    if len(found) > 1:
+        keys = " or ".join("/".join(clip.key) for clip in found)
+        raise ValueError(f"{name!r} is the name of {len(found)} clips; say {keys}")
+    return found[0]
+
+
+def _windows_of(loaded: runs.Loaded, data: str | None, clip: str | None) -> motion.Windows:
+    """The test windows of a run's data or of others, or all windows of one clip, of any split."""
+    opened = data_of(loaded, data)
+    if clip is None:
+        return opened.windows("test")  # type: ignore[no-any-return]
+    chosen = motion.MotionSet([_clip(opened.motion, clip)], opened.motion.skeleton, opened.path)
+    anywhere = replace(opened.protocol, split_by="split", test=tuple(chosen.splits), train=())
+    return motion.windows(chosen, anywhere, "test")
+
+
+def _forecasts(
+    loaded: runs.Loaded,
+    windows: motion.Windows,
+    chosen: Sequence[int],
+    samples: int,
+    seed: int,
+    horizon: int | None = None,
+    fix: Sequence[str] = (),
+) -> motion.Forecasts:
+    """Futures of some of the windows; those of a window share one draw of what is fixed."""
+    free = {*getattr(loaded.model, "parts", ()), *_statics(loaded.model)}
+    if unknown := [name for name in fix if name not in free]:
+        raise UsageError(
+            f"--fix {' '.join(unknown)}: {loaded.path} has "
+            + (f"{', '.join(sorted(free))} to fix" if free else "nothing to fix, no parts and no static latents")
+        )
+    observed, horizon = loaded.schema.protocol.observed, horizon or loaded.schema.protocol.predicted
+    x, keys = windows.all()["x"][list(chosen)], windows.keys
+    past, future = x[:, :observed], x[:, observed:][:, :horizon]
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        whole = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # parts are fixed as a whole
+        parts = []
+        for part in past.split(64):
+            once = loaded.model.forecast({"x": part}, whole, 1) if fix else {}
+            held = {"fix": {name: once[name][0] for name in fix}} if fix else {}
+            made = loaded.model.forecast({"x": part}, whole, samples, **held)["x"][:, :, :horizon]
+            parts.append(windows.positions(made).numpy())
+            del made  # with many samples the largest thing here
+    positions = [np.concatenate(parts, axis=1), *(windows.positions(frames).numpy() for frames in (past, future))]
+    return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], *positions)
+
+
+def _statics(model: Any) -> list[str]:
+    return [name for name in model.latents if not model.generative.local(name)]
+
+
+def _alike(futures: motion.Forecasts) -> list[int]:
+    """The joints but the root that move alike in all futures of the first window, where there are several."""
+    sampled = futures.forecasts[:, 0]
+    alike = (sampled == sampled[:1]).all((0, 1, 3)) & (len(sampled) > 1)
+    return [joint for joint in np.flatnonzero(alike).tolist() if joint != futures.skeleton.root]
+
+
+def _liveliest(positions: np.ndarray, window: int | None) -> int:
+    """The window that was asked for, or the one of (N, T, J, 3) whose joints move fastest."""
+    if window is None:
+        return int(np.linalg.norm(np.diff(positions, axis=1), axis=-1).mean((1, 2)).argmax())
+    if window >= len(positions):
+        raise UsageError(f"--window {window}: they go from 0 to {len(positions) - 1}")
+    return window
+
+
+def _title(futures: motion.Forecasts) -> str:
+    split, clip, start = futures.keys[0]
+    return f"{split}/{clip} from frame {start}: {len(futures.forecasts)} futures"
+
+
+def _save_futures(futures: motion.Forecasts, path: Path, paths: Mapping[str, Any] | None = None) -> None:
+    """A figure of the first window's futures, and of the paths that joints were given."""
+    from matplotlib.figure import Figure
+
+    from ..motion.plot import futures as draw
+
+    drawing = Figure(figsize=(9, 2.6), layout="constrained")
+    window = futures.observed[0], futures.forecasts[:, 0], futures.truth[0]
+    axes = draw(futures.skeleton, *window, ax=drawing.subplots(), paths=paths)
+    axes.set_title(_title(futures), fontsize=9, parse_math=False)
+    save_figure(drawing, path)

@@ -1,0 +1,294 @@
+"""Commands that judge runs: evaluate, criticise, compare."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from .. import files, motion
+from ..inference.calibration import Calibration, calibrate
+from ..inference.checkpoints import Run
+from ..inference.checks import PredictiveChecks, predictive_checks
+from ..inference.compare import compare as compare_models
+from ..inference.evaluate import evaluate as evaluate_models
+from ..models.trajectories import TrajectoryModel
+from ..motion.judges.pose_prior import PosePriorModel
+from ..runs import directory as runs
+from .console import ERROR, OUT, UsageError, at_least, check_figure, check_file, save_figure
+from .futures import joint_names
+from .opening import (
+    config_without_seed,
+    data_of,
+    load_run,
+    names,
+    note_unfinished,
+    on_the_same_data,
+    own,
+    record,
+    rows,
+    unfinished,
+)
+
+
+def evaluate(
+    run: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    data: str | None = None,
+    samples: int = 50,
+    bound_particles: int = 0,
+    log_score_particles: int = 0,
+    pose_prior: Path | None = None,
+    classifier: tuple[Path, ...] = (),
+    joints: tuple[str, ...] | None = None,
+    exchange: float | None = None,
+    temperature: float | None = None,
+    seed: int = 0,
+    batch_size: int = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Score runs on the test windows of their protocol, beside zero velocity and nearest neighbours.
+
+    Prints the table, and writes it with all that it rests on to evaluation.json in each run, or to --out. With given
+    joints or other data, the name of the file says which; nearest neighbours are those in the runs' own data alone.
+
+    Args:
+        run: run directories, fitted on the same data under the same protocol.
+        data: where the data lie now, if the path in the runs no longer leads there; or other data of the same joints.
+        samples: forecasts of each window, K.
+        bound_particles: particles of the importance-weighted bound; 0 leaves it out.
+        log_score_particles: particles of the log density of the future under the forecasts; 0 leaves it out.
+        pose_prior: run of a pose-prior, by which to score the poses of the forecasts.
+        classifier: runs of action-classifiers of different labels, by which to score what the forecasts show.
+        joints: joints whose paths are given to the runs, for methods that take some (trajevae, cvae-rnn).
+        exchange: begin each window with the pose of another one, whose given joints are so many metres from its own at
+            most (in the paper .01).
+        temperature: of the latents' scale, for such methods; 0 for motion at the mean of the prior.
+        seed: of the draws.
+        batch_size: windows forecast at once.
+        out: file to write instead of evaluation.json in each run.
+        figure: save the scores as dots with error bars.
+    """
+    at_least(1, samples=samples, batch_size=batch_size)
+    at_least(0, bound_particles=bound_particles, log_score_particles=log_score_particles)
+    check_file(out, "out", ".json")
+    check_figure(figure, "figure")
+    loaded, opened = on_the_same_data(run, data)
+    note_unfinished(loaded)
+    given = None if (joints, exchange, temperature) == (None, None, None) else joint_names(joints or ())
+    if given is not None:
+        _check_that_paths_are_taken(loaded)
+    windows = opened.windows("test")
+    classifiers = _classifiers(classifier, data, loaded[0])
+    prior = None if pose_prior is None else _pose_prior(pose_prior, data, windows.skeleton)
+    if given is not None:
+        windows = windows.given(given)
+    result = evaluate_models(
+        {name: each.model for name, each in zip(names(loaded), loaded, strict=True)},
+        windows if exchange is None else motion.Exchanged(windows, exchange),
+        scores=partial(motion.scores, pose_prior=prior, classifiers=classifiers),
+        samples=samples,
+        seed=seed,
+        batch_size=batch_size,
+        bound_particles=bound_particles,
+        log_score_particles=log_score_particles,
+        training_windows=opened.windows("train+validation") if own(loaded[0], opened) else None,
+        configs={name: Run(each.path).config for name, each in zip(names(loaded), loaded, strict=True)},
+        options={} if temperature is None else {"temperature": temperature},
+    )
+    OUT.print(result.table())
+    kind = "-".join([record("evaluation", loaded[0], opened), *(given or ())])
+    kind += "" if exchange is None else f"-exchanged-{exchange:g}"
+    kind += "" if temperature is None else f"-temperature-{temperature:g}"
+    for path in [out] if out is not None else [each.path / f"{kind}.json" for each in loaded]:
+        result.save(path)
+        ERROR.print(f"wrote {path}")
+    if figure is not None:
+        save_figure(result.plot(), figure)
+
+
+def _check_that_paths_are_taken(loaded: Sequence[runs.Loaded]) -> None:
+    for each in loaded:
+        if not isinstance(each.model, TrajectoryModel):
+            raise UsageError(
+                f"--joints, --exchange and --temperature are for methods that take trajectories; {each.path} holds "
+                f"{each.method.name}"
+            )
+
+
+def criticise(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str | None = None,
+    simulations: int = 200,
+    draws: int = 99,
+    ranked_steps: int = 4,
+    samples: int = 20,
+    draw_emission: bool = True,
+    seed: int = 0,
+    batch_size: int = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Simulation-based calibration of a run's guide, and predictive checks on the test windows.
+
+    Prints both tables, and writes them with all that they rest on to criticism.json in the run, or to --out. Each is
+    written as soon as it is there.
+
+    Args:
+        run: the run directory.
+        data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
+        simulations: sequences drawn from the model, as long as its windows.
+        draws: from the guide for each simulation.
+        ranked_steps: time steps, evenly spread, at which local latents are ranked.
+        samples: replicates of each test window, at least 19.
+        draw_emission: replicate draws of x, or its means, which lack the emission's noise: motion as it is shown. Of
+            trajevae and cvae-rnn always means, as their emission is a weight of the loss.
+        seed: of the draws.
+        batch_size: windows replicated at once.
+        out: file to write instead of criticism.json in the run.
+        figure: save the figures, with -calibration and -checks added to this name.
+    """
+    at_least(1, simulations=simulations, draws=draws, ranked_steps=ranked_steps, batch_size=batch_size)
+    at_least(19, samples=samples)
+    check_file(out, "out", ".json")
+    check_figure(figure, "figure")
+    loaded = load_run(run, data)
+    note_unfinished([loaded])
+    opened, model = data_of(loaded, data), loaded.model
+    windows = opened.windows("test")
+    steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
+    document: dict[str, Any] = {}
+    path = out or run / f"{record('criticism', loaded, opened)}.json"
+    if model.context:
+        ERROR.print(
+            f"no calibration: sequences are simulated from nothing, but {loaded.method.name} starts from a pose"
+        )
+    else:
+        calibration = calibrate(model, windows.length, simulations, draws, steps=steps, seed=seed)
+        _keep(document, "calibration", calibration, path, figure, "calibration")
+    checks = predictive_checks(
+        {loaded.method.name: model},
+        windows,
+        motion.statistics(windows),
+        samples=samples,
+        draw_emission=draw_emission and not isinstance(model, TrajectoryModel),
+        seed=seed,
+        batch_size=batch_size,
+    )
+    _keep(document, "predictive", checks, path, figure, "checks")
+
+
+def _keep(
+    document: dict[str, Any],
+    part: str,
+    result: Calibration | PredictiveChecks,
+    path: Path,
+    figure: Path | None,
+    drawn: str,
+) -> None:
+    """Prints a part of the criticism, and writes what there is of it."""
+    OUT.print(result.table())
+    document[part] = result.document()
+    with files.written(path) as file:
+        file.write((json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+    ERROR.print(f"wrote {path}: {part}")
+    if figure is not None:
+        save_figure(result.plot(), figure.with_stem(f"{figure.stem}-{drawn}"))
+
+
+def compare(
+    run: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    data: str | None = None,
+    particles: int = 64,
+    estimates: int = 1,
+    contrasts: int = 128,
+    samples: int = 50,
+    forecasts: bool = True,
+    draw_emission: bool = False,
+    stride: int | None = None,
+    seed: int = 0,
+    batch_size: int = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Compare runs on the test windows of their protocol. Runs that differ in the seed only are seeds of one row.
+
+    All must have ended: one that was stopped is no whole fit.
+
+    Args:
+        run: run directories, fitted on the same data under the same protocol.
+        data: where the data lie now, if the path in the runs no longer leads there; or other data of the same joints.
+        particles: of the importance-weighted bound, K.
+        estimates: independent estimates of that bound; 25 or more for arviz, 1 otherwise.
+        contrasts: windows among which the information of latents is measured; 0 leaves it out.
+        samples: forecasts of each window.
+        forecasts: score forecasts too, which takes longest.
+        draw_emission: forecast draws of x instead of its means.
+        stride: frames between the starts of test windows, in place of the protocol's: more is faster.
+        seed: of the draws.
+        batch_size: windows scored at once.
+        out: file to write the comparison to, as JSON.
+        figure: save bounds, differences, k-hat, and KL over time.
+    """
+    at_least(1, particles=particles, estimates=estimates, samples=samples, batch_size=batch_size, stride=stride)
+    at_least(0, contrasts=contrasts)
+    check_file(out, "out", ".json")
+    check_figure(figure, "figure")
+    loaded, opened = on_the_same_data(run, data)
+    if stopped := unfinished(loaded):
+        raise ValueError("\n".join(stopped))
+    protocol = opened.protocol if stride is None else replace(opened.protocol, test_stride=stride)
+    shown = rows(loaded)
+    result = compare_models(
+        {name: [each.model for each in row] for name, row in shown.items()},
+        motion.windows(opened.motion, protocol, "test"),
+        scores=motion.scores,
+        particles=particles,
+        estimates=estimates,
+        contrasts=contrasts,
+        samples=samples if forecasts else 0,
+        draw_emission=draw_emission,
+        seed=seed,
+        batch_size=batch_size,
+        configs={name: config_without_seed(row[0]) for name, row in shown.items()},
+    )
+    OUT.print(result.table())
+    if out is not None:
+        result.save(out)
+        ERROR.print(f"wrote {out}")
+    if figure is not None:
+        save_figure(result.plot(), figure)
+
+
+def _pose_prior(path: Path, data: str | None, skeleton: motion.Skeleton) -> Any:
+    """The pose prior of a run, for poses of a skeleton."""
+    model = runs.load(path, data).model
+    if not isinstance(model, PosePriorModel) or model.skeleton != skeleton:
+        raise UsageError(f"--pose-prior {path} is no run of a pose-prior of the skeleton {skeleton.name!r}")
+    return model
+
+
+def _classifiers(paths: Sequence[Path], data: str | None, judged: runs.Loaded) -> dict[str, Any]:
+    """The action classifiers of runs by their label, fitted on what the judged run was."""
+    found: dict[str, Any] = {}
+    for path in paths:
+        loaded = runs.load(path, data)
+        if loaded.method.name != "action-classifier":
+            raise UsageError(f"--classifier {path} is a fitted {loaded.method.name}, no action-classifier")
+        if loaded.model.label in found:
+            raise UsageError(f"--classifier {path} is the second of the label {loaded.model.label!r}; give one of them")
+        if not loaded.alike(judged):
+            there, here = (f"{run.config.data.path}, {run.schema.protocol.name}" for run in (loaded, judged))
+            raise UsageError(
+                f"--classifier {path} was fitted on other data or under another protocol ({there}) than the runs "
+                f"({here}); it may have seen test clips"
+            )
+        note_unfinished([loaded])
+        found[loaded.model.label] = loaded.model
+    return found

@@ -1,0 +1,89 @@
+"""Commands on methods and equations: list and show."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from ..graph import audit
+from ..inference.result import Table
+from ..models.registry import method as method_by_name
+from ..models.registry import methods
+from ..notation import Factorization
+from .console import OUT, UsageError, arguments, at_least, check_figure, save_figure
+
+
+def list_methods() -> None:
+    """List the methods: their equations and where they come from."""
+    table = Table(show_lines=True)
+    for column in ("method", "equations", "source"):
+        table.add_column(column)
+    for name, kind in methods().items():
+        equations = (
+            "--generative and --inference" if _asks_for_equations(kind) else f"{kind.generative}\n{kind.inference}"
+        )
+        table.add_row(name, equations, kind.source)
+    OUT.print(table, highlight=False)
+
+
+def show(
+    method: Annotated[str | None, tyro.conf.Positional] = None,
+    generative: str | None = None,
+    inference: str | None = None,
+    steps: int = 4,
+    out: Path | None = None,
+) -> None:
+    """Show two equations: the joint distributions, the audit of the guide, and the graph.
+
+    Args:
+        method: name of a method, or give two equations instead.
+        generative: the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)".
+        inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})".
+        steps: time steps in the figure.
+        out: save the unrolled graphs of model and guide to this file (png, pdf, svg).
+    """
+    at_least(1, steps=steps)
+    check_figure(out, "out")
+    if method is not None and (generative or inference):
+        raise UsageError("give the name of a method or two equations, not both")
+    if method is not None:
+        with arguments():
+            kind = method_by_name(method)
+        if _asks_for_equations(kind):
+            raise UsageError(f"{method} has no equations of its own; give --generative and --inference")
+        pair = kind.equations()
+        observed = [name for name in pair[0].variables if name not in pair[1].variables]
+    elif generative and inference:
+        with arguments():
+            pair = Factorization.parse(generative), Factorization.parse(inference)
+        observed = ["x"]
+    else:
+        raise UsageError("give the name of a method, or both --generative and --inference")
+    with arguments():
+        found = audit(*pair, observed=observed)
+    OUT.print(str(found.generative), highlight=False, markup=False, soft_wrap=True)
+    if found.inference.factors:
+        OUT.print(str(found.inference), highlight=False, markup=False, soft_wrap=True)
+        OUT.print(found.table())
+        OUT.print(found.verdict)
+    else:
+        OUT.print("nothing is latent: there is no guide, and the bound is the log evidence")
+    if out is not None:
+        from matplotlib.figure import Figure
+
+        graphs = 2 if found.inference.factors else 1
+        figure = Figure(figsize=(graphs * (0.85 * steps + 1.6), 4.2 if graphs == 2 else 1.6), layout="constrained")
+        model, *guide = figure.subplots(1, graphs, squeeze=False)[0]
+        found.generative.draw(steps, ax=model, observed=observed).set_title("model")
+        for axes in guide:
+            title = "guide" if found.exact else "guide (dashed: what the exact posterior also reads)"
+            found.draw(steps, ax=axes).set_title(title)
+        save_figure(figure, out)
+
+
+def _asks_for_equations(kind: Any) -> bool:
+    """Whether the equations of a method are options of it."""
+    return "generative" in {option.name for option in fields(kind)}

@@ -1,0 +1,135 @@
+"""Runs as arguments of commands: read, checked, and told apart."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..inference.checkpoints import Run
+from ..models.registry import judges
+from ..options import flat
+from ..runs import directory as runs
+from ..runs.sweep import ENDED
+from .console import UsageError, note
+
+
+def load_run(path: Path, data: str | None) -> runs.Loaded:
+    """A run of a method that forecasts."""
+    loaded = runs.load(path, data)
+    if loaded.method.name in judges():
+        raise ValueError(
+            f"{path} is a fitted {loaded.method.name}, which forecasts nothing; its bounds are in {path / 'log.jsonl'}"
+        )
+    return loaded
+
+
+def data_of(run: runs.Loaded, path: str | None) -> Any:
+    """The data of a run or, where a path leads to others, these under the protocol of the run."""
+    if path is None:
+        return run.data
+    found = run.on(path)
+    if not own(run, found):
+        note(f"{path} is not the data that {run.path} was fitted on")
+    return found
+
+
+def on_the_same_data(paths: Sequence[Path], path: str | None) -> tuple[list[runs.Loaded], Any]:
+    """Runs, and the data whose test windows they share: those that all were fitted on, or other data."""
+    if not paths:
+        raise UsageError("give at least one run directory")
+    twice, count = Counter(map(str, paths)).most_common(1)[0]
+    if count > 1:
+        raise UsageError(f"a run is named twice: {twice}")
+    loaded = [load_run(each, path) for each in paths]
+    first = loaded[0]
+    for other in loaded[1:]:
+        if not (other.alike(first) if path is None else other.schema == first.schema):
+            there, here = (f"{run.config.data.path}, {run.schema.protocol.name}" for run in (other, first))
+            raise ValueError(
+                f"{other.path} has other test windows ({there}) than {first.path} ({here}); give runs of the same data "
+                "and protocol"
+            )
+    opened, *_ = (data_of(run, path) for run in (loaded if path else loaded[:1]))
+    return loaded, opened
+
+
+def own(run: runs.Loaded, opened: Any) -> bool:
+    """Whether data are those that a run was fitted on."""
+    return bool(opened.fingerprint == run.config.data.fingerprint)
+
+
+def record(kind: str, run: runs.Loaded, opened: Any) -> str:
+    """What to call a record of a run, which names data that are not its own."""
+    return kind if own(run, opened) else f"{kind}-{Path(opened.location).stem}"
+
+
+def rows(loaded: Sequence[runs.Loaded]) -> dict[str, list[runs.Loaded]]:
+    """Runs by row: those that differ in the training seed only together, under the method and what tells rows apart."""
+    rows: dict[str, list[runs.Loaded]] = {}
+    seeds: dict[tuple[str, int], Path] = {}
+    for run in loaded:
+        key = json.dumps(config_without_seed(run), sort_keys=True)
+        seed = run.config.training.seed
+        if (key, seed) in seeds:
+            raise UsageError(f"{run.path} and {seeds[key, seed]} are the same fit with the same seed; give one of them")
+        seeds[key, seed] = run.path
+        rows.setdefault(key, []).append(run)
+    firsts = [row[0] for row in rows.values()]
+    names = [first.method.name for first in firsts]
+    for name in [name for name, count in Counter(names).items() if count > 1]:
+        places = [place for place, other in enumerate(names) if other == name]
+        for place, said in zip(places, _apart([firsts[place] for place in places]), strict=True):
+            names[place] = f"{name} ({said})"
+    return dict(zip(names, rows.values(), strict=True))
+
+
+def _apart(loaded: Sequence[runs.Loaded]) -> list[str]:
+    """What tells runs of one method apart: options, or else the names of their directories, or else whole paths."""
+    options = [_options(run) for run in loaded]
+    keys = dict.fromkeys(key for own in options for key in own)
+    differing = [key for key in keys if len({str(own.get(key)) for own in options}) > 1]
+    said = [", ".join(f"{key.partition('.')[2]} {own[key]}" for key in differing if key in own) for own in options]
+    candidates = (said, [run.path.absolute().name for run in loaded], [str(run.path) for run in loaded])
+    return next(texts for texts in candidates if all(texts) and len(set(texts)) == len(texts))
+
+
+def _options(run: runs.Loaded) -> dict[str, Any]:
+    """The options of method and training that were chosen; the training's self-feeding follows from the method's."""
+    config = config_without_seed(run)
+    training = {key: value for key, value in config["training"].items() if key != "self_feeding"}
+    return dict(flat({"method": config["method"], "training": training}))
+
+
+def unfinished(loaded: Sequence[runs.Loaded]) -> list[str]:
+    """A sentence on every run that has not ended."""
+    sentences = []
+    for run in loaded:
+        state, steps = Run(run.path).state, run.config.training.steps
+        if (status := state["status"]) not in ENDED:
+            where = f"{status} at step {state['step']} of {steps}"
+            sentences.append(f"{run.path} has not ended ({where}); dvae resume {run.path} goes on")
+    return sentences
+
+
+def note_unfinished(loaded: Sequence[runs.Loaded]) -> None:
+    """Notes on them."""
+    for sentence in unfinished(loaded):
+        note(sentence)
+
+
+def config_without_seed(run: runs.Loaded) -> dict[str, Any]:
+    """What was run, without the seed and what bears on no result."""
+    config = Run(run.path).config
+    aside = {"seed", "progress", "log_every"}
+    training = {key: value for key, value in config["training"].items() if key not in aside}
+    return {**config, "training": training, "data": {k: v for k, v in config["data"].items() if k != "path"}}
+
+
+def names(loaded: Sequence[runs.Loaded]) -> list[str]:
+    """Names of methods, of run directories where methods repeat, and whole paths where these repeat too."""
+    candidates = ([run.method.name for run in loaded], [run.path.name for run in loaded])
+    paths = [str(run.path) for run in loaded]
+    return next((names for names in candidates if len(set(names)) == len(names)), paths)

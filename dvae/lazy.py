@@ -1,0 +1,30 @@
+"""Packages that import a module when it is first used (PEP 562)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+
+def importing(package: str, places: Mapping[str, str] | None = None) -> Callable[[str], Any]:
+    """The `__getattr__` of a package: its modules by name, and what is shown of them.
+
+    Args:
+        package: its name.
+        places: name to the module within the package that has it.
+    """
+
+    def find(name: str) -> Any:
+        if places and name in places:
+            found = getattr(import_module(f"{package}.{places[name]}"), name)
+        elif name.startswith("_") or find_spec(f"{package}.{name}") is None:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        else:
+            found = import_module(f"{package}.{name}")
+        setattr(sys.modules[package], name, found)
+        return found
+
+    return find
