@@ -11,9 +11,8 @@ from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib.figure
 import numpy as np
 import torch
 from pyro import poutine
@@ -25,7 +24,10 @@ from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import require_likelihood
 from .held import on_device_of, reproducibly
-from .result import Result, Table, progress_bar
+from .result import Result, Table, canvas, progress_bar
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Calibration", "calibrate"]
 
@@ -137,7 +139,7 @@ class Calibration(Result):
             table.add_row(f"and {len(self.names) - worst} more", style="dim")
         return table
 
-    def plot(self, worst: int = 8) -> matplotlib.figure.Figure:
+    def plot(self, worst: int = 8) -> Figure:
         """Rank histogram above ECDF difference, for the quantities with the smallest p-values.
 
         Histograms are relative to uniform, with a band that holds a bin in 99 % of cases. ECDF differences have the
@@ -148,7 +150,7 @@ class Calibration(Result):
         order = np.argsort(self.p_values, kind="stable")[:worst]
         columns = min(4, len(order))
         rows = math.ceil(len(order) / columns)
-        figure = matplotlib.figure.Figure(figsize=(0.8 + 2.4 * columns, 0.6 + 3.1 * rows), layout="constrained")
+        figure = canvas(0.8 + 2.4 * columns, 0.6 + 3.1 * rows)
         panels = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, sharey="row")
         points, low, high = self.envelope(0.05 / len(self.names))
         levels, count = self.draws + 1, len(self.ranks)

@@ -10,9 +10,8 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib.figure
 import numpy as np
 import torch
 from rich.text import Text
@@ -24,7 +23,10 @@ from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import require_likelihood
 from .held import hold, on_device_of, plain, reproducibly
-from .result import Result, Table, as_they_are, progress_bar
+from .result import Result, Table, as_they_are, canvas, progress_bar
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["STATISTICS", "Check", "PredictiveChecks", "Statistic", "predictive_checks"]
 
@@ -183,11 +185,11 @@ class PredictiveChecks(Result):
                     table.add_row("", model, *_quantiles(check.replicated), *outcome)
         return table
 
-    def plot(self) -> matplotlib.figure.Figure:
+    def plot(self) -> Figure:
         """Densities of each statistic: real windows grey, replicates as one line per model."""
         models, programs, names = (list(dict.fromkeys(keys)) for keys in zip(*self.checks, strict=True))
         size = (0.6 + 2.3 * len(names), 0.8 + 2.0 * len(programs))
-        figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
+        figure = canvas(*size)
         panels = figure.subplots(len(programs), len(names), squeeze=False, sharex="col")
         for column, name in enumerate(names):
             checks = [self.checks[model, program, name] for program in programs for model in models]

@@ -21,6 +21,8 @@ tests of Satterthwaite (1946) and Welch (1947): V_seeds of a difference between 
     f_total = V_total^2 / (V_sequences^2 / (C - 1) + sum over rows V_seeds^2 / (S - 1))
 """
 
+from __future__ import annotations
+
 import dataclasses
 import json
 import math
@@ -28,10 +30,8 @@ import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib.axes
-import matplotlib.figure
 import numpy as np
 from rich.console import Group
 from scipy import special
@@ -39,8 +39,12 @@ from scipy import special
 from ..options import nearest
 from .bounds import KHAT_PARTICLES
 from .held import clip_places, plain
-from .result import Result, Table, as_they_are
+from .result import Result, Table, as_they_are, canvas
 from .uncertainty import clustered_variance, linearised, student_interval
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 __all__ = ["Comparison", "Contender", "Estimate"]
 
@@ -212,7 +216,7 @@ class Comparison(Result):
             return Estimate(0.0, 0.0, 0.0, 0.0)
         return self._estimate(*parts)
 
-    def join(self, other: "Comparison") -> "Comparison":
+    def join(self, other: Comparison) -> Comparison:
         """This comparison with the rows of another one, made of other models on the same sequences in the same way.
 
         Raises:
@@ -230,7 +234,7 @@ class Comparison(Result):
         tables = [self._bound_table(), self._latent_table()]
         return Group(*tables, *([self._free_running_table()] if self.samples else []))
 
-    def plot(self) -> matplotlib.figure.Figure:
+    def plot(self) -> Figure:
         """Bounds, paired differences to the best, k-hat, and the KL of every local latent over time."""
         ranking = self.ranking
         colours = {name: f"C{place % 10}" for place, name in enumerate(self.rows)}
@@ -240,7 +244,7 @@ class Comparison(Result):
         widest = min(30, max(map(len, ranking)))
         lines = sum(label.count("\n") + 1 for label in labels.values())
         heights = [1.4 + 0.25 * lines] + [3.0] * (rows - 1)
-        figure = matplotlib.figure.Figure(figsize=(10, sum(heights) + 0.3), layout="constrained")
+        figure = canvas(10, sum(heights) + 0.3)
         panels = list(figure.subplots(rows, 2, squeeze=False, gridspec_kw={"height_ratios": heights}).flat)
         bounds = {name: self[name]["importance bound"] for name in ranking}
         differences = {name: self.difference(name, ranking[0]) for name in ranking}
@@ -282,7 +286,7 @@ class Comparison(Result):
         as_they_are(legend.get_texts())
         return figure
 
-    def _khat_panel(self, panel: matplotlib.axes.Axes, colours: Mapping[str, str]) -> None:
+    def _khat_panel(self, panel: Axes, colours: Mapping[str, str]) -> None:
         khats = {name: self.rows[name].bounds["k-hat"] for name in self.ranking}
         khats = {name: khat[~np.isnan(khat)] for name, khat in khats.items() if not np.isnan(khat).all()}
         known = np.concatenate([np.zeros(1), *khats.values()])
@@ -366,7 +370,7 @@ class Comparison(Result):
         return json.dumps({"ranking": ranking, **plain({**vars(self), "rows": rows})}, allow_nan=False)
 
     @classmethod
-    def from_json(cls, text: str) -> "Comparison":
+    def from_json(cls, text: str) -> Comparison:
         """The comparison that `to_json` wrote.
 
         Raises:
@@ -382,7 +386,7 @@ class Comparison(Result):
             raise ValueError(f"this is not a comparison written by Comparison.to_json: {error!r}") from error
 
     @classmethod
-    def load(cls, path: str | Path) -> "Comparison":
+    def load(cls, path: str | Path) -> Comparison:
         """Read the file that `save` wrote; errors as in `from_json`."""
         return cls.from_json(cls.read(path))
 
@@ -399,7 +403,7 @@ class Comparison(Result):
     def _clips(self) -> list[str]:
         return [f"{split}/{clip}" for split, clip, _ in self.keys]
 
-    def _parts(self, name: str, metric: str) -> "_Parts":
+    def _parts(self, name: str, metric: str) -> _Parts:
         row = self._row(name)
         if metric not in {*row.bounds, *row.free_running} - {"k-hat"}:
             known = [known for known in (*row.bounds, *row.free_running) if known != "k-hat"]
@@ -413,7 +417,7 @@ class Comparison(Result):
         return _Parts.of(means, weights)
 
     @staticmethod
-    def _estimate(first: "_Parts", second: "_Parts | None" = None) -> Estimate:
+    def _estimate(first: _Parts, second: _Parts | None = None) -> Estimate:
         mean, deviations, between, rest = first.mean, first.deviations, first.seeds, first.rest
         of_seeds = [(first.seeds, first.count - 1)]
         if second is not None:
@@ -528,7 +532,7 @@ class _Parts:
     count: int
 
     @classmethod
-    def of(cls, means: np.ndarray, weights: np.ndarray) -> "_Parts":
+    def of(cls, means: np.ndarray, weights: np.ndarray) -> _Parts:
         """From means by seed and clip (S, C) and the clips' weights (C,)."""
         by_seed, deviations = linearised(means, weights)
         common = deviations.mean(0)

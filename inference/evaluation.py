@@ -1,23 +1,27 @@
 """Evaluations: scores of several methods on the same windows, with all that is needed to say what was measured."""
 
+from __future__ import annotations
+
 import dataclasses
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib.figure
 import numpy as np
 from rich.text import Text
 
 from ..options import nearest
 from .held import plain
 from .references import multimodal_note
-from .result import Result, Table
+from .result import Result, Table, canvas
 from .scores import Metric
 from .uncertainty import clustered_variance, linearised, student_interval
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Evaluation", "Row", "Score"]
 
@@ -135,13 +139,13 @@ class Evaluation(Result):
                 table.add_row(Text.assemble(name + ARROWS[metric.better], (unit, "dim")), *values)
         return table
 
-    def plot(self, metrics: Sequence[str] | None = None) -> matplotlib.figure.Figure:
+    def plot(self, metrics: Sequence[str] | None = None) -> Figure:
         """One panel per metric, with an arrow for what is better; a dot per method with a bar of one standard error."""
         names = list(self.metrics if metrics is None else metrics)
         columns = min(4, len(names))
         rows = math.ceil(len(names) / columns)
         height = 0.7 + 0.22 * len(self.rows)
-        figure = matplotlib.figure.Figure(figsize=(2 + 2.2 * columns, height * rows), layout="constrained")
+        figure = canvas(2 + 2.2 * columns, height * rows)
         panels = list(figure.subplots(rows, columns, sharey=True, squeeze=False).flat)
         scores = {method: self[method] for method in self.rows}
         for panel, name in zip(panels, names, strict=False):
@@ -168,7 +172,7 @@ class Evaluation(Result):
         return json.dumps({**vars(self), "rows": rows, "metrics": metrics}, indent=1, allow_nan=False)
 
     @classmethod
-    def from_json(cls, text: str) -> "Evaluation":
+    def from_json(cls, text: str) -> Evaluation:
         """The evaluation that `to_json` wrote.
 
         Raises:
@@ -185,7 +189,7 @@ class Evaluation(Result):
             raise ValueError(f"this is not an evaluation written by Evaluation.to_json: {error!r}") from error
 
     @classmethod
-    def load(cls, path: str | Path) -> "Evaluation":
+    def load(cls, path: str | Path) -> Evaluation:
         """Read the file that `save` wrote; errors as in `from_json`."""
         return cls.from_json(cls.read(path))
 

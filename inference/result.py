@@ -17,6 +17,7 @@ from .. import files
 
 if TYPE_CHECKING:
     import matplotlib.text
+    from matplotlib.figure import Figure
 
 LARGEST = 2**28
 """Bytes of a result."""
@@ -62,6 +63,13 @@ def _shown(text: str) -> str:
 def reason(error: BaseException) -> str:
     """What an error says, without the table of shapes that Pyro appends where it passes a program."""
     return re.split(r"\n\s*Trace Shapes:", str(error))[0]
+
+
+def canvas(width: float, height: float) -> "Figure":
+    """An empty figure, in inches; matplotlib is imported by whoever draws."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def as_they_are(texts: "Iterable[matplotlib.text.Text]") -> None:

@@ -7,11 +7,13 @@ from dataclasses import fields
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..inference.recipe import Trainable
 from ..options import nearest, tuples
-from .method import Method
+
+if TYPE_CHECKING:
+    from ..inference.recipe import Trainable
+    from .method import Method
 
 METHODS = {
     "vae": "dvae.models.vae:VAE",

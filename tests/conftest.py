@@ -13,7 +13,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-import dvae
+import dvae.program
 
 # A shell has what it starts in the background ignore Ctrl-C, and so would all that is started from there.
 signal.signal(signal.SIGINT, signal.default_int_handler)

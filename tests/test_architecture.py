@@ -129,6 +129,32 @@ def test_the_public_names_exist():
         assert getattr(dvae, name) is not None
 
 
+def test_what_is_shown_is_found_where_it_is_imported_from():
+    """Names that type checkers read, and the table by which they are imported when they are used."""
+    tree = ast.parse((ROOT / "dvae" / "__init__.py").read_text(encoding="utf-8"))
+    imported = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level]
+    places = {alias.name: node.module for node in imported for alias in node.names}
+    del places["importing"]
+    assert places == {name: dvae._PLACES.get(name) for name in dvae.__all__}
+    assert set(dvae.__all__) <= set(dir(dvae))
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        "from dvae.cli import main; assert main(['--help']) == 0",
+        "from dvae.cli import main; assert main(['fitt']) == 2",
+        "from dvae.cli import main; assert main(['show', 'hitdvae']) == 2",
+        "import dvae; dvae.audit(*map(dvae.Factorization.parse, ('p(z_t) p(x_t | z_t)', 'q(z_t | x_t)')))",
+        "import dvae; list(dvae.methods())",
+    ],
+)
+def test_torch_is_imported_when_it_is_used(program):
+    command = [sys.executable, "-c", f"{program}; import sys; assert 'torch' not in sys.modules"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+
+
 def test_every_module_can_be_imported_and_says_what_it_is():
     for module, path in sources().items():
         name = module.removesuffix(".__init__")

@@ -113,7 +113,7 @@ def _meant(given: Sequence[str]) -> Iterator[str]:
     name, *rest = given
     loose = [
         word
-        for before, word in zip(["", *rest[:-1]], rest, strict=True)
+        for before, word in zip(["", *rest], rest, strict=False)
         if not word.startswith("-") and (name == "sweep" or not before.startswith("-"))
     ]
     hints = [get_type_hints(called)]

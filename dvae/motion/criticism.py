@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-import matplotlib.figure
 import numpy as np
 from torch import Tensor
 
 from ..inference.checks import Statistic
+from ..inference.result import canvas
 from ..inference.traversal import Traversal
 from .skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["draw_traversal", "statistics"]
 
@@ -79,9 +82,7 @@ def statistics(windows: Posed) -> dict[str, Statistic]:
     }
 
 
-def draw_traversal(
-    found: Traversal, windows: Posed, frame: int = -1, sequence: int = 0, rows: int = 6
-) -> matplotlib.figure.Figure:
+def draw_traversal(found: Traversal, windows: Posed, frame: int = -1, sequence: int = 0, rows: int = 6) -> Figure:
     """Poses of one sequence at one frame: a row for each coordinate, that of most effect first.
 
     Args:
@@ -101,7 +102,7 @@ def draw_traversal(
     sided = bool(skeleton.left and skeleton.right)
     azimuth = math.pi / 5 - (float(skeleton.heading(poses[0, middle])) if sided else 0.0)
     size = (0.5 + 0.95 * len(found.offsets), 0.6 + 1.9 * len(order))
-    figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
+    figure = canvas(*size)
     panels = figure.subplots(len(order), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
     for panel, chosen, row in zip(panels, order.tolist(), poses, strict=True):
         for column, drawn in enumerate(row):

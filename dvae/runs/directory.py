@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from reprlib import repr as brief
 from typing import Any
@@ -100,7 +101,8 @@ class Loaded:
         here, there = (dict(flat(schema.config())) for schema in (self.schema, other.schema))
         if differing := [name for name in here | there if here.get(name) != there.get(name)]:
             values = (f"{name} is {brief(there.get(name))}, not {brief(here.get(name))}" for name in differing)
-            raise ValueError(f"{os.fspath(path)} does not fit {self.path}: {'; '.join(values)}")
+            more = f"; and {len(differing) - 3} more" if len(differing) > 3 else ""
+            raise ValueError(f"{os.fspath(path)} does not fit {self.path}: {'; '.join(islice(values, 3))}{more}")
         return other
 
 

@@ -80,6 +80,10 @@ def test_wrong_arguments_exit_with_2(capsys, tmp_path):
     assert "both --generative and --inference" in failure(capsys, "show", code=2)
     assert "not both" in failure(capsys, "show", "srnn", "--generative", "p(z_t) p(x_t | z_t)", code=2)
     assert "hit-dvae, gsps, trajevae, cvae-rnn, equations" in failure(capsys, "fit", "hitdvae", *out, code=2)
+    for command in ("fit", "resume", "data"):
+        assert f"dvae {command} --help" in failure(capsys, command, code=2)
+    assert "did you mean 'info'" in failure(capsys, "data", "inf", code=2)
+    assert "did you mean 'adam'" in failure(capsys, "fit", "vae", *out, "--optimizer", "adm", code=2)
     assert "--steps" in failure(capsys, "fit", "vae", *out, "--step", "3", code=2)
     assert "emission" in failure(capsys, "fit", "vae", *out, "--emission", "loud", code=2)
     assert "batch_size is 0" in failure(capsys, "fit", "vae", *out, "--batch-size", "0", code=2)

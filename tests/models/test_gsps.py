@@ -400,9 +400,10 @@ def test_a_fitted_pose_prior_is_taken_along(windows, prior_run):
     fitted, poses = runs.load(prior_run).model, windows.poses()[:5]
     assert isinstance(fitted, PosePriorModel)
     assert torch.equal(model.pose_prior.log_prob(poses), fitted.log_prob(poses))
+    other = replace(method, heading=False)
+    recipe, turned = other.train(windows), other.build(windows)
     with pytest.raises(ValueError, match=r"fitted with heading=True .* sees poses with heading=False"):
-        other = replace(method, heading=False)
-        other.train(windows).prepare(other.build(windows))
+        recipe.prepare(turned)
 
 
 def test_a_model_without_a_likelihood_is_not_compared_by_bounds(windows):

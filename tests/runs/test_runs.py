@@ -541,10 +541,11 @@ def python(*arguments, path=ROOT):
     return subprocess.Popen([sys.executable, *arguments], env=environment, text=True, **pipes)
 
 
-def test_ctrl_c_while_importing_is_a_sentence(tmp_path):
+@pytest.mark.parametrize("where", ["", "def main(): pass\ndef command(given):\n    "], ids=["dvae.cli", "its command"])
+def test_ctrl_c_while_importing_is_a_sentence(tmp_path, where):
     (tmp_path / "dvae").mkdir()
     (tmp_path / "dvae" / "__init__.py").write_text("")
-    (tmp_path / "dvae" / "cli.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
+    (tmp_path / "dvae" / "cli.py").write_text(f"{where}import time; print('importing', flush=True); time.sleep(60)\n")
     program = python(PROGRAM, "list", path=tmp_path)
     assert program.stdout.readline() == "importing\n"
     program.send_signal(signal.SIGINT)
