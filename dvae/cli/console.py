@@ -44,7 +44,7 @@ def at_least(smallest: int, **options: int | None) -> None:
             raise UsageError(f"--{name.replace('_', '-')} is {value}; it must be at least {smallest}")
 
 
-def check_file(path: Path | None, option: str, *suffixes: str) -> None:
+def _check_file(path: Path | None, option: str, *suffixes: str) -> None:
     """Refuse, before any work, a path that cannot become a file, or whose name ends as that of another kind of file."""
     if path is not None and path.is_dir():
         raise UsageError(f"--{option} {path} is a directory; name a file")
@@ -54,13 +54,19 @@ def check_file(path: Path | None, option: str, *suffixes: str) -> None:
 
 def check_figure(path: Path | None, option: str) -> None:
     """Refuse, before any work, a path that cannot become a figure."""
-    check_file(path, option)
+    _check_file(path, option)
     if path is not None:
         from matplotlib.backend_bases import FigureCanvasBase
 
         known = FigureCanvasBase.get_supported_filetypes()
         if path.suffix.lower().removeprefix(".") not in known:
             raise UsageError(f"--{option} {path}: the end of the name is the format, one of {', '.join(sorted(known))}")
+
+
+def check_files(out: Path | None, figure: Path | None, *suffixes: str) -> None:
+    """Refuse, before any work, what cannot be written."""
+    _check_file(out, "out", *suffixes)
+    check_figure(figure, "figure")
 
 
 def save_figure(figure: Figure, path: Path) -> None:

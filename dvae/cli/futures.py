@@ -16,7 +16,7 @@ from ..models.trajectories import TrajectoryModel
 from ..motion.dataset import SIMULATED
 from ..options import nearest
 from ..runs import directory as runs
-from .console import ERROR, OUT, UsageError, at_least, check_figure, check_file, save_figure
+from .console import ERROR, OUT, UsageError, at_least, check_files, save_figure
 from .opening import data_of, load_run
 
 
@@ -49,8 +49,7 @@ def forecast(
         figure: save a figure of the first window's futures.
     """
     at_least(1, samples=samples, horizon=horizon)
-    check_file(out, "out", ".npz")
-    check_figure(figure, "figure")
+    check_files(out, figure, ".npz")
     loaded = load_run(run, data)
     windows = _windows_of(loaded, data, clip)
     futures = _forecasts(loaded, windows, range(len(windows)), samples, seed, horizon, fix)
@@ -99,8 +98,7 @@ def complete(
     """
     at_least(1, samples=samples)
     at_least(0, window=window)
-    check_file(out, "out", ".npz")
-    check_figure(figure, "figure")
+    check_files(out, figure, ".npz")
     loaded = load_run(run, data)
     if not isinstance(loaded.model, TrajectoryModel):
         raise UsageError(f"{run} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
@@ -168,8 +166,7 @@ def animate(
     """
     at_least(1, samples=samples, every=every)
     at_least(0, window=window)
-    check_file(out, "out", ".html", ".htm")
-    check_figure(figure, "figure")
+    check_files(out, figure, ".html", ".htm")
     if Path(source).is_dir():
         loaded = load_run(Path(source), data)
         windows = _windows_of(loaded, data, clip)

@@ -17,11 +17,13 @@ from ..inference.calibration import Calibration, calibrate
 from ..inference.checkpoints import Run
 from ..inference.checks import PredictiveChecks, predictive_checks
 from ..inference.compare import compare as compare_models
+from ..inference.comparison import Comparison
 from ..inference.evaluate import evaluate as evaluate_models
+from ..inference.evaluation import Evaluation
 from ..models.trajectories import TrajectoryModel
 from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
-from .console import ERROR, OUT, UsageError, at_least, check_figure, check_file, save_figure
+from .console import ERROR, OUT, UsageError, at_least, check_files, save_figure
 from .futures import joint_names
 from .opening import (
     config_without_seed,
@@ -77,20 +79,19 @@ def evaluate(
     """
     at_least(1, samples=samples, batch_size=batch_size)
     at_least(0, bound_particles=bound_particles, log_score_particles=log_score_particles)
-    check_file(out, "out", ".json")
-    check_figure(figure, "figure")
+    check_files(out, figure, ".json")
     loaded, opened = on_the_same_data(run, data)
     note_unfinished(loaded)
     given = None if (joints, exchange, temperature) == (None, None, None) else joint_names(joints or ())
     if given is not None:
         _check_that_paths_are_taken(loaded)
-    windows = opened.windows("test")
+    called, windows = dict(zip(names(loaded), loaded, strict=True)), opened.windows("test")
     classifiers = _classifiers(classifier, data, loaded[0])
     prior = None if pose_prior is None else _pose_prior(pose_prior, data, windows.skeleton)
     if given is not None:
         windows = windows.given(given)
     result = evaluate_models(
-        {name: each.model for name, each in zip(names(loaded), loaded, strict=True)},
+        {name: each.model for name, each in called.items()},
         windows if exchange is None else motion.Exchanged(windows, exchange),
         scores=partial(motion.scores, pose_prior=prior, classifiers=classifiers),
         samples=samples,
@@ -99,14 +100,19 @@ def evaluate(
         bound_particles=bound_particles,
         log_score_particles=log_score_particles,
         training_windows=opened.windows("train+validation") if own(loaded[0], opened) else None,
-        configs={name: Run(each.path).config for name, each in zip(names(loaded), loaded, strict=True)},
+        configs={name: Run(each.path).config for name, each in called.items()},
         options={} if temperature is None else {"temperature": temperature},
     )
-    OUT.print(result.table())
     kind = "-".join([record("evaluation", loaded[0], opened), *(given or ())])
     kind += "" if exchange is None else f"-exchanged-{exchange:g}"
     kind += "" if temperature is None else f"-temperature-{temperature:g}"
-    for path in [out] if out is not None else [each.path / f"{kind}.json" for each in loaded]:
+    _keep(result, [out] if out is not None else [each.path / f"{kind}.json" for each in loaded], figure)
+
+
+def _keep(result: Comparison | Evaluation, paths: Sequence[Path], figure: Path | None) -> None:
+    """Prints a result, and writes it to files."""
+    OUT.print(result.table())
+    for path in paths:
         result.save(path)
         ERROR.print(f"wrote {path}")
     if figure is not None:
@@ -156,8 +162,7 @@ def criticise(
     """
     at_least(1, simulations=simulations, draws=draws, ranked_steps=ranked_steps, batch_size=batch_size)
     at_least(19, samples=samples)
-    check_file(out, "out", ".json")
-    check_figure(figure, "figure")
+    check_files(out, figure, ".json")
     loaded = load_run(run, data)
     note_unfinished([loaded])
     opened, model = data_of(loaded, data), loaded.model
@@ -171,7 +176,7 @@ def criticise(
         )
     else:
         calibration = calibrate(model, windows.length, simulations, draws, steps=steps, seed=seed)
-        _keep(document, "calibration", calibration, path, figure, "calibration")
+        _add(document, "calibration", calibration, path, figure, "calibration")
     checks = predictive_checks(
         {loaded.method.name: model},
         windows,
@@ -181,10 +186,10 @@ def criticise(
         seed=seed,
         batch_size=batch_size,
     )
-    _keep(document, "predictive", checks, path, figure, "checks")
+    _add(document, "predictive", checks, path, figure, "checks")
 
 
-def _keep(
+def _add(
     document: dict[str, Any],
     part: str,
     result: Calibration | PredictiveChecks,
@@ -238,8 +243,7 @@ def compare(
     """
     at_least(1, particles=particles, estimates=estimates, samples=samples, batch_size=batch_size, stride=stride)
     at_least(0, contrasts=contrasts)
-    check_file(out, "out", ".json")
-    check_figure(figure, "figure")
+    check_files(out, figure, ".json")
     loaded, opened = on_the_same_data(run, data)
     if stopped := unfinished(loaded):
         raise ValueError("\n".join(stopped))
@@ -258,12 +262,7 @@ def compare(
         batch_size=batch_size,
         configs={name: config_without_seed(row[0]) for name, row in shown.items()},
     )
-    OUT.print(result.table())
-    if out is not None:
-        result.save(out)
-        ERROR.print(f"wrote {out}")
-    if figure is not None:
-        save_figure(result.plot(), figure)
+    _keep(result, [] if out is None else [out], figure)
 
 
 def _pose_prior(path: Path, data: str | None, skeleton: motion.Skeleton) -> Any:
