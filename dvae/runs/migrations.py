@@ -49,7 +49,12 @@ def _from_1(config: Mapping[str, Any], run: Path, data: str | os.PathLike[str] |
     aside = {option.name for option in fields(LatentMethod)} - {option.name for option in fields(kind)}
     method = {option: value for option, value in config["method"].items() if option not in aside}
     source = DATA["motion"].source(**config["data"])
-    schema = opened(run, "motion", source, config["protocol"], data).schema
+    try:
+        schema = opened(run, "motion", source, config["protocol"], data).schema
+    except CheckpointError:
+        if data is None:
+            raise
+        schema = opened(run, "motion", source, config["protocol"]).schema  # the run is to be used on other data
     described = {"kind": schema.kind, **schema.config()}
     now = {"method": method, "schema": described, "data": {"kind": "motion", **config["data"]}}
     return {**config, **now, "format": FORMAT}

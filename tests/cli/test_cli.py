@@ -521,6 +521,21 @@ def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monke
     assert set(found.rows) == {"zero velocity", "run", "second"}  # the neighbours went with the training data
 
 
+def test_a_run_of_format_1_is_used_on_other_data_while_its_own_are_there(capsys, run, people, tmp_path):
+    config = json.loads((run / "config.json").read_text())
+    del config["format"], config["data"]["kind"]
+    config["protocol"] = config.pop("schema")["protocol"]
+    (run / "config.json").write_text(json.dumps(config))
+    motion.save(tmp_path / "other.npz", motion.simulate(clips=14, frames=90, seed=5))
+    other = ["forecast", str(run), "--data", str(tmp_path / "other.npz"), "--out", str(tmp_path / "f.npz")]
+    assert main([*other, "--samples", "1"]) == 0
+    assert "is not the data that" in capsys.readouterr().err
+    config["data"]["path"] = str(tmp_path / "gone.npz")
+    (run / "config.json").write_text(json.dumps(config))
+    assert "gone.npz is not here" in failure(capsys, *other)
+    assert main([*other[:3], str(people), *other[4:], "--samples", "1"]) == 0
+
+
 def test_data_of_other_joints_are_refused(capsys, run, tmp_path):
     clips = motion.simulate(clips=14, frames=90, seed=1)
     skeleton = replace(clips.skeleton, name="stranger", fps=60.0)
