@@ -138,7 +138,7 @@ def resume(
 def sweep(
     method: Annotated[tuple[SweptMethod, ...], tyro.conf.Positional],
     out: Path,
-    options: MethodOptions,
+    model: MethodOptions,
     training: SweepOptions,
     seeds: tuple[int, ...] = (0, 1, 2),
     latent: tuple[int, ...] = (),
@@ -155,7 +155,7 @@ def sweep(
     Args:
         method: names of methods.
         out: directory of the run directories, such as srnn-seed0, or srnn-z8-seed0 where sizes differ.
-        options: of all methods, in place of their defaults.
+        model: options of all methods, in place of their defaults.
         training: options of the runs.
         seeds: of initial weights, batches and draws; a run for each.
         latent: sizes of z; a run for each.
@@ -170,7 +170,7 @@ def sweep(
     at_least(1, jobs=jobs)
     if out.is_file():
         raise UsageError(f"--out {out} is a file; name a directory for the runs")
-    given = {name: value for name, value in vars(options).items() if value is not None}
+    given = {name: value for name, value in vars(model).items() if value is not None}
     with arguments():
         sizes: list[dict[str, int]] = [{"latent": size} for size in latent] or [{}]
         chosen = [method_by_name(name, **given, **size) for name in method for size in sizes]
