@@ -10,8 +10,8 @@ import tyro
 
 from ..graph import audit
 from ..inference.result import Table
+from ..models.registry import judges, methods
 from ..models.registry import method as method_by_name
-from ..models.registry import methods
 from ..notation import Factorization
 from .console import OUT, UsageError, arguments, at_least, check_figure, save_figure
 
@@ -26,6 +26,8 @@ def list_methods() -> None:
             "--generative and --inference" if _asks_for_equations(kind) else f"{kind.generative}\n{kind.inference}"
         )
         table.add_row(name, equations, kind.source)
+    for name, judge in judges().items():
+        table.add_row(name, "a judge of what methods make", judge.source)
     OUT.print(table, highlight=False)
 
 
