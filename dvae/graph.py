@@ -127,6 +127,11 @@ class Audit:
             given the rest of what that factor reads. Harmless: nothing is lost by dropping it.
         steps: the one length T that it holds for, where a mask is the user's own and may be another at every length;
             None where it holds for all.
+
+    Example:
+        >>> found = dvae.audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})")
+        >>> found.exact, found.missing
+        (False, {'z': ('z_{t-1}',)})
     """
 
     generative: Factorization
@@ -246,7 +251,7 @@ def audit(
     Raises:
         ValueError: the two do not fit each other (see `dvae.notation.check_pair`).
 
-    >>> audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})").missing
+    >>> dvae.audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})").missing
     {'z': ('z_{t-1}',)}
     """
     generative = Factorization.parse(generative) if isinstance(generative, str) else generative

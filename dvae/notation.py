@@ -161,7 +161,7 @@ class Factorization:
     Made by `parse`. Construction checks that it can be drawn: a variable that reads what is drawn after
     it is refused, with the cycle. The order in which factors are written matters only as a tie-break.
 
-    >>> print(Factorization.parse("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)"))
+    >>> print(dvae.Factorization.parse("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)"))
     p(x_{1:T}, z_{1:T}, w) = p(w) ∏_t p(z_t | z_{t-1}, w) p(x_t | z_t)
 
     Raises:

@@ -39,6 +39,11 @@ def twin(
         steps: T, the number of time steps.
         seed: of the weights.
         scale: standard deviation of the weights.
+
+    Example:
+        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
+        >>> model.sample(5, length=4)["x"].shape
+        torch.Size([5, 4, 2])
     """
     equations = [f if isinstance(f, Factorization) else Factorization.parse(f) for f in (generative, inference)]
     laws = {
@@ -74,6 +79,11 @@ class Oracle:
 
     Raises:
         ValueError: a model that is not linear-Gaussian, or has context.
+
+    Example:
+        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
+        >>> dvae.Oracle(model, 4).evidence(torch.randn(3, 4, 2).double()).shape
+        torch.Size([3])
     """
 
     def __init__(self, model: DynamicalVAE, steps: int):
@@ -229,6 +239,10 @@ def price(
         generative, inference, sizes, observed: as of `DynamicalVAE`.
         steps: T.
         seeds: number of random models.
+
+    Example:
+        >>> dvae.price("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, steps=3, seeds=1) > 0
+        tensor([True])
     """
     gaps = [
         Oracle(twin(generative, inference, sizes, steps, seed, observed), steps).fit_guide() for seed in range(seeds)

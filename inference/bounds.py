@@ -39,6 +39,12 @@ class Terms:
         energies: penalty (a `pyro.factor` site) to (B,), positive where it costs.
         frames: (B,) number of valid steps.
         steps: local variable to (B, T): its log-likelihood or KL by step, 0 at padding.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2))
+        >>> terms.kl["z"].shape, torch.allclose(terms.bound, terms.log_likelihood["x"] - terms.kl["z"])
+        (torch.Size([3]), True)
     """
 
     log_likelihood: dict[str, Tensor]
@@ -78,6 +84,11 @@ class SequenceELBO(ELBO):
 
     Args:
         num_particles: draws from the guide to average over.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> dvae.SequenceELBO().loss(model, model.guide, torch.randn(3, 4, 2)) > 0
+        True
     """
 
     def __init__(self, num_particles: int = 1):
@@ -305,6 +316,11 @@ def importance_bound(
 
     Returns:
         Bound and tail shape, (B,) each.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> dvae.importance_bound(model, torch.randn(3, 4, 2), particles=16).bound.shape
+        torch.Size([3])
     """
     if particles < 1:
         raise ValueError(f"particles is at least 1, got {particles}")

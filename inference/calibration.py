@@ -257,6 +257,10 @@ def calibrate(
     Raises:
         ValueError: numbers below 1, steps beyond the length, context that is missing, or a guide without some latent.
         FloatingPointError: a simulation that is not finite.
+
+    Example:
+        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
+        >>> found = dvae.calibrate(model, 4, simulations=20, draws=19, steps=(2, 4), progress=False)
     """
     if min(length, simulations, draws, chunk) < 1:
         raise ValueError(

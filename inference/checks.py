@@ -269,6 +269,11 @@ def predictive_checks(
     Raises:
         ValueError: incomplete windows, too few samples, a statistic of the wrong shape or not finite on real windows.
         FloatingPointError: a statistic that is not finite on replicated windows.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> windows = dvae.data.ArrayWindows(torch.randn(6, 8, 2), observed=4)
+        >>> checks = dvae.predictive_checks({"model": model}, windows, progress=False)
     """
     models = dict(model) if isinstance(model, Mapping) else {"model": model}
     if samples < 19 or batch_size < 1 or not models:

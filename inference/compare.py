@@ -100,6 +100,12 @@ def compare(
             sequences; windows that are ragged or masked, for forecasts.
         TypeError: data of another kind, or what is no model.
         FloatingPointError: a bound that is not finite, naming model and sequence.
+
+    Example:
+        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
+        >>> found = dvae.compare({"twin": model}, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
+        >>> found.ranking
+        ['twin']
     """
     if particles < 1 or estimates < 1 or batch_size < 1 or contrasts < 0 or samples < 0:
         raise ValueError(

@@ -180,6 +180,13 @@ class Comparison(Result):
         seed: of every model's draws.
         shown: free-running score to its unit, those of the table.
         notes: lines below that table on how scores are to be read.
+
+    Example:
+        >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
+        >>> models = {n: dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", q, {"z": 1, "x": 2}, 4) for n, q in pairs.items()}
+        >>> found = dvae.compare(models, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
+        >>> found.difference("smooths", "filters").mean, found.ranking  # doctest: +ELLIPSIS
+        (..., [...])
     """
 
     rows: dict[str, Contender]

@@ -87,6 +87,12 @@ def evaluate(
         ValueError: windows that are ragged, masked or leave nothing to predict; a forecast of the wrong
             shape; a model with the name of a reference row; fewer than one sample; two scores of one name.
         FloatingPointError: a forecast or bound that is not finite, naming method and window.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> windows = dvae.data.ArrayWindows(torch.randn(6, 8, 2), observed=4)
+        >>> list(dvae.evaluate(model, windows, samples=5, progress=False)["model"])[:3]
+        ['energy score', 'variogram score', 'CRPS']
     """
     models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
     _check(models, samples, batch_size, bound_particles, log_score_particles)

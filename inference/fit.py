@@ -56,6 +56,12 @@ class Fit:
         status: "finished", "stopped early" or "interrupted".
         run: the run directory, if there is one.
         per: what bounds are per: a frame, unless the model has another word in `per`.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> found = dvae.fit(model, torch.randn(6, 4, 2), steps=3, log_every=1, progress=False)
+        >>> found.status, found.series("bound")[0]
+        ('finished', [1, 2, 3])
     """
 
     history: list[dict[str, Any]]

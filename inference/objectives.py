@@ -52,7 +52,7 @@ class Evidence:
         ValueError: on the first call, when a name is not among the terms.
 
     Example:
-        Evidence(kl_weight=Ramp(0.0, 1.0, steps=500), free_bits={"z": 0.1})
+        >>> warm_up = dvae.Evidence(kl_weight=dvae.schedules.Ramp(0.0, 1.0, steps=500), free_bits={"z": 0.1})
     """
 
     kl_weight: float | Schedule | Mapping[str, float | Schedule] = 1.0

@@ -78,6 +78,11 @@ def particle_bound(
     Raises:
         ValueError: a factorization that cannot be run forward step by step: a guide that runs backward in time, a
             factor that reads latents after t, such as p(x_t | z_{1:T}); data or context missing in the batch.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2})
+        >>> dvae.particle_bound(model, torch.randn(3, 4, 2), particles=16).bound.shape
+        torch.Size([3])
     """
     if not isinstance(particles, int) or particles < 1:
         raise ValueError(f"particles is a whole number, at least 1, not {particles!r}")

@@ -38,6 +38,10 @@ class Training:
 
     Raises:
         ValueError: when an option is out of range.
+
+    Example:
+        >>> dvae.Training(steps=100, learning_rate=1e-3, decay=0.5).rate(75)
+        0.0005
     """
 
     steps: Count = 2000

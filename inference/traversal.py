@@ -80,6 +80,10 @@ def traverse(
 
     Raises:
         ValueError: an unknown latent or coordinate, offsets without 0, or a latent that nothing on the way to x reads.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3})
+        >>> found = dvae.traverse(model, torch.randn(4, 5, 3), "w", steps=5)
     """
     if latent not in model.latents or not set(free) <= set(model.latents) - {latent}:
         raise ValueError(

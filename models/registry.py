@@ -70,7 +70,12 @@ class Registry(Mapping[str, type[Any]]):
 
 @cache
 def methods() -> Mapping[str, type[Method]]:
-    """Every known method by name: those of this package and of installed packages (entry points "dvae.methods")."""
+    """Every known method by name: those of this package and of installed packages (entry points "dvae.methods").
+
+    Example:
+        >>> "hit-dvae" in dvae.methods(), dvae.methods()["vae"].generative
+        (True, 'p(z_t) p(x_t | z_t)')
+    """
     return Registry(METHODS, "dvae.methods")
 
 
@@ -85,6 +90,10 @@ def method(name: str, **options: Any) -> Method:
 
     Raises:
         ValueError: an unknown name or option, with the nearest known one.
+
+    Example:
+        >>> dvae.method("srnn", latent=8).build({"x": 48}).sizes["z"]
+        8
     """
     return _chosen(methods(), "method", name, options)  # type: ignore[no-any-return]
 

@@ -225,7 +225,7 @@ def test_steps_only_widen_the_view():
 
 @pytest.mark.parametrize("module", [dvae.graph, dvae.notation])
 def test_examples_in_the_docstrings(module):
-    assert doctest.testmod(module).failed == 0
+    assert doctest.testmod(module, extraglobs={"dvae": dvae}).failed == 0
 
 
 def documented():

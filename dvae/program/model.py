@@ -57,7 +57,7 @@ class DynamicalVAE(nn.Module):
         ValueError: equations that cannot be read or do not fit together; sizes missing or unknown.
 
     Example:
-        >>> model = DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})", {"z": 2, "x": 3})
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})", {"z": 2, "x": 3})
         >>> model.sample(5, length=10)["x"].shape
         torch.Size([5, 10, 3])
     """

@@ -36,6 +36,10 @@ class SelfFeeding:
             have it) a step takes half the time or less, and the gradient is not that of the self-fed bound. The means
             in place of missing entries always carry theirs.
         start: frames at the beginning that stay as they are, such as those that a forecast will have observed.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2), self_feeding=dvae.SelfFeeding(0.5))
     """
 
     probability: float

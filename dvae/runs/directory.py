@@ -189,6 +189,16 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
 
     Raises:
         CheckpointError: no run, or a damaged one.
+
+    Example:
+        >>> import tempfile
+        >>> clips = dvae.motion.simulate(clips=8, frames=90)
+        >>> people = dvae.motion.MotionData("simulated", clips, dvae.motion.PROTOCOLS["simulated"])
+        >>> training = dvae.Training(steps=1, batch_size=2, progress=False)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = dvae.runs.directory.fit_run(dvae.method("vae", latent=2), people, folder + "/a", training)
+        ...     dvae.load(folder + "/a").method.name
+        'vae'
     """
     config, size = read_config(path, data), Run(path).size()
     with reading_config(path), at_most(size, f"{Path(path) / CONFIG}"):

@@ -1,13 +1,10 @@
 """The loop by hand: steps of one's own are those of `fit`, bit for bit, and leave the caller's random state alone."""
 
-import doctest
-
 import pytest
 import torch
 
 import dvae
 from dvae.data import Sequences
-from dvae.inference import fit, svi, training
 from dvae.inference.checkpoints import Run, weights
 from dvae.inference.objectives import Evidence
 from dvae.inference.resuming import restore, store
@@ -157,8 +154,3 @@ def test_what_comes_too_early_is_refused_in_a_sentence():
     loop.init()
     with pytest.raises(RuntimeError, match="no step has been taken since init"):
         loop.row()
-
-
-@pytest.mark.parametrize("module", [svi, fit, training])
-def test_examples_in_the_docstrings(module):
-    assert doctest.testmod(module).failed == 0

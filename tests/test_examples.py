@@ -1,0 +1,19 @@
+"""Every name that a notebook starts from has an example, which runs."""
+
+import doctest
+from types import ModuleType
+
+import pytest
+import torch
+
+import dvae
+
+
+@pytest.mark.parametrize("name", [name for name in dvae.__all__ if not isinstance(getattr(dvae, name), ModuleType)])
+@pytest.mark.filterwarnings("ignore:.*clamped to:UserWarning")
+def test_the_example_of_a_public_name_runs(name, capsys):
+    names = {"dvae": dvae, "torch": torch}
+    found = doctest.DocTestFinder(recurse=False).find(getattr(dvae, name), name, globs=names)
+    examples = [each for each in found if each.examples]
+    assert examples, f"dvae.{name} has no example"
+    assert sum(doctest.DocTestRunner().run(each).failed for each in examples) == 0, capsys.readouterr().out
