@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from torch import nn
 
-from ..data import Sequences, Source, sequences
+from ..data import Fingerprinted, Sequences, Source, sequences
+from ..program.protocols import Program
 from ..turns import alone
 from .checkpoints import CONFIG, CheckpointError, Run
 from .objectives import Objective
@@ -193,7 +194,7 @@ def fit(
     held_out = None if validation is None else sequences(validation)
     if training.patience is not None and held_out is None:
         raise ValueError("patience counts validations; give validation data, or leave patience out")
-    fingerprint = getattr(train, "fingerprint", None)
+    fingerprint = train.fingerprint if isinstance(train, Fingerprinted) else None
     record = {"training_data": fingerprint} if isinstance(fingerprint, str) else {}
     run = _directory(out, resume, record)
     record |= recorded(training, svi.plan)
@@ -226,7 +227,7 @@ def fit(
         _train(svi, source, held_out, run, receivers, callbacks, signals)
         if state.best is not None:
             model.load_state_dict(state.best)
-    path, per = run.path if run else None, getattr(model, "per", Fit.per)
+    path, per = run.path if run else None, model.per if isinstance(model, Program) else Fit.per
     result = Fit(history.rows, state.step, state.best_step, state.best_bound, state.status, path, per)
     if state.status == "interrupted":
         raise Interrupted(result, signals.received or signal.SIGINT)

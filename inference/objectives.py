@@ -8,7 +8,7 @@ model selection reads `Terms.bound`.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -23,6 +23,19 @@ class Objective(Protocol):
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
         """Return the loss of a batch at a global step."""
+
+
+@runtime_checkable
+class Asking(Protocol):
+    """An objective that says what draws it needs, and what tells the best weights; see `Evidence`."""
+
+    @property
+    def draws(self) -> Mapping[str, int]:
+        """Of a latent, by name, for each sequence."""
+
+    @property
+    def select(self) -> Literal["bound", "loss"]:
+        """What tells the best weights."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from ..data import Batch, Sequences, each, sequences
 from ..turns import alone
 from .bounds import SequenceELBO, Terms
 from .checkpoints import weights
-from .objectives import Objective
+from .objectives import Asking, Objective
 from .result import reason
 from .schedules import schedule
 from .training import Stage, lay_out, stage_at
@@ -249,7 +249,7 @@ class SVI:
             for batch in data.split(self.training.batch_size):
                 terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
                 found = _sums(terms)
-                if not terms.likelihood or getattr(objective, "select", "bound") == "loss":
+                if not terms.likelihood or (isinstance(objective, Asking) and objective.select == "loss"):
                     found["loss"] = objective(terms, last).double() * found["frames"]
                 for name, value in found.items():
                     sums[name] = sums[name] + value if name in sums else value
@@ -263,8 +263,8 @@ class SVI:
         named = {"x": batch} if isinstance(batch, Tensor) else batch
         placed = each(named, lambda v: v.to(dtype) if v.is_floating_point() else v)
         program: dict[str, Any] = {"self_feeding": feeding} if feeding else {}
-        if draws := getattr(objective, "draws", None):
-            program["draws"] = draws
+        if isinstance(objective, Asking) and objective.draws:
+            program["draws"] = objective.draws
         try:
             return Terms(**self.module(self.fabric.to_device(placed), program))
         except ValueError as error:
