@@ -1,5 +1,6 @@
 # make demo    simulated people: fit two methods, print the table, save demo/futures.png
 # make test    lint, types, tests, and some of these once more as on another processor
+# make quick   lint, types, and the tests that are not slow
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
 # make coverage   the tests, and which lines none of them runs
 # make bench   the benchmarks
@@ -18,7 +19,7 @@ export OMP_NUM_THREADS := 1
 NUMERICAL := laws networks test_oracle.py program/test_model.py models/test_trajectories.py motion/test_control.py \
 	motion/test_forecasts.py $(addprefix inference/test_,bounds.py compare.py metrics.py particles.py)
 
-.PHONY: venv demo test fuzz coverage bench notebooks docs dist clean
+.PHONY: venv demo lint quick test fuzz coverage bench notebooks docs dist clean
 
 venv: .venv/installed
 
@@ -35,10 +36,15 @@ venv: .venv/installed
 demo: venv
 	$(BIN)/python -m benchmarks.tables.demo
 
-test: venv
+quick: lint
+	$(BIN)/pytest -n 2 -m "not slow"
+
+lint: venv
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p dvae
+
+test: lint
 	$(BIN)/pytest -n 2
 	ATEN_CPU_CAPABILITY=default $(BIN)/pytest -n 2 $(addprefix tests/,$(NUMERICAL))
 

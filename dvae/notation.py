@@ -541,6 +541,8 @@ def check_pair(
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Checks that a guide fits a generative model.
 
+    (Longer than other functions by the mistakes that it names.)
+
     Args:
         generative: p over latents and observed variables.
         inference: q over the latents, given the data.

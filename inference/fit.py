@@ -151,6 +151,8 @@ def fit(
 ) -> Fit:
     """Fit a model and its guide.
 
+    (Longer than other functions by what its arguments mean.)
+
     Afterwards the model is in evaluation mode and holds the weights of the best unweighted validation bound,
     or without validation data the last ones. The caller's random state is left as it was. Threads take turns, as Pyro's
     handlers and torch's random state are the process's: another fit or forecast waits until this one is done.

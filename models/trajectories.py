@@ -213,6 +213,8 @@ class TrajectoryModel(DynamicalVAE):
     ) -> dict[str, Tensor]:
         """Goes on from a pose, along the given trajectories if there are any.
 
+        (Longer than other functions by what its arguments mean.)
+
         Of motions that are shorter than those the model was fitted to, it makes the whole, with joints at rest where
         their trajectories end, and gives the beginning: z has the length of the whole.
 
@@ -304,6 +306,8 @@ class TrajectoryModel(DynamicalVAE):
         progress: bool = False,
     ) -> Completion:
         """Motions that start at a pose and follow paths of some joints.
+
+        (Longer than other functions by the arguments that it refuses.)
 
         The networks know of a path frame by frame. Where it has gaps they are told of a straight one across them, from
         the joint's place in the first pose on, and of a resting joint behind the last known frame. See `forecast` for

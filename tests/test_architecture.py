@@ -169,6 +169,7 @@ def test_nothing_is_tied_to_one_machine():
         assert not absolute.search(path.read_text(encoding="utf-8")), path
 
 
+@pytest.mark.slow
 def test_readme_example_beats_zero_velocity():
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     variables = {}

@@ -74,7 +74,10 @@ class GaussianChain(torch.autograd.Function):
         first: Tensor,
         *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Run the chain."""
+        """Run the chain.
+
+        (Longer than other functions, as one loop with all that it writes into.)
+        """
         steps, batch, size = noise.shape
         act = IN_PLACE[activation]
         before, after = _layers(tensors[: 2 * count]), _layers(tensors[2 * count :])
@@ -171,7 +174,10 @@ class GaussianChain(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of base, gates, weights and biases from those of draws, locations, scales and states."""
+        """Gradients of base, gates, weights and biases from those of draws, locations, scales and states.
+
+        (Longer than other functions, as one loop with all that it writes into.)
+        """
         noise, values, out, recurrent, first, inputs, activated, cells, squashed, *rest = ctx.saved_tensors
         n_features, n_hidden = ctx.lists
         count = ctx.count

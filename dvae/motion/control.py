@@ -48,6 +48,8 @@ def bend(
 ) -> tuple[Tensor, Tensor]:
     """Motions that follow the paths, each by L-BFGS.
 
+    (Longer than other functions by what its arguments mean.)
+
     Args:
         decode: motions (1, T, D) in metres of latents (1, ...).
         latents: (S, ...), where to start from.

@@ -97,6 +97,8 @@ def futures(
 ) -> Axes:
     """Observed motion and sampled futures, as skeletons from left to right over time.
 
+    (Longer than other functions by what is drawn, one thing after the other.)
+
     The past is black, the truth green, each sample has a colour of its own through time. Every pose is drawn
     relative to its pelvis, all from the same side: the last observed pose is seen from the front, turned by
     `view`. Where joints were given paths, these are crosses, and all of a frame is drawn relative to one place, the
@@ -173,6 +175,8 @@ def animate(
     title: str = "",
 ) -> go.Figure:
     """Skeletons that move side by side, to play, scrub and turn: what happened, and sampled futures.
+
+    (Longer than other functions by what is drawn, one thing after the other.)
 
     Everybody repeats the observed motion in black and goes on in the colours of `futures`, seen from the same side.
     Time zero is the last observed pose.

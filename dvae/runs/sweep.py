@@ -110,6 +110,8 @@ def sweep(
 ) -> list[Outcome]:
     """Fits each method with each seed, several runs at a time.
 
+    (Longer than other functions by what its arguments mean.)
+
     A run directory has the name of the method, the options in which methods of that name differ, and the seed, such as
     srnn-z8-seed0. Runs are spread over processes of this machine, or as the caller's `joblib.parallel_config` says;
     workers on other machines need the file system of `out`. Ctrl-C lets every run write a checkpoint; a second one

@@ -23,6 +23,7 @@ def shown(notebook):
 # The kernel's transport warns of its own affairs.
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.timeout(1200)
+@pytest.mark.slow
 def test_a_run_shows_what_is_stored(path):
     stored, run = nbformat.read(path, as_version=4), notebooks.execute(path, share=0.1)
     for cell, before, now in zip(

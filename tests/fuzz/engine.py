@@ -51,9 +51,9 @@ def scaled(seconds: float) -> float:
     return seconds * SECONDS / 60
 
 
-def limited(seconds: float) -> pytest.MarkDecorator:
-    """Of a test of that share: the time after which it hangs."""
-    return pytest.mark.timeout(300 + scaled(seconds))
+def limited(seconds: float) -> Callable[[Any], Any]:
+    """Of a test of that share: it is slow, and the time after which it hangs."""
+    return lambda test: pytest.mark.slow(pytest.mark.timeout(300 + scaled(seconds))(test))
 
 
 def fuzz(check: Callable[[Example], None], examples: SearchStrategy[Example], seconds: float) -> None:

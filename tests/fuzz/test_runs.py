@@ -20,7 +20,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 import dvae
-from dvae import cli, motion
+from dvae import motion
+from dvae.cli import futures, judging
 from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE
 from dvae.motion.dataset import MotionData
 from dvae.runs import directory as runs
@@ -210,13 +211,13 @@ def check(example: tuple, directory: Path) -> None:
 
 def use(call: str, run: Path, data: Path) -> None:
     if call == "load":
-        dvae.load(run, data)
+        assert dvae.load(run, data).data
     elif call == "resume":
         runs.resume(run, data, steps=6, progress=False)
     elif call == "forecast":
-        cli.forecast(run, run / "futures.npz", samples=1, horizon=2, data=str(data))
+        futures.forecast(run, run / "futures.npz", samples=1, horizon=2, data=str(data))
     else:
-        cli.evaluate((run,), samples=1, data=str(data))
+        judging.evaluate((run,), samples=1, data=str(data))
 
 
 @limited(SHARE)

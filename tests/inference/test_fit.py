@@ -755,6 +755,7 @@ print("weights", torch.equal(whole, run("halves", 20, resume=True)), whole.tolis
 
 
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch is built without torch.distributed")
+@pytest.mark.slow
 def test_two_processes_agree_draw_differently_and_resume_bit_for_bit(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)

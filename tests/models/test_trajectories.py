@@ -554,6 +554,7 @@ def test_gaps_are_bridged_from_the_first_pose_on(windows, walk, monkeypatch):
     assert np.isfinite(done.errors["LWrist"][0, known]).all()
 
 
+@pytest.mark.slow
 def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
     """After some training, so that there is something that the latents move."""
     torch.manual_seed(0)
@@ -583,6 +584,7 @@ def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
     assert np.linalg.norm(np.diff(wrist, axis=1), axis=-1).max() < 0.1  # the hand does not jump there and back
 
 
+@pytest.mark.slow
 def test_a_recurrent_decoder_is_bent_through_its_loop(windows):
     torch.manual_seed(0)
     method = small("cvae-rnn", latent=16, width=16)

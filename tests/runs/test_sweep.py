@@ -66,6 +66,7 @@ def printed(capsys):
     return capsys.readouterr().err.splitlines()
 
 
+@pytest.mark.slow
 def test_a_run_of_a_sweep_is_bit_for_bit_what_it_is_alone(swept, data, tmp_path, one_thread):
     out, methods, results = swept
     assert [result.path.name for result in results] == ["vae-z3-seed0", "vae-z2-seed0", "vae-z3-seed1", "vae-z2-seed1"]
@@ -264,6 +265,7 @@ def states(out):
     return {path.parent.name: json.loads(path.read_text()) for path in out.glob("*/state.json")}
 
 
+@pytest.mark.slow
 def test_a_sweep_that_ctrl_c_stopped_is_continued(people, tmp_path, capsys):
     """The signal goes to all processes, as from a terminal; each run writes a checkpoint, and no process stays."""
     arguments = ["sweep", "vae", "vrnn", "--seeds", "0", "1", "--data", str(people), "--out", str(tmp_path)]
@@ -303,6 +305,7 @@ def test_a_sweep_that_ctrl_c_stopped_is_continued(people, tmp_path, capsys):
     assert [(state["status"], state["step"]) for state in ended.values()] == [("finished", 30)] * 4
 
 
+@pytest.mark.slow
 def test_runs_on_a_dask_cluster_are_those_of_this_machine(swept, data, people, tmp_path, capsys):
     distributed = pytest.importorskip("distributed")
     out, _, _ = swept

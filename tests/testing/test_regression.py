@@ -426,6 +426,7 @@ def run(pytester, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 def test_the_life_of_a_record(pytester, run):
     result = run(1.5, "--elbo-strict")
     result.assert_outcomes(failed=2)
@@ -456,6 +457,7 @@ def test_the_life_of_a_record(pytester, run):
     run(2.0).assert_outcomes(passed=2)
 
 
+@pytest.mark.slow
 def test_workers_report_to_the_summary(pytester, run):
     result = run(1.0, "-n", "1", inside=False)
     result.assert_outcomes(passed=2)
@@ -487,6 +489,7 @@ def test_the_price_of_a_mean_field_guide(elbo_regression):
     assert abs(record.mean - oracle.bound(x).mean().item()) < 5 * record.mean_error
 
 
+@pytest.mark.slow
 def test_the_documented_examples_run(pytester):
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "testing.md").read_text(encoding="utf-8"), re.DOTALL)
     pytester.makepyfile(test_documented="\n".join(blocks))
