@@ -147,6 +147,8 @@ def sequences(data: Any) -> Sequences:
     Raises:
         TypeError, ValueError: when it is none of these.
     """
+    if isinstance(data, Sequences):
+        return data
     if isinstance(data, Mapping):
         return Sequences(each(data, torch.as_tensor))
     if isinstance(data, Tensor | np.ndarray):

@@ -59,6 +59,8 @@ Count = Annotated[int, Range(1, 10**9)]
 """Of steps, draws or frames."""
 Delay = Annotated[int, Range(0, 10**9)]
 """Steps, possibly none."""
+Frames = Annotated[int, Range(1, 200_000)]
+"""Steps of a sequence."""
 Size = Annotated[int, Range(1, 16384)]
 """Of a variable, a layer or a state."""
 Extra = Annotated[int, Range(0, 16384)]

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
+from .options import Frames, Size, check
+
 
 class SchemaError(ValueError):
     """Data of which less is known than a method needs to know."""
@@ -19,13 +21,19 @@ class Schema:
         sizes: dimension of every variable of the data, context included, such as {"x": 48}.
         length: T, steps of a sequence; None where they differ, or nobody knows.
         observed: O, the steps that forecasts start from; None likewise.
+
+    Raises:
+        TypeError, ValueError: sizes or lengths that are none.
     """
 
     kind: ClassVar[str] = "sequences"
 
-    sizes: Mapping[str, int]
-    length: int | None = None
-    observed: int | None = None
+    sizes: Mapping[str, Size]
+    length: Frames | None = None
+    observed: Frames | None = None
+
+    def __post_init__(self) -> None:
+        check(self)
 
     @classmethod
     def of(cls, data: Any, who: str = "this method") -> Self:

@@ -24,20 +24,18 @@ from .notation import Factorization
 WHOLE = "x"
 """Name of the data where a view makes several variables of them."""
 
-"""Values by name, with "lengths" and, by name, "mask"."""
-
 
 class View:
     """What a model sees of the data; this view, all as it is.
 
-    What a view finds in the data and needs for the way back, as a heading, it adds under a name of its own. Batch that
-    were seen are seen as they are.
+    What a view finds in the data and needs for the way back, as a heading, it adds under a name of its own. Values
+    that were seen are seen as they are.
     """
 
     names: tuple[str, ...] = ()
     """Names in batches, beside those of the variables: what the view reads, and what it adds."""
     parts: Mapping[str, Sequence[int]] | None = None
-    """Batch variables that are coordinates of x, in place of it."""
+    """Data variables that are coordinates of x, in place of it."""
     history: str | None = None
     """Name of the context that is the data themselves."""
 
@@ -107,7 +105,7 @@ class Views(View):
 
 @dataclass(frozen=True)
 class Parts(View):
-    """Batch variables that are coordinates of one array x, which stands for all of them in batches and forecasts.
+    """Data variables that are coordinates of one array x, which stands for all of them in batches and forecasts.
 
     Args:
         parts: variable to its coordinates. Every coordinate belongs to one of them.

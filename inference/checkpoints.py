@@ -1,6 +1,6 @@
 """Run directories: weights, the state that training resumes from, and what was run.
 
-    config.json        what was run: method, equations, data, protocol, training options
+    config.json        what was run: method, schema, data, training options
     best.safetensors   weights at the best unweighted validation bound (absent without validation data)
     last.safetensors   weights at the last checkpoint
     last.state.pt      optimiser and random number generators, read with torch's restricted unpickler

@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Literal, Self
 
+import torch
 from torch import nn
 
 from ..data import Source
@@ -55,7 +56,8 @@ class Recipe:
                 steps are the recipe's.
         """
         if not resume:
-            self.prepare(model)
+            with torch.random.fork_rng():
+                self.prepare(model)
         options |= {"steps": sum(stage.steps for stage in self.stages), "self_feeding": self.feeding}
         return fit(model, self.batches, self.validation, stages=self.stages, resume=resume, **options)
 

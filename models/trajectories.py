@@ -320,7 +320,7 @@ class TrajectoryModel(DynamicalVAE):
             frames: T; needed without trajectories.
             samples: S, motions.
             exact: have the given joints on their paths, by the most likely move of the latents and correction of the
-                poses, with bones at their lengths; see `inference.control`. The completion has the corrections.
+                poses, with bones at their lengths; see `dvae.motion.control`. The completion has the corrections.
             temperature: of the latents' scales; 0 for the motion of the prior's mean.
             steps: of the optimiser, with `exact`.
             progress: whether to show a progress bar, with `exact`.

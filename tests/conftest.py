@@ -41,6 +41,26 @@ def real() -> Callable[[str], Any]:
     return read
 
 
+@pytest.fixture(scope="session")
+def people(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file of simulated people, enough for windows of every split; nobody writes to it."""
+    path = tmp_path_factory.mktemp("data") / "people.npz"
+    dvae.motion.save(path, dvae.motion.simulate(clips=14, frames=90, seed=1))
+    return path
+
+
+@pytest.fixture(scope="session")
+def walkers() -> Any:
+    """The simulated people of the default, as motion data."""
+    return dvae.motion.MotionData.open()
+
+
+@pytest.fixture(scope="session")
+def windows(walkers: Any) -> Any:
+    """Their training windows."""
+    return walkers.windows("train")
+
+
 def global_state() -> dict[str, Any]:
     return {
         "default dtype": torch.get_default_dtype(),

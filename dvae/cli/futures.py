@@ -251,7 +251,7 @@ def _forecasts(
     fix: Sequence[str] = (),
 ) -> motion.Forecasts:
     """Futures of some of the windows; those of a window share one draw of what is fixed."""
-    free = {*getattr(loaded.model, "parts", ()), *_statics(loaded.model)}
+    free = {*(loaded.model.view.parts or ()), *_statics(loaded.model)}
     if unknown := [name for name in fix if name not in free]:
         raise UsageError(
             f"--fix {' '.join(unknown)}: {loaded.path} has "

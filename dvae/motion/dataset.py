@@ -54,6 +54,7 @@ class MotionData:
     """
 
     kind: ClassVar[str] = "motion"
+    described: ClassVar[str] = Poses.kind
     source: ClassVar[type[Recordings]] = Recordings
 
     path: str

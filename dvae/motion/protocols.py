@@ -28,12 +28,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
-from ..options import Amount, Range, check, nearest, tuples
+from ..options import Amount, Frames, Range, check, nearest, tuples
 from ..schema import Schema
 from .data import Clip, MotionSet
 from .skeleton import Skeleton, rotate_about_up
-
-Frames = Annotated[int, Range(1, 100_000)]
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def _apart(network: Network, spec: Any) -> tuple[list[Input], Input]:
 
 
 class CosineEncoderNetwork(AtOnce):
-    """See `CosineEncoder`. Networks may share `over_time`, `static`, `before` and `between`."""
+    """What `CosineEncoder` describes. Networks may share `over_time`, `static`, `before` and `between`."""
 
     def __init__(self, spec: CosineEncoder, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, 2 * spec.width)
@@ -139,7 +139,7 @@ class CosineEncoderNetwork(AtOnce):
 
 
 class MotionDecoderNetwork(AtOnce):
-    """See `MotionDecoder`. Networks may share `static`."""
+    """What `MotionDecoder` describes. Networks may share `static`."""
 
     def __init__(self, spec: MotionDecoder, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)

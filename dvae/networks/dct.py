@@ -6,8 +6,9 @@ sum_t w_k cos(pi (t + 1/2) k / T) v_t, with w_0 = sqrt(1/T) and w_k = sqrt(2/T) 
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from scipy.fft import dct
+from scipy.fft import idct
 from torch import Tensor
 
 
@@ -27,4 +28,4 @@ def cosine_basis(length: int, coefficients: int) -> Tensor:
     """
     if not 1 <= coefficients <= length:
         raise ValueError(f"a sequence of {length} steps has 1 to {length} coefficients, not {coefficients}")
-    return torch.from_numpy(dct(torch.eye(length, dtype=torch.float64).numpy(), axis=0, norm="ortho")[:coefficients])
+    return torch.from_numpy(idct(np.eye(coefficients, length), axis=1, norm="ortho"))

@@ -58,7 +58,7 @@ class GraphConv:
 
 
 class GraphConvNetwork(AtOnce):
-    """See `GraphConv`; the features (B, T, D) are the child's coordinates themselves."""
+    """What `GraphConv` describes; the features (B, T, D) are the child's coordinates themselves."""
 
     def __init__(self, spec: GraphConv, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)

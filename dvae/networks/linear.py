@@ -34,7 +34,7 @@ class Linear:
 
 
 class LinearNetwork(Network):
-    """See `Linear`. Weights are (T, S, H, D): T is 1 for a static child, S is 1 for a static parent."""
+    """What `Linear` describes. Weights are (T, S, H, D): T is 1 for a static child, S is 1 for a static parent."""
 
     def __init__(self, spec: Linear, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)

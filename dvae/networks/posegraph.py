@@ -44,7 +44,7 @@ class PoseGraph:
 
 
 class PoseFeatures(nn.Module):
-    """See `PoseGraph`: (..., D) to (..., nodes * width)."""
+    """What `PoseGraph` describes: (..., D) to (..., nodes * width)."""
 
     def __init__(self, spec: PoseGraph, size: int):
         super().__init__()
@@ -124,7 +124,7 @@ class FrameGraph:
 
 
 class FrameGraphNetwork(Network):
-    """See `FrameGraph`; the features are those of all frames, one after the other."""
+    """What `FrameGraph` describes; the features are those of all frames, one after the other."""
 
     def __init__(self, spec: FrameGraph, inputs: Sequence[Input], size: int):
         super().__init__(inputs, False, spec.frames * spec.width)

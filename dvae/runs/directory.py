@@ -220,10 +220,12 @@ def read_config(path: str | os.PathLike[str], data: str | os.PathLike[str] | Non
     with reading_config(path):
         config = upgraded(Run(path).config, Path(path), data)
         schema, source, training = dict(config["schema"]), dict(config["data"]), config["training"]
-        kind = source.pop("kind")
+        kind, described = source.pop("kind"), schema.pop("kind")
+        if described != DATA[kind].described:
+            raise ValueError(f"data of the kind {kind!r} are {DATA[kind].described}, not {described!r}")
         return Config(
             configured(config["method"]),
-            SCHEMAS[schema.pop("kind")].from_config(schema),
+            SCHEMAS[described].from_config(schema),
             kind,
             DATA[kind].source(**source),
             Training(**{name: option_from_config(value) for name, value in training.items()}),
@@ -240,7 +242,7 @@ def reading_config(path: str | os.PathLike[str]) -> Iterator[None]:
     except Exception as error:  # a method of somebody else's may fail in any way at options that are not its own
         what = f"it lacks {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
         raise CheckpointError(
-            f"{Path(path) / CONFIG} does not tell method, data, protocol and training of a run on its data "
+            f"{Path(path) / CONFIG} does not tell method, schema, data and training of a run "
             f"({_shortened(what)}); it is damaged, or was not written by `dvae fit` with these methods"
         ) from error
 

@@ -25,6 +25,8 @@ class Dataset(Protocol):
     """Data that runs are fitted on, such as `dvae.motion.MotionData`."""
 
     kind: ClassVar[str]
+    described: ClassVar[str]
+    """The kind of their schema."""
     source: ClassVar[type[Any]]
     """What `recorded` is."""
 

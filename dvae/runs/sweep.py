@@ -136,7 +136,7 @@ def sweep(
 
     Example:
         methods = [dvae.method("srnn", latent=latent) for latent in (8, 16)]
-        results = sweep(methods, Data.open("people.npz"), "runs", training=dvae.Training(steps=4000), jobs=4)
+        results = sweep(methods, MotionData.open("people.npz"), "runs", training=dvae.Training(steps=4000), jobs=4)
     """
     out, training = Path(out), training or Training()
     if training.devices != 1:
@@ -332,7 +332,7 @@ def _earlier(run: _Run) -> Outcome | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run itself tells which schedules it makes shorter
         training = clamp(run.training, run.training.steps)
-    here = _options(run.method, run.data.schema, training, run.data.fingerprint)
+    here = _options(run.method.suited(run.data.schema), run.data.schema, training, run.data.fingerprint)
     if changed := [name for name in {**there, **here} if there.get(name) != here.get(name)]:
         name = changed[0]
         others = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""

@@ -27,13 +27,6 @@ EQUATIONS = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t)", "--inference", "q(
 
 
 @pytest.fixture(scope="module")
-def people(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "people.npz"
-    motion.save(path, motion.simulate(clips=14, frames=90, seed=1))
-    return path
-
-
-@pytest.fixture(scope="module")
 def fitted(people, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "fitted"
     assert main(["fit", "vae", "--data", str(people), "--out", str(out), "--steps", "10", *SMALL]) == 0
@@ -432,7 +425,7 @@ def test_a_damaged_run_is_refused(capsys, run):
     (run / "config.json").write_text(json.dumps({**config, "method": {**config["method"], "latent": 4}}))
     assert "weights of another model" in failure(capsys, "evaluate", str(run))
     (run / "config.json").write_text(json.dumps({"method": config["method"]}))
-    assert "does not tell method, data, protocol and training" in failure(capsys, "evaluate", str(run))
+    assert "does not tell method, schema, data and training" in failure(capsys, "evaluate", str(run))
     (run / "config.json").write_text("{")
     assert "not JSON" in failure(capsys, "evaluate", str(run))
 

@@ -579,13 +579,6 @@ def test_every_method_can_be_criticised(name):
         assert traverse(model, x, latent, [0], steps=3, draws=2).frames.shape == (1, 3, 3, 6, 9)
 
 
-@pytest.fixture(scope="module")
-def people(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "people.npz"
-    motion.save(path, motion.simulate(clips=14, frames=80, seed=1))
-    return path
-
-
 def test_checks_and_traversals_of_motion_print_draw_and_write(people):
     clips = motion.read_motion(people)
     windows = motion.windows(clips, motion.PROTOCOLS["simulated"], "test")

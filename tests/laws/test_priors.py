@@ -10,7 +10,7 @@ import torch
 from scipy import stats
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO, importance_bound, laws, motion
+from dvae import DynamicalVAE, SequenceELBO, importance_bound, laws
 from dvae.cli import main
 from dvae.inference.checkpoints import load_weights, save_weights
 from dvae.motion.dataset import MotionData
@@ -228,13 +228,6 @@ def test_weights_of_heads_and_priors_are_found_under_their_new_names():
 
 OPTIONS = {"latent": 2, "static": 2, "width": 4, "heads_count": 1, "decoder": 4, "warm_up": 0, "self_feeding": 0.0}
 VAMP = {**OPTIONS, "prior": "vamp", "prior_components": 3, "prior_steps": 6, "heading": False, "pose_prior": 0.0}
-
-
-@pytest.fixture(scope="module")
-def people(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "people.npz"
-    motion.save(path, motion.simulate(clips=14, frames=90, seed=1))
-    return path
 
 
 def weights(run: Path):

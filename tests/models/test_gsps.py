@@ -9,12 +9,12 @@ from pyro import poutine
 
 import dvae
 from dvae import motion
+from dvae.cli import main
 from dvae.inference.metrics import average_pairwise_distance
 from dvae.models.gsps import PRESETS, GSPSModel, part_by_part
 from dvae.models.registry import configured, judge
 from dvae.motion import energies
 from dvae.motion.body import LIMBS, body_parts
-from dvae.motion.dataset import MotionData
 from dvae.motion.judges.pose_prior import PosePriorModel
 from dvae.networks import GraphConv
 from dvae.runs import directory as runs
@@ -26,22 +26,12 @@ FIVE = ("torso", "right_leg", "left_leg", "right_arm", "left_arm")
 
 
 @pytest.fixture(scope="module")
-def people():
-    return MotionData.open()
-
-
-@pytest.fixture(scope="module")
-def prior_run(people, tmp_path_factory):
+def prior_run(walkers, tmp_path_factory):
     """A run of a pose prior, of two steps."""
     out = tmp_path_factory.mktemp("prior") / "run"
     method = judge("pose-prior", heading=True)
-    runs.fit_run(method, people, out, dvae.Training(steps=2, progress=False, accelerator="cpu"))
+    runs.fit_run(method, walkers, out, dvae.Training(steps=2, progress=False, accelerator="cpu"))
     return str(out)
-
-
-@pytest.fixture(scope="module")
-def windows(people):
-    return people.windows("train")
 
 
 def build(windows, **options):
@@ -367,11 +357,11 @@ def test_presets_by_skeleton(windows):
     assert [len(five.draws), len(five.diversity), len(five.diversity_scale)] == [5, 5, 5]
 
 
-def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, people, prior_run):
+def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, walkers, prior_run):
     method = dvae.method("gsps", **{**SMALL, "pose_prior": 0.01, "pose_prior_run": prior_run, "draws": (2, 2)})
     options = {"batch_size": 4, "validate_every": 3, "progress": False, "accelerator": "cpu"}
-    whole = runs.fit_run(method, people, tmp_path / "whole", dvae.Training(steps=6, **options))
-    runs.fit_run(method, people, tmp_path / "half", dvae.Training(steps=3, **options))
+    whole = runs.fit_run(method, walkers, tmp_path / "whole", dvae.Training(steps=6, **options))
+    runs.fit_run(method, walkers, tmp_path / "half", dvae.Training(steps=3, **options))
     resumed = runs.resume(tmp_path / "half", steps=6, progress=False)
     losses = whole.series("validation/loss")[1]
     assert whole.best_bound == -min(losses)
@@ -379,9 +369,9 @@ def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, people, prior_run):
     loaded, other = runs.load(tmp_path / "whole"), runs.load(tmp_path / "half")
     for (name, value), found in zip(loaded.model.state_dict().items(), other.model.state_dict().values(), strict=True):
         assert torch.equal(value, found), name
-    assert loaded.method == method.suited(people.windows("train"))
+    assert loaded.method == method.suited(walkers.windows("train"))
     assert (loaded.model.angle_low > -1).any()
-    test = people.windows("test")
+    test = walkers.windows("test")
     prior = runs.load(prior_run).model
     judged = partial(motion.scores, pose_prior=prior)
     scores = dvae.evaluate({"gsps": loaded.model}, test, scores=judged, samples=3, progress=False)
@@ -391,6 +381,19 @@ def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, people, prior_run):
     stays = energies.pose_prior_energy(last[None], prior, test.skeleton)
     assert scores["zero velocity"]["pose NLL"].mean == pytest.approx(stays.mean().item(), rel=1e-5)
     assert not {"ELBO", "KL a"} & score.keys()
+
+
+def test_forecasts_of_a_run_share_a_part_that_is_fixed(tmp_path, walkers):
+    method = dvae.method("gsps", **{**SMALL, "pose_prior": 0.0, "draws": (2, 2)})
+    options = {"batch_size": 4, "validate_every": 1, "progress": False, "accelerator": "cpu"}
+    runs.fit_run(method, walkers, tmp_path / "run", dvae.Training(steps=1, **options))
+    out = tmp_path / "futures.npz"
+    assert main(["forecast", str(tmp_path / "run"), "--fix", "lower", "--samples", "3", "--out", str(out)]) == 0
+    futures = motion.Forecasts.load(out).forecasts
+    alike = (futures == futures[:1]).all((0, 1, 2, 4))
+    legs = [motion.WALKER.names.index(name) for name in motion.WALKER.names if "Knee" in name or "Foot" in name]
+    assert alike[legs].all()
+    assert not alike.all()
 
 
 def test_a_fitted_pose_prior_is_taken_along(windows, prior_run):

@@ -13,7 +13,6 @@ from dvae.models.hit_dvae import PRESETS, HiTModel
 from dvae.models.registry import configured
 from dvae.motion import energies
 from dvae.motion.body import body_parts
-from dvae.motion.dataset import MotionData
 from dvae.networks.posegraph import PoseFeatures
 from dvae.runs import directory as runs
 
@@ -33,16 +32,6 @@ ABLATIONS = {
     "evidence, turned": {"loss": "evidence", "heading": True},
 }
 ENERGIES = {"samples": None, "pose_prior": None, "angles": None, "multimodal": None}
-
-
-@pytest.fixture(scope="module")
-def people():
-    return MotionData.open()
-
-
-@pytest.fixture(scope="module")
-def windows(people):
-    return people.windows("train")
 
 
 def build(windows, **options):
@@ -338,19 +327,19 @@ def test_missing_joints_stay_missing_where_windows_are_turned(windows):
 
 
 @pytest.mark.parametrize("ablation", ABLATIONS)
-def test_every_ablation_is_fitted_loaded_and_forecasts(people, tmp_path, ablation):
+def test_every_ablation_is_fitted_loaded_and_forecasts(walkers, tmp_path, ablation):
     """And the best weights are by what is trained."""
     method = small(warm_up=1, **ABLATIONS[ablation])
     training = dvae.Training(steps=4, validate_every=2, batch_size=2, progress=False, accelerator="cpu")
-    result = runs.fit_run(method, people, tmp_path / "run", training)
+    result = runs.fit_run(method, walkers, tmp_path / "run", training)
     rows = [row for row in result.history if any(name.startswith("validation/") for name in row)]
     assert all(("validation/loss" in row) == (method.selects == "loss") for row in rows)
     assert ("validation loss" in result.best) == (method.selects == "loss")
     loaded = runs.load(tmp_path / "run")
-    assert loaded.method == replace(method.suited(people.windows("train")))
+    assert loaded.method == replace(method.suited(walkers.windows("train")))
     assert configured(loaded.method.config()) == loaded.method
     assert loaded.model.feeding.probability == 0
-    past = people.windows("test").all()["x"][:2, :15]
+    past = walkers.windows("test").all()["x"][:2, :15]
     assert torch.isfinite(loaded.model.forecast(past, 3, 2)["x"]).all()
     assert ("w" in loaded.model.latents) == bool(method.static)
 

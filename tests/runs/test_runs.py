@@ -38,13 +38,6 @@ TRAINING = dvae.Training(steps=4, batch_size=2, validate_every=2, log_every=1, p
 
 
 @pytest.fixture(scope="module")
-def people(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "people.npz"
-    motion.save(path, motion.simulate(clips=14, frames=80, seed=1))
-    return path
-
-
-@pytest.fixture(scope="module")
 def fitted(people, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "fitted"
     runs.fit_run(METHOD, MotionData.open(people), out, TRAINING)
@@ -259,6 +252,12 @@ def test_the_state_of_each_optimiser_is_read(optimiser, run):
             ("training", "learning_rate"),
             {"schedule": "Linear", "start": 0, "end": float("inf"), "steps": 3},
             "end is inf",
+        ),
+        (("schema", "length"), 10**12, "length is 1000000000000; it must be"),
+        (
+            ("schema",),
+            {"kind": "sequences", "sizes": {"x": 48}},
+            "of the kind 'motion' are poses, not 'sequences'",
         ),
         (("schema", "protocol", "fps"), 0, "fps is 0; it must be at least 0.001"),
         (("schema", "protocol", "observed"), 10**9, "observed is 1000000000; it must be"),

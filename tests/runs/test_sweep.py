@@ -27,13 +27,6 @@ SMALL = ["--batch-size", "4", "--warm-up", "4", "--latent", "3", "--validate-eve
 
 
 @pytest.fixture(scope="module")
-def people(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "people.npz"
-    motion.save(path, motion.simulate(clips=14, frames=90, seed=1))
-    return path
-
-
-@pytest.fixture(scope="module")
 def data(people):
     return MotionData.open(people)
 
@@ -226,6 +219,14 @@ def test_the_callers_backend_is_used_and_threads_take_turns(swept, data, tmp_pat
     monkeypatch.setattr(sweeps._Leased, "check", gone)  # as if on a machine without the file system of the sweep
     with parallel_config(backend="threading"), pytest.raises(RuntimeError, match="a worker does not see the files in"):
         sweep([VAE], data, tmp_path / "far", seeds=(0, 1), training=TRAINING)
+
+
+def test_a_method_that_the_data_complete_goes_on_too(data, tmp_path):
+    small = {"width": 4, "coefficients": 2, "blocks": 1, "draws": (2, 2), "latent": 2, "angles": 0.0, "pose_prior": 0.0}
+    method = dvae.method("gsps", **small)  # its other options are chosen by the skeleton
+    first, again = (sweep([method], data, tmp_path, [0], TRAINING, jobs=1) for _ in range(2))
+    assert [outcome.status for outcome in (*first, *again)] == ["finished"] * 2
+    assert again[0].seconds == 0
 
 
 def test_ctrl_c_in_a_sweep_of_one_job_is_the_sweeps(data, tmp_path):

@@ -220,11 +220,16 @@ def load_pose_prior(path: str | Path, skeleton: Skeleton, heading: bool) -> Pose
         ValueError: a run of something else, of another skeleton, or of other options.
     """
     config = Run(path).config
-    options = config.get("method", {})
-    known = config.get("schema", {}).get("skeleton", {}).get("parents", skeleton.parents)
-    if options.get("method") != PosePrior.name or tuple(known) != skeleton.parents:
+    try:
+        options = config["method"]
+        parents = config["schema"]["skeleton"]["parents"] if "schema" in config else skeleton.parents
+        fits = options["method"] == PosePrior.name and tuple(parents) == skeleton.parents
+        given = options["heading"], options["layers"]
+    except (KeyError, TypeError):
+        fits = False
+    if not fits:
         raise ValueError(f"{path} holds no pose prior of the skeleton {skeleton.name!r}")
-    if (options["heading"], options["layers"]) != (heading, PosePrior.layers):
+    if given != (heading, PosePrior.layers):
         raise ValueError(
             f"{path} was fitted with heading={options['heading']} and layers={options['layers']}, but this model sees "
             f"poses with heading={heading}, and takes a prior of {PosePrior.layers} layers"
