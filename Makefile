@@ -16,8 +16,8 @@ BIN := .venv/bin
 export OMP_NUM_THREADS := 1
 
 # Numerical tests, for the second run: other instructions round otherwise.
-NUMERICAL := laws/test_laws.py networks/test_networks.py networks/test_graphconv.py test_oracle.py program/test_model.py models/test_trajectories.py motion/test_control.py \
-	motion/test_forecasts.py $(addprefix inference/test_,bounds.py compare.py metrics.py particles.py)
+NUMERICAL := laws/test_laws.py networks/test_networks.py networks/test_graphconv.py test_oracle.py program/test_model.py \
+	models/test_trajectories.py motion/test_control.py motion/test_forecasts.py $(addprefix inference/test_,bounds.py compare.py metrics.py particles.py)
 
 .PHONY: venv demo lint quick test fuzz coverage bench notebooks docs dist clean
 
@@ -46,7 +46,7 @@ lint: venv
 
 test: lint
 	$(BIN)/pytest -n 2
-	ATEN_CPU_CAPABILITY=default $(BIN)/pytest -n 2 $(addprefix tests/,$(NUMERICAL))
+	ATEN_CPU_CAPABILITY=default $(BIN)/pytest -n 2 -m "not slow" $(addprefix tests/,$(NUMERICAL))
 
 SECONDS := 600
 SEED := $(shell date +%s)

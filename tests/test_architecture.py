@@ -5,6 +5,7 @@ import importlib
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import networkx as nx
@@ -30,6 +31,7 @@ MOTION = re.compile(
 )
 
 
+@cache
 def sources():
     """Module name -> file, without going through the links."""
     files = [path for path in (ROOT / "dvae").rglob("*.py") if not {"models", "inference"} & set(path.parts)]

@@ -31,7 +31,7 @@ from hypothesis.strategies import SearchStrategy
 
 Example = TypeVar("Example")
 
-SECONDS = float(os.environ.get("DVAE_FUZZ_SECONDS", "60"))
+SECONDS = float(os.environ.get("DVAE_FUZZ_SECONDS", "30"))
 """Of all tests together."""
 
 SEED = int(os.environ.get("DVAE_FUZZ_SEED", "0"))
