@@ -29,7 +29,8 @@ class View:
     """What a model sees of the data; this view, all as it is.
 
     What a view finds in the data and needs for the way back, as a heading, it adds under a name of its own. Values
-    that were seen are seen as they are.
+    that were seen are seen as they are. It keeps volume, so that bounds of what is seen are bounds of the data: a scale
+    is for `DynamicalVAE.standardise`, whose densities stay in the variable's own unit.
     """
 
     names: tuple[str, ...] = ()

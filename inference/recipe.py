@@ -52,13 +52,19 @@ class Recipe:
         Args:
             model: as the method has built it.
             resume: continue the run in `out`.
-            **options: of `dvae.inference.fit.fit`: out, config, trackers, callbacks, and those of `Training`; the
-                steps are the recipe's.
+            **options: of `dvae.inference.fit.fit`: out, config, trackers, callbacks, and those of `Training`; steps and
+                self-feeding are the recipe's.
+
+        Raises:
+            ValueError: other steps than the recipe's, which are laid out over its own.
         """
+        steps = sum(stage.steps for stage in self.stages)
+        if options.get("steps", steps) != steps:
+            raise ValueError(f"this recipe is of {steps} steps, not {options['steps']}; ask the method for another")
         if not resume:
             with torch.random.fork_rng():
                 self.prepare(model)
-        options |= {"steps": sum(stage.steps for stage in self.stages), "self_feeding": self.feeding}
+        options |= {"steps": steps, "self_feeding": self.feeding}
         return fit(model, self.batches, self.validation, stages=self.stages, resume=resume, **options)
 
 

@@ -28,11 +28,17 @@ def load_run(path: Path, data: str | None) -> runs.Loaded:
 
 def data_of(run: runs.Loaded, path: str | None) -> Any:
     """The data of a run or, where a path leads to others, these under the protocol of the run."""
+    return _opened([run], path)
+
+
+def _opened(alike: Sequence[runs.Loaded], path: str | None) -> Any:
+    """`data_of` runs of one schema, opened once."""
     if path is None:
-        return run.data
-    found = run.on(path)
-    if not own(run, found):
-        note(f"{path} is not the data that {run.path} was fitted on")
+        return alike[0].data
+    found = alike[0].on(path)
+    for run in alike:
+        if not own(run, found):
+            note(f"{path} is not the data that {run.path} was fitted on")
     return found
 
 
@@ -52,8 +58,7 @@ def on_the_same_data(paths: Sequence[Path], path: str | None) -> tuple[list[runs
                 f"{other.path} has other test windows ({there}) than {first.path} ({here}); give runs of the same data "
                 "and protocol"
             )
-    opened, *_ = (data_of(run, path) for run in (loaded if path else loaded[:1]))
-    return loaded, opened
+    return loaded, _opened(loaded, path)
 
 
 def own(run: runs.Loaded, opened: Any) -> bool:

@@ -254,6 +254,13 @@ def test_every_method_takes_every_option_or_says_why_not(name, option):
     assert torch.isfinite(torch.cat([parameter.flatten() for parameter in model.parameters()])).all()
 
 
+def test_a_recipe_is_of_its_own_steps():
+    method = dvae.method("vae", latent=2)
+    recipe = method.train(Sequences({"x": torch.randn(4, 6, 3)}), steps=2)
+    with pytest.raises(ValueError, match="this recipe is of 2 steps, not 5; ask the method"):
+        recipe.fit(method.build({"x": 3}), steps=5)
+
+
 def test_options_of_the_loss_reach_it():
     schedules = dvae.inference.schedules
     method = dvae.method("hit-dvae", loss="evidence", warm_up=7, warm_up_shape="cosine", free_bits=0.3)
