@@ -21,7 +21,7 @@ from PIL import Image
 
 ROOT = Path(__file__).parents[2]
 PLOTLY = "application/vnd.plotly.v1+json"
-STEPS = re.compile(r"(\"(?:steps|warm_up)\": |Stage\(|method\.feeding\()(\d+)")
+SHARED = re.compile(r"(\b(?:steps|particles)=|\bStage\(|\"warm_up\": )(\d{3,})")  # a sequence has fewer steps than 100
 TEXTS = ("text/plain", "text/html", "text/latex")
 
 
@@ -30,12 +30,12 @@ def execute(path: Path, share: float = 1.0) -> nbformat.NotebookNode:
 
     Args:
         path: the notebook.
-        share: of the steps of training that are taken; fewer change no more than numbers and pictures.
+        share: of the steps of training, and of particles; fewer change no more than numbers and pictures.
     """
     notebook = nbformat.read(path, as_version=4)
     sources = [cell.source for cell in notebook.cells]
     for cell in notebook.cells:
-        cell.source = STEPS.sub(lambda found: f"{found[1]}{max(int(share * int(found[2])), 1)}", cell.source)
+        cell.source = SHARED.sub(lambda found: f"{found[1]}{max(int(share * int(found[2])), 1)}", cell.source)
     options = {"timeout": 1200, "kernel_name": "python3", "record_timing": False}
     client = NotebookClient(notebook, resources={"metadata": {"path": str(ROOT)}}, **options)
     own = {"PYTHONPATH": str(ROOT), "MPLBACKEND": "module://matplotlib_inline.backend_inline"}

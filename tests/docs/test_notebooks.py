@@ -1,6 +1,7 @@
 """The notebooks are stored with what they show, and a run from top to bottom shows the same."""
 
 import copy
+import re
 from pathlib import Path
 
 import nbformat
@@ -45,6 +46,13 @@ def test_a_notebook_is_stored_whole_with_its_pictures(path):
         drawn = any(word in cell.source for word in ("plt.show()", "animate(test", "animate(skeleton"))
         assert not drawn or any("image/png" in output.get("data", {}) for output in cell.outputs)
     assert str(ROOT) not in path.read_text(encoding="utf-8")
+
+
+@each_notebook
+def test_a_share_is_taken_of_all_training(path):
+    code = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    trained = [source for source in code if re.search(r"\.fit\(", source)]
+    assert all(notebooks.SHARED.search(source) for source in trained)
 
 
 def test_notebooks_are_small():
