@@ -1,6 +1,7 @@
 """What every test starts from: the same seeds, an empty parameter store; and what it must leave as it was."""
 
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ import torch
 from hypothesis import settings
 
 import dvae.program
+import dvae.runs.directory
 
 # A shell has what it starts in the background ignore Ctrl-C, and so would all that is started from there.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -59,6 +61,22 @@ def walkers() -> Any:
 def windows(walkers: Any) -> Any:
     """Their training windows."""
     return walkers.windows("train")
+
+
+@pytest.fixture(scope="session")
+def fitted(people: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run directory of a small model of those people, after ten steps; nobody writes to it."""
+    out = tmp_path_factory.mktemp("runs") / "fitted"
+    training = dvae.Training(steps=10, batch_size=4, validate_every=5, progress=False)
+    method = dvae.method("vae", latent=3, warm_up=4)
+    dvae.runs.directory.fit_run(method, dvae.motion.MotionData.open(people), out, training)
+    return out
+
+
+@pytest.fixture
+def run(fitted: Path, tmp_path: Path) -> Path:
+    """A copy of it, or of what a module calls `fitted`, to be used up."""
+    return Path(shutil.copytree(fitted, tmp_path / "run"))
 
 
 def global_state() -> dict[str, Any]:

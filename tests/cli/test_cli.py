@@ -26,19 +26,6 @@ SMALL = ["--batch-size", "4", "--warm-up", "4", "--latent", "3", "--validate-eve
 EQUATIONS = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t)", "--inference", "q(z_t | x_{t:T}, z_{t-1})"]
 
 
-@pytest.fixture(scope="module")
-def fitted(people, tmp_path_factory):
-    out = tmp_path_factory.mktemp("runs") / "fitted"
-    assert main(["fit", "vae", "--data", str(people), "--out", str(out), "--steps", "10", *SMALL]) == 0
-    return out
-
-
-@pytest.fixture
-def run(fitted, tmp_path):
-    """A copy of a run, to be damaged."""
-    return Path(shutil.copytree(fitted, tmp_path / "run"))
-
-
 def failure(capsys, *arguments, code=1):
     """The sentence with which a command fails."""
     assert main(list(arguments)) == code

@@ -613,11 +613,7 @@ def test_names_are_no_markup():
         assert name in text
 
 
-def test_the_command_criticises_a_run(people, tmp_path, capsys, monkeypatch):
-    run = tmp_path / "run"
-    small = ["--batch-size", "4", "--warm-up", "4", "--latent", "2", "--steps", "5", "--validate-every", "5"]
-    assert main(["fit", "vae", "--data", str(people), "--out", str(run), *small]) == 0
-    capsys.readouterr()
+def test_the_command_criticises_a_run(run, tmp_path, capsys, monkeypatch):
     options = ["--simulations", "20", "--draws", "9", "--ranked-steps", "2", "--samples", "19"]
     assert main(["criticise", str(run), *options, "--figure", str(tmp_path / "figure.png")]) == 0
     printed = capsys.readouterr().out

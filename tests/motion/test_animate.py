@@ -17,14 +17,14 @@ MILLIMETRE = 1e-3
 
 
 @pytest.fixture(scope="module")
-def people():
+def clips():
     return motion.simulate(clips=4, frames=NOW + HORIZON, seed=2)
 
 
 @pytest.fixture(scope="module")
-def bodies(people):
+def bodies(clips):
     """(observed, samples, truth) of walking people."""
-    positions = np.stack([clip.positions for clip in people])
+    positions = np.stack([clip.positions for clip in clips])
     return positions[0, :NOW], positions[1:, NOW:], positions[0, NOW:]
 
 
@@ -129,9 +129,9 @@ def test_fixed_joints_are_told_apart_in_samples_only(bodies):
     )
 
 
-def test_a_motion_is_played_alone(people):
-    clip = people.clips[0]
-    figure = animate(people.skeleton, clip.positions.tolist(), every=1)
+def test_a_motion_is_played_alone(clips):
+    clip = clips.clips[0]
+    figure = animate(clips.skeleton, clip.positions.tolist(), every=1)
     assert len(figure.frames) == clip.frames
     assert len(figure.frames[0].data) == 1
     assert figure.layout.sliders[0].steps[0].label == "0.00"
@@ -219,10 +219,10 @@ def test_a_notebook_shows_it(bodies, monkeypatch):
 
 
 @pytest.fixture
-def forecasts(people, bodies):
+def forecasts(clips, bodies):
     observed, samples, truth = bodies
     return motion.Forecasts(
-        people.skeleton,
+        clips.skeleton,
         [("test", "walk", 0), ("test", "stand", 40)],
         np.stack([samples, samples[:, :1].repeat(HORIZON, 1)], 1),
         np.stack([observed, observed[:1].repeat(NOW, 0)]),
@@ -300,12 +300,9 @@ def test_the_command_plays_what_dvae_forecast_wrote(forecasts, tmp_path, capsys)
     assert "no run directory" in failure(capsys, file, "--out", page, "--data", "simulated", code=2)
 
 
-def test_the_command_plays_a_run_and_its_data(tmp_path, capsys):
-    data, run, page = (tmp_path / name for name in ("people.npz", "run", "page.html"))
+def test_the_command_plays_a_run_and_its_data(run, tmp_path, capsys):
+    data, page = tmp_path / "people.npz", tmp_path / "page.html"
     motion.save(data, motion.simulate(clips=14, frames=80, seed=1))
-    small = ["--steps", "2", "--batch-size", "4", "--warm-up", "2", "--latent", "3"]
-    assert main(["fit", "vae", "--data", str(data), "--out", str(run), *small]) == 0
-    capsys.readouterr()
     options = ["--out", str(page), "--every", "15"]
     assert main(["animate", str(run), *options, "--samples", "2"]) == 0
     assert re.search(r"window \d, test/person_\d+ from frame \d+: 2 futures", capsys.readouterr().err)

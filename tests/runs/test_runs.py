@@ -5,7 +5,6 @@ import io
 import json
 import math
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -42,12 +41,6 @@ def fitted(people, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "fitted"
     runs.fit_run(METHOD, MotionData.open(people), out, TRAINING)
     return out
-
-
-@pytest.fixture
-def run(fitted, tmp_path):
-    """A copy of a run, to be damaged."""
-    return Path(shutil.copytree(fitted, tmp_path / "run"))
 
 
 @pytest.fixture
