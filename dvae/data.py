@@ -17,11 +17,12 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import Protocol, runtime_checkable  # typing's own, in Python 3.11, evaluates properties
 
 Batch = Mapping[str, Any]
 

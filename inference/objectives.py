@@ -8,9 +8,10 @@ model selection reads `Terms.bound`.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal
 
 from torch import Tensor
+from typing_extensions import Protocol, runtime_checkable
 
 from .schedules import Schedule, from_config, schedule, to_config
 

@@ -7,9 +7,10 @@ own, whatever it is made of, is `Forecasting`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from torch import Tensor
+from typing_extensions import Protocol, runtime_checkable
 
 from ..notation import Factorization
 
