@@ -1,7 +1,7 @@
 """Units: the mean and the spread of a variable, in which networks read it and make it.
 
-A network that must find them out first learns much more slowly: in metres, what varies between poses is a tenth of what
-they share. Densities and all that a program returns stay in the variable's own unit.
+A network that must find them out first learns much more slowly where what varies is a tenth of what is always there.
+Densities and all that a program returns stay in the variable's own unit.
 
 Units are no view of the data (`dvae.views`), though they are a bijection with the same way back and its determinant.
 Latents and context have them too, of which nothing is handed out in another unit. And a law is put into the data's

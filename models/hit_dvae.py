@@ -50,7 +50,7 @@ from ..inference.training import Stage
 from ..motion import Skeleton, energies
 from ..motion.body import body_parts
 from ..motion.protocols import Poses
-from ..networks import Attention, FrameGraph, NetworkSpec, PoseGraph, Recurrent, SelfAttention
+from ..networks import Attention, FrameGraph, NetworkSpec, NodeGraph, Recurrent, SelfAttention
 from ..networks.extract import share
 from ..notation import Factorization
 from ..options import Amount, Delay, Extra, Layers, Range, Share, Size
@@ -204,7 +204,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 
     def networks(self) -> Mapping[str, NetworkSpec]:
         """The paper's networks, or LSTMs; `build` shares the features of poses."""
-        poses = {"x": PoseGraph(self.pose_width)} if self.pose_width else {}
+        poses = {"x": NodeGraph(self.pose_width, coordinates=3)} if self.pose_width else {}
         decoder = self.decoder or PRESETS[""]["decoder"]
         shape: dict[str, Any] = {"heads": self.heads_count, "layers": self.layers, "extract": poses}
         found: dict[str, NetworkSpec] = {}

@@ -31,7 +31,7 @@ from typing_extensions import override
 from ..laws.base import Law, LawSpec, Parameters, Shape
 from ..laws.families import FixedNormal, Normal, NormalLaw
 from ..motion import Skeleton
-from ..networks import CosineEncoder, MotionDecoder, NetworkSpec
+from ..networks import CosineDecoder, CosineEncoder, NetworkSpec
 from ..networks.base import share_modules
 from ..notation import Factorization
 from ..options import Extra, Layers, Range, Size
@@ -135,7 +135,7 @@ class TrajeVAE(TrajectoryMethod):
         found: dict[str, NetworkSpec] = {"q(z)": encoder}
         if self.learned_prior:
             found["p(z)"] = encoder
-        return {**found, "p(x)": MotionDecoder(hidden=2 * shape["width"], **shape)}
+        return {**found, "p(x)": CosineDecoder(hidden=2 * shape["width"], **shape)}
 
     def laws(self) -> Mapping[str, LawSpec]:
         """The decoder makes poses; normal latents, of which those beyond `components` are noise that nothing reads."""

@@ -72,6 +72,21 @@ def test_motion_is_imported_by_its_own_methods_and_commands_alone():
             assert not [target for target in imports(module, path) if layer(target) == LAYERS["dvae.motion"]], module
 
 
+def words(path):
+    """Those of which the names in a module are made."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        name = next((getattr(node, field) for field in ("name", "id", "attr", "arg") if hasattr(node, field)), None)
+        yield from re.findall(r"[a-z]+", re.sub("([A-Z])", r"_\1", name or "").lower())
+
+
+def test_the_core_has_no_name_for_a_joint():
+    for module, path in sources().items():
+        if not layer(module):
+            assert not {*words(path)} & {"joints", "pose", "poses", "skeleton", "limb", "limbs", "bone", "bones"}, (
+                module
+            )
+
+
 def definitions(path):
     """Public classes, functions and types that a module defines, by name."""
     for node in ast.parse(path.read_text(encoding="utf-8")).body:

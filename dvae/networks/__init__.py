@@ -2,25 +2,25 @@
 
 from .attention import Attention, SelfAttention
 from .base import Input, Network, NetworkSpec
-from .cosine import CosineEncoder, MotionDecoder
+from .cosine import CosineDecoder, CosineEncoder
 from .dense import Dense
 from .graphconv import GraphConv
+from .graphs import FrameGraph, NodeGraph
 from .linear import Linear
-from .posegraph import FrameGraph, PoseGraph
 from .recurrent import Recurrent
 
 __all__ = [
     "Attention",
+    "CosineDecoder",
     "CosineEncoder",
     "Dense",
     "FrameGraph",
     "GraphConv",
     "Input",
     "Linear",
-    "MotionDecoder",
     "Network",
     "NetworkSpec",
-    "PoseGraph",
+    "NodeGraph",
     "Recurrent",
     "SelfAttention",
 ]

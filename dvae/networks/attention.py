@@ -37,10 +37,10 @@ class Attention:
         layers: cross-attention layers over the same keys.
         feedforward: width of the perceptron after each attention; 0 for four times the width.
         activation: of the perceptrons.
-        nearest: the nearest visible frame of each range joins the query, which then knows where in a motion it is
+        nearest: the nearest visible frame of each range joins the query, which then knows where in a sequence it is
             before it attends to more.
         extract: what comes before all else, by parent: widths of a perceptron, or the description of another module,
-            such as `PoseGraph()`.
+            such as `NodeGraph()`.
     """
 
     width: int = 64

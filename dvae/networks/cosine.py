@@ -1,16 +1,16 @@
-"""CosineEncoder and MotionDecoder: transformers between a motion and the cosine coefficients of a latent sequence.
+"""CosineEncoder and CosineDecoder: transformers between a sequence and the cosine coefficients of a latent one.
 
-Step k of the latent is its coefficient k. The encoder reads what is given over time, and what the body was like at
-first, and changes over to coefficients half way:
+Step k of the latent is its coefficient k. The encoder reads what is given over time, and the first step s of all, and
+changes over to coefficients half way:
 
     h_t = transformer([f(y_t); g(s)] + position)        features_k = transformer(sum_t basis_{kt} h_t)
 
-The decoder goes back in time, and makes a motion by its offsets from the first pose:
+The decoder goes back in time, and makes a sequence by its offsets from the first step:
 
     o_t = transformer(f([sum_k basis_{kt} z_k; g(s)]) + position)        x_t = s + o_1 + ... + o_t
 
 Everything is parallel in time. TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with the layers of its
-public implementation. Ours: a decoder starts near the motion that stands still.
+public implementation. Ours: a decoder starts near the sequence that stays where it begins.
 """
 
 from __future__ import annotations
@@ -63,36 +63,29 @@ class CosineEncoder:
 
 
 @dataclass(frozen=True)
-class MotionDecoder:
-    """Poses (B, T, D) from coefficients, a parent over time, and from a static parent of size D, the first pose.
+class CosineDecoder(CosineEncoder):
+    """A sequence (B, T, D) from coefficients, a parent over time, and from a static parent of size D, its first step.
 
     A further parent over all time joins the coefficients, once they are back in time.
 
     Args:
         width: W, features of the static parent.
-        hidden: features in time.
         components: C, coefficients that are read; 0 for all.
-        feedforward, heads, layers, dropout, cosine: see `CosineEncoder`; there is one transformer.
+        feedforward, heads, layers, dropout, cosine: as of `CosineEncoder`; there is one transformer.
+        hidden: features in time.
         latent: name of the parent that holds coefficients.
     """
 
-    width: int = 256
     hidden: int = 512
-    components: int = 0
-    feedforward: int = 512
-    heads: int = 4
-    layers: int = 2
-    dropout: float = 0.1
-    cosine: bool = True
     latent: str = "z"
 
-    def build(self, inputs: Sequence[Input], local: bool, size: int) -> MotionDecoderNetwork:
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineDecoderNetwork:  # type: ignore[override]
         """The network of a factor with these parents.
 
         Raises:
             ValueError: other parents, or a static child.
         """
-        return MotionDecoderNetwork(self, inputs, local, size)
+        return CosineDecoderNetwork(self, inputs, local, size)
 
 
 def _apart(network: Network, spec: Any) -> tuple[list[Input], Input]:
@@ -129,8 +122,8 @@ class CosineEncoderNetwork(AtOnce):
         """No sequence is padded."""
         self.refuse_ragged(lengths)
         source, static = (parents[name] for name in self.names)
-        body = once(self.static, [static], partial(self.static, static))
-        hidden = torch.cat([self.over_time(source), body[:, None].expand(-1, length, -1)], dim=-1)
+        first = once(self.static, [static], partial(self.static, static))
+        hidden = torch.cat([self.over_time(source), first[:, None].expand(-1, length, -1)], dim=-1)
         hidden = self.before(self.dropout(hidden + positions(length, self.features, hidden)))
         if self.spec.cosine:
             components = min(self.spec.components or length, length)
@@ -138,16 +131,16 @@ class CosineEncoderNetwork(AtOnce):
         return functional.pad(self.after(self.between(hidden)), (0, 0, 0, length - hidden.shape[1]))
 
 
-class MotionDecoderNetwork(AtOnce):
-    """What `MotionDecoder` describes. Networks may share `static`."""
+class CosineDecoderNetwork(AtOnce):
+    """What `CosineDecoder` describes. Networks may share `static`."""
 
-    def __init__(self, spec: MotionDecoder, inputs: Sequence[Input], local: bool, size: int):
+    def __init__(self, spec: CosineDecoder, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)
         over_time, static = _apart(self, spec)
         sizes = {parent.name: parent.size for parent in over_time}
         if spec.latent not in sizes or static.size != size:
             raise ValueError(
-                f"MotionDecoder makes poses of size {size} from {spec.latent}_{{1:T}} and a first pose of that size; "
+                f"CosineDecoder makes steps of size {size} from {spec.latent}_{{1:T}} and a first step of that size; "
                 f"it was given {', '.join(f'{p.name} of size {p.size}' for p in self.inputs)}"
             )
         self.spec, self.first = spec, static.name
@@ -157,7 +150,7 @@ class MotionDecoderNetwork(AtOnce):
         self.into = nn.Sequential(*_layer(into, spec.hidden), nn.Linear(spec.hidden, spec.hidden))
         self.transformer: Any = transformer(spec.hidden, spec)
         last = nn.Linear(spec.hidden, size)
-        with torch.no_grad():  # summed up over time, offsets of the usual size would lead tens of metres away
+        with torch.no_grad():  # summed up over time, offsets of the usual size would lead far away
             for parameter in last.parameters():
                 parameter.mul_(0.01)
         self.offsets = nn.Sequential(*_layer(spec.hidden, spec.hidden), last)
@@ -172,8 +165,8 @@ class MotionDecoderNetwork(AtOnce):
         values = values[:, :components]
         if self.spec.cosine:
             values = _basis(length, components, values).T @ values
-        body = once(self.static, [first], partial(self.static, first))
-        joined = [body[:, None].expand(-1, length, -1), values, *(parents[name] for name in self.others)]
+        start = once(self.static, [first], partial(self.static, first))
+        joined = [start[:, None].expand(-1, length, -1), values, *(parents[name] for name in self.others)]
         hidden = self.into(torch.cat(joined, dim=-1))
         hidden = self.transformer(self.dropout(hidden + positions(length, hidden.shape[-1], hidden)))
         offsets: Tensor = self.offsets(hidden)
@@ -224,7 +217,7 @@ class TransformerLayer(nn.TransformerEncoderLayer):
 
 
 def two_layers(size: int, width: int) -> nn.Sequential:
-    """Two layers with normalisation, pose by pose."""
+    """Two layers with normalisation, step by step."""
     return nn.Sequential(*_layer(size, width), *_layer(width, width))
 
 
@@ -232,7 +225,7 @@ def _layer(size: int, out: int) -> list[nn.Module]:
     return [nn.Linear(size, out), nn.LayerNorm(out), nn.LeakyReLU(0.1)]
 
 
-def transformer(size: int, spec: CosineEncoder | MotionDecoder) -> nn.TransformerEncoder:
+def transformer(size: int, spec: CosineEncoder) -> nn.TransformerEncoder:
     """A transformer's encoder, normalised behind each layer and at its end."""
     layer = TransformerLayer(size, spec.heads, spec.feedforward, spec.dropout, batch_first=True)
     made = nn.TransformerEncoder(layer, spec.layers, nn.LayerNorm(size), enable_nested_tensor=False)

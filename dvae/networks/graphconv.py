@@ -1,12 +1,12 @@
-"""GraphConv: residual graph convolutions over the joints of a body, on the cosine coefficients of their trajectories.
+"""GraphConv: residual graph convolutions over nodes, on the cosine coefficients of their trajectories.
 
     H' = tanh(BN(A H W + b))
 
-A is a free matrix over joints, learned, one per layer. The layers see a whole trajectory at once as its first C
+A is a free matrix over nodes, learned, one per layer. The layers see a whole trajectory at once as its first C
 coefficients; and so they make one, for all steps together.
 
 Mao, Liu, Salzmann and Li, 2019, arXiv 1908.05436 (the network); Mao, Liu and Salzmann, 2021, arXiv 2108.08422 (one for
-every part of the body), with the layers of its public implementation.
+every part of the nodes), with the layers of its public implementation.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from .dct import cosine_basis
 
 @dataclass(frozen=True)
 class GraphConv:
-    """Trajectories of some joints from those of others, and from static parents, which every joint reads.
+    """Trajectories of some nodes from those of others, and from static parents, which every node reads.
 
     Args:
-        joints: name of every local variable, parents and child, to the joints that it holds, three coordinates each.
-            One parent holds all joints: it is what the network starts from, and others take their joints' place in it.
+        nodes: name of every local variable, parents and child, to the nodes that it holds, of as many coordinates each.
+            One parent holds all nodes: it is what the network starts from, and others take their nodes' place in it.
         child: the name of the child.
         length: T, the steps of every sequence.
         coefficients: C, of T, that are kept.
-        width: features of a joint.
+        width: features of a node.
         blocks: residual blocks, of two convolutions each.
     """
 
-    joints: Mapping[str, Sequence[int]]
+    nodes: Mapping[str, Sequence[int]]
     child: str
     length: int
     coefficients: int = 10
@@ -52,7 +52,7 @@ class GraphConv:
         """The network of a factor with these parents.
 
         Raises:
-            ValueError: the parents or the joints are not as this network needs them.
+            ValueError: the parents or the nodes are not as this network needs them.
         """
         return GraphConvNetwork(self, inputs, local, size)
 
@@ -62,31 +62,34 @@ class GraphConvNetwork(AtOnce):
 
     def __init__(self, spec: GraphConv, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)
-        own, coefficients = list(spec.joints[spec.child]), spec.coefficients
-        if not local or size != 3 * len(own):
+        own, coefficients = list(spec.nodes[spec.child]), spec.coefficients
+        self.spec, self.own, self.coordinates = spec, own, size // len(own)
+        if not local or size % len(own):
             raise ValueError(
-                f"GraphConv makes the trajectories of {len(own)} joints, (B, T, {3 * len(own)}), for a local variable "
-                f"{spec.child}, not of size {size}"
+                f"GraphConv makes the trajectories of {len(own)} nodes, all of as many coordinates, for a local "
+                f"variable {spec.child}, not of size {size}"
             )
-        self.spec, self.own = spec, own
         self.trajectories: list[tuple[str, list[int], int]] = []
         for parent in self.inputs:
             if parent.relation is None:
                 continue
-            held = list(spec.joints.get(parent.name, ()))
-            if parent.size != 3 * len(held):
-                raise ValueError(f"{parent.name} has size {parent.size}, but GraphConv was told of joints {held} in it")
+            held = list(spec.nodes.get(parent.name, ()))
+            if parent.size != self.coordinates * len(held):
+                raise ValueError(
+                    f"{parent.name} has size {parent.size}, but GraphConv was told of nodes {held} in it, of "
+                    f"{self.coordinates} coordinates"
+                )
             self.trajectories.append((parent.name, held, _seen(parent, spec.length)))
         self.trajectories.sort(key=lambda trajectory: -len(trajectory[1]))
         if not self.trajectories or sorted(self.trajectories[0][1]) != list(range(len(self.trajectories[0][1]))):
             raise ValueError(
-                "GraphConv starts from a parent that holds every joint, such as the history h_{1:O}; the parents are "
+                "GraphConv starts from a parent that holds every node, such as the history h_{1:O}; the parents are "
                 f"{', '.join(parent.name for parent in self.inputs)}"
             )
         cosine_basis(spec.length, coefficients)  # refuses too many
         self.statics = [parent.name for parent in self.inputs if parent.relation is None]
         nodes = len(self.trajectories[0][1])
-        self.inner = 3 * coefficients
+        self.inner = self.coordinates * coefficients
         into = self.inner + sum(parent.size for parent in self.inputs if parent.relation is None)
         self.first: Any = _Convolution(nodes, into, spec.width, normalised=True)
         self.rest: Any = nn.ModuleList(
@@ -115,22 +118,22 @@ class GraphConvNetwork(AtOnce):
         hidden = self.first(joined)
         for block in self.rest:
             hidden = hidden + block(hidden)
-        made: Tensor = (self.last(hidden) + joined)[:, self.own, : self.inner]  # (B, own joints, 3 C)
-        made = made.unflatten(-1, (3, -1)).flatten(1, 2).to(known.dtype)
+        made: Tensor = (self.last(hidden) + joined)[:, self.own, : self.inner]  # (B, own nodes, coordinates * C)
+        made = made.unflatten(-1, (self.coordinates, -1)).flatten(1, 2).to(known.dtype)
         with torch.autocast(made.device.type, enabled=False):
             return (made @ self._transform(length, made)).transpose(1, 2)
 
     def _coefficients(self, parents: Mapping[str, Tensor]) -> Tensor:
-        """(B, joints, 3 C): coefficients of x, then of y, then of z."""
+        """(B, nodes, coordinates * C): coefficients of the first coordinate, then of the second, and so on."""
         known: Tensor | None = None
-        for name, joints, seen in self.trajectories:
+        for name, nodes, seen in self.trajectories:
             values = parents[name][:, :seen]
-            found = (self._transform(seen, values) @ values).transpose(1, 2)  # (B, 3 joints, C)
-            found = found.unflatten(1, (-1, 3)).flatten(2)
+            found = (self._transform(seen, values) @ values).transpose(1, 2)  # (B, nodes * coordinates, C)
+            found = found.unflatten(1, (-1, self.coordinates)).flatten(2)
             if known is None:
-                known = found[:, torch.tensor(joints).argsort()]
+                known = found[:, torch.tensor(nodes).argsort()]
             else:
-                known = known.index_copy(1, torch.tensor(joints, device=known.device), found)
+                known = known.index_copy(1, torch.tensor(nodes, device=known.device), found)
         assert known is not None
         return known
 
@@ -139,17 +142,17 @@ class GraphConvNetwork(AtOnce):
 
 
 class _Convolution(nn.Module):
-    """A H W + b over (B, joints, features), with a normalisation over the batch and tanh behind it if it has one."""
+    """A H W + b over (B, nodes, features), with a normalisation over the batch and tanh behind it if it has one."""
 
-    def __init__(self, joints: int, features: int, out: int, bias: bool = True, normalised: bool = False):
+    def __init__(self, nodes: int, features: int, out: int, bias: bool = True, normalised: bool = False):
         super().__init__()
 
         def uniform(*shape: int) -> nn.Parameter:
             return nn.Parameter(torch.empty(shape).uniform_(-1, 1) / math.sqrt(out))
 
-        self.weight, self.adjacency = uniform(features, out), uniform(joints, joints)
+        self.weight, self.adjacency = uniform(features, out), uniform(nodes, nodes)
         self.bias = uniform(out) if bias else None
-        self.norm: Any = nn.BatchNorm1d(joints * out) if normalised else None
+        self.norm: Any = nn.BatchNorm1d(nodes * out) if normalised else None
 
     def forward(self, nodes: Tensor) -> Tensor:
         nodes = nodes @ self.weight
@@ -160,7 +163,7 @@ class _Convolution(nn.Module):
 
 
 class _Mix(Function):
-    """A H over (B, joints, features).
+    """A H over (B, nodes, features).
 
     A batched product on a view of A: matmul and einsum would copy H to and fro. The gradient of A is one long product
     in place of B small ones. Forward and backward take a third of the time of einsum's.

@@ -52,7 +52,7 @@ class Recurrent:
             are then their concatenation.
         activation: "tanh", "relu", "gelu" or "elu".
         extract: what comes before all else, by parent: widths of a perceptron, or the description of another module,
-            such as `PoseGraph()`. Outside the sequence what it gives is 0.
+            such as `NodeGraph()`. Outside the sequence what it gives is 0.
         separate: a forward and a backward state for each parent, in place of one for all.
         apart: a parent read over {<=t} enters the forward network up to t-1, and joins with its value at t.
         stack: the backward network reads the forward states too, and alone joins. Only for parents read over {1:T}.

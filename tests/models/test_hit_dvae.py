@@ -13,7 +13,7 @@ from dvae.models.hit_dvae import PRESETS, HiTModel
 from dvae.models.registry import configured
 from dvae.motion import energies
 from dvae.motion.body import body_parts
-from dvae.networks.posegraph import PoseFeatures
+from dvae.networks.graphs import NodeFeatures
 from dvae.runs import directory as runs
 
 SMALL = {"latent": 3, "static": 2, "width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "samples": 3}
@@ -353,7 +353,7 @@ def test_without_a_skeleton_there_are_the_equations_and_their_networks():
 @pytest.mark.parametrize("loss", ["best-of-many", "evidence"])
 def test_only_poses_go_through_pose_graphs(windows, loss):
     def graphs(model):
-        return any(isinstance(module, PoseFeatures) for module in model.modules())
+        return any(isinstance(module, NodeFeatures) for module in model.modules())
 
     method = dvae.method("hit-dvae", loss=loss)
     assert not graphs(method.build({"x": windows.size}))  # numbers that nobody called joints

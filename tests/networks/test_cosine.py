@@ -8,7 +8,7 @@ import torch
 from scipy.fft import dct, idct
 from scipy.stats import binomtest
 
-from dvae.networks import CosineEncoder, MotionDecoder
+from dvae.networks import CosineDecoder, CosineEncoder
 from dvae.networks.base import Input, share_modules
 from dvae.networks.cosine import Dropout, TransformerLayer, positions
 from dvae.relations import Relation
@@ -24,7 +24,7 @@ def encoder(**options):
 
 def decoder(**options):
     inputs = [Input("z", 4, ALL), *options.pop("others", ()), Input("s", 9)]
-    return MotionDecoder(hidden=12, **{**SMALL, **options}).build(inputs, True, 9).double().eval()
+    return CosineDecoder(hidden=12, **{**SMALL, **options}).build(inputs, True, 9).double().eval()
 
 
 def values(**sizes):
@@ -155,8 +155,8 @@ def test_dropout_is_in_training_alone():
             lambda: CosineEncoder(**SMALL).build([Input("y", 9, Relation.parse("<t")), Input("s", 9)], True, 4),
             "reads one parent over all time",
         ),
-        (lambda: MotionDecoder(**SMALL).build([Input("z", 4, ALL), Input("s", 8)], True, 9), "s of size 8"),
-        (lambda: MotionDecoder(**SMALL).build([Input("y", 4, ALL), Input("s", 9)], True, 9), r"from z_\{1:T\}"),
+        (lambda: CosineDecoder(**SMALL).build([Input("z", 4, ALL), Input("s", 8)], True, 9), "s of size 8"),
+        (lambda: CosineDecoder(**SMALL).build([Input("y", 4, ALL), Input("s", 9)], True, 9), r"from z_\{1:T\}"),
     ],
 )
 def test_what_they_refuse(run, message):

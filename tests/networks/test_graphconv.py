@@ -30,6 +30,17 @@ def parents(batch=3):
     return {name: torch.randn(shape, dtype=torch.float64) for name, shape in sizes.items()}
 
 
+@pytest.mark.parametrize("coordinates", [1, 2, 3])
+def test_nodes_have_any_number_of_coordinates_and_keep_their_order(coordinates):
+    net = GraphConv({"h": [2, 0, 1], "x": [1]}, "x", 6, 6, 5, 1)
+    net = net.build([Input("h", 3 * coordinates, FIRST)], True, coordinates).double().eval()
+    for parameter in net.last.parameters():
+        torch.nn.init.zeros_(parameter)  # what is left is the way around the layers
+    h = torch.randn(2, 6, 3 * coordinates, dtype=torch.float64)
+    stays = torch.cat([h[:, :OBSERVED], h[:, OBSERVED - 1 : OBSERVED].expand(-1, 2, -1)], 1)
+    torch.testing.assert_close(net({"h": h}, 6), stays[..., 2 * coordinates :], rtol=0, atol=1e-12)
+
+
 def test_the_basis_is_scipys_orthonormal_transform():
     values = np.random.default_rng(0).normal(size=(7, 3))
     assert np.allclose(cosine_basis(7, 7).numpy() @ values, dct(values, axis=0, norm="ortho"), atol=1e-14, rtol=0)
@@ -126,7 +137,7 @@ def test_step_by_step_is_all_at_once():
         (lambda: GraphConv(EVERYTHING, "lower", 9, 3).build([Input("h", 12, ALL)], True, 6), "h has size 12"),
         (
             lambda: GraphConv(EVERYTHING, "upper", 9, 3).build([Input("lower", 6, ALL)], True, 9),
-            "starts from a parent that holds every joint",
+            "starts from a parent that holds every node",
         ),
         (
             lambda: GraphConv(EVERYTHING, "lower", 9, 3).build([Input("h", 15, Relation.parse("<t"))], True, 6),

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvae.networks import Attention, Dense, FrameGraph, Input, Linear, PoseGraph, Recurrent, SelfAttention
+from dvae.networks import Attention, Dense, FrameGraph, Input, Linear, NodeGraph, Recurrent, SelfAttention
 from dvae.networks.base import computing_once, shift
 from dvae.networks.recurrent import tie
 from dvae.relations import Relation
@@ -27,8 +27,8 @@ NETWORKS = {
     ),
     "attention": Attention(8, heads=2),
     "attention, two layers": Attention(8, heads=4, layers=2, feedforward=6),
-    "attention, extracted": Attention(8, heads=2, nearest=False, extract={"z": PoseGraph(2), "x": (3,), "w": (4,)}),
-    "lstm, poses": Recurrent(4, extract={"z": PoseGraph(2), "x": PoseGraph(2)}, hidden=(5,)),
+    "attention, extracted": Attention(8, heads=2, nearest=False, extract={"z": NodeGraph(2), "x": (3,), "w": (4,)}),
+    "lstm, poses": Recurrent(4, extract={"z": NodeGraph(2), "x": NodeGraph(2)}, hidden=(5,)),
     "dense": Dense((5, 4)),
 }
 RELATIONS = [
@@ -140,7 +140,7 @@ def encoder_inputs(pair):
 @pytest.mark.parametrize("pair", ENCODERS)
 def test_an_encoder_obeys_its_masks_step_by_step_and_in_ragged_batches(pair, layers):
     inputs, live = encoder_inputs(pair), ENCODERS[pair][1]
-    network = SelfAttention(8, heads=4, layers=layers, extract={"x": PoseGraph(2)}).build(inputs, True, 2).double()
+    network = SelfAttention(8, heads=4, layers=layers, extract={"x": NodeGraph(2)}).build(inputs, True, 2).double()
     parents = draw(inputs, 1)
     for parent in inputs:
         if parent.relation is not None:
@@ -162,7 +162,7 @@ def test_an_encoder_obeys_its_masks_step_by_step_and_in_ragged_batches(pair, lay
 def test_attention_can_be_looked_at():
     """Shares sum to one, nothing hidden has one, and the values they mix are what the layers go on with."""
     inputs = [Input("z", 2, Relation.parse("<t")), Input("x", 3, Relation.parse("1:T")), Input("w", 2)]
-    network = Attention(8, heads=2, layers=2, extract={"x": PoseGraph(2)}).build(inputs, True, 2).double()
+    network = Attention(8, heads=2, layers=2, extract={"x": NodeGraph(2)}).build(inputs, True, 2).double()
     parents = draw(inputs, 3)
     mixed = []
     for layer in network.layers:
@@ -187,7 +187,7 @@ def test_an_encoder_tells_past_from_future():
 
 @pytest.mark.parametrize("steps", [1, 3, 4, 6])
 def test_a_frame_graph_reads_the_first_frames_and_in_training_a_window_anywhere(steps):
-    network = FrameGraph(4, width=5, blocks=2, extract={"x": PoseGraph(2)})
+    network = FrameGraph(4, width=5, blocks=2, extract={"x": NodeGraph(2)})
     network = network.build([Input("x", 3, Relation.parse("1:T"))], False, 2).double()
     x = torch.randn(64, steps, 3, dtype=torch.float64)
     read = torch.autograd.functional.jacobian(lambda x: network.eval()({"x": x}, steps), x[:1])[0, :, 0]
@@ -204,8 +204,8 @@ def test_a_frame_graph_reads_the_first_frames_and_in_training_a_window_anywhere(
 
 
 @pytest.mark.parametrize(("size", "features"), [(6, 4), (4, 8)])
-def test_pose_features_are_the_published_convolutions_frame_by_frame(size, features):
-    module = PoseGraph(2).build(size).double()
+def test_node_features_are_the_published_convolutions_frame_by_frame(size, features):
+    module = NodeGraph(2, coordinates=3).build(size).double()
     poses = torch.randn(3, 5, size, dtype=torch.float64)
 
     def convolution(layer, nodes):

@@ -1,10 +1,10 @@
-"""PoseGraph and FrameGraph: graph convolutions over the joints of one pose, and over the frames of a short motion.
+"""NodeGraph and FrameGraph: graph convolutions over the coordinates of one frame, and over the frames of a window.
 
     H' = act(A H W + b)
 
 A is a free matrix over the nodes, learned, one per layer (Mao et al., 2019, arXiv 1908.05436). HiT-DVAE (Bie et al.,
-2022, arXiv 2204.01565) has the first before all its factors and sums up a motion by the second. Ours: poses are not
-normalised over the batch, which would let other frames into the features of one.
+2022, arXiv 2204.01565) has the first before all its factors and sums up a sequence by the second. Ours: frames are not
+normalised over the batch, which would let others into the features of one.
 """
 
 from __future__ import annotations
@@ -25,47 +25,47 @@ from .extract import Extract, Extractors
 
 
 @dataclass(frozen=True)
-class PoseGraph:
-    """Features of poses, frame by frame: an extractor of `Attention`, `SelfAttention`, `FrameGraph` and `Recurrent`.
-
-    A node is a joint, of three coordinates; where the size is no multiple of three, a coordinate.
+class NodeGraph:
+    """Features, frame by frame: an extractor of `Attention`, `SelfAttention`, `FrameGraph` and `Recurrent`.
 
     Args:
         width: features of a node.
         blocks: residual blocks, of two convolutions each.
+        coordinates: successive numbers that make a node; where the size is no multiple of that, each number is one.
     """
 
     width: int = 8
     blocks: int = 1
+    coordinates: int = 1
 
-    def build(self, size: int) -> PoseFeatures:
-        """The module for poses (..., size)."""
-        return PoseFeatures(self, size)
+    def build(self, size: int) -> NodeFeatures:
+        """The module for frames (..., size)."""
+        return NodeFeatures(self, size)
 
 
-class PoseFeatures(nn.Module):
-    """What `PoseGraph` describes: (..., D) to (..., nodes * width)."""
+class NodeFeatures(nn.Module):
+    """What `NodeGraph` describes: (..., D) to (..., nodes * width)."""
 
-    def __init__(self, spec: PoseGraph, size: int):
+    def __init__(self, spec: NodeGraph, size: int):
         super().__init__()
-        coordinates = 1 if size % 3 else 3
+        coordinates = 1 if size % spec.coordinates else spec.coordinates
         nodes = size // coordinates
         self.features = nodes * spec.width
-        self.first = PoseConvolution(nodes, coordinates, spec.width)
+        self.first = NodeConvolution(nodes, coordinates, spec.width)
         self.blocks: Any = nn.ModuleList(
-            nn.ModuleList(PoseConvolution(nodes, spec.width, spec.width) for _ in range(2)) for _ in range(spec.blocks)
+            nn.ModuleList(NodeConvolution(nodes, spec.width, spec.width) for _ in range(2)) for _ in range(spec.blocks)
         )
 
-    def forward(self, poses: Tensor) -> Tensor:
-        """Features of each pose."""
-        return self.hoisted()(poses)
+    def forward(self, frames: Tensor) -> Tensor:
+        """Features of each frame."""
+        return self.hoisted()(frames)
 
     def hoisted(self) -> Callable[[Tensor], Tensor]:
         """`forward` with the products of weights done, for a loop that calls it many times."""
         first, *others = (layer.product() for layer in (self.first, *(layer for b in self.blocks for layer in b)))
 
-        def features(poses: Tensor) -> Tensor:
-            found = torch.tanh(functional.linear(poses, *first))
+        def features(frames: Tensor) -> Tensor:
+            found = torch.tanh(functional.linear(frames, *first))
             for inner, outer in zip(others[::2], others[1::2], strict=True):
                 found = found + torch.tanh(functional.linear(torch.tanh(functional.linear(found, *inner)), *outer))
             return found
@@ -73,10 +73,10 @@ class PoseFeatures(nn.Module):
         return features
 
 
-class PoseConvolution(nn.Module):
-    """The weights of A H W + b on poses (..., nodes * features): one product, with the Kronecker product of A and W.
+class NodeConvolution(nn.Module):
+    """The weights of A H W + b on frames (..., nodes * features): one product, with the Kronecker product of A and W.
 
-    As long as the features are few, that is faster than a product with each for every pose.
+    As long as the features are few, that is faster than a product with each for every frame.
     """
 
     def __init__(self, nodes: int, features: int, out: int):
@@ -86,13 +86,13 @@ class PoseConvolution(nn.Module):
         self.bias = nn.Parameter(_uniform(out) / math.sqrt(features))
 
     def product(self) -> tuple[Tensor, Tensor]:
-        """Weight and bias of one linear layer on whole poses."""
+        """Weight and bias of one linear layer on whole frames."""
         return torch.kron(self.adjacency, self.weight), self.bias.repeat(len(self.adjacency))
 
 
 @dataclass(frozen=True)
 class FrameGraph:
-    """The summary of a motion for a static variable: graph convolutions over the frames of a window.
+    """The summary of a sequence for a static variable: graph convolutions over the frames of a window.
 
     A parent is read over {1:T}, but the graph has a fixed number of frames. In training the window starts anywhere,
     anew for every sequence at every evaluation; else it is the first frames. A shorter sequence stays in its last one.
@@ -140,15 +140,15 @@ class FrameGraphNetwork(Network):
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """(B, frames * width)."""
-        values = self.extractors.of(parents, lengths)
-        motion = torch.cat([values[parent.name] for parent in self.inputs], dim=-1)
-        last = motion.new_full((len(motion),), length - 1, dtype=torch.long) if lengths is None else lengths - 1
+        found = self.extractors.of(parents, lengths)
+        values = torch.cat([found[parent.name] for parent in self.inputs], dim=-1)
+        last = values.new_full((len(values),), length - 1, dtype=torch.long) if lengths is None else lengths - 1
         first = torch.zeros_like(last)
         if self.training:
             room = (last + 2 - self.frames).clamp_min(1)  # of starts whose window ends with the sequence
-            first = (torch.rand(len(motion), device=motion.device) * room).long()
-        window = (first[:, None] + torch.arange(self.frames, device=motion.device)).minimum(last[:, None])
-        features: Tensor = self.first(motion.gather(1, window[..., None].expand(-1, -1, motion.shape[-1])))
+            first = (torch.rand(len(values), device=values.device) * room).long()
+        window = (first[:, None] + torch.arange(self.frames, device=values.device)).minimum(last[:, None])
+        features: Tensor = self.first(values.gather(1, window[..., None].expand(-1, -1, values.shape[-1])))
         for block in self.blocks:
             features = features + block(features)
         return features.flatten(1)
@@ -163,9 +163,9 @@ class FrameConvolution(nn.Module):
         self.linear = nn.Linear(features, out)
         self.norm = nn.LayerNorm(out)
 
-    def forward(self, motion: Tensor) -> Tensor:
+    def forward(self, values: Tensor) -> Tensor:
         """(B, frames, out)."""
-        return torch.tanh(self.norm(self.adjacency @ self.linear(motion)))
+        return torch.tanh(self.norm(self.adjacency @ self.linear(values)))
 
 
 def _uniform(*shape: int) -> Tensor:
