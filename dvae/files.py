@@ -99,7 +99,7 @@ def written(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         OSError: it cannot be written; the error names it.
     """
     path = Path(path)
-    if _special(path):
+    if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
         raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device; choose another name")
     path.parent.mkdir(parents=True, exist_ok=True)
     new = path.with_name(f".{uuid4().hex}.new")
@@ -130,11 +130,3 @@ def naming(path: str | os.PathLike[str], temporary: Path | None = None) -> Itera
         if error.errno is None:  # of a library
             raise OSError(f"{path}: {error}") from error
         raise OSError(error.errno, error.strerror, os.fspath(path)) from error
-
-
-def _special(path: Path) -> bool:
-    """Whether there is something that is neither a file nor a link."""
-    with suppress(OSError):
-        mode = os.lstat(path).st_mode
-        return not (stat.S_ISREG(mode) or stat.S_ISLNK(mode))
-    return False

@@ -10,13 +10,8 @@ unit where it is made (`Head.in_units`, the push-forward), so that given scales 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
-
-from .networks.base import once, valid_steps
-from .networks.rows import Rows
 
 
 class Units(nn.Module):
@@ -61,22 +56,3 @@ class Units(nn.Module):
     def log_det(self, values: Tensor) -> Tensor:
         """(B,) log of the determinant of the Jacobian of `forward` at values (B, ..., D)."""
         return -self.scale.log().expand(len(values)) * values[0].numel()
-
-    def of(self, values: Tensor, lengths: Tensor | None) -> Tensor:
-        """`forward` of (B, T, D) or (B, D), zero at padding; once for all that read the same values."""
-
-        def found() -> Tensor:
-            standard: Tensor = self(values)
-            if lengths is None or values.dim() == 2:
-                return standard
-            return standard * valid_steps(lengths, values.shape[1])[..., None]
-
-        return once(self, [values, lengths], found)
-
-    def drawn(self, kept: Rows, values: Sequence[Tensor], lengths: Tensor | None) -> Rows:
-        """The draws of a loop so far, each standardised once and kept."""
-        for s in range(len(values)):
-            if kept.missing(s) and values[s] is not None:
-                standard = self(values[s])
-                kept[s] = standard if lengths is None else standard * (s < lengths)[:, None]
-        return kept

@@ -174,12 +174,10 @@ class AngleLimits:
                 f"{len(self.names)} angles with limits of shapes {tuple(self.low.shape)} and "
                 f"{tuple(self.high.shape)}, expected {sizes} twice"
             )
-        crossed = [name for name, low, high in zip(*self._columns(), strict=True) if not low <= high]
+        limits = zip(self.names, self.low.tolist(), self.high.tolist(), strict=True)
+        crossed = [name for name, low, high in limits if not low <= high]
         if crossed:
             raise ValueError(f"lower limits above the upper ones, or no numbers: {', '.join(dict.fromkeys(crossed))}")
-
-    def _columns(self) -> tuple[tuple[str, ...], list[float], list[float]]:
-        return self.names, self.low.tolist(), self.high.tolist()
 
 
 def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
@@ -280,8 +278,7 @@ def estimate_angle_limits(poses: Tensor, skeleton: Skeleton, quantile: float = 0
     if not poses.numel():
         raise ValueError(f"no poses in a tensor of shape {tuple(poses.shape)}: limits need at least one")
     with torch.no_grad():
-        blocks = poses.flatten(end_dim=-2).split(BLOCK) if poses.dim() > 1 else (poses[None],)
-        cos = torch.cat([cosines(block, skeleton) for block in blocks])
+        cos = torch.cat([cosines(block, skeleton) for block in poses.reshape(-1, poses.shape[-1]).split(BLOCK)])
     names = angle_names(skeleton)
     low, high = torch.full_like(cos[:1], -1.0)[0], torch.ones_like(cos[0])
     for name in set(names):

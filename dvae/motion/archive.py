@@ -61,9 +61,8 @@ def archive(path: str | Path) -> Iterator[dict[str, Member]]:
     except MemoryError:
         raise ValueError(f"{path}: there is not enough memory to read it") from None
     except Refused as error:
-        text = "".join(
-            c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(error)
-        )  # no terminal's commands
+        # no terminal's commands
+        text = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(error))
         raise ValueError(f"{path}: {text}") from error
 
 
@@ -413,9 +412,6 @@ class _Interpreter:
         else:
             self.items()
 
-    def pop_mark(self, _: Any) -> None:
-        self.items()
-
     def put(self, place: Any) -> None:
         self.memo[len(self.memo) if place is None else place] = self.stack[-1]
 
@@ -503,10 +499,6 @@ def _encode(text: Any, encoding: Any) -> bytes:  # how protocols 0 to 2 spell by
     return bytes(_bytes(text if isinstance(text, str) else None))
 
 
-def _empty_bytes() -> bytes:
-    return b""
-
-
 _ALLOWED = (
     "a motion archive may hold only dict, list, tuple, str, numbers and numpy arrays; this one would run something "
     "else, do not trust it"
@@ -519,8 +511,7 @@ _GLOBALS: dict[str, Callable[..., Any] | None] = {
     "numpy.core.multiarray.scalar": _scalar,
     "numpy.core.numeric._frombuffer": _from_buffer,
     "_codecs.encode": _encode,
-    "builtins.bytes": _empty_bytes,
-    "__builtin__.bytes": _empty_bytes,
+    **dict.fromkeys(("builtins.bytes", "__builtin__.bytes"), lambda: b""),
 }
 
 _PUSHED = {
@@ -530,14 +521,14 @@ _PUSHED = {
 }
 """Instructions that put their argument on the stack."""
 
-_RULES: dict[str, Callable[[_Interpreter, Any], None]] = {
+_RULES: dict[str, Callable[[_Interpreter, Any], Any]] = {
     **dict.fromkeys(("PROTO", "FRAME", "STOP"), lambda self, _: None),
     "NONE": lambda self, _: self.push(None),
     "NEWTRUE": lambda self, _: self.push(True),
     "NEWFALSE": lambda self, _: self.push(False),
     "MARK": _Interpreter.mark,
     "POP": _Interpreter.pop,
-    "POP_MARK": _Interpreter.pop_mark,
+    "POP_MARK": lambda self, _: self.items(),
     "DUP": lambda self, _: self.push(self.stack[-1]),
     **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"), _Interpreter.put),
     **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda self, place: self.push(self.memo[place])),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from torch import Tensor
@@ -13,26 +13,14 @@ from torch import Tensor
 from ..inference.checks import Statistic
 from ..inference.result import canvas
 from ..inference.traversal import Traversal
-from .skeleton import Skeleton
+from .exchange import Exchanged
+from .protocols import Windows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_traversal", "statistics"]
 
-
-class Posed(Protocol):
-    """Windows of a skeleton, such as `Windows`."""
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The joints."""
-
-    def positions(self, x: Tensor) -> Tensor:
-        """(..., T, J, 3) in metres from frames (..., T, D)."""
-
-
-def statistics(windows: Posed) -> dict[str, Statistic]:
+def statistics(windows: Windows | Exchanged) -> dict[str, Statistic]:
     """What predictive checks compare of motion.
 
     * speed: mean over frames and joints, by first differences.
@@ -49,40 +37,30 @@ def statistics(windows: Posed) -> dict[str, Statistic]:
     ends = set(range(skeleton.joints)) - set(skeleton.parents)
     feet = [j for j in sorted(ends) if re.search("foot|toe|ankle|heel", skeleton.names[j], re.IGNORECASE)]
 
-    def speed(positions: Tensor) -> Tensor:
-        found: Tensor = fps * positions.diff(dim=-3).norm(dim=-1).mean((-2, -1))
-        return found
-
-    def acceleration(positions: Tensor) -> Tensor:
-        found: Tensor = fps**2 * positions.diff(n=2, dim=-3).norm(dim=-1).mean((-2, -1))
-        return found
-
-    def bone_length(positions: Tensor) -> Tensor:
-        found: Tensor = skeleton.bone_lengths(positions).mean((-2, -1))
-        return found
-
     def bone_stretch(positions: Tensor) -> Tensor:
         lengths = skeleton.bone_lengths(positions)
-        found: Tensor = 100 * (lengths.std(-2, correction=0) / lengths.mean(-2)).mean(-1)
-        return found
+        stretch: Tensor = (lengths.std(-2, correction=0) / lengths.mean(-2)).mean(-1)
+        return 100 * stretch
 
     def foot_height(positions: Tensor) -> Tensor:
         heights = positions[..., up]
         return (heights[..., feet] - heights.amin(-1, keepdim=True)).mean((-2, -1))
 
-    def of(function: Callable[[Tensor], Tensor], unit: str) -> Statistic:
+    def of(unit: str, function: Callable[[Tensor], Tensor]) -> Statistic:
         return Statistic(lambda x: function(windows.positions(x)), unit)
 
     return {
-        "speed": of(speed, "m/s"),
-        "acceleration": of(acceleration, "m/s²"),
-        "bone length": of(bone_length, "m"),
-        "bone stretch": of(bone_stretch, "%"),
-        **({"foot height": of(foot_height, "m")} if feet else {}),
+        "speed": of("m/s", lambda found: fps * found.diff(dim=-3).norm(dim=-1).mean((-2, -1))),
+        "acceleration": of("m/s²", lambda found: fps**2 * found.diff(n=2, dim=-3).norm(dim=-1).mean((-2, -1))),
+        "bone length": of("m", lambda found: skeleton.bone_lengths(found).mean((-2, -1))),
+        "bone stretch": of("%", bone_stretch),
+        **({"foot height": of("m", foot_height)} if feet else {}),
     }
 
 
-def draw_traversal(found: Traversal, windows: Posed, frame: int = -1, sequence: int = 0, rows: int = 6) -> Figure:
+def draw_traversal(
+    found: Traversal, windows: Windows | Exchanged, frame: int = -1, sequence: int = 0, rows: int = 6
+) -> Figure:
     """Poses of one sequence at one frame: a row for each coordinate, that of most effect first.
 
     Args:
@@ -92,31 +70,25 @@ def draw_traversal(found: Traversal, windows: Posed, frame: int = -1, sequence: 
         sequence: which sequence of the batch.
         rows: how many coordinates to draw.
     """
-    from .plot import SPACING, pose
+    from .plot import SPACING, bare, facing, pose
 
     order = found.effect.argsort(descending=True, stable=True)[:rows]
     skeleton = windows.skeleton
     poses = windows.positions(found.frames[order, :, sequence])[:, :, frame].double().cpu()
     poses = poses - poses[..., skeleton.root : skeleton.root + 1, :]
     middle = int(found.offsets.abs().argmin())
-    sided = bool(skeleton.left and skeleton.right)
-    azimuth = math.pi / 5 - (float(skeleton.heading(poses[0, middle])) if sided else 0.0)
-    size = (0.5 + 0.95 * len(found.offsets), 0.6 + 1.9 * len(order))
-    figure = canvas(*size)
+    azimuth = math.pi / 5 - facing(skeleton, poses[0, middle])
+    figure = canvas(0.5 + 0.95 * len(found.offsets), 0.6 + 1.9 * len(order))
     panels = figure.subplots(len(order), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
     for panel, chosen, row in zip(panels, order.tolist(), poses, strict=True):
         for column, drawn in enumerate(row):
             at = (column * SPACING, 0.0)
             pose(panel, row[middle], skeleton, at=at, azimuth=azimuth, colors="0.8", linewidths=1.6)
             pose(panel, drawn, skeleton, at=at, azimuth=azimuth, colors="C0", linewidths=1.4)
-        panel.autoscale_view()
-        panel.set_aspect("equal")
+        bare(panel)
         moved = f"{found.latent}[{found.coordinates[chosen]}], which moves x by {float(found.effect[chosen]):.2g} m"
         panel.set_title(moved, loc="left", fontsize=8)
-        panel.set_yticks([])
-        panel.tick_params(length=0, labelsize=8)
-        for spine in panel.spines.values():
-            spine.set_visible(False)
+        panel.tick_params(labelsize=8)
     panels[-1].set_xticks(
         SPACING * np.arange(len(found.offsets)), [f"{o:+.2g}" if o else "0" for o in found.offsets.tolist()]
     )

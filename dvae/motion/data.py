@@ -13,9 +13,8 @@ from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
 
+from ..inference.result import Table  # which shows what files say as it is
 from .skeleton import Skeleton
 
 SMALLEST, TALLEST = 0.3, 3.0
@@ -186,12 +185,12 @@ class MotionSet:
 
     def info(self) -> RenderableType:
         """What `dvae data info` prints: splits, skeleton, how rigid the bones are, and the labels."""
-        splits = Table(title=_shown(self.name, "table.title") if self.name else None, title_justify="left")
+        splits = Table(title=self.name, title_justify="left")
         rows = self.summary()
         for column in rows[0]:
             splits.add_column(column, justify="left" if column == "split" else "right")
         for row in rows:
-            splits.add_row(*(_shown(f"{value:,}" if isinstance(value, int) else str(value)) for value in row.values()))
+            splits.add_row(*(f"{value:,}" if isinstance(value, int) else str(value) for value in row.values()))
 
         bones = [self.skeleton.bone_lengths(clip.positions.astype(np.float64)) for clip in self.clips]
         variation = [lengths.std(axis=0) / np.maximum(lengths.mean(axis=0), 1e-9) for lengths in bones]
@@ -200,10 +199,7 @@ class MotionSet:
         extent = np.median([np.median(np.ptp(clip.positions, axis=1)[:, self.skeleton.vertical]) for clip in self])
 
         facts = Table.grid(padding=(0, 2))
-
-        def fact(*cells: str) -> None:
-            facts.add_row(*map(_shown, cells))
-
+        fact = facts.add_row
         fact("skeleton", f"{self.skeleton.name}: {self.skeleton.joints} joints, {self.skeleton.up} up")
         fact("frames per second", f"{self.skeleton.fps:g}")
         fact("vertical extent", f"{extent:.2f} m (median)")
@@ -220,8 +216,3 @@ class MotionSet:
         for split, name, reason in self.skipped[:10]:
             fact("skipped", f"{split}/{name}: {reason}")
         return Group(splits, facts)
-
-
-def _shown(text: str, style: str = "") -> Text:
-    """What a file says, as it is: it holds no markup, and cannot command the terminal."""
-    return Text(text.replace("\x1b", r"\x1b"), style)

@@ -20,16 +20,6 @@ from torch.autograd.function import Function, once_differentiable
 from .angles import AngleLimits, angle_names, cosines
 from .skeleton import Skeleton
 
-__all__ = [
-    "best_of_many",
-    "history_error",
-    "joint_angles",
-    "limb_length",
-    "multimodal_best_of_many",
-    "pairwise_diversity",
-    "pose_prior_energy",
-]
-
 BLOCK = 2**18
 """Numbers that are worked on at once on a CPU, so that what is made of them stays in cache."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from .. import files
 from .archive import archive, write_arrays
 from .formats import read_arrays
-from .skeleton import Skeleton
+from .skeleton import FIELDS, Skeleton
 
 
 def is_forecasts(path: str | Path) -> bool:
@@ -82,14 +82,9 @@ class Forecasts:
             "split": np.array(split),
             "clip": np.array(clip),
             "start": np.array(start),
-            "name": np.array(self.skeleton.name),
-            "joint_names": np.array(self.skeleton.names),
-            "parents": np.array(self.skeleton.parents),
-            "joints_left": np.array(self.skeleton.left, int),
-            "joints_right": np.array(self.skeleton.right, int),
-            "up_axis": np.array(self.skeleton.up),
-            "fps": np.array(self.skeleton.fps),
         }
+        for field, key in FIELDS.items():
+            arrays[key] = np.array(getattr(self.skeleton, field), int if field in ("left", "right") else None)
         with files.written(path) as file:
             write_arrays(file, arrays)
 
@@ -103,15 +98,7 @@ class Forecasts:
         """
         arrays = read_arrays(path)
         try:
-            skeleton = Skeleton(
-                names=arrays["joint_names"].tolist(),
-                parents=arrays["parents"].tolist(),
-                left=arrays["joints_left"].tolist(),
-                right=arrays["joints_right"].tolist(),
-                up=arrays["up_axis"].item(),
-                fps=arrays["fps"].item(),
-                name=arrays["name"].item(),
-            )
+            skeleton = Skeleton(**{field: arrays[key].tolist() for field, key in FIELDS.items()})
             if (arrays["split"].dtype.kind, arrays["clip"].dtype.kind, arrays["start"].dtype.kind) != ("U", "U", "i"):
                 raise ValueError("split and clip are text and start is a whole number; these are not")
             keys = list(zip(*(arrays[name].tolist() for name in ("split", "clip", "start")), strict=True))

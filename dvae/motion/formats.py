@@ -249,25 +249,17 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"{path}: it has more than {MOST_NUMBERS:,} numbers")
             values += [np.full(len(header), np.nan)] * blank
             blank = 0
-            try:
-                values.append(np.array([float(cell) if cell.strip() else np.nan for cell in cells]))
-            except ValueError:
-                wrong = next(place for place, cell in enumerate(cells) if cell.strip() and not _is_number(cell))
-                raise ValueError(
-                    f"{path}: row {number}, {header[wrong]}: {cells[wrong][:100]!r} is no number"
-                ) from None
+            row = np.full(len(header), np.nan)
+            for place, cell in enumerate(cells):
+                try:
+                    row[place] = float(cell if cell.strip() else "nan")
+                except ValueError:
+                    raise ValueError(f"{path}: row {number}, {header[place]}: {cell[:100]!r} is no number") from None
+            values.append(row)
     if not columns or not values:
         raise ValueError(f"{path}: expected a header and one row for each frame")
     table = np.stack(values)
     return {joint: table[:, places] for joint, places in columns.items()}
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _read_clips(path: Path) -> list[tuple[str, str, np.ndarray]]:

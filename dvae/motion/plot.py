@@ -17,6 +17,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
+from torch import Tensor
 
 from .. import files
 from .skeleton import Skeleton, rotate_about_up
@@ -85,6 +86,15 @@ def pose(
     ax.add_collection(LineCollection(bones, **{"capstyle": "round", **line}))
 
 
+def bare(ax: Axes) -> None:
+    """As wide as it is high, without a frame and marks."""
+    ax.autoscale_view()
+    ax.set_aspect("equal")
+    ax.set_yticks([])
+    ax.tick_params(length=0)
+    ax.spines[:].set_visible(False)
+
+
 def futures(
     skeleton: Skeleton,
     observed: Any,
@@ -122,7 +132,7 @@ def futures(
     """
     past, future, real = _checked(skeleton, observed, samples, truth)
     crosses = _given(paths or {}, skeleton, future.shape[1])
-    azimuth = view - _heading(skeleton, past[-1])
+    azimuth = view - facing(skeleton, torch.from_numpy(past[-1]))
     now, horizon = len(past) - 1, future.shape[1]
     ahead = np.unique(np.linspace(0, horizon, frames + 1)[1:].round().clip(1)).astype(int)
     shown = [*sorted({0, now}), *(now + ahead)]
@@ -150,14 +160,9 @@ def futures(
             seen = rotate_about_up(places, torch.tensor(azimuth, dtype=torch.float64), skeleton.up).numpy()
             ax.plot(column * SPACING + seen[:, 0], seen[:, skeleton.vertical], "x", color=GIVEN, zorder=3)
 
-    ax.autoscale_view()
-    ax.set_aspect("equal")
+    bare(ax)
     seconds = [(frame - now) / skeleton.fps for frame in shown]
     ax.set_xticks(SPACING * np.arange(len(shown)), [f"{s:+.1f} s" if s else "0 s" for s in seconds])
-    ax.set_yticks([])
-    ax.tick_params(length=0)
-    for spine in ax.spines.values():
-        spine.set_visible(False)
     _key(ax, len(future), real is not None, len(crosses) > 0)
     return ax
 
@@ -225,7 +230,7 @@ def animate(
     motion = np.full((len(people), len(past) + future.shape[1], skeleton.joints, 3), np.nan)
     for k, (_, _, ahead) in enumerate(people):  # a truth that ends early leaves NaN, which plotly does not draw
         motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
-    turn = torch.tensor(view - _heading(skeleton, past[-1]), dtype=torch.float64)
+    turn = torch.tensor(view - facing(skeleton, torch.from_numpy(past[-1])), dtype=torch.float64)
     motion = rotate_about_up(torch.from_numpy(motion), turn, skeleton.up).numpy()
     if skeleton.up == "y":  # plotly turns a scene about z
         motion = motion[..., [0, 2, 1]] * [1, -1, 1]
@@ -380,9 +385,9 @@ def _colours(samples: int) -> np.ndarray:
     return plt.get_cmap("turbo")(np.linspace(0.05, 0.95, samples))
 
 
-def _heading(skeleton: Skeleton, positions: np.ndarray) -> float:
+def facing(skeleton: Skeleton, positions: Tensor) -> float:
     """Where the person of a pose (J, 3) faces; zero where the skeleton does not tell left from right."""
-    return float(skeleton.heading(torch.from_numpy(positions))) if skeleton.left and skeleton.right else 0.0
+    return float(skeleton.heading(positions)) if skeleton.left and skeleton.right else 0.0
 
 
 def _polylines(skeleton: Skeleton, joints: Collection[int]) -> list[int]:

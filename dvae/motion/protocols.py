@@ -334,7 +334,7 @@ class Windows:
         if self.protocol.heading:
             joints = rotate_about_up(joints, -self.skeleton.heading(joints)[:, None], self.skeleton.up)
         if self.protocol.root == "drop":
-            joints = torch.cat([joints[:, :root], joints[:, root + 1 :]], 1)
+            joints = self.skeleton.without_root(joints)
         return joints.flatten(1)
 
     def labels(self, name: str) -> list[str]:
@@ -381,11 +381,7 @@ class Windows:
                 f"frames have {x.shape[-1]} numbers, expected {self.size}: {self.skeleton.joints} joints, "
                 f"root {self.protocol.root}"
             )
-        joints: Tensor = x.unflatten(-1, (-1, 3))
-        if self.protocol.root == "relative":
-            return joints
-        root = self.skeleton.root
-        return torch.cat([joints[..., :root, :], torch.zeros_like(joints[..., :1, :]), joints[..., root:, :]], -2)
+        return self.skeleton.with_root(x.unflatten(-1, (-1, 3)))
 
     def given(self, joints: Sequence[str] | float) -> Windows:
         """These windows, whose batches hold trajectories too: {"y": (B, T, D)}, x at given joints and 0 at others.
@@ -478,8 +474,7 @@ class Windows:
         if self.protocol.heading:
             heading = self.skeleton.heading(joints[:, self.protocol.observed - 1])[:, None, None]
         if self.protocol.root == "drop":
-            joints = joints - joints[:, :, root : root + 1]
-            joints = torch.cat([joints[:, :, :root], joints[:, :, root + 1 :]], 2)
+            joints = self.skeleton.without_root(joints - joints[:, :, root : root + 1])
         else:
             joints = joints - joints[:, :1, root : root + 1]
         if self.protocol.heading:

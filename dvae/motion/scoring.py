@@ -30,8 +30,7 @@ from ..inference.scores import ENERGY, VARIOGRAM, Measure, paired
 from .energies import pose_prior_energy
 from .exchange import Exchanged
 from .protocols import Windows
-
-__all__ = ["displacements", "scores"]
+from .skeleton import Skeleton
 
 
 def scores(
@@ -60,7 +59,7 @@ def scores(
             "errors in metres alone take dvae.motion.displacements"
         )
     moves = windows.protocol.root == "relative"
-    found = displacements(windows, _body(windows.skeleton.root) if moves else lambda x: x)
+    found = displacements(windows, _body(windows.skeleton) if moves else lambda x: x)
     if moves:
         found += [replace(measure, name=f"global {measure.name}", headline=False) for measure in (_ADE, _FDE)]
     if windows.given_joints:
@@ -129,14 +128,13 @@ def _multimodal(windows: HeldOutWindows, body: Callable[[Tensor], Tensor]) -> li
     return [Measure(name, over(score), headline=name in shown, **shared) for name, score in _MULTIMODAL.items()]
 
 
-def _body(root: int) -> Callable[[Tensor], Tensor]:
+def _body(skeleton: Skeleton) -> Callable[[Tensor], Tensor]:
     """Frames (..., T, D) relative to their own root, which is left out."""
 
     @lru_cache(maxsize=2)  # of forecasts and futures, for all scores of a batch
     def body(x: Tensor) -> Tensor:
         joints = x.unflatten(-1, (-1, 3))
-        joints = joints - joints[..., root : root + 1, :]
-        return torch.cat([joints[..., :root, :], joints[..., root + 1 :, :]], -2).flatten(-2)
+        return skeleton.without_root(joints - joints[..., skeleton.root, None, :]).flatten(-2)
 
     return body
 

@@ -113,10 +113,9 @@ def _morphology(random: np.random.Generator, clips: int) -> np.ndarray:
     rest = np.zeros((WALKER.joints, 3))
     for name, offset in _REST.items():
         rest[_J[name]] = offset
-    part = np.zeros(WALKER.joints, int)  # 0 trunk and head, 1 legs, 2 arms, 3 widths
-    for name, joint in _J.items():
-        part[joint] = 1 if "Knee" in name or "Foot" in name else 2 if "Elbow" in name or "Wrist" in name else 0
-        part[joint] = 3 if "Hip" in name or "Shoulder" in name else part[joint]
+    # legs, arms and widths; the trunk is 0
+    parts = {"Knee": 1, "Foot": 1, "Elbow": 2, "Wrist": 2, "Hip": 3, "Shoulder": 3}
+    part = [parts.get(name.lstrip("LR"), 0) for name in WALKER.names]
     size = np.exp(0.07 * random.standard_normal((clips, 1)))
     proportions = np.exp(0.05 * random.standard_normal((clips, 4)))
     found: np.ndarray = rest * (size * proportions[:, part])[..., None]

@@ -21,6 +21,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
+import networkx as nx
 import torch
 from torch import Tensor
 
@@ -84,6 +85,18 @@ def _values(given: Any, kind: type, what: str, expected: str) -> tuple[Any, ...]
         if isinstance(value, str) and not is_name(value):
             raise ValueError(f"{what} has {brief(value)} at place {place}, expected text that can be printed")
     return tuple(map(int, values)) if kind is Integral else values
+
+
+FIELDS = {
+    "name": "name",
+    "names": "joint_names",
+    "parents": "parents",
+    "left": "joints_left",
+    "right": "joints_right",
+    "up": "up_axis",
+    "fps": "fps",
+}
+"""Of a skeleton, and what files call them."""
 
 
 @dataclass(frozen=True)
@@ -198,20 +211,25 @@ class Skeleton:
     @property
     def order(self) -> list[int]:
         """The joints, every parent before its children: generation after generation, each in the order of the names."""
-        children: list[list[int]] = [[] for _ in self.parents]
-        for joint, parent in enumerate(self.parents):
-            if parent >= 0:
-                children[parent].append(joint)
-        found, generation = [], [self.root]
-        while generation:
-            found += generation
-            generation = sorted(child for joint in generation for child in children[joint])
-        return found
+        tree = nx.DiGraph(self.edges)
+        tree.add_node(self.root)
+        return [joint for generation in nx.bfs_layers(tree, self.root) for joint in sorted(generation)]
 
     @property
     def vertical(self) -> int:
         """Index of the up axis in a position's three coordinates."""
         return "xyz".index(self.up)
+
+    def without_root(self, joints: Tensor) -> Tensor:
+        """Joints (..., J, 3) but for the root."""
+        return torch.cat([joints[..., : self.root, :], joints[..., self.root + 1 :, :]], -2)
+
+    def with_root(self, joints: Tensor, value: float = 0.0) -> Tensor:
+        """Joints (..., J, 3) as they are, or of those without a root, with one of this value."""
+        if joints.shape[-2] == self.joints:
+            return joints
+        root = torch.full_like(joints[..., :1, :], value)
+        return torch.cat([joints[..., : self.root, :], root, joints[..., self.root :, :]], -2)
 
     def bone_lengths(self, positions: Any) -> Any:
         """Bone lengths in metres: positions (..., J, 3), numpy or torch -> (..., J - 1), as in `edges`."""
@@ -309,32 +327,16 @@ class Skeleton:
                 raise ValueError(
                     f"bone_lengths_m has {len(lengths)} entries, expected one for each of {len(parents)} joints"
                 )
-            return cls(
-                names=fields["joint_names"],
-                parents=parents,
-                left=fields.get("joints_left", ()),
-                right=fields.get("joints_right", ()),
-                up=fields.get("up_axis", "y"),
-                fps=fields.get("fps", 30.0),
-                name=fields.get("name", path.absolute().parent.name),
-                # the file has one entry per joint, and a zero for the root
-                lengths=tuple(length for length, parent in zip(lengths, parents, strict=bool(lengths)) if parent != -1),
-            )
+            given = {field: fields[key] for field, key in FIELDS.items() if key in fields}
+            # the file has one entry per joint, and a zero for the root
+            bones = tuple(length for length, parent in zip(lengths, parents, strict=bool(lengths)) if parent != -1)
+            return cls(**{"name": path.absolute().parent.name, **given, "parents": parents, "lengths": bones})
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
     def to_json(self, path: str | Path) -> None:
         """Write the skeleton as a JSON file that people can read; it replaces an older one once it is whole."""
-        fields: dict[str, object] = {
-            "name": self.name,
-            "joint_names": self.names,
-            "parents": self.parents,
-            "joints_left": self.left,
-            "joints_right": self.right,
-            "units": "m",
-            "up_axis": self.up,
-            "fps": self.fps,
-        }
+        fields = {**{key: getattr(self, field) for field, key in FIELDS.items()}, "units": "m"}
         if self.lengths:
             lengths = iter(self.lengths)
             fields["bone_lengths_m"] = [0.0 if parent == -1 else next(lengths) for parent in self.parents]
@@ -391,25 +393,11 @@ def rotate_about_up(positions: Tensor, angle: Tensor, up: str) -> Tensor:
     return rotated
 
 
+# fmt: off
 HUMAN36M = Skeleton(
     names=(
-        "Pelvis",
-        "RHip",
-        "RKnee",
-        "RFoot",
-        "LHip",
-        "LKnee",
-        "LFoot",
-        "Spine",
-        "Thorax",
-        "Neck",
-        "Head",
-        "LShoulder",
-        "LElbow",
-        "LWrist",
-        "RShoulder",
-        "RElbow",
-        "RWrist",
+        "Pelvis", "RHip", "RKnee", "RFoot", "LHip", "LKnee", "LFoot", "Spine", "Thorax", "Neck", "Head", "LShoulder",
+        "LElbow", "LWrist", "RShoulder", "RElbow", "RWrist",
     ),
     parents=(-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 9, 8, 11, 12, 8, 14, 15),
     left=(4, 5, 6, 11, 12, 13),
@@ -418,28 +406,17 @@ HUMAN36M = Skeleton(
     fps=50.0,
     name="human36m",
 )
+# fmt: on
 """The 17 joints of Human3.6M that the papers keep, as in VideoPose3D's archive: z up, 50 Hz."""
 
 HUMAN36M_KEPT = (0, 1, 2, 3, 6, 7, 8, 12, 13, 14, 15, 17, 18, 19, 25, 26, 27)
 """Which of the archive's 32 joints these are; `load` takes them by itself from an archive of 32 joints."""
 
+# fmt: off
 HUMANEVA = Skeleton(
     names=(
-        "Pelvis",
-        "Thorax",
-        "LShoulder",
-        "LElbow",
-        "LWrist",
-        "RShoulder",
-        "RElbow",
-        "RWrist",
-        "LHip",
-        "LKnee",
-        "LAnkle",
-        "RHip",
-        "RKnee",
-        "RAnkle",
-        "Head",
+        "Pelvis", "Thorax", "LShoulder", "LElbow", "LWrist", "RShoulder", "RElbow", "RWrist", "LHip", "LKnee",
+        "LAnkle", "RHip", "RKnee", "RAnkle", "Head",
     ),
     parents=(-1, 0, 1, 2, 3, 1, 5, 6, 0, 8, 9, 0, 11, 12, 1),
     left=(2, 3, 4, 8, 9, 10),
@@ -448,6 +425,7 @@ HUMANEVA = Skeleton(
     fps=60.0,
     name="humaneva",
 )
+# fmt: on
 """HumanEva-I's 15 joints: z up, 60 Hz."""
 
 WALKER = Skeleton(HUMAN36M.names, HUMAN36M.parents, HUMAN36M.left, HUMAN36M.right, "y", 30.0, "walker")

@@ -87,11 +87,7 @@ class Heading(View):
                 f"{self.pose or WHOLE} has shape {tuple(x.shape)}; poses of the skeleton {self.skeleton.name!r} have "
                 f"{sizes[0]} coordinates, or {sizes[1]} without the root"
             )
-        pose, at = pose.unflatten(-1, (-1, 3)), self.skeleton.root
-        if pose.shape[-2] == self.skeleton.joints:
-            found: Tensor = pose
-            return found
-        return torch.cat([pose[..., :at, :], torch.full_like(pose[..., :1, :], root), pose[..., at:, :]], -2)
+        return self.skeleton.with_root(pose.unflatten(-1, (-1, 3)), root)
 
     def _check_lengths(self, lengths: Tensor, steps: int) -> None:
         needed = min(self.frames, steps)

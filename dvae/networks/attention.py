@@ -19,8 +19,7 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..relations import Relation
-from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, at, valid_steps
-from .dense import part
+from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, at, part, valid_steps
 from .extract import Extract, Extractors
 from .rows import Rows, select
 
@@ -436,17 +435,10 @@ class Attending:
 
     def select(self, rows: Tensor) -> Attending:
         """Its rows."""
-        return replace(
-            self,
-            queries=select(self.queries, rows),
-            batch=len(rows),
-            caches=select(self.caches, rows),
-            extracted=select(self.extracted, rows),
-            lengths=None if self.lengths is None else self.lengths[rows],
-            masks=self.masks.copy(),
-            seen=list(self.seen),
-            rows=rows if self.rows is None else self.rows.index_select(0, rows),
-        )
+        moved = {name: select(getattr(self, name), rows) for name in ("queries", "caches", "extracted", "lengths")}
+        masks, seen = self.masks.copy(), list(self.seen)
+        rows = rows if self.rows is None else self.rows.index_select(0, rows)
+        return replace(self, **moved, batch=len(rows), masks=masks, seen=seen, rows=rows)
 
     def fresh(self, t: int) -> list[int]:
         """The live tokens that step t is the first to see, which enter the cache now."""

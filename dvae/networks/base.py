@@ -190,6 +190,11 @@ def shift(values: Tensor, lag: int) -> Tensor:
     return functional.pad(moved, (0, 0, gap, 0) if lag < 0 else (0, 0, 0, gap))
 
 
+def part(values: Tensor, lag: int | None) -> Tensor:
+    """A parent's contribution at every step: itself if static, else shifted by its lag."""
+    return values if lag is None else shift(values, lag)
+
+
 def at(values: Sequence[Tensor], t: int, like: Tensor, size: int) -> Tensor:
     """values[t] of a loop's draws, zero outside the sequence; `like` is any (B, ...) tensor."""
     return values[t] if 0 <= t < len(values) else like.new_zeros(like.shape[0], size)
@@ -198,6 +203,18 @@ def at(values: Sequence[Tensor], t: int, like: Tensor, size: int) -> Tensor:
 def valid_steps(lengths: Tensor, length: int) -> Tensor:
     """(B, T) True at the steps of a ragged batch that exist."""
     return torch.arange(length, device=lengths.device) < lengths[:, None]
+
+
+def once_valid(module: nn.Module, values: Tensor, lengths: Tensor | None) -> Tensor:
+    """The module's features of (B, T, D) or (B, D), 0 at padding; once for all that read the same values."""
+
+    def compute() -> Tensor:
+        found: Tensor = module(values)
+        if lengths is None or found.dim() == 2:
+            return found
+        return found * valid_steps(lengths, found.shape[1])[..., None]
+
+    return once(module, [values, lengths], compute)
 
 
 def reverse(values: Tensor, lengths: Tensor | None) -> Tensor:

@@ -124,10 +124,10 @@ class CosineEncoderNetwork(AtOnce):
         source, static = (parents[name] for name in self.names)
         first = once(self.static, [static], partial(self.static, static))
         hidden = torch.cat([self.over_time(source), first[:, None].expand(-1, length, -1)], dim=-1)
-        hidden = self.before(self.dropout(hidden + positions(length, self.features, hidden)))
+        hidden = self.before(self.dropout(hidden + positions(length, self.features, hidden.dtype, hidden.device)))
         if self.spec.cosine:
             components = min(self.spec.components or length, length)
-            hidden = _basis(length, components, hidden) @ hidden
+            hidden = cosine_basis(length, components, hidden.dtype, hidden.device) @ hidden
         return functional.pad(self.after(self.between(hidden)), (0, 0, 0, length - hidden.shape[1]))
 
 
@@ -164,11 +164,13 @@ class CosineDecoderNetwork(AtOnce):
         components = min(self.spec.components or length, length)
         values = values[:, :components]
         if self.spec.cosine:
-            values = _basis(length, components, values).T @ values
+            values = cosine_basis(length, components, values.dtype, values.device).T @ values
         start = once(self.static, [first], partial(self.static, first))
         joined = [start[:, None].expand(-1, length, -1), values, *(parents[name] for name in self.others)]
         hidden = self.into(torch.cat(joined, dim=-1))
-        hidden = self.transformer(self.dropout(hidden + positions(length, hidden.shape[-1], hidden)))
+        hidden = self.transformer(
+            self.dropout(hidden + positions(length, hidden.shape[-1], hidden.dtype, hidden.device))
+        )
         offsets: Tensor = self.offsets(hidden)
         return first[:, None] + offsets.cumsum(1)
 
@@ -236,24 +238,9 @@ def transformer(size: int, spec: CosineEncoder) -> nn.TransformerEncoder:
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)
-def _positions(length: int, size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+@torch.inference_mode(False)  # as of `cosine_basis`
+def positions(length: int, size: int, dtype: torch.dtype, device: torch.device | None = None) -> Tensor:
+    """Sinusoidal encodings (T, size) of the steps (Vaswani et al., 2017)."""
     waves = torch.exp(torch.arange(0, size, 2, dtype=torch.float64) * (-math.log(10000.0) / size))
     phase = torch.arange(length, dtype=torch.float64)[:, None] * waves
     return torch.stack([phase.sin(), phase.cos()], dim=-1).flatten(1)[:, :size].to(device, dtype)
-
-
-def positions(length: int, size: int, like: Tensor) -> Tensor:
-    """Sinusoidal encodings (T, size) of the steps (Vaswani et al., 2017)."""
-    return _positions(length, size, like.dtype, like.device)
-
-
-@lru_cache(maxsize=64)
-@torch.inference_mode(False)  # whoever asks first, others will differentiate through it
-def _cached_basis(length: int, coefficients: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    return cosine_basis(length, coefficients).to(device, dtype)
-
-
-def _basis(length: int, coefficients: int, like: Tensor) -> Tensor:
-    """(C, T), see `cosine_basis`."""
-    return _cached_basis(length, coefficients, like.dtype, like.device)

@@ -6,21 +6,28 @@ sum_t w_k cos(pi (t + 1/2) k / T) v_t, with w_0 = sqrt(1/T) and w_k = sqrt(2/T) 
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from scipy.fft import idct
 from torch import Tensor
 
 
-def cosine_basis(length: int, coefficients: int) -> Tensor:
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)  # whoever asks first, others will differentiate through it
+def cosine_basis(
+    length: int, coefficients: int, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> Tensor:
     """The first rows of the orthonormal DCT-II matrix.
 
     Args:
         length: T.
         coefficients: C, at most T.
+        dtype, device: of the matrix, which all who ask for it share.
 
     Returns:
-        (C, T) in double precision, with orthonormal rows: `basis @ v` are the coefficients of v (T, D), and
+        (C, T) with orthonormal rows: `basis @ v` are the coefficients of v (T, D), and
         `basis.T @ c` the sequence of coefficients c (C, D).
 
     Raises:
@@ -28,4 +35,4 @@ def cosine_basis(length: int, coefficients: int) -> Tensor:
     """
     if not 1 <= coefficients <= length:
         raise ValueError(f"a sequence of {length} steps has 1 to {length} coefficients, not {coefficients}")
-    return torch.from_numpy(idct(np.eye(coefficients, length), axis=1, norm="ortho"))
+    return torch.from_numpy(idct(np.eye(coefficients, length), axis=1, norm="ortho")).to(device, dtype)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Protocol
 
 from torch import Tensor, nn
 
-from .base import Input, once, perceptron, valid_steps
+from .base import Input, once_valid, perceptron
 from .rows import Rows
 
 
@@ -51,17 +50,7 @@ class Extractors(nn.ModuleDict):
 
     def of(self, parents: Mapping[str, Tensor], lengths: Tensor | None) -> dict[str, Tensor]:
         """What the network reads of its parents (B, T, D) or (B, D)."""
-
-        def features(name: str) -> Tensor:
-            found: Tensor = self[name](parents[name])
-            if lengths is None or found.dim() == 2:
-                return found
-            return found * valid_steps(lengths, found.shape[1])[..., None]
-
-        own = {
-            name: once(self[name], [parents[name], lengths], partial(features, name)) for name in self.keys() & parents
-        }
-        return {**parents, **own}
+        return {**parents, **{n: once_valid(self[n], parents[n], lengths) for n in self.keys() & parents}}
 
     def start(self, length: int) -> dict[str, tuple[Any, Rows]]:
         """What `drawn` evaluates in a loop, with what can be done before it done, and where it keeps what it finds."""
@@ -74,15 +63,7 @@ class Extractors(nn.ModuleDict):
         lengths: Tensor | None,
     ) -> dict[str, Sequence[Tensor]]:
         """The draws of a loop so far as the network reads them; each passes through its extractor once."""
-        found = dict(drawn)
-        for name in self.keys() & drawn:
-            extractor, seen = kept[name]
-            for s in range(len(drawn[name])):
-                if seen.missing(s) and (value := drawn[name][s]) is not None:
-                    features = extractor(value)
-                    seen[s] = features if lengths is None else features * (s < lengths)[:, None]
-            found[name] = seen
-        return found
+        return {**drawn, **{n: kept[n][1].follow(drawn[n], kept[n][0], lengths) for n in self.keys() & drawn}}
 
 
 def share(name: str, *networks: Any) -> None:

@@ -60,30 +60,28 @@ class LinearNetwork(Network):
         weight: Tensor = self.weights[name][:length, :length]
         return weight * self.mask(name, length)[:, :, None, None].to(weight.device)
 
-    @override
-    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+    def known(self, given: Mapping[str, Tensor], length: int) -> Tensor:
+        """The share of given parents in the features (B, T, H), or (T, H) without any."""
         features: Tensor = self.bias[:length]
         for parent in self.inputs:
-            values = parents[parent.name]
-            values = values[:, None] if parent.relation is None else values
-            features = features + torch.einsum("tshd,bsd->bth", self.weight(parent.name, length), values)
+            if parent.name in given:
+                values = given[parent.name]
+                values = values[:, None] if parent.relation is None else values
+                features = features + torch.einsum("tshd,bsd->bth", self.weight(parent.name, length), values)
+        return features
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         if not self.inputs:
             raise ValueError("Linear needs at least one parent; leave a factor without parents to its prior")
+        features = self.known(parents, length)
         return features if self.local else features[:, 0]
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        base: Tensor = self.bias[:length].expand(batch, -1, -1)
-        live = {}
-        for parent in self.inputs:
-            weight = self.weight(parent.name, length)
-            if parent.name in given:
-                values = given[parent.name]
-                values = values[:, None] if parent.relation is None else values
-                base = base + torch.einsum("tshd,bsd->bth", weight, values)
-            else:
-                live[parent.name] = (weight, self.mask(parent.name, length).tolist())
-        return base.unbind(1), live
+        base = self.known(given, length).expand(batch, -1, -1)
+        live = [parent.name for parent in self.inputs if parent.name not in given]
+        return base.unbind(1), {n: (self.weight(n, length), self.mask(n, length).tolist()) for n in live}
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:

@@ -13,20 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from .base import (
-    Chain,
-    Hoisted,
-    Input,
-    Join,
-    Network,
-    at,
-    keep,
-    once,
-    perceptron,
-    reverse,
-    shift,
-)
-from .dense import part
+from .base import Chain, Hoisted, Input, Join, Network, at, keep, once, part, perceptron, reverse, shift
 from .extract import Extract, Extractors
 from .rows import Rows, select
 
@@ -197,8 +184,7 @@ class MemoryState:
 
     def select(self, rows: Tensor) -> MemoryState:
         """Its rows; the base is that of the start."""
-        lengths = None if self.lengths is None else self.lengths[rows]
-        chosen = MemoryState(self.base, self.live, lengths, select(self.hidden, rows))
+        chosen = MemoryState(self.base, self.live, select(self.lengths, rows), select(self.hidden, rows))
         chosen.steps = select(self.steps, rows)
         return chosen
 
@@ -260,7 +246,7 @@ class RecurrentNetwork(Network):
         pasts = [Memory(spec, entries, +1) for entries in _groups(past, spec.separate)]
         under = pasts[0] if spec.stack else None
         futures = [Memory(spec, entries, -1, under) for entries in _groups(future, spec.separate)]
-        self.memories = nn.ModuleList(futures if spec.stack else pasts + futures)
+        self.memories: Any = nn.ModuleList(futures if spec.stack else pasts + futures)
         sizes = [spec.width] * len(self.memories) + [parent.size for parent, _ in self.points]
         self.join = Join(sizes, spec.hidden, spec.activation, spec.mean)
         self.features = self.join.features
@@ -268,22 +254,16 @@ class RecurrentNetwork(Network):
     @property
     def past(self) -> Memory | None:
         """The forward memory, where there is one for all parents."""
-        memories = [memory.under or memory for memory in self._memories()]
+        memories = [memory.under or memory for memory in self.memories]
         forward = [memory for memory in memories if memory.direction > 0]
         return forward[0] if len(forward) == 1 else None
-
-    def _memories(self) -> list[Memory]:
-        return list(self.memories)  # type: ignore[arg-type]
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         values = self.extractors.of(parents, lengths)
-        states = [memory(values, parents, lengths) for memory in self._memories()]
+        states = [memory(values, parents, lengths) for memory in self.memories]
         if not self.local:
-            states = [
-                summary(state, memory.direction, lengths)
-                for state, memory in zip(states, self._memories(), strict=True)
-            ]
+            states = [summary(s, memory.direction, lengths) for s, memory in zip(states, self.memories, strict=True)]
         features: Tensor = self.join([*states, *(part(values[parent.name], lag) for parent, lag in self.points)])
         return features[:, None].expand(-1, length, -1) if self.local and features.dim() == 2 else features
 
@@ -292,7 +272,7 @@ class RecurrentNetwork(Network):
         values = self.extractors.of(given, lengths)
         known: dict[int, Tensor] = {}
         memories: list[tuple[Memory, MemoryState]] = []
-        for i, memory in enumerate(self._memories()):
+        for i, memory in enumerate(self.memories):
             if all(parent.name in given for parent, _ in memory.entries):
                 known[i] = memory(values, given, lengths)
             else:
@@ -316,9 +296,9 @@ class RecurrentNetwork(Network):
 
     @override
     def chain(self, state: RecurrentState) -> Chain | None:
-        if len(state.memories) + len(state.live) != 1 or not all(map(_is_perceptron, self.extractors.values())):
+        plain = all(isinstance(extractor, nn.Sequential) for extractor in self.extractors.values())
+        if len(state.memories) + len(state.live) != 1 or not plain:
             return None
-        before: tuple[tuple[Tensor, Tensor], ...] = ()
         if not state.memories:
             ((parent, lag),) = state.live
             return Chain(lag, self.join, state.hoisted, self._layers(parent.name))
@@ -327,12 +307,11 @@ class RecurrentNetwork(Network):
         if cell is None or len(memory_state.live) != 1:
             return None
         ((parent, lag, _),) = memory_state.live
-        before = self._layers(parent.name)
 
         def remember(drawn: Tensor, states: Tensor) -> None:
             keep(memory, memory.key({**state.given, parent.name: drawn}, memory_state.lengths), states)
 
-        return Chain(lag, self.join, state.hoisted, before, cell, remember)
+        return Chain(lag, self.join, state.hoisted, self._layers(parent.name), cell, remember)
 
     def _layers(self, name: str) -> tuple[tuple[Tensor, Tensor], ...]:
         if name not in self.extractors:
@@ -363,14 +342,8 @@ class RecurrentState:
 
     def select(self, rows: Tensor) -> RecurrentState:
         """Its rows; the known parents stay those of the start."""
-        memories = [(memory, state.select(rows)) for memory, state in self.memories]
-        return replace(
-            self,
-            hoisted=self.hoisted.select(rows),
-            memories=memories,
-            extracted=select(self.extracted, rows),
-            lengths=None if self.lengths is None else self.lengths[rows],
-        )
+        moved = {name: select(getattr(self, name), rows) for name in ("hoisted", "memories", "extracted", "lengths")}
+        return replace(self, **moved)
 
 
 def tie(first: Any, *others: Any) -> None:
@@ -393,10 +366,6 @@ def tie(first: Any, *others: Any) -> None:
         for name, _ in first.past.reads:
             if name in first.extractors:
                 other.extractors[name] = first.extractors[name]
-
-
-def _is_perceptron(module: Any) -> bool:
-    return isinstance(module, nn.Sequential)
 
 
 def _shape(network: Any) -> dict[str, Any]:

@@ -7,14 +7,14 @@ is read and not before, so that a run costs the same per step however long it is
 
 from __future__ import annotations
 
-from collections.abc import MutableSequence, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from torch import Tensor
 
 
-class Rows(MutableSequence[Any]):
+class Rows(Sequence[Any]):
     """Tensors (B, ...) by step, or None, as the rows that were chosen since they were written.
 
     Args:
@@ -35,9 +35,13 @@ class Rows(MutableSequence[Any]):
         chosen.origin = rows if self.origin is None else self.origin.index_select(0, rows)
         return chosen
 
-    def missing(self, t: int) -> bool:
-        """Whether step t has not been written."""
-        return self.values[t] is None
+    def follow(self, drawn: Sequence[Any], change: Callable[[Tensor], Tensor], lengths: Tensor | None) -> Rows:
+        """What `change` makes of the draws of a loop so far, of each once; 0 at padding."""
+        for s in range(len(drawn)):
+            if self.values[s] is None and (value := drawn[s]) is not None:
+                changed = change(value)
+                self[s] = changed if lengths is None else changed * (s < lengths)[:, None]
+        return self
 
     def __getitem__(self, t: Any) -> Any:
         value, since = self.values[t], self.written[t]
@@ -53,13 +57,6 @@ class Rows(MutableSequence[Any]):
 
     def __setitem__(self, t: Any, value: Any) -> None:
         self.values[t], self.written[t] = value, len(self.moves)
-
-    def __delitem__(self, t: Any) -> None:
-        raise TypeError("every step has its value")
-
-    def insert(self, index: int, value: Any) -> None:
-        """Not possible."""
-        raise TypeError("every step has its value")
 
     def __len__(self) -> int:
         return len(self.values)

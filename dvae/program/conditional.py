@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ..laws.base import LawSpec, Parameters, Shape
 from ..laws.chain import DERIVATIVES, gaussian_chain
 from ..laws.families import NormalLaw
-from ..networks.base import Input, Network, NetworkSpec, at, shift
+from ..networks.base import Input, Network, NetworkSpec, at, once_valid, shift
 from ..networks.rows import Rows
 from ..notation import Factor
 from ..units import Units
@@ -150,7 +150,7 @@ class Conditional(nn.Module):
         if not self.parents:
             return {CONSTANT: next(self.parameters()).new_ones(batch, 1)}
         found = {name: values[name] for name in self.parents if name in values}
-        return found | {n: self.units[n].of(v, lengths) for n, v in found.items() if n in self.units}
+        return found | {n: once_valid(self.units[n], v, lengths) for n, v in found.items() if n in self.units}
 
     @property
     def _made_in(self) -> Units | None:
@@ -180,7 +180,7 @@ class Conditional(nn.Module):
         read = drawn
         if isinstance(state, Standardised):
             kept, lengths = state.kept, state.lengths
-            read = {**drawn, **{n: self.units[n].drawn(rows, drawn[n], lengths) for n, rows in kept.items()}}
+            read = {**drawn, **{n: rows.follow(drawn[n], self.units[n], lengths) for n, rows in kept.items()}}
             features, state.network = self.network.step(state.network, t, read)
         else:
             features, state = self.network.step(state, t, read)

@@ -22,12 +22,11 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -38,6 +37,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from torch import Tensor, nn
 
+from .. import files
 from ..inference.bounds import SequenceELBO
 from ..program.conditional import evaluating
 
@@ -176,6 +176,7 @@ class Change:
         return "\n".join(lines)
 
 
+@dataclass
 class ElboRegression:
     """The fixture `elbo_regression`.
 
@@ -188,18 +189,13 @@ class ElboRegression:
         owners: the tests whose records have been read or written, by file.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        test: str,
-        update: bool,
-        strict: bool,
-        note: Callable[[str], None],
-        owners: dict[Path, str],
-    ):
-        self.folder, self.test, self.update, self.strict = folder, test, update, strict
-        self.note, self.owners = note, owners
-        self._mine: set[Path] = set()
+    folder: Path
+    test: str
+    update: bool
+    strict: bool
+    note: Callable[[str], None]
+    owners: dict[Path, str]
+    _mine: set[Path] = field(default_factory=set, init=False)
 
     def check(
         self,
@@ -341,10 +337,8 @@ def checksums(data: Any, sequences: int) -> dict[str, Any]:
         sums = rows @ np.cos(np.arange(rows.shape[1])) / math.sqrt(rows.shape[1])
         rms = np.sqrt((rows**2).mean(1))
         numbers = {"rms": rms, "checksums": sums}
-        return {
-            "shape": list(values.shape),
-            **{key: [_rounded(n, 6) for n in column] for key, column in numbers.items()},
-        }
+        rounded = {key: [_rounded(n, 6) for n in column] for key, column in numbers.items()}
+        return {"shape": list(values.shape), **rounded}
 
     return {name: table(values) for name, values in _leaves(data)}
 
@@ -396,7 +390,5 @@ def _shown(path: Path) -> Path:
 
 def _write(path: Path, text: str) -> None:
     """Writes whole or not at all: other processes may read and write the same file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_name(f"{path.name}.{os.getpid()}.new")
-    new.write_text(text, encoding="utf-8", newline="\n")
-    os.replace(new, path)
+    with files.written(path) as file:
+        file.write(text.encode())

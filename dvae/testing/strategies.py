@@ -18,16 +18,11 @@ BACKWARD = {
 
 
 @st.composite
-def factorizations(draw: st.DrawFn, max_locals: int = 2, static: bool = True, backward: bool = True) -> tuple[str, str]:
+def factorizations(draw: st.DrawFn) -> tuple[str, str]:
     """Pairs (generative, inference) of equations, always valid together.
 
     Variables are the observed x, the local latents z and (with two) u, and perhaps a static latent w. Factors
-    are written in random order, so not always in one in which they can be drawn.
-
-    Args:
-        max_locals: 1 or 2 local latents at most.
-        static: allow the static latent w.
-        backward: allow guides that run backward in time.
+    are written in random order, so not always in one in which they can be drawn. Some guides run backward in time.
 
     Example::
 
@@ -35,8 +30,8 @@ def factorizations(draw: st.DrawFn, max_locals: int = 2, static: bool = True, ba
         def test_bound(pair):
             generative, inference = map(dvae.Factorization.parse, pair)
     """
-    latents = draw(st.sampled_from([("z",), ("z", "u")][:max_locals]))
-    shared = ["w"] if static and draw(st.booleans()) else []
+    latents = draw(st.sampled_from([("z",), ("z", "u")]))
+    shared = ["w"] if draw(st.booleans()) else []
 
     order = draw(st.permutations([*latents, "x"]))
     # Either all locals share one loop over time, or each reads the earlier ones at any step and its own past.
@@ -51,7 +46,7 @@ def factorizations(draw: st.DrawFn, max_locals: int = 2, static: bool = True, ba
                 reads[parent] = draw(st.sampled_from(allowed))
         generative.append(_factor("p", child, reads, [name for name in shared if draw(st.booleans())]))
 
-    flip = BACKWARD if backward and draw(st.booleans()) else {}
+    flip = BACKWARD if draw(st.booleans()) else {}
     static_first = draw(st.booleans())
     order = draw(st.permutations(latents))
     inference = []

@@ -402,8 +402,8 @@ def test_memories_of_different_pasts_are_not_tied():
     other = build("lstm", [Input("x", 2, Relation.parse("<=t"))])
     with pytest.raises(ValueError, match="different pasts"):
         tie(first, other)
-    with pytest.raises(ValueError, match="only recurrent networks have a memory to tie, not a DenseNetwork"):
-        tie(first, build("dense", [Input("x", 2, Relation.parse("t"))]))
+    with pytest.raises(ValueError, match="only recurrent networks have a memory to tie, not a AttentionNetwork"):
+        tie(first, build("attention", [Input("x", 2, Relation.parse("t"))]))
     with pytest.raises(ValueError, match="cannot tie a network without a past"):
         tie(first, build("lstm", [Input("x", 2, Relation.parse(">t"))]))
     for spec in (Recurrent(5, hidden=(4,)), Recurrent(4, extract={"x": (2,)})):
