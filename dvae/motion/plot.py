@@ -227,18 +227,9 @@ def animate(
         people.insert(0, ("truth", TRUTH, real))
     if not all(np.isfinite(positions).all() for positions in (past, *(ahead for _, _, ahead in people))):
         raise ValueError("observed, samples or truth have NaN or infinite positions, which cannot be drawn")
-    motion = np.full((len(people), len(past) + future.shape[1], skeleton.joints, 3), np.nan)
-    for k, (_, _, ahead) in enumerate(people):  # a truth that ends early leaves NaN, which plotly does not draw
-        motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
-    turn = torch.tensor(view - facing(skeleton, torch.from_numpy(past[-1])), dtype=torch.float64)
-    motion = rotate_about_up(torch.from_numpy(motion), turn, skeleton.up).numpy()
-    if skeleton.up == "y":  # plotly turns a scene about z
-        motion = motion[..., [0, 2, 1]] * [1, -1, 1]
+    motion = _seen(skeleton, past, [ahead for _, _, ahead in people], future.shape[1], view)
     low, high = np.nanmin(motion, (0, 1, 2)), np.nanmax(motion, (0, 1, 2))
-    step = np.maximum(high - low + 0.4, SPACING)
-    columns = _abreast(len(people), step[0] / step[2])
-    row, column = np.divmod(np.arange(len(people)), columns)
-    places = np.stack([column * step[0], 0.0 * row, -row * step[2]], axis=-1)  # rows one above the other
+    places = _places(len(people), np.maximum(high - low + 0.4, SPACING))
     gap = np.full((*motion.shape[:2], 1, 3), np.nan)
     motion = np.concatenate([motion + places[:, None, None], gap], axis=2).astype(np.float32)
 
@@ -272,17 +263,7 @@ def animate(
         for (name, _, _), (x, y, z) in zip(people, places, strict=True)
     ]
     low, high = low + places.min(0) - MARGIN, high + places.max(0) + MARGIN
-    size = high - low
-    height = size[2] * np.cos(ELEVATION) + size[1] * np.sin(ELEVATION)
-    # an orthographic scene is 2 high, and as wide as the window makes it, here taken for 2:1; what lies behind the eye
-    # is not seen, from wherever it looks
-    ratio = 1.9 * size / max(height, size[0] / 2)
-    far = float(np.linalg.norm(ratio))
-    axes = {
-        # what lies on the limits of a range would be cut away in part
-        f"{axis}axis": {"visible": False, "range": [low[i] - 0.01, high[i] + 0.01]}
-        for i, axis in enumerate("xyz")
-    }
+    scene, fill = _scene(low, high)
     return go.Figure(
         data=[*first, *(_floor(low[:2], high[:2], height) for height in floors)],
         frames=[go.Frame(name=str(f), data=traces(f), traces=list(range(len(drawn)))) for f in shown],
@@ -291,19 +272,9 @@ def animate(
             "template": "none",
             "showlegend": False,
             "margin": {"l": 0, "r": 0, "t": 40 if title else 0, "b": 110},
-            "scene": {
-                **axes,
-                "aspectmode": "manual",
-                "aspectratio": dict(zip("xyz", ratio, strict=True)),
-                "annotations": labels,
-                "dragmode": "turntable",
-                "camera": {
-                    "eye": {"x": 0.0, "y": -far * np.cos(ELEVATION), "z": far * np.sin(ELEVATION)},
-                    "projection": {"type": "orthographic"},
-                },
-            },
+            "scene": {**scene, "annotations": labels},
             **_player({str(f): (f - now) / skeleton.fps for f in shown}, 1000 * every / skeleton.fps),
-            "meta": {"milliseconds": 1000 * every / skeleton.fps, "high": 1.9 * height / max(height, size[0] / 2)},
+            "meta": {"milliseconds": 1000 * every / skeleton.fps, "high": fill},
         },
     )
 
@@ -356,10 +327,45 @@ def _player(seconds: dict[str, float], spacing: float) -> dict[str, Any]:
     }
 
 
-def _abreast(people: int, wide: float) -> int:
-    """How many stand in a row, so that all are as large as can be in a window of 2:1; one is `wide` by 1."""
+def _seen(skeleton: Skeleton, past: np.ndarray, futures: Sequence[np.ndarray], horizon: int, view: float) -> np.ndarray:
+    """Motions (P, O + H, J, 3) as the viewer of an animation sees them, with z up."""
+    motion = np.full((len(futures), len(past) + horizon, skeleton.joints, 3), np.nan)
+    for k, ahead in enumerate(futures):  # a truth that ends early leaves NaN, which plotly does not draw
+        motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
+    turn = torch.tensor(view - facing(skeleton, torch.from_numpy(past[-1])), dtype=torch.float64)
+    motion = rotate_about_up(torch.from_numpy(motion), turn, skeleton.up).numpy()
+    return motion if skeleton.up == "z" else motion[..., [0, 2, 1]] * [1, -1, 1]  # plotly turns a scene about z
+
+
+def _places(people: int, step: np.ndarray) -> np.ndarray:
+    """Where to stand (P, 3), `step` apart, so that all are as large as can be in a window of 2:1."""
+    wide = step[0] / step[2]
     rows = min(range(1, people + 1), key=lambda rows: max(rows, ceil(people / rows) * wide / 2))
-    return ceil(people / rows)
+    row, column = np.divmod(np.arange(people), ceil(people / rows))
+    return np.stack([column * step[0], 0.0 * row, -row * step[2]], axis=-1)  # rows one above the other
+
+
+def _scene(low: np.ndarray, high: np.ndarray) -> tuple[dict[str, Any], float]:
+    """The part of a layout that shows what lies between two corners (3,), and how much of its height is filled."""
+    size = high - low
+    height = size[2] * np.cos(ELEVATION) + size[1] * np.sin(ELEVATION)
+    # an orthographic scene is 2 high, and as wide as the window makes it, here taken for 2:1; what lies behind the eye
+    # is not seen, from wherever it looks
+    fit = max(height, size[0] / 2)
+    ratio = 1.9 * size / fit
+    far = float(np.linalg.norm(ratio))
+    eye = {"x": 0.0, "y": -far * np.cos(ELEVATION), "z": far * np.sin(ELEVATION)}
+    scene = {
+        # what lies on the limits of a range would be cut away in part
+        f"{axis}axis": {"visible": False, "range": [low[i] - 0.01, high[i] + 0.01]}
+        for i, axis in enumerate("xyz")
+    } | {
+        "aspectmode": "manual",
+        "aspectratio": dict(zip("xyz", ratio, strict=True)),
+        "dragmode": "turntable",
+        "camera": {"eye": eye, "projection": {"type": "orthographic"}},
+    }
+    return scene, 1.9 * height / fit
 
 
 def _literal(text: str) -> str:
