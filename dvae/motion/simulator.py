@@ -118,16 +118,14 @@ def _morphology(random: np.random.Generator, clips: int) -> np.ndarray:
     part = [parts.get(name.lstrip("LR"), 0) for name in WALKER.names]
     size = np.exp(0.07 * random.standard_normal((clips, 1)))
     proportions = np.exp(0.05 * random.standard_normal((clips, 4)))
-    found: np.ndarray = rest * (size * proportions[:, part])[..., None]
-    return found
+    return rest * (size * proportions[:, part])[..., None]
 
 
 def _style(random: np.random.Generator, clips: int) -> np.ndarray:
     """(N, 7): cadence (Hz); stride, knee lift, arm swing, elbow bend, lean (radians); pace of waving (Hz)."""
     middle = np.array([0.95, 0.42, 0.95, 0.45, 0.45, 0.06, 1.4])
     spread = np.array([0.14, 0.07, 0.12, 0.16, 0.22, 0.06, 0.3])
-    found: np.ndarray = middle + spread * np.clip(random.standard_normal((clips, 7)), -2, 2)
-    return found
+    return middle + spread * np.clip(random.standard_normal((clips, 7)), -2, 2)
 
 
 def _activities(random: np.random.Generator, clips: int, frames: int) -> np.ndarray:
@@ -156,21 +154,18 @@ def _smooth(signals: np.ndarray, seconds: float) -> np.ndarray:
     kernel /= kernel.sum()
     padded = np.pad(signals, ((0, 0), (half, half), (0, 0)), mode="edge")
     frames = signals.shape[1]
-    found: np.ndarray = sum(w * padded[:, k : k + frames] for k, w in enumerate(kernel))
-    return found
+    return sum(w * padded[:, k : k + frames] for k, w in enumerate(kernel))
 
 
 def _drift(random: np.random.Generator, clips: int, frames: int) -> np.ndarray:
     """A slow random signal (N, F) of unit variance: four sinusoids below 0.4 Hz."""
     time = np.arange(frames) / WALKER.fps
     hertz, phase = random.uniform(0.05, 0.4, (clips, 4, 1)), random.uniform(0, 2 * np.pi, (clips, 4, 1))
-    found: np.ndarray = np.sin(2 * np.pi * hertz * time + phase).sum(axis=1) / np.sqrt(2)
-    return found
+    return np.sin(2 * np.pi * hertz * time + phase).sum(axis=1) / np.sqrt(2)
 
 
 def _of(weights: np.ndarray, prefix: str) -> np.ndarray:
-    found: np.ndarray = weights[..., [k for k, name in enumerate(ACTIVITIES) if name.startswith(prefix)]].sum(axis=-1)
-    return found
+    return weights[..., [k for k, name in enumerate(ACTIVITIES) if name.startswith(prefix)]].sum(axis=-1)
 
 
 def _phase(random: np.random.Generator, weights: np.ndarray, style: np.ndarray) -> np.ndarray:
@@ -284,5 +279,4 @@ def _stand_on_feet(
     moves = _smooth(np.concatenate([travel, height[..., None]], axis=2), SETTLE)
     path = random.uniform(-1, 1, (len(positions), 1, 2)) + np.cumsum(moves[..., :2], axis=1)
     pelvis = np.stack([path[..., 0], moves[..., 2], path[..., 1]], axis=2)
-    found: np.ndarray = positions + pelvis[:, :, None]
-    return found
+    return positions + pelvis[:, :, None]
