@@ -17,6 +17,7 @@ Node = tuple[str, int | None]
 Edge = tuple[Node, Node]
 
 RADIUS = 0.3
+ARROW: dict[str, Any] = {"shrinkA": 0, "shrinkB": 0, "arrowstyle": "-|>", "mutation_scale": 9, "zorder": 2}
 EDGE: dict[str, Any] = {"color": "0.35", "linestyle": "-", "linewidth": 0.9}
 MISSING: dict[str, Any] = {"color": "#c0392b", "linestyle": "--", "linewidth": 1.3}
 REDUNDANT: dict[str, Any] = {"color": "0.6", "linestyle": ":", "linewidth": 1.2}
@@ -53,22 +54,9 @@ def draw_dag(
     dotted = set(redundant)
     arrows = [(edge, REDUNDANT if edge in dotted else EDGE) for edge in dag.edges]
     for (source, target), style in arrows + [(edge, MISSING) for edge in missing]:
-        bend = _bend(source, target, place)
-        ax.add_patch(
-            FancyArrowPatch(
-                place[source],
-                place[target],
-                patchA=patches[source],
-                patchB=patches[target],
-                shrinkA=0,
-                shrinkB=0,
-                arrowstyle="-|>",
-                mutation_scale=9,
-                connectionstyle=f"arc3,rad={bend}",
-                zorder=2,
-                **style,
-            )
-        )
+        ends: dict[str, Any] = {"patchA": patches[source], "patchB": patches[target]}
+        curve = f"arc3,rad={_bend(source, target, place)}"
+        ax.add_patch(FancyArrowPatch(place[source], place[target], connectionstyle=curve, **ends, **ARROW, **style))
     ax.set_aspect("equal")
     ax.autoscale_view()
     ax.margins(0.05)

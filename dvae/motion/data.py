@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field
 
 import numpy as np
@@ -90,8 +90,8 @@ class MotionSet:
         clips: the clips; copied as float32.
         skeleton: the tree that all of them have.
         name: what to call the set.
-        skipped: clips that were left out on reading, as (split, name, reason).
         copy: False takes over arrays that are float32 already, which nobody else may hold.
+        skip_bad: leave out clips that cannot be used, and list them in `skipped`, as (split, name, reason).
 
     Raises:
         ValueError: a clip has NaN, wrong joints, a wrong shape or implausible units, two clips share a key,
@@ -101,42 +101,32 @@ class MotionSet:
     clips: Sequence[Clip]
     skeleton: Skeleton
     name: str = ""
-    skipped: Sequence[tuple[str, str, str]] = ()
+    skipped: Sequence[tuple[str, str, str]] = field(default=(), init=False)
     copy: InitVar[bool] = True
+    skip_bad: InitVar[bool] = False
 
-    def __post_init__(self, copy: bool) -> None:
-        single, what = [], self.name or "motion set"
+    def __post_init__(self, copy: bool, skip_bad: bool) -> None:
+        single, skipped, what = [], [], self.name or "motion set"
         for clip in self.clips:  # once: an iterator need not hold clips that were taken over
-            reason = defect(clip, self.skeleton)
-            if reason:
-                raise ValueError(f"{what}: {reason}")
+            if reason := defect(clip, self.skeleton):
+                if not skip_bad:
+                    raise ValueError(f"{what}: {reason}")
+                skipped.append((*clip.key, reason))
+                del clip
+                continue
             positions = np.require(clip.positions, np.float32, ["C", "A", "W"])
             positions = positions.copy() if copy and np.may_share_memory(positions, clip.positions) else positions
             single.append(Clip(clip.split, clip.name, positions, clip.labels, clip.truth))
             del clip, positions
         if not single:
-            dropped = f"; {len(self.skipped)} were skipped, the first: {self.skipped[0][2]}" if self.skipped else ""
+            dropped = f"; {len(skipped)} were skipped, the first: {skipped[0][2]}" if skipped else ""
             raise ValueError(f"{what}: no clips{dropped}")
         twice = [key for key, count in Counter(clip.key for clip in single).items() if count > 1]
         if twice:
             raise ValueError(f"{what}: clip {'/'.join(twice[0])} is there twice")
         object.__setattr__(self, "clips", tuple(single))
+        object.__setattr__(self, "skipped", tuple(skipped))
         object.__setattr__(self, "_index", {clip.key: clip for clip in single})
-
-    @classmethod
-    def usable(cls, clips: Iterable[Clip], skeleton: Skeleton, name: str = "", copy: bool = True) -> MotionSet:
-        """The set of those clips that have no defect; the others are listed in `skipped` with the reason."""
-        skipped: list[tuple[str, str, str]] = []
-
-        def kept() -> Iterator[Clip]:
-            for clip in clips:
-                if reason := defect(clip, skeleton):
-                    skipped.append((clip.split, clip.name, reason))
-                else:
-                    yield clip
-                del clip
-
-        return cls(kept(), skeleton, name, skipped, copy)  # type: ignore[arg-type]
 
     def __len__(self) -> int:
         return len(self.clips)

@@ -64,10 +64,7 @@ class MotionData:
 
     @classmethod
     def open(
-        cls,
-        path: str | os.PathLike[str] = SIMULATED,
-        protocol: str | Protocol | None = None,
-        skip_bad: bool = False,
+        cls, path: str | os.PathLike[str] = SIMULATED, protocol: str | Protocol | None = None, skip_bad: bool = False
     ) -> Self:
         """Reads a motion file, or simulates.
 

@@ -81,9 +81,7 @@ def read_motion(
             yield Clip(split, name, positions, known.get((split, name), known.get((None, name), {})))
             del positions
 
-    if skip_bad:
-        return MotionSet.usable(clips(), skeleton, path.stem, copy=False)
-    return MotionSet(clips(), skeleton, path.stem, copy=False)  # type: ignore[arg-type]
+    return MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad)  # type: ignore[arg-type]
 
 
 def save(path: str | Path, motion: MotionSet) -> None:

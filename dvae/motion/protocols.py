@@ -89,11 +89,7 @@ class Protocol:
         return self.observed + self.predicted
 
 
-_HUMAN36M: dict[str, Any] = {
-    "train": ("S1", "S5", "S6", "S7", "S8"),
-    "test": ("S9", "S11"),
-    "sampling": "subject",
-}
+_HUMAN36M: dict[str, Any] = {"train": ("S1", "S5", "S6", "S7", "S8"), "test": ("S9", "S11"), "sampling": "subject"}
 _STYLES: dict[str, Any] = {"split_by": "file_group", "train": ("A", "B"), "test": ("C",)}
 _TRAJECTORIES: dict[str, Any] = {"root": "relative", "rotate": True}
 

@@ -185,11 +185,7 @@ def _heading(random: np.random.Generator, weights: np.ndarray) -> np.ndarray:
 
 
 def _angles(
-    random: np.random.Generator,
-    weights: np.ndarray,
-    style: np.ndarray,
-    phase: np.ndarray,
-    heading: np.ndarray,
+    random: np.random.Generator, weights: np.ndarray, style: np.ndarray, phase: np.ndarray, heading: np.ndarray
 ) -> dict[str, list[tuple[str, np.ndarray]]]:
     """Rotations of the bones that start at each joint: (axis, angle (N, F)), the outermost first.
 
@@ -204,11 +200,7 @@ def _angles(
 
     sway = 0.05 * walk * np.sin(phase)
     rotations: dict[str, list[tuple[str, np.ndarray]]] = {
-        "Pelvis": [
-            ("y", heading + 0.1 * walk * np.sin(phase)),
-            ("x", 0.4 * lean + 0.01 * drift[0]),
-            ("z", sway),
-        ],
+        "Pelvis": [("y", heading + 0.1 * walk * np.sin(phase)), ("x", 0.4 * lean + 0.01 * drift[0]), ("z", sway)],
         "Spine": [("x", 0.6 * lean + 0.02 * drift[1]), ("y", 0.03 * drift[2])],
         "Thorax": [("y", -0.22 * walk * np.sin(phase) + 0.05 * drift[2]), ("z", -sway)],
         "Neck": [("x", -0.7 * lean + 0.04 * drift[3]), ("y", 0.12 * drift[2] + 0.05 * drift[1])],

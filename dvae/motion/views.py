@@ -53,7 +53,12 @@ class Heading(View):
             seen[name] = torch.where(data["mask"][name], data[name], 0.0)
         if found is None:
             if self.pose is None and "lengths" in data:
-                self._check_lengths(data["lengths"], data[WHOLE].shape[-2])
+                shortest, needed = data["lengths"].min(), min(self.frames, data[WHOLE].shape[-2])
+                if shortest < needed:
+                    raise ValueError(
+                        f"this model turns every window by its frame {needed}, but a sequence has {shortest}; leave it "
+                        "out, or fit with heading=False"
+                    )
             found = self.of(seen[source])
         return self._turn(seen, -found) | {HEADING: found}
 
@@ -88,14 +93,6 @@ class Heading(View):
                 f"{sizes[0]} coordinates, or {sizes[1]} without the root"
             )
         return self.skeleton.with_root(pose.unflatten(-1, (-1, 3)), root)
-
-    def _check_lengths(self, lengths: Tensor, steps: int) -> None:
-        needed = min(self.frames, steps)
-        if lengths.min() < needed:
-            raise ValueError(
-                f"this model turns every window by its frame {needed}, but a sequence has {lengths.min()}; leave it "
-                "out, or fit with heading=False"
-            )
 
     def _check_mask(self, name: str, mask: Tensor) -> None:
         """Refuses missing entries that leave the heading open, or half of what a turn mixes."""

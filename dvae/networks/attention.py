@@ -123,7 +123,6 @@ class AttentionNetwork(Network):
     """What `Attention` describes."""
 
     slopes: Tensor
-    layers: Any
 
     def __init__(self, spec: Attention, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, spec.width)
@@ -151,7 +150,7 @@ class AttentionNetwork(Network):
         sizes = [parent.size for parent, _ in self.points]
         self.point = Join(sizes, (spec.width, spec.width), spec.activation) if sizes else None
         self.origin = nn.Parameter(torch.randn(spec.width) / math.sqrt(spec.width))
-        self.layers = nn.ModuleList(Layer(spec) for _ in range(spec.layers if self.ranged else 0))
+        self.layers: Any = nn.ModuleList(Layer(spec) for _ in range(spec.layers if self.ranged else 0))
         self.norm = nn.LayerNorm(spec.width)
         self.register_buffer("slopes", _slopes(spec.heads), persistent=False)
 
@@ -206,12 +205,7 @@ class AttentionNetwork(Network):
         return stream + (joined if joined.dim() == 3 else joined[:, None])
 
     def tokens(
-        self,
-        parents: Sequence[Input],
-        values: Mapping[str, Tensor],
-        batch: int,
-        length: int,
-        lengths: Tensor | None,
+        self, parents: Sequence[Input], values: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Tokens (B, 1 + T * parents, W), the start token first, and their bias to every step."""
         tokens = [self.start_token.expand(batch, 1, -1)]
@@ -290,7 +284,6 @@ class SelfAttentionNetwork(Network):
     """What `SelfAttention` describes."""
 
     slopes: Tensor
-    layers: Any
 
     def __init__(self, spec: SelfAttention, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, spec.width)
@@ -307,7 +300,7 @@ class SelfAttentionNetwork(Network):
             )
         tokens = [self.extractors.seen(parent).size for parent in (*self.encoded, *self.statics)]
         self.embed = nn.Linear(sum(tokens), spec.width)
-        self.layers = nn.ModuleList(Layer(spec) for _ in range(spec.layers))
+        self.layers: Any = nn.ModuleList(Layer(spec) for _ in range(spec.layers))
         self.norm = nn.LayerNorm(spec.width)
         self.register_buffer("slopes", _slopes(spec.heads), persistent=False)
         then = replace(spec, extract={n: e for n, e in spec.extract.items() if n in [p.name for p in rest]})

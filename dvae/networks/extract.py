@@ -57,10 +57,7 @@ class Extractors(nn.ModuleDict):
         return {n: (getattr(m, "hoisted", lambda m=m: m)(), Rows([None] * length)) for n, m in self.items()}
 
     def drawn(
-        self,
-        kept: Mapping[str, tuple[Any, Rows]],
-        drawn: Mapping[str, Sequence[Tensor]],
-        lengths: Tensor | None,
+        self, kept: Mapping[str, tuple[Any, Rows]], drawn: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
     ) -> dict[str, Sequence[Tensor]]:
         """The draws of a loop so far as the network reads them; each passes through its extractor once."""
         return {**drawn, **{n: kept[n][1].follow(drawn[n], kept[n][0], lengths) for n in self.keys() & drawn}}

@@ -82,17 +82,15 @@ class Memory(nn.Module):
         self, spec: Recurrent, entries: Sequence[tuple[Input, int]], direction: int, under: Memory | None = None
     ):
         super().__init__()
-        self.layers: list[Any]
-        self.embed: Any
         self.entries = tuple(entries)
         self.direction = direction
-        self.under: Memory | None = under
+        self.under = under
         size = sum(parent.size for parent, _ in entries) + (spec.width if under else 0)
         self.reads = [(parent.name, lag) for parent, lag in entries]
-        self.embed = perceptron((size, spec.embed), spec.activation) if spec.embed else None
+        self.embed: Any = perceptron((size, spec.embed), spec.activation) if spec.embed else None
         kind = CELLS[spec.cell]
         sizes = [spec.embed or size] + [spec.width] * (spec.layers - 1)
-        self.layers = nn.ModuleList(kind(a, spec.width, batch_first=True) for a in sizes)  # type: ignore[assignment]
+        self.layers: Any = nn.ModuleList(kind(a, spec.width, batch_first=True) for a in sizes)
         self.cell = gru_cell if spec.cell == "gru" else lstm_cell
 
     def forward(self, values: Mapping[str, Tensor], keys: Mapping[str, Tensor], lengths: Tensor | None) -> Tensor:

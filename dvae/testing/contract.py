@@ -80,7 +80,7 @@ class FactorizationContract:
     def test_networks_read_the_declared_parents_and_nothing_else(self) -> None:
         """Parameters at t have a Jacobian of exactly zero to a parent at s wherever the mask is False."""
         model = self._model()
-        values = self._values(model)
+        values = self._data(model, 1, names=model.sizes)
         for conditional in (*model.generator.values(), *model.encoder.values()):
             for name in conditional.parents:
                 shown = torch.as_tensor(conditional.factor.mask(name, self.steps))
@@ -244,16 +244,12 @@ class FactorizationContract:
     def _model(self, size: int = 2) -> DynamicalVAE:
         return self.build(size).double().eval()
 
-    def _values(self, model: DynamicalVAE) -> dict[str, Tensor]:
-        """A value of every variable, for one sequence."""
-        shapes = {name: (1, self.steps, d) if self._local(model, name) else (1, d) for name, d in model.sizes.items()}
-        return {name: torch.randn(shape, dtype=torch.float64) for name, shape in shapes.items()}
-
-    def _data(self, model: DynamicalVAE, batch: int = 0, steps: int = 0) -> dict[str, Tensor]:
+    def _data(self, model: DynamicalVAE, batch: int = 0, steps: int = 0, names: Any = ()) -> dict[str, Tensor]:
+        """Values of the data and the context, or of other variables."""
         batch, steps = batch or self.batch, steps or self.steps
         return {
             name: torch.randn(batch, *([steps] * self._local(model, name)), model.sizes[name], dtype=torch.float64)
-            for name in (*model.observed, *model.context)
+            for name in names or (*model.observed, *model.context)
         }
 
     def _local(self, model: DynamicalVAE, name: str) -> bool:

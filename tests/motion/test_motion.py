@@ -162,12 +162,12 @@ class TestMotionSet:
 
     def test_bad_clips_can_be_dropped_and_are_counted(self):
         clips = [*people(), *(replace(damaged(c), name=f"bad_{i}") for i, (c, _) in enumerate(BAD))]
-        kept = MotionSet.usable(clips, WALKER)
+        kept = MotionSet(clips, WALKER, skip_bad=True)
         assert len(kept) == len(people())
         assert [name for _, name, _ in kept.skipped] == [f"bad_{i}" for i in range(len(BAD))]
         assert kept.summary()[0]["skipped"] == len(BAD)
         with pytest.raises(ValueError, match="no clips; 1 were skipped, the first: clip train/walk has NaN"):
-            MotionSet.usable([damaged(with_nan)], WALKER)
+            MotionSet([damaged(with_nan)], WALKER, skip_bad=True)
 
     def test_a_lying_person_is_a_person(self):
         lying = simulate(1, 30).clips[0].positions[..., [1, 2, 0]]  # what was height is now along x
