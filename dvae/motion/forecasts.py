@@ -74,15 +74,8 @@ class Forecasts:
         skeleton as in its JSON file: `name`, `joint_names`, `parents`, `joints_left`, `joints_right`, `up_axis`,
         `fps`.
         """
-        split, clip, start = zip(*self.keys, strict=True)
-        arrays = {
-            "forecasts": self.forecasts,
-            "observed": self.observed,
-            "truth": self.truth,
-            "split": np.array(split),
-            "clip": np.array(clip),
-            "start": np.array(start),
-        }
+        arrays = {"forecasts": self.forecasts, "observed": self.observed, "truth": self.truth}
+        arrays |= zip(("split", "clip", "start"), map(np.array, zip(*self.keys, strict=True)), strict=True)
         for field, key in FIELDS.items():
             arrays[key] = np.array(getattr(self.skeleton, field), int if field in ("left", "right") else None)
         with files.written(path) as file:

@@ -325,13 +325,7 @@ class Windows:
 
     def poses(self) -> Tensor:
         """Every frame of the clips, once, as a window that starts there has it: (N, D) float32."""
-        root = self.skeleton.root
-        joints = self._frames - self._frames[:, root : root + 1]
-        if self.protocol.heading:
-            joints = rotate_about_up(joints, -self.skeleton.heading(joints)[:, None], self.skeleton.up)
-        if self.protocol.root == "drop":
-            joints = self.skeleton.without_root(joints)
-        return joints.flatten(1)
+        return self._represented(self._frames[:, None], 0)[:, 0]
 
     def labels(self, name: str) -> list[str]:
         """The label of every listed window's clip; empty text where a clip lacks it.
@@ -465,10 +459,13 @@ class Windows:
     def _cut(self, clips: Tensor, starts: Tensor) -> Tensor:
         """(B,), (B,) -> (B, T, D): one gather, then the protocol's representation."""
         frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
-        joints = self._frames[frames]
+        return self._represented(self._frames[frames], self.protocol.observed - 1)
+
+    def _represented(self, joints: Tensor, now: int) -> Tensor:
+        """Frames (B, T, D) of joints (B, T, J, 3), of whose frame `now` the heading is zero, if it is fixed."""
         root = self.skeleton.root
         if self.protocol.heading:
-            heading = self.skeleton.heading(joints[:, self.protocol.observed - 1])[:, None, None]
+            heading = self.skeleton.heading(joints[:, now])[:, None, None]
         if self.protocol.root == "drop":
             joints = self.skeleton.without_root(joints - joints[:, :, root : root + 1])
         else:

@@ -86,6 +86,8 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
     lengths = np.linalg.norm(offsets, axis=-1)[:, 1:]
     trunk = offsets[:, [_J[j] for j in ("Spine", "Thorax", "Neck", "Head")], 1].sum(axis=1)
     height = _ANKLE_HEIGHT + trunk - offsets[:, [_J[j] for j in ("LHip", "LKnee", "LFoot")], 1].sum(axis=1)
+    known = {"activity": activity, "weights": weights, "phase": phase, "heading": heading}
+    known |= {"bone_lengths": lengths, "style": style}
     made = []
     for i in range(clips):
         switches = [0, *(np.flatnonzero(np.diff(activity[i])) + 1)]
@@ -95,14 +97,7 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
             "height_m": f"{height[i]:.3f}",
             "cadence_hz": f"{style[i, 0]:.3f}",
         }
-        truth = {
-            "activity": activity[i],
-            "weights": weights[i],
-            "phase": phase[i],
-            "heading": heading[i],
-            "bone_lengths": lengths[i],
-            "style": style[i],
-        }
+        truth = {name: values[i] for name, values in known.items()}
         split = "test" if i >= round(clips * (1 - test)) else "train"
         made.append(Clip(split, f"person_{i:04d}", positions[i], labels, truth))
     return MotionSet(made, WALKER, "simulated")

@@ -208,19 +208,17 @@ class AttentionNetwork(Network):
         self, parents: Sequence[Input], values: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Tokens (B, 1 + T * parents, W), the start token first, and their bias to every step."""
-        tokens = [self.start_token.expand(batch, 1, -1)]
-        biases = [self.slopes.new_zeros(1, length if self.local else 1, 1)]
-        for parent in parents:
-            tokens.append(self.embed[parent.name](values[parent.name]))
-            biases.append(self.bias(parent, length))
-        rows = max(b.shape[0] for b in biases)
-        bias = torch.cat([b.expand(rows, -1, -1) for b in biases], dim=-1)[None]
-        if lengths is not None:
-            hidden = ~valid_steps(lengths, length)
-            seen = hidden.new_zeros(batch, 1)
-            hidden = torch.cat([seen] + [hidden] * len(parents), dim=1)
-            bias = bias.masked_fill(hidden[:, None, None, :], -math.inf)
-        return torch.cat(tokens, dim=1), bias
+        tokens = [self.embed[parent.name](values[parent.name]) for parent in parents]
+        bias = functional.pad(self.biases(parents, length, lengths), (1, 0))
+        return torch.cat([self.start_token.expand(batch, 1, -1), *tokens], dim=1), bias
+
+    def biases(self, parents: Sequence[Input], length: int, lengths: Tensor | None) -> Tensor:
+        """(B or 1, heads or 1, T or 1, T * parents), of every step to the parents' valid ones."""
+        none = self.slopes.new_zeros(len(self.slopes) if self.local else 1, length if self.local else 1, 0)
+        bias = torch.cat([none, *(self.bias(parent, length) for parent in parents)], dim=-1)[None]
+        if lengths is None:
+            return bias
+        return bias.masked_fill(~valid_steps(lengths, length).repeat(1, len(parents))[:, None, None], -math.inf)
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
@@ -232,19 +230,12 @@ class AttentionNetwork(Network):
         tokens = bias = self.origin.new_zeros(1, 1, 1)
         if self.ranged:
             tokens, bias = self.tokens(fixed, given, batch, length, lengths)
-        given_tokens = bias.shape[-1]
-        if live:
-            ahead = torch.cat([self.bias(p, length) for p in live], dim=-1)[None]
-            if lengths is not None:
-                padding = ~valid_steps(lengths, length).repeat(1, len(live))
-                ahead = ahead.masked_fill(padding[:, None, None], -math.inf)
-            shape = torch.broadcast_shapes(bias.shape[:3], ahead.shape[:3])
-            bias = torch.cat([bias.expand(*shape, -1), ahead.expand(*shape, -1)], dim=-1)
+            bias = torch.cat([bias, self.biases(live, length, lengths)], dim=-1)
         return Attending(
             queries=queries,
             points=[entry for i, entry in enumerate(self.points) if i not in known],
             bias=bias,
-            given=given_tokens,
+            given=1 + length * len(fixed),
             batch=batch,
             live=live,
             length=length,

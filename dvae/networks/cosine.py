@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -27,7 +27,7 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..relations import ALL
-from .base import AtOnce, Input, Network, once
+from .base import AtOnce, Input, Network, once_valid
 from .dct import cosine_basis
 
 
@@ -122,7 +122,7 @@ class CosineEncoderNetwork(AtOnce):
         """No sequence is padded."""
         self.refuse_ragged(lengths)
         source, static = (parents[name] for name in self.names)
-        first = once(self.static, [static], partial(self.static, static))
+        first = once_valid(self.static, static, None)
         hidden = torch.cat([self.over_time(source), first[:, None].expand(-1, length, -1)], dim=-1)
         hidden = self.before(self.dropout(hidden + positions(length, self.features, hidden.dtype, hidden.device)))
         if self.spec.cosine:
@@ -165,7 +165,7 @@ class CosineDecoderNetwork(AtOnce):
         values = values[:, :components]
         if self.spec.cosine:
             values = cosine_basis(length, components, values.dtype, values.device).T @ values
-        start = once(self.static, [first], partial(self.static, first))
+        start = once_valid(self.static, first, None)
         joined = [start[:, None].expand(-1, length, -1), values, *(parents[name] for name in self.others)]
         hidden = self.into(torch.cat(joined, dim=-1))
         hidden = self.transformer(
