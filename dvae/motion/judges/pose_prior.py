@@ -176,13 +176,16 @@ class PosePriorModel(nn.Module):
 
 
 @alone
-def fit_pose_prior(windows: Windows, steps: int = 1000, seed: int = 0, **options: Any) -> PosePriorModel:
+def fit_pose_prior(
+    windows: Windows, steps: int = 1000, seed: int = 0, progress: bool = True, **options: Any
+) -> PosePriorModel:
     """Fits a pose prior quietly, on the CPU, in about fifteen seconds.
 
     Args:
         windows: training windows.
         steps: optimiser steps.
         seed: of the fit; the caller's random state is left as it was.
+        progress: show a bar.
         **options: of `PosePrior`.
 
     Returns:
@@ -200,7 +203,7 @@ def fit_pose_prior(windows: Windows, steps: int = 1000, seed: int = 0, **options
             weight_decay=1e-3,
             accelerator="cpu",
             progress=False,
-            trackers=[_Bar(steps)],
+            trackers=[_Bar(steps, progress)],
         )
     return model
 
@@ -239,8 +242,8 @@ def load_pose_prior(path: str | Path, skeleton: Skeleton, heading: bool) -> Pose
 class _Bar:
     """A tracker that shows how far a fit is, and no numbers."""
 
-    def __init__(self, steps: int) -> None:
-        self.bar = progress_bar(True)
+    def __init__(self, steps: int, shown: bool) -> None:
+        self.bar = progress_bar(shown)
         self.task = self.bar.add_task("pose prior", total=steps)
 
     def start(self, step: int) -> None:
