@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 RESERVED = {
     "lengths": "the batch's entry for the number of valid steps",
+    "log_det": "the batch's entry for the log-determinant of a view",
     "mask": "the batch's entry for which entries are observed",
     "sequences": "the name of the plate over the batch",
 }

@@ -20,6 +20,7 @@ from .networks.linear import Linear, LinearNetwork
 from .notation import Factorization
 from .program.model import DynamicalVAE
 from .turns import alone
+from .views import LOG_DET, volume
 
 
 @alone
@@ -153,12 +154,13 @@ class Oracle:
 
     def evidence(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
         """log p(x), (B,), of data (B, T, D)."""
-        data = self._stack(self.model.read(x), self.model.observed)
+        seen = self.model.read(x)
+        data = self._stack(seen, self.model.observed)
         mean, precision = self._joint()
         start = len(mean) - data.shape[1]
         covariance = torch.linalg.inv(precision)[start:, start:]
         evidence: Tensor = torch.distributions.MultivariateNormal(mean[start:], covariance).log_prob(data)
-        return evidence
+        return evidence + volume(seen) if LOG_DET in seen else evidence
 
     def posterior(self, x: Tensor | Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Mean (B, N) and covariance (N, N) of the latents, stacked in the guide's order, given data (B, T, D)."""

@@ -4,8 +4,12 @@ A model has one view. A batch goes through it where it is read (`DynamicalVAE.re
 data goes back through it where it is handed out (`DynamicalVAE.shown`): between the two, everything is as the model
 sees it. Views of one kind of data are with that data, as `dvae.motion.Heading` is.
 
-Views keep volume, so that bounds of what a model sees are bounds of the data. Another unit does not: it is one of the
-networks and of the laws (`dvae.units`), beside which densities stay in a variable's own.
+Densities and bounds are of the data as they are given: where a view changes volume, its log-determinant is added to
+what a model says of what it sees. All views here keep volume.
+
+>>> view = dvae.views.Parts({"legs": [0, 2], "arms": [1]})
+>>> {name: value.tolist() for name, value in view({"x": torch.tensor([[[1.0, 2.0, 3.0]]])}).items()}
+{'legs': [[[1.0, 3.0]]], 'arms': [[[2.0]]]}
 """
 
 from __future__ import annotations
@@ -19,18 +23,20 @@ from torch import Tensor
 from typing_extensions import override
 
 from .data import Batch
+from .networks.base import valid_steps
 from .notation import Factorization
 
 WHOLE = "x"
 """Name of the data where a view makes several variables of them."""
+LOG_DET = "log_det"
+"""Name, in batches that were seen and among the terms of a bound, of the log-determinant of a view."""
 
 
 class View:
     """What a model sees of the data; this view, all as it is.
 
     What a view finds in the data and needs for the way back, as a heading, it adds under a name of its own. Values
-    that were seen are seen as they are. It keeps volume, so that bounds of what is seen are bounds of the data: a scale
-    is for `DynamicalVAE.standardise`, whose densities stay in the variable's own unit.
+    that were seen are seen as they are; `LOG_DET` is among them, where a view changes volume.
     """
 
     names: tuple[str, ...] = ()
@@ -64,10 +70,40 @@ class View:
         return dict(seen)
 
     def log_det(self, data: Batch) -> Tensor:
-        """(B,) log of the absolute determinant of the Jacobian: 0, as views keep volume."""
+        """Log of the absolute determinant of the Jacobian: (B,), 0 of a view that keeps volume.
+
+        A view that changes each entry of x by itself gives it by entry, (B, T, D), of which those that are missing or
+        padding do not count; with any other that changes volume, data have to be complete.
+        """
         some = next(iter(data.values()))
         found: Tensor = some.new_zeros(len(some))
         return found
+
+    @property
+    def keeps_volume(self) -> bool:
+        """Whether there is no other log-determinant than 0."""
+        return type(self).log_det is View.log_det
+
+    def counted(self, data: Batch) -> Tensor:
+        """`log_det` over the entries that were observed: by step (B, T) where it is by entry, else (B,).
+
+        Raises:
+            ValueError: one of whole sequences, some of whose entries are missing or padding, or one of another shape.
+        """
+        log_det, partial = self.log_det(data), {"lengths", "mask"} & data.keys()
+        if log_det.dim() == 1 and not partial:
+            return log_det
+        if WHOLE not in data or log_det.shape != data[WHOLE].shape:
+            raise ValueError(
+                f"{self} changes volume by a log_det {tuple(log_det.shape)}, of data with "
+                f"{' and '.join(sorted(partial)) or 'all their entries'}; it is (B,) of complete sequences, or "
+                "(B, T, D) by entry of x, of which those that are missing or padding do not count"
+            )
+        if WHOLE in data.get("mask", {}):
+            log_det = torch.where(data["mask"][WHOLE], log_det, 0.0)
+        if "lengths" in data:
+            log_det = log_det.masked_fill(~valid_steps(data["lengths"], log_det.shape[1])[..., None], 0)
+        return log_det.sum(-1)
 
 
 class Views(View):
@@ -75,6 +111,9 @@ class Views(View):
 
     Args:
         *views: the first sees the data, the last one shows the model.
+
+    Raises:
+        ValueError: a `FirstFrame`, whose frame nothing scores, behind a view that changes its volume.
     """
 
     def __init__(self, *views: View):
@@ -82,6 +121,9 @@ class Views(View):
         self.names = tuple(name for view in views for name in view.names)
         self.parts = next((view.parts for view in views if view.parts), None)
         self.history = next((view.history for view in views if view.history), None)
+        firsts = [place for place, view in enumerate(views) if isinstance(view, FirstFrame)]
+        if not all(view.keeps_volume for view in views[: max(firsts, default=0)]):
+            raise ValueError(f"{self} changes the volume of a frame that nothing scores; let FirstFrame be the first")
 
     def __repr__(self) -> str:
         return f"Views({', '.join(map(repr, self.views))})"
@@ -102,6 +144,30 @@ class Views(View):
         for view in reversed(self.views):
             seen = view.inverse(seen)
         return dict(seen)
+
+    @override
+    def log_det(self, data: Batch) -> Tensor:
+        return super().log_det(data) if self.keeps_volume else volume({LOG_DET: self.counted(data)})
+
+    @property
+    @override
+    def keeps_volume(self) -> bool:
+        return all(view.keeps_volume for view in self.views)
+
+    @override
+    def counted(self, data: Batch) -> Tensor:
+        found = []
+        for view in self.views:
+            found += [] if view.keeps_volume else [view.counted(data)]
+            data = view(data)
+        whole = any(each.dim() == 1 for each in found)
+        return torch.stack([volume({LOG_DET: each}) if whole else each for each in found]).sum(0)
+
+
+def volume(seen: Batch) -> Tensor:
+    """(B,) the log-determinant in a batch that was seen through a view that changes volume."""
+    found: Tensor = seen[LOG_DET]
+    return found.sum(-1) if found.dim() == 2 else found
 
 
 @dataclass(frozen=True)

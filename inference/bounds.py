@@ -27,6 +27,7 @@ from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, Sequence
 from ..turns import alone
+from ..views import LOG_DET
 
 
 @dataclass
@@ -34,7 +35,7 @@ class Terms:
     """What a bound is made of, per sequence and in nats.
 
     Args:
-        log_likelihood: data variable to (B,).
+        log_likelihood: data variable to (B,); beside them the log-determinant of a view that changes volume.
         kl: latent to (B,); summed over the steps of a local one.
         energies: penalty (a `pyro.factor` site) to (B,), positive where it costs.
         frames: (B,) number of valid steps.
@@ -148,7 +149,9 @@ class SequenceELBO(ELBO):
             fn, value, run = site["fn"], site["value"], site["infer"].get("run")
             if run is not None:
                 terms.frames = _frames(run)
-            if isinstance(fn, Unit):
+            if name == LOG_DET:
+                terms.log_likelihood[name] = fn.log_prob(value)
+            elif isinstance(fn, Unit):
                 terms.energies[name] = -fn.log_prob(value)
             elif name in guide_sites:
                 _record(terms, terms.kl, name, _kl(fn, guide_sites[name]["fn"], value, name in closed), run)
@@ -356,7 +359,8 @@ def _log_weights(model: DynamicalVAE, batch: AnyBatch, options: Mapping[str, Any
     joint, sites = map(sites_of, _traces(model, model.guide, (batch,), options))
 
     def total(table: Mapping[str, Mapping[str, Any]]) -> Tensor:
-        parts = (site_log_prob(s["fn"], s["value"]) for s in table.values() if not isinstance(s["fn"], Unit))
+        counts = (site for name, site in table.items() if name == LOG_DET or not isinstance(site["fn"], Unit))
+        parts = (site_log_prob(site["fn"], site["value"]) for site in counts)
         return sum(part.sum(-1) if part.dim() == 2 else part for part in parts)  # type: ignore[return-value]
 
     return total(joint) - total(sites)

@@ -30,6 +30,7 @@ from ..program.conditional import Conditional, like
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout
 from ..turns import alone
+from ..views import LOG_DET, volume
 from .bounds import require_likelihood
 
 
@@ -103,7 +104,7 @@ def particle_bound(
             some = each(data, itemgetter(slice(first, first + at_once)))
             parts.append(Filter(model, some, particles).run(resample_below))
     return ParticleBound(
-        bound=torch.cat([part.bound for part in parts]),
+        bound=torch.cat([part.bound for part in parts]) + (volume(data) if LOG_DET in data else 0),
         effective=torch.cat([part.effective for part in parts], dim=1),
         resamplings=torch.cat([part.resamplings for part in parts]),
         particles=particles,

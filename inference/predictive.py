@@ -17,6 +17,7 @@ worse score, by the less the more particles there are, and not at all where both
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -26,6 +27,7 @@ from torch import Tensor
 from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
+from ..views import LOG_DET
 from .bounds import ImportanceBound, importance_mean, require_likelihood, site_log_prob, sites_of
 
 
@@ -63,6 +65,12 @@ def predictive_bound(
         raise ValueError(
             f"expected at least 1 particle, and observed frames from 1 to {length - 1}; got {particles} and {observed}"
         )
+    log_det = data.get(LOG_DET, torch.zeros(size, length))
+    if log_det.dim() == 1:
+        raise ValueError(
+            "the view changes the volume of whole sequences, and what of that is due to the future is not known; leave "
+            "the log score out, or give the view a log_det by entry, (B, T, D)"
+        )
     past = {n: v[:, :observed] if v.dim() == 3 else v for n, v in data.items()}
 
     def log_weights(count: int) -> Tensor:
@@ -77,7 +85,8 @@ def predictive_bound(
         return _total(future) + _total(_logs(seen)) - _total(_logs(proposed))
 
     with model._evaluating():
-        return importance_mean(log_weights, size, particles, chunk)
+        found = importance_mean(log_weights, size, particles, chunk)
+    return replace(found, bound=found.bound + log_det[:, observed:].sum(1).to(found.bound))
 
 
 def _logs(trace: Any) -> dict[str, Tensor]:

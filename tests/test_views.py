@@ -1,15 +1,18 @@
-"""Views: bijections that keep volume, and models that see through them as one would turn the data by hand."""
+"""Views: bijections with their log-determinants, and models that see through them as one would turn data by hand."""
 
+import pyro
 import pytest
 import torch
 
 import dvae
 from dvae import motion
+from dvae.data import ArrayWindows
+from dvae.inference.predictive import predictive_bound
 from dvae.models.trajectories import Rest
 from dvae.motion import HUMANEVA, WALKER, Heading, rotate_about_up
 from dvae.networks import Recurrent
 from dvae.units import Units
-from dvae.views import FirstFrame, History, Parts, View, Views
+from dvae.views import LOG_DET, FirstFrame, History, Parts, View, Views
 
 B, T, J = 3, 5, WALKER.joints
 D = 3 * J - 3
@@ -193,3 +196,152 @@ def test_windows_of_the_simulator_face_one_way():
     x = Heading(windows.skeleton, 15).face(windows.all()["x"])
     poses = windows.positions(x)[:, 14]
     assert windows.skeleton.heading(poses).abs().max() < 1e-5
+
+
+# --------------------------------------------------------------------------------------------- views that change volume
+
+FACTORS = torch.tensor([0.5, -2.0, 3.0], dtype=torch.float64)
+MIXING = torch.tensor([[2.0, 1.0, 0.0], [0.0, 0.5, 0.3], [0.1, 0.0, 3.0]], dtype=torch.float64)
+
+
+class Scaled(View):
+    """Each coordinate of x times a number of its own."""
+
+    def __call__(self, data, beside=None):
+        return {**data, "x": data["x"] * FACTORS} if "x" in data and LOG_DET not in data else dict(data)
+
+    def inverse(self, seen):
+        return {**seen, "x": seen["x"] / FACTORS} if "x" in seen else dict(seen)
+
+    def log_det(self, data):
+        return FACTORS.abs().log().expand_as(data["x"])
+
+
+class Mixed(Scaled):
+    """Frames times a matrix; how much volume changes is known of whole sequences."""
+
+    def __call__(self, data, beside=None):
+        return {**data, "x": data["x"] @ MIXING} if "x" in data and LOG_DET not in data else dict(data)
+
+    def inverse(self, seen):
+        return {**seen, "x": seen["x"] @ MIXING.inverse()} if "x" in seen else dict(seen)
+
+    def log_det(self, data):
+        return torch.full((len(data["x"]),), data["x"].shape[1] * MIXING.logdet().item(), dtype=data["x"].dtype)
+
+
+SMALL = ("p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3})
+ESTIMATES = {
+    "bound": lambda model, batch: dvae.SequenceELBO().terms(model, batch).bound,
+    "importance": lambda model, batch: dvae.importance_bound(model, batch, particles=8, chunk=9).bound,
+    "particles": lambda model, batch: dvae.particle_bound(model, batch, particles=8, chunk=24).bound,
+    "joint": lambda model, batch: sum(model.log_joint(batch, {"z": torch.ones(B, T, 2).double()}).values()),
+    "Pyro's": lambda model, batch: torch.tensor([-pyro.infer.Trace_ELBO().loss(model, model.guide, batch)]),
+}
+
+
+def seeing(view):
+    torch.manual_seed(0)
+    return dvae.DynamicalVAE(*SMALL, Recurrent(4), view=view).double().eval()
+
+
+def incomplete(kind):
+    """Windows, their entry of a batch, and which entries count."""
+    counts = torch.ones(B, T, 3, dtype=torch.bool)
+    beside = {}
+    if "mask" in kind:
+        counts = torch.rand(B, T, 3) < 0.7
+        beside["mask"] = counts
+    if "lengths" in kind:
+        beside["lengths"] = torch.tensor([2, T, 4])
+        counts = counts & (torch.arange(T) < beside["lengths"][:, None])[..., None]
+    return people(B, T, 3), beside, counts
+
+
+@pytest.mark.parametrize("kind", ["complete", "mask", "lengths", "mask and lengths"])
+@pytest.mark.parametrize("estimate", ESTIMATES)
+def test_densities_are_of_the_data_as_given(estimate, kind):
+    """A change of variables: what is said of scaled data, and the log-determinant of the entries that are there."""
+    x, beside, counts = incomplete(kind)
+    view = Scaled()
+    ours, theirs = {"x": x, **beside}, {"x": x * FACTORS, **beside}
+    expected = torch.where(counts, view.log_det(ours), 0.0).sum((1, 2))
+    plain, found = (seeded(ESTIMATES[estimate], seeing(v), data) for v, data in ((None, theirs), (view, ours)))
+    torch.testing.assert_close(found, plain + (expected if len(plain) == B else expected.sum()))
+    assert (expected.abs() > 0.1).all()
+
+
+@pytest.mark.parametrize("estimate", ESTIMATES)
+def test_volume_that_is_known_of_whole_sequences_counts_where_they_are_complete(estimate):
+    x, model = people(B, T, 3), seeing(Mixed())
+    plain, found = (seeded(ESTIMATES[estimate], m, v) for m, v in ((seeing(None), x @ MIXING), (model, x)))
+    torch.testing.assert_close(found, plain + T * MIXING.logdet() * (B / len(plain)))
+    for partial in ("mask", "lengths"):
+        _, beside, _ = incomplete(partial)
+        with pytest.raises(ValueError, match=rf"log_det \(3,\), of data with {partial}; it is \(B,\) of complete"):
+            ESTIMATES[estimate](model, {"x": x, **beside})
+
+
+def test_the_log_score_has_the_volume_of_the_future():
+    x, seen = people(B, T, 3), 3
+    plain = seeded(predictive_bound, seeing(None), x * FACTORS, seen, 8).bound
+    found = seeded(predictive_bound, seeing(Scaled()), x, seen, 8).bound
+    torch.testing.assert_close(found, plain + (T - seen) * FACTORS.abs().log().sum())
+    with pytest.raises(ValueError, match="what of that is due to the future is not known"):
+        predictive_bound(seeing(Mixed()), x, seen, 8)
+
+
+def test_comparison_and_evaluation_rank_by_densities_of_the_data():
+    x, options = people(B, T, 3), {"progress": False}
+    added = FACTORS.abs().log().sum().item()
+    models = {"seen": seeing(Scaled())}
+    plain = {"seen": seeing(None)}
+    compared = [
+        dvae.compare(m, v, particles=4, contrasts=0, **options)["seen"] for m, v in ((models, x), (plain, x * FACTORS))
+    ]
+    windows = [ArrayWindows(v, 3) for v in (x, x * FACTORS)]
+    chosen = {"bound_particles": 4, "log_score_particles": 4, "samples": 1, **options}
+    scored = [dvae.evaluate(m, w, **chosen)["seen"] for m, w in zip((models, plain), windows, strict=True)]
+    for ours, theirs in (compared, scored):
+        for name in {"ELBO", "importance bound", "log score"} & ours.keys():
+            assert ours[name].mean == pytest.approx(theirs[name].mean + added, rel=1e-9)
+        assert ours["KL z"].mean == pytest.approx(theirs["KL z"].mean)
+
+
+def test_a_scaled_normal_has_its_closed_form():
+    model = dvae.DynamicalVAE("p(x_t)", None, {"x": 3}, view=Scaled()).double()
+    x = people(B, T, 3)
+    expected = torch.distributions.Normal(0, 1 / FACTORS.abs()).log_prob(x).sum((1, 2))
+    torch.testing.assert_close(dvae.SequenceELBO().terms(model, x).bound, expected)
+
+
+def test_the_oracle_of_a_scaled_model_is_the_density_of_the_data():
+    model = dvae.twin(*SMALL, T)
+    x = people(B, T, 3)
+    mean, precision = dvae.Oracle(model, T)._joint()
+    scale = FACTORS.repeat(T)
+    covariance = precision.inverse()[-3 * T :, -3 * T :] / scale / scale[:, None]
+    expected = torch.distributions.MultivariateNormal(mean[-3 * T :] / scale, covariance).log_prob(x.flatten(1))
+    arguments = model.generative, model.inference, model.sizes, model.networks, model.laws
+    scaled = dvae.DynamicalVAE(*arguments, view=Scaled()).double()
+    scaled.load_state_dict(model.state_dict())
+    torch.testing.assert_close(dvae.Oracle(scaled, T).evidence(x), expected)
+
+
+def test_views_in_a_row_add_their_volumes():
+    parts = Parts({"legs": [0, 2], "arms": [1]})
+    x, beside, counts = incomplete("mask and lengths")
+    view, data = Views(Scaled(), parts), {"x": x, **beside, "mask": {"x": beside["mask"]}}
+    by_entry = torch.where(counts, Scaled().log_det(data), 0.0)
+    torch.testing.assert_close(view.log_det(data), by_entry.sum((1, 2)))
+    torch.testing.assert_close(view.counted(data), by_entry.sum(2))
+    both = Views(Scaled(), Mixed())
+    torch.testing.assert_close(both.log_det({"x": x}), T * (FACTORS.abs().log().sum() + MIXING.logdet()).expand(B))
+    assert not view.keeps_volume
+    assert Views(parts, History("h")).keeps_volume
+
+
+def test_volumes_that_cannot_be_right_are_refused():
+    with pytest.raises(ValueError, match="changes the volume of a frame that nothing scores"):
+        Views(Scaled(), FirstFrame("s"))
+    assert Views(FirstFrame("s"), Scaled()).log_det({"x": people(B, T, 3)}).shape == (B,)

@@ -13,7 +13,7 @@ from torch.nn import functional
 from ..data import Batch
 from ..networks.base import valid_steps
 from ..notation import Factorization
-from ..views import WHOLE, View
+from ..views import LOG_DET, WHOLE, View
 from .rollout import Rollout
 
 CHUNK = 2048
@@ -64,7 +64,7 @@ class Reader:
             if len(self.observed) > 1 and not self.view.parts:
                 raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
             batch = {whole: batch}
-        if unknown := [name for name in batch if name not in (*names, *self.extras, "lengths", "mask")]:
+        if unknown := [name for name in batch if name not in (*names, *self.extras, "lengths", "mask", LOG_DET)]:
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
             )
@@ -75,6 +75,8 @@ class Reader:
             for name, seen in masks.items():
                 self._check_mask(name, seen, values)
         seen = self.view(values)
+        if whole in values and LOG_DET not in values and not self.view.keeps_volume:
+            seen[LOG_DET] = self.view.counted(values)
         seen = {name: value for name, value in seen.items() if name in values or name not in self.made}
         if "mask" in seen:  # of context too, which is told no more of it
             known = {name: mask for name, mask in seen["mask"].items() if name in seen}

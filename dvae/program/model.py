@@ -28,7 +28,7 @@ from ..notation import Factor, Factorization, check_pair
 from ..relations import MaskFunction
 from ..turns import alone
 from ..units import Units
-from ..views import View
+from ..views import LOG_DET, View, volume
 from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
 from .forecast import forecast, reconstruct
@@ -111,6 +111,8 @@ class DynamicalVAE(nn.Module):
         else:
             self.encoder: Any = guides
         self._check_latents()
+        if masses := [name for name in self.observed if self.generator[name].discrete and not self.view.keeps_volume]:
+            raise ValueError(f"{self.view} changes volume, but {', '.join(masses)} is discrete and has none to change")
         self.reader = Reader(
             self.sizes,
             {**_locality(self.inference), **_locality(self.generative)},
@@ -232,10 +234,12 @@ class DynamicalVAE(nn.Module):
                 rollout = rollout.fork((draws or {}).get(name, 1))
                 with rollout.plate:
                     rollout.know(name, self._site(name, rollout))
-        penalties = self.penalties(rollout, data, draws or {})
-        with pyro.plate("windows", rollout.batch // rollout.draws, dim=-1) if penalties else nullcontext():
-            for name, energy in penalties.items():
-                pyro.factor(name, -energy)
+        factors = {name: -energy for name, energy in self.penalties(rollout, data, draws or {}).items()}
+        if LOG_DET in data and self.likelihood:
+            factors[LOG_DET] = volume(data)
+        with pyro.plate("windows", rollout.batch // rollout.draws, dim=-1) if factors else nullcontext():
+            for name, value in factors.items():
+                pyro.factor(name, value)
         return dict(rollout.values)
 
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> Mapping[str, Tensor]:
@@ -372,6 +376,8 @@ class DynamicalVAE(nn.Module):
     def log_joint(self, batch: AnyBatch, latents: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint.
 
+        The log-determinant of a view that changes volume is one of them: the joint is that of the data as given.
+
         Raises:
             ValueError: a latent without a value, or with one of another shape.
         """
@@ -380,8 +386,9 @@ class DynamicalVAE(nn.Module):
         for name, value in latents.items():
             self.reader.check(name, value)
         trace = poutine.trace(poutine.condition(self.model, data=dict(latents))).get_trace(batch)
-        trace.compute_log_prob(site_filter=lambda name, site: name in self.generative.variables)
-        return {name: trace.nodes[name]["log_prob"] for name in self.generative.variables}
+        names = [name for name in (*self.generative.variables, LOG_DET) if name in trace]
+        trace.compute_log_prob(site_filter=lambda name, site: name in names)
+        return {name: trace.nodes[name]["log_prob"] for name in names}
 
     def _register(self) -> None:
         """Names the parameters in Pyro's store while `pyro.infer.SVI` looks for them, and else costs nothing."""

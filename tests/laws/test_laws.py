@@ -16,6 +16,7 @@ from dvae.laws.families import NormalLaw
 from dvae.networks import Dense, Recurrent
 from dvae.notation import Factorization
 from dvae.program.conditional import Conditional
+from dvae.views import View
 
 LAWS = {
     "normal": laws.Normal(),
@@ -229,6 +230,16 @@ def model(**own):
 def test_discrete_latents_are_refused(place, factor):
     with pytest.raises(ValueError, match=rf"the latent z are discrete by the law of {factor}.*no gradient"):
         model(**{place: Bernoulli})
+
+
+def test_discrete_data_have_no_volume_that_a_view_could_change():
+    class Halved(View):
+        def log_det(self, data):
+            return torch.full_like(data["x"], 0.5).log()
+
+    arguments = {"z": 2, "x": 2}, Recurrent(4), {"p(x)": Own(Bernoulli)}
+    with pytest.raises(ValueError, match="changes volume, but x is discrete"):
+        dvae.DynamicalVAE(*PAIR, *arguments, view=Halved())
 
 
 def test_latents_whose_draws_have_no_gradient_are_refused():
