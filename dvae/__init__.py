@@ -25,6 +25,7 @@ if sys.flags.optimize > 1:  # Pyro fills in its docstrings as it is imported
 
 if TYPE_CHECKING:
     from . import laws, motion, networks, views
+    from .data import ArrayWindows
     from .graph import Audit, audit
     from .inference import schedules
     from .inference.bounds import SequenceELBO, Terms, importance_bound
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "SVI",
+    "ArrayWindows",
     "Audit",
     "Comparison",
     "DynamicalVAE",
@@ -86,6 +88,7 @@ __all__ = [
 _PLACES = {
     name: module
     for module, names in {
+        "data": "ArrayWindows",
         "graph": "Audit audit",
         "inference": "schedules",
         "inference.bounds": "SequenceELBO Terms importance_bound",

@@ -186,6 +186,11 @@ class ArrayWindows:
 
     Raises:
         ValueError: x that is not `(N, T, D)`, or as many clip names as windows are not given.
+
+    Example:
+        >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=5, clips=["a", "a", "a", "b", "b", "b"])
+        >>> windows.all()["x"].shape, windows.keys[0]
+        (torch.Size([6, 8, 2]), ('array', 'a', 0))
     """
 
     x: Tensor | np.ndarray

@@ -272,7 +272,7 @@ def predictive_checks(
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
-        >>> windows = dvae.data.ArrayWindows(torch.randn(6, 8, 2), observed=4)
+        >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=4)
         >>> checks = dvae.predictive_checks({"model": model}, windows, progress=False)
     """
     models = dict(model) if isinstance(model, Mapping) else {"model": model}

@@ -90,7 +90,7 @@ class Evaluation(Result):
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
-        >>> windows = dvae.data.ArrayWindows(torch.randn(6, 8, 2), observed=4)
+        >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=4)
         >>> scores = dvae.evaluate(model, windows, samples=5, progress=False)
         >>> list(scores.rows), scores.difference("model", "zero velocity", "CRPS").mean < 0
         (['zero velocity', 'model'], True)

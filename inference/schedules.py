@@ -2,7 +2,13 @@
 probability.
 
 A schedule is a frozen dataclass called on the global step, so it carries no state: a resumed run continues
-where it stood. KL warm-up is due to Bowman et al. (2016, arXiv 1511.06349), cosine annealing to Loshchilov
+where it stood.
+
+>>> warm_up = dvae.schedules.Ramp(0.0, 1.0, steps=100)
+>>> warm_up(25), warm_up(500)
+(0.25, 1.0)
+
+KL warm-up is due to Bowman et al. (2016, arXiv 1511.06349), cosine annealing to Loshchilov
 and Hutter (2017, arXiv 1608.03983), cyclical annealing (a `Piecewise`) to Fu et al. (2019, arXiv 1903.10145).
 """
 

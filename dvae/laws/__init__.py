@@ -1,4 +1,8 @@
-"""Laws: distributions of a variable given features, and what they are made of."""
+"""Laws: distributions of a variable given features, and what they are made of.
+
+>>> laws = {"p(x)": dvae.laws.StudentT(df=4), "p(w)": dvae.laws.Mixture(components=3)}
+>>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, laws=laws)
+"""
 
 from .base import Law, LawSpec, Shape, renamed
 from .families import Delta, FixedNormal, Normal, StandardNormal, StudentT

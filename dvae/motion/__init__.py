@@ -1,4 +1,10 @@
-"""Motion capture: skeletons, files, windows and protocols, and a simulator of people."""
+"""Motion capture: skeletons, files, windows and protocols, and a simulator of people.
+
+>>> people = dvae.motion.simulate(clips=4, frames=90)
+>>> windows = dvae.motion.windows(people, dvae.motion.PROTOCOLS["simulated"], "train")
+>>> windows.all()["x"].shape[1:]
+torch.Size([75, 48])
+"""
 
 from .angles import AngleLimits, estimate_angle_limits
 from .criticism import draw_traversal, statistics
