@@ -132,10 +132,10 @@ def each(batch: Mapping[str, Any], change: Callable[[Any], Tensor]) -> Batch:
 
 def leaves(batch: Batch) -> dict[str, Tensor]:
     """Every tensor by name; those of a mapping under "name/key"."""
-    flat = {name: value for name, value in batch.items() if not isinstance(value, Mapping)}
+    flat: dict[str, Tensor] = {}
     for name, value in batch.items():
-        if isinstance(value, Mapping):
-            flat |= {f"{name}/{key}": inner for key, inner in leaves(value).items()}
+        inner = leaves(value) if isinstance(value, Mapping) else None
+        flat |= {name: value} if inner is None else {f"{name}/{key}": each for key, each in inner.items()}
     return flat
 
 

@@ -232,8 +232,6 @@ def audit(
 ) -> Audit:
     """Compares what each factor of a guide reads with what the exact posterior factor depends on.
 
-    (Longer than other functions by what its arguments mean.)
-
     The exact factor is p(latent | latents the guide has drawn before, all data and context); a variable that
     the guide draws at all steps at once counts as drawn forward in time. Relations are read off `steps`
     inner steps of the unrolled graphs, away from the first and the last, where there is no past or no future

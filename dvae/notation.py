@@ -460,7 +460,8 @@ class _Reader:
                 self.take("")
                 start = self.at
                 parent = self.variable()
-                if not child.local and parent.relation is not None and not self.readable_by_static(parent.relation):
+                timed = parent.relation not in (None, ALL) and parent.relation.intervals is not None
+                if timed and not child.local:
                     self.fail(
                         f"{child.name} has one value per sequence and so no t that {parent} could refer to; "
                         f"it can read {parent.name}_{{1:T}}",
@@ -474,10 +475,6 @@ class _Reader:
         if not self.take(r"(?:\\right)?\)"):
             self.fail('expected "," or ")"' if parents else 'expected "|" or ")" after the one variable of a factor')
         return Factor(kind, child.name, child.local, tuple(parents.values()))
-
-    @staticmethod
-    def readable_by_static(relation: Relation) -> bool:
-        return relation == ALL or relation.intervals is None
 
     def variable(self) -> Parent:
         name = self.take(self.NAME_IN_BRACES) or self.take(self.NAME)
@@ -542,8 +539,6 @@ def check_pair(
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Checks that a guide fits a generative model.
 
-    (Longer than other functions by the mistakes that it names.)
-
     Args:
         generative: p over latents and observed variables.
         inference: q over the latents, given the data.
@@ -568,10 +563,7 @@ def check_pair(
             raise ValueError(f"the observed {name} has no factor in {generative.text!r}; add p({name}_t | ...)")
     for name in inference.variables:
         if name in observed:
-            raise ValueError(
-                f"{inference.factor(name)}: {name} is observed, and a guide draws latents given what is "
-                "observed; remove this factor"
-            )
+            raise ValueError(f"{inference.factor(name)}: {name} is observed and no latent; remove this factor")
         if name not in latents:
             raise ValueError(
                 f"{inference.factor(name)}: no latent {name} in {generative.text!r}; remove this factor, "
@@ -593,9 +585,7 @@ def check_pair(
             what = " (no factor, so read as context)" if set(missing) <= set(context) else ""
             raise ValueError(f"sizes missing for {_names(missing)}{what}; needed are {_names(everything)}")
         if unknown := [name for name in sizes if name not in everything]:
-            raise ValueError(
-                f"sizes given for {_names(unknown)}, not in the equations, which have {_names(everything)}"
-            )
+            raise ValueError(f"sizes given for {_names(unknown)}; the equations have {_names(everything)}")
     return tuple(name for block in inference.blocks for name in block.names), observed, context
 
 

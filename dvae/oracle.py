@@ -178,11 +178,8 @@ class Oracle:
         n = len(mean.t())
         precision = self._joint()[1][:n, :n]
         difference = data @ gain.t() + offset - mean
-        spread = (root.t() @ precision * root.t()).sum()
-        log_volume = torch.linalg.slogdet(precision)[1] + 2 * torch.linalg.slogdet(root)[1]
         distance = torch.einsum("bi,ij,bj->b", difference, precision, difference)
-        divergence: Tensor = 0.5 * (spread + distance - n - log_volume)
-        return self.evidence(x) - divergence
+        return self.evidence(x) - self._divergence(distance, precision, root)
 
     def gap(self) -> Tensor:
         """The expected evidence minus bound, in nats a sequence, over data drawn from the model."""
@@ -194,11 +191,16 @@ class Oracle:
         slope = gain - exact_gain
         shift = gain @ mean[n:] + offset - mean[:n]
         covariance = torch.linalg.inv(precision)[n:, n:]
-        spread = (root.t() @ within * root.t()).sum()
-        log_volume = torch.linalg.slogdet(within)[1] + 2 * torch.linalg.slogdet(root)[1]
         distance = shift @ within @ shift + (slope.t() @ within @ slope * covariance).sum()
-        gap: Tensor = 0.5 * (spread + distance - n - log_volume)
-        return gap
+        return self._divergence(distance, within, root)
+
+    @staticmethod
+    def _divergence(distance: Tensor, precision: Tensor, root: Tensor) -> Tensor:
+        """Of N(m, root root') from N(n, precision^-1), with the distance of m and n under the precision."""
+        spread = (root.t() @ precision * root.t()).sum()
+        log_volume = torch.linalg.slogdet(precision)[1] + 2 * torch.linalg.slogdet(root)[1]
+        divergence: Tensor = 0.5 * (spread + distance - len(root) - log_volume)
+        return divergence
 
     def fit_guide(self, iterations: int = 2000) -> float:
         """Fits the guide to the model's exact gap by L-BFGS and returns what is left of it, in nats a sequence."""

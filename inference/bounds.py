@@ -134,11 +134,8 @@ class SequenceELBO(ELBO):
     def _get_trace(self, model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Trace, poutine.Trace]:
         return _traces(model, guide, args, kwargs)
 
+    @computing_once()
     def _terms(self, model: Any, guide: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Terms:
-        with computing_once():
-            return self._evaluate(model, guide, args, kwargs)
-
-    def _evaluate(self, model: Any, guide: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Terms:
         model_sites, guide_sites = map(sites_of, self._get_trace(model, guide, args, kwargs))
         for name in guide_sites:
             if name not in model_sites:
@@ -348,11 +345,7 @@ def importance_mean(
     at_once = max(1, min(particles, chunk // size))
     counts = [min(at_once, particles - first) for first in range(0, particles, at_once)]
     log_weights = torch.cat([log_weights_of(count).unflatten(0, (count, size)) for count in counts])
-    return ImportanceBound(
-        bound=torch.logsumexp(log_weights, 0) - math.log(particles),
-        khat=_khat(log_weights),
-        particles=particles,
-    )
+    return ImportanceBound(log_weights.logsumexp(0) - math.log(particles), _khat(log_weights), particles)
 
 
 def _log_weights(model: DynamicalVAE, batch: AnyBatch, options: Mapping[str, Any]) -> Tensor:

@@ -240,7 +240,7 @@ def calibrate(
     """Simulation-based calibration: draws latents and data from the model, and asks the guide for the latents.
 
     Says whether the guide is the model's posterior on the model's own data; it knows nothing of real data, nor
-    of whether the model is a good one. (Longer than other functions by what its options mean.)
+    of whether the model is a good one.
 
     Args:
         model: the generative model; its own guide is examined where no other is given.

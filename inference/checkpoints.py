@@ -289,9 +289,7 @@ def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tens
     try:
         tensors = {renamed(name): value for name, value in load_tensors(content).items()}
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:  # also for types it has none for
-        raise CheckpointError(
-            f"{path} is damaged or no safetensors file ({error}); copy it again, or fit again"
-        ) from error
+        raise CheckpointError(f"{path} is damaged or no safetensors file ({error}); copy or fit it again") from error
     _check_names_and_shapes(model, tensors, path)
     for name, value in model.state_dict().items():
         found = tensors[name]

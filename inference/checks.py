@@ -252,8 +252,7 @@ def predictive_checks(
 
     Two replications, both free-running. "forecast": the frames after the observed ones; the last two observed frames
     are joined to them, so that a jump at the seam counts. "posterior", the posterior predictive distribution proper:
-    latents are inferred from the whole window, and all its frames are generated anew from them. (Longer than other
-    functions by what its options mean.)
+    latents are inferred from the whole window, and all its frames are generated anew from them.
 
     Args:
         model: a model, or `{name: model}`.

@@ -51,8 +51,7 @@ def compare(
     """Compare models on held-out sequences: bounds, differences with their errors, use of latents, forecasts.
 
     All models see the same sequences, and each draws from the same seed, so that no score depends on which others are
-    compared; scores do depend on `batch_size`, as draws come batch by batch. (Longer than other functions by what its
-    numbers mean.)
+    compared; scores do depend on `batch_size`, as draws come batch by batch.
 
     *Active units* of a latent (Burda et al., 2016): coordinates whose posterior mean varies over the data with a
     variance above 0.01. For a local latent the variance is that over sequences at the same step, pooled over steps:
@@ -217,17 +216,13 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
             require_likelihood(version)
         first = versions[0]
         for other in versions[1:]:
-            ours, theirs = map(_kind, (first, other))
+            ours, theirs = ((m.generative.text, m.inference.text, dict(m.sizes)) for m in (first, other))
             if ours != theirs:
                 raise ValueError(
                     f"the models of {name!r} must differ in their seed only, but one is {ours} and another {theirs}; "
                     "give them names of their own"
                 )
     return found
-
-
-def _kind(model: Any) -> tuple[str, str, dict[str, int]]:
-    return model.generative.text, model.inference.text, dict(model.sizes)
 
 
 def _each(contenders: Mapping[str, list[Any]]) -> Iterator[tuple[str, str, Any]]:

@@ -29,12 +29,12 @@ import math
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from rich.console import Group
 from scipy import special
+from typing_extensions import override
 
 from ..options import nearest
 from .bounds import KHAT_PARTICLES
@@ -377,12 +377,8 @@ class Comparison(Result):
         return json.dumps({"ranking": ranking, **plain({**vars(self), "rows": rows})}, allow_nan=False)
 
     @classmethod
-    def from_json(cls, text: str) -> Comparison:
-        """The comparison that `to_json` wrote.
-
-        Raises:
-            ValueError: text that is not such a document.
-        """
+    @override
+    def from_json(cls, text: str) -> Self:
         try:
             document = _FORMER | json.loads(text)
             del document["ranking"]
@@ -391,11 +387,6 @@ class Comparison(Result):
             return cls(rows=rows, keys=keys, frames=np.array(document.pop("frames"), dtype=float), **document)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"this is not a comparison written by Comparison.to_json: {error!r}") from error
-
-    @classmethod
-    def load(cls, path: str | Path) -> Comparison:
-        """Read the file that `save` wrote; errors as in `from_json`."""
-        return cls.from_json(cls.read(path))
 
     # Estimates
 

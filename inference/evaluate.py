@@ -58,7 +58,7 @@ def evaluate(
 
     Every method draws from the same seed, so that its scores do not depend on which others are evaluated;
     they do depend on `batch_size`, as draws come batch by batch. The models' modes and torch's random state
-    are restored. (Longer than other functions by what its options mean.)
+    are restored.
 
     Args:
         model: a model (`Forecasting`), or `{name: model}`.

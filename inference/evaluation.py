@@ -7,11 +7,11 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from rich.text import Text
+from typing_extensions import override
 
 from ..options import nearest
 from .held import plain
@@ -179,12 +179,8 @@ class Evaluation(Result):
         return json.dumps({**vars(self), "rows": rows, "metrics": metrics}, indent=1, allow_nan=False)
 
     @classmethod
-    def from_json(cls, text: str) -> Evaluation:
-        """The evaluation that `to_json` wrote.
-
-        Raises:
-            ValueError: text that is not such a document.
-        """
+    @override
+    def from_json(cls, text: str) -> Self:
         try:
             document = json.loads(text)
             if "metrics" not in document:
@@ -194,11 +190,6 @@ class Evaluation(Result):
             return cls(rows=rows, metrics=metrics, **document)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"this is not an evaluation written by Evaluation.to_json: {error!r}") from error
-
-    @classmethod
-    def load(cls, path: str | Path) -> Evaluation:
-        """Read the file that `save` wrote; errors as in `from_json`."""
-        return cls.from_json(cls.read(path))
 
     def _row(self, method: str) -> Row:
         if method not in self.rows:

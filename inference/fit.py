@@ -151,8 +151,6 @@ def fit(
 ) -> Fit:
     """Fit a model and its guide.
 
-    (Longer than other functions by what its arguments mean.)
-
     Afterwards the model is in evaluation mode and holds the weights of the best unweighted validation bound,
     or without validation data the last ones. The caller's random state is left as it was. Threads take turns, as Pyro's
     handlers and torch's random state are the process's: another fit or forecast waits until this one is done.
@@ -240,9 +238,7 @@ def _directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapping
     """The run directory, refused where `fit` would lose a run, find none, or go on with data known to be others."""
     run = None if out is None else Run(out)
     if resume and (run is None or not run.exists):
-        raise CheckpointError(
-            f"there is no run to resume in {out}; give its directory as out=…, or leave out resume=True"
-        )
+        raise CheckpointError(f"no run to resume in {out}; give its directory as out=…, or leave out resume=True")
     if run is None or not run.exists:
         return run
     if not resume:

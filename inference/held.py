@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ..data import Batch, HeldOutWindows, each
+from ..program.conditional import evaluating
 
 
 @dataclass(frozen=True)
@@ -93,14 +94,9 @@ def clip_places(keys: Sequence[tuple[str, str, int]]) -> Tensor:
 def reproducibly(model: nn.Module, seed: int) -> Iterator[None]:
     """Evaluation mode, no gradients and draws from `seed`; mode and random state are restored."""
     device = next(model.parameters()).device
-    training = model.training
-    model.eval()
-    try:
-        with torch.no_grad(), torch.random.fork_rng([device] if device.type == "cuda" else []):
-            torch.manual_seed(seed)
-            yield
-    finally:
-        model.train(training)
+    with evaluating(model), torch.no_grad(), torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        yield
 
 
 def on_device_of(model: nn.Module, batch: Batch) -> dict[str, Any]:

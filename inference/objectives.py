@@ -7,13 +7,13 @@ model selection reads `Terms.bound`.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from torch import Tensor
 from typing_extensions import Protocol, runtime_checkable
 
-from .schedules import Schedule, from_config, schedule, to_config
+from .schedules import Schedule, schedule, to_config
 
 if TYPE_CHECKING:
     from .bounds import Terms
@@ -98,23 +98,8 @@ class Evidence:
         return loss
 
     def to_config(self) -> dict[str, Any]:
-        """Return the objective as a JSON object; `from_config` reads it."""
+        """Return the objective as a JSON object."""
         return {"objective": "Evidence"} | {name: to_config(value) for name, value in vars(self).items()}
-
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> "Evidence":
-        """Return the objective of a JSON object.
-
-        Raises:
-            ValueError: when the object describes another objective, or has unknown keys.
-        """
-        arguments = {key: from_config(value) for key, value in config.items() if key != "objective"}
-        known = [f.name for f in fields(cls)]
-        if config.get("objective") != "Evidence" or set(arguments) - set(known):
-            raise ValueError(
-                f"expected an objective 'Evidence' with {', '.join(known)}; the config gives {dict(config)}"
-            )
-        return cls(**arguments)
 
 
 def _by_name(option: str, value: Any, names: Iterable[str], default: float) -> dict[str, Any]:

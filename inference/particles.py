@@ -102,13 +102,10 @@ def particle_bound(
         parts = []
         for first in range(0, size, at_once):
             some = each(data, itemgetter(slice(first, first + at_once)))
-            parts.append(Filter(model, some, particles).run(resample_below))
-    return ParticleBound(
-        bound=torch.cat([part.bound for part in parts]) + (volume(data) if LOG_DET in data else 0),
-        effective=torch.cat([part.effective for part in parts], dim=1),
-        resamplings=torch.cat([part.resamplings for part in parts]),
-        particles=particles,
-    )
+            part = Filter(model, some, particles).run(resample_below)
+            parts.append((part.bound, part.effective, part.resamplings))
+    bound, effective, resamplings = (torch.cat(found, dim=-1) for found in zip(*parts, strict=True))
+    return ParticleBound(bound + (volume(data) if LOG_DET in data else 0), effective, resamplings, particles)
 
 
 class Filter:
@@ -142,7 +139,8 @@ class Filter:
         effective: list[Tensor] = []
         with computing_once():
             guide = {name: self._law(model.encoder[name], self.known.values) for name in self._local(model.latents)}
-            prior = {name: self._law(model.generator[name], self.shared) for name in self._local(self._order())}
+            order = [name for block in model.generative.blocks for name in block.names]
+            prior = {name: self._law(model.generator[name], self.shared) for name in self._local(order)}
         noise = {
             name: law.conditional.law.noise((len(self.sequence), length, law.conditional.size), bound).unbind(1)
             for name, law in guide.items()
@@ -179,10 +177,6 @@ class Filter:
 
     def _local(self, names: Any) -> list[str]:
         return [name for name in names if self.model.generative.local(name)]
-
-    def _order(self) -> list[str]:
-        """Variables in the order in which the model draws them."""
-        return [name for block in self.model.generative.blocks for name in block.names]
 
     def _by_step(self, values: Tensor) -> Rows:
         return Rows(values.unbind(1)).select(self.sequence)

@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import rich.table
 from rich.console import Console, RenderableType
@@ -98,14 +98,23 @@ class Result:
         with files.written(path) as file:
             file.write((self.to_json() + "\n").encode())
 
-    @staticmethod
-    def read(path: str | Path) -> str:
-        """What `save` wrote, as text.
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """The result that `to_json` wrote, of a kind that can be read again.
 
         Raises:
-            OSError, ValueError: there is no such file, or it is no plain one, or no text.
+            ValueError: text that is not such a document.
         """
-        return files.read(path, LARGEST, links=True).decode()
+        raise NotImplementedError
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read the file that `save` wrote.
+
+        Raises:
+            OSError, ValueError: there is no such file, or it is no plain one, or no result of this kind.
+        """
+        return cls.from_json(files.read(path, LARGEST, links=True).decode())
 
     def __rich__(self) -> RenderableType:
         return self.table()

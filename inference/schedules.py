@@ -179,18 +179,15 @@ def clamp(value: Any, steps: int) -> Any:
         warnings.warn(f"{value} would end at step {end}, after the last step {steps}; clamped to {clamped}")
         return clamped
     if isinstance(value, Mapping):
-        changes = _changes(value, steps)
-        return {**value, **changes} if changes else value
-    if is_dataclass(value) and not isinstance(value, type):
-        changes = _changes({field.name: getattr(value, field.name) for field in fields(value) if field.init}, steps)
-        return replace(value, **changes) if changes else value
-    return value
-
-
-def _changes(items: Mapping[str, Any], steps: int) -> dict[str, Any]:
-    """The items that `clamp` changes."""
-    clamped = {name: clamp(item, steps) for name, item in items.items()}
-    return {name: item for name, item in clamped.items() if item is not items[name]}
+        items = value
+    elif is_dataclass(value) and not isinstance(value, type):
+        items = {field.name: getattr(value, field.name) for field in fields(value) if field.init}
+    else:
+        return value
+    changes = {name: new for name, item in items.items() if (new := clamp(item, steps)) is not item}
+    if not changes:
+        return value
+    return {**value, **changes} if isinstance(value, Mapping) else replace(value, **changes)
 
 
 def _end(value: Schedule) -> int:
@@ -257,6 +254,4 @@ def from_config(config: Any) -> Any:
     try:
         return kind(**arguments)
     except TypeError as error:
-        raise ValueError(
-            f"schedule {name} takes {', '.join(known)}; the config gives {', '.join(arguments)}"
-        ) from error
+        raise ValueError(f"{name} takes {', '.join(known)}; the config gives {', '.join(arguments)}") from error

@@ -83,9 +83,7 @@ class SVI:
         self.training, self.plan = lay_out(options, objective, stages)
         trained = {name: parameter for name, parameter in model.named_parameters() if parameter.requires_grad}
         if not trained:
-            raise ValueError(
-                f"{type(model).__name__} has no parameters that require gradients; there is nothing to fit"
-            )
+            raise ValueError(f"{type(model).__name__} has no parameters that require gradients: nothing to fit")
         for stage in self.plan:
             if missing := [start for start in stage.frozen if not any(name.startswith(start) for name in trained)]:
                 raise ValueError(f"no parameter's name starts with {', '.join(missing)}; they are {', '.join(trained)}")

@@ -35,10 +35,8 @@ def bounds(
     parts: Iterable[slice],
 ) -> dict[str, Any]:
     """Bounds and KL terms in nats a sequence (N,), KL by step (T,), estimates (E, N), frames (N,)."""
-    bounds: list[dict[str, Tensor]] = []
+    found: list[dict[str, Tensor]] = []
     steps: dict[str, Tensor] = {}
-    weighted: list[Tensor] = []
-    frames: list[Tensor] = []
     for part in parts:
         piece = on_device_of(model, each(batch, itemgetter(part)))
         terms = SequenceELBO().terms(model, piece)
@@ -51,16 +49,16 @@ def bounds(
         scores |= {f"KL {latent}": kl for latent, kl in terms.kl.items()}
         for latent in terms.kl.keys() & terms.steps.keys():
             steps[latent] = steps.get(latent, 0) + terms.steps[latent].double().sum(0)
-        bounds.append({metric: value.double().cpu() for metric, value in scores.items()})
-        weighted.append(values.double().cpu())
-        frames.append(terms.frames.double().cpu())
-    length = torch.cat(frames)
+        scores |= {"estimates": values, "frames": terms.frames}
+        found.append({metric: value.double().cpu() for metric, value in scores.items()})
+    whole = {metric: torch.cat([piece[metric] for piece in found], dim=-1) for metric in found[0]}
+    weighted, length = whole.pop("estimates"), whole.pop("frames")
     return {
-        "bounds": {metric: torch.cat([piece[metric] for piece in bounds]).numpy() for metric in bounds[0]},
+        "bounds": {metric: values.numpy() for metric, values in whole.items()},
         "kl_steps": {
             latent: (total.cpu() / _alive(length, len(total)).clamp(min=1)).numpy() for latent, total in steps.items()
         },
-        "estimates": torch.cat(weighted, dim=1).numpy(),
+        "estimates": weighted.numpy(),
         "frames": length.numpy(),
     }
 

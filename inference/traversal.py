@@ -62,8 +62,7 @@ def traverse(
     """Moves one coordinate of a latent at a time, a local one at all steps alike, and decodes.
 
     Latents are drawn once from the guide. One coordinate is then shifted, the rest stays, and x runs free from its own
-    past, set to its mean: all that changes between two decoded motions is what x reads of that coordinate. (Longer than
-    other functions by the arguments that it refuses.)
+    past, set to its mean: all that changes between two decoded motions is what x reads of that coordinate.
 
     Args:
         model: the model with its guide.

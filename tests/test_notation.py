@@ -478,7 +478,7 @@ def test_a_pair_that_fits():
             "q(w) q(z_t)",
             ["x"],
             {"w": 1, "z": 1, "x": 1, "v": 1},
-            "sizes given for v, not in the equations, which have w, z, x",
+            "sizes given for v; the equations have w, z, x",
         ),
     ],
 )

@@ -76,7 +76,7 @@ class GaussianChain(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Run the chain.
 
-        (Longer than other functions, as one loop with all that it writes into.)
+        (Over 60 lines: the loop's tensors, made before it, are too many to be handed from one function to another.)
         """
         steps, batch, size = noise.shape
         act = IN_PLACE[activation]
@@ -176,7 +176,7 @@ class GaussianChain(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients of base, gates, weights and biases from those of draws, locations, scales and states.
 
-        (Longer than other functions, as one loop with all that it writes into.)
+        (Over 60 lines: the loop's tensors, made before it, are too many to be handed from one function to another.)
         """
         noise, values, out, recurrent, first, inputs, activated, cells, squashed, *rest = ctx.saved_tensors
         n_features, n_hidden = ctx.lists

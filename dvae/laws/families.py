@@ -136,9 +136,7 @@ class FixedNormalLaw(Gaussian):
         if self.steps:
             needed = loc.shape[1] if t is None else t + 1
             if needed > self.steps:
-                raise ValueError(
-                    f"FixedNormal(steps={self.steps}) was given {needed} steps; build it with steps={needed}"
-                )
+                raise ValueError(f"FixedNormal(steps={self.steps}) was given {needed} steps; build it with so many")
             scale = scale[: loc.shape[1]] if t is None else scale[t]
         return self.moved(loc, previous), scale.expand_as(loc)
 
@@ -205,9 +203,7 @@ class Delta:
     def build(self, shape: Shape) -> Law:
         """The law of a variable of this shape."""
         if shape.features != shape.size:
-            raise ValueError(
-                f"a Delta of size {shape.size} takes so many features, but the network gives {shape.features}"
-            )
+            raise ValueError(f"a Delta takes {shape.size} features, its size, but the network gives {shape.features}")
         return DeltaLaw()
 
 

@@ -129,9 +129,7 @@ class Reader:
         local = {name: v for name, v in values.items() if v.dim() == 3}
         prefix = {name: v for name, v in local.items() if v.shape[1] < length}
         if max((v.shape[1] for v in local.values()), default=0) > length or not set(prefix) <= set(self.observed):
-            raise ValueError(
-                f"expected {length} steps (fewer of data to continue), but the batch holds {shapes(local)}"
-            )
+            raise ValueError(f"expected {length} steps (fewer of data to continue), the batch holds {shapes(local)}")
         if lengths is not None:
             if lengths.is_floating_point() or lengths.shape != (size,) or lengths.min() < 1 or lengths.max() > length:
                 raise ValueError(f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}")

@@ -274,9 +274,7 @@ class DynamicalVAE(nn.Module):
         rollout = self._rollout(self.inference, self.encoder, batch, None, 1)
         for name in self.observed:
             if name not in rollout.values and any(name in c.parents for c in self.encoder.values()):
-                raise ValueError(
-                    f"the guide reads {name}, but the batch holds {', '.join(rollout.values) or 'nothing'}"
-                )
+                raise ValueError(f"the guide reads {name}, the batch holds {', '.join(rollout.values) or 'nothing'}")
         values = {}
         for name in self.latents:
             n = (draws or {}).get(name, 1)

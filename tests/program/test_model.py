@@ -622,7 +622,7 @@ X = torch.zeros(B, T, 3, dtype=torch.float64)
     ("change", "message"),
     [
         ({"sizes": {"z": 2}}, "sizes missing for x; needed are z, x"),
-        ({"sizes": {"z": 2, "x": 3, "y": 1}}, "sizes given for y, not in the equations, which have z, x"),
+        ({"sizes": {"z": 2, "x": 3, "y": 1}}, "sizes given for y; the equations have z, x"),
         ({"sizes": {"z": 0, "x": 3}}, "the size of z is 0; sizes are positive"),
         (
             {"network": {"p(y)": Dense()}},
@@ -665,7 +665,7 @@ def test_models_that_cannot_be(change, message):
         ),
         (lambda m: m.model(), "neither a batch nor length= tells how many steps to run; pass length="),
         (lambda m: m.model(length=0), "length is at least 1, got 0"),
-        (lambda m: m.model(X, length=4), r"expected 4 steps .* but the batch holds x \(3, 5, 3\)"),
+        (lambda m: m.model(X, length=4), r"expected 4 steps .* the batch holds x \(3, 5, 3\)"),
         (
             lambda m: m.model({"x": X[:, :4], "z": X[..., :2]}),
             r"different numbers of steps: x \(3, 4, 3\), z",
@@ -684,7 +684,7 @@ def test_models_that_cannot_be(change, message):
         (lambda m: m.model({"x": X, "lengths": torch.tensor([5, 1])}), "lengths must be"),
         (lambda m: m.model(X / 0), "x holds values that are not finite; where entries are missing, set 'mask' False"),
         (lambda m: m.guide(None), "neither a batch nor length="),
-        (lambda m: m.guide({"z": X[..., :2]}), "the guide reads x, but the batch holds z"),
+        (lambda m: m.guide({"z": X[..., :2]}), "the guide reads x, the batch holds z"),
         (
             lambda m: m.forecast({"x": X, "lengths": torch.tensor([5, 5, 5])}, 2),
             "forecast continues sequences of one length",
