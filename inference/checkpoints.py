@@ -193,13 +193,12 @@ class Run:
         """
         name = BEST if BEST in self.state["fingerprints"] else LAST
         self._settle(name, self.state["fingerprints"][name])
+        path = self.path / name
         try:
-            with _refusing(), files.open_plain(self.path / name) as file:
+            with _refusing(), files.open_plain(path) as file:
                 return os.fstat(file.fileno()).st_size
         except FileNotFoundError:
-            raise CheckpointError(
-                f"{self.path / name} is missing; copy the run directory whole, or fit again"
-            ) from None
+            raise CheckpointError(f"{path} is missing; copy the run directory whole, or fit again") from None
 
     def optimiser_state(self, most: int = 2 * LARGEST_WEIGHTS) -> dict[str, Any]:
         """Return the optimiser and random number states of the last checkpoint, on the CPU.

@@ -27,7 +27,7 @@ import dataclasses
 import json
 import math
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
@@ -442,40 +442,30 @@ class Comparison(Result):
         return " · ".join(part for part in parts if part)
 
     def _bound_table(self) -> Table:
-        table = Table(
-            title=f"{self._title()}\nteacher-forced, nats a frame",
-            caption="mean ± standard error over sequences (clustered by clip) ± over seeds\n"
+        bounds = (f"importance bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
+        table = _table(
+            f"{self._title()}\nteacher-forced, nats a frame",
+            "mean ± standard error over sequences (clustered by clip) ± over seeds\n"
             "95 %: from both, by Student's t, in brackets its degrees of freedom",
+            ("seeds", *bounds, f"k-hat\n> {KHAT}"),
         )
-        table.add_column("", overflow="fold")  # a long name takes no room from the numbers
-        for column in (
-            "seeds",
-            f"importance bound ↑\nK = {self.particles}",
-            "difference to the best",
-            "95 % (df)",
-            "ELBO ↑",
-            f"k-hat\n> {KHAT}",
-        ):
-            table.add_column(column, justify="right", overflow="fold")
         ranking = self.ranking
         for name in ranking:
             row, scores = self.rows[name], self[name]
             difference = self.difference(name, ranking[0])
             behind = ["–", "–"] if name == ranking[0] else [str(difference), _interval(difference)]
             share = "–" if math.isnan(row.unreliable) else f"{100 * row.unreliable:.1f} %"
-            bounds = (str(scores["importance bound"]), *behind, str(scores["ELBO"]))
-            table.add_row(name, str(row.seeds), *bounds, share)
+            means = (str(scores["importance bound"]), *behind, str(scores["ELBO"]))
+            table.add_row(name, str(row.seeds), *means, share)
         return table
 
     def _latent_table(self) -> Table:
         limit = f"at most log {self.contrasts} = {math.log(self.contrasts):.2f}" if self.contrasts else "left out"
-        table = Table(
-            title="latents under the guide, teacher-forced",
-            caption=f"active: variance of the posterior mean over data above {ACTIVE}\ninformation {limit}",
+        table = _table(
+            "latents under the guide, teacher-forced",
+            f"active: variance of the posterior mean over data above {ACTIVE}\ninformation {limit}",
+            ("latent", "KL\nnats a frame", "active\nunits", "information\nnats"),
         )
-        table.add_column("", overflow="fold")
-        for column in ("latent", "KL\nnats a frame", "active\nunits", "information\nnats"):
-            table.add_column(column, justify="right", overflow="fold")
         for name in self.ranking:
             row, scores = self.rows[name], self[name]
             for latent in row.latents:
@@ -500,16 +490,23 @@ class Comparison(Result):
         return f"{_number((weights * steps).sum() / weights.sum())} a step"
 
     def _free_running_table(self) -> Table:
-        table = Table(
-            title=f"free-running, K = {self.samples}, {self.emission} emission",
-            caption="\n".join(["mean ± standard error over windows (clustered by clip) ± over seeds", *self.notes]),
+        table = _table(
+            f"free-running, K = {self.samples}, {self.emission} emission",
+            "\n".join(["mean ± standard error over windows (clustered by clip) ± over seeds", *self.notes]),
+            [f"{metric} ↓{f' ({unit})' if unit else ''}" for metric, unit in self.shown.items()],
         )
-        table.add_column("", overflow="fold")
-        for metric, unit in self.shown.items():
-            table.add_column(f"{metric} ↓{f' ({unit})' if unit else ''}", justify="right", overflow="fold")
         for name in self.ranking:
             table.add_row(name, *(str(self[name][metric]) for metric in self.shown))
         return table
+
+
+def _table(title: str, caption: str, columns: Iterable[str]) -> Table:
+    """An empty table whose first column has the names, which take no room from the numbers."""
+    table = Table(title=title, caption=caption)
+    table.add_column("", overflow="fold")
+    for column in columns:
+        table.add_column(column, justify="right", overflow="fold")
+    return table
 
 
 def _freedom(total: float, *parts: tuple[float, float]) -> float:

@@ -8,7 +8,7 @@ changes nothing, nor the reverse.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -287,11 +287,9 @@ class _Bound(nn.Module):
         return dict(vars(self.estimator.terms(self.model, batch, **program)))
 
 
-@contextmanager
-def _forked(device: torch.device) -> Iterator[None]:
-    """Put the random state of torch back at the end."""
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        yield
+def _forked(device: torch.device) -> AbstractContextManager[None]:
+    """Puts the random state of torch back at the end."""
+    return torch.random.fork_rng([device] if device.type == "cuda" else [])
 
 
 def _sums(terms: Terms) -> dict[str, Tensor]:

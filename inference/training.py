@@ -156,10 +156,8 @@ def recorded(training: Training, plan: Sequence[Stage]) -> dict[str, Any]:
     """The options and the stages in JSON's types."""
 
     def config(stage: Stage) -> dict[str, Any]:
-        options = {option.name: getattr(stage, option.name) for option in fields(stage)}
         objective = stage.objective
         said = objective.to_config() if isinstance(objective, Evidence) else repr(objective)
-        return to_config(options | {"objective": said})
+        return to_config(vars(stage) | {"objective": said})
 
-    options = {option.name: getattr(training, option.name) for option in fields(training)}
-    return {"training": to_config(options), "stages": [config(stage) for stage in plan]}
+    return {"training": to_config(vars(training)), "stages": [config(stage) for stage in plan]}

@@ -42,7 +42,7 @@ from ..motion.body import body_parts
 from ..networks import GraphConv
 from ..notation import Factorization
 from ..options import Amount, Layers, Size
-from ..program.batch import CHUNK, AnyBatch
+from ..program.batch import AnyBatch
 from ..program.rollout import Rollout
 from ..views import WHOLE, History, Parts
 from .energies import EnergyMethod, EnergyModel
@@ -284,16 +284,7 @@ class GSPSModel(EnergyModel):
 
     @torch.no_grad()
     @override
-    def forecast(
-        self,
-        batch: AnyBatch,
-        horizon: int,
-        samples: int = 1,
-        *,
-        draw_emission: bool | None = None,
-        fix: Mapping[str, Tensor] | None = None,
-        chunk: int = CHUNK,
-    ) -> dict[str, Tensor]:
+    def forecast(self, batch: AnyBatch, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
         """At most as far as the networks' T frames, all of which a fixed part has.
 
         Raises:
@@ -306,7 +297,7 @@ class GSPSModel(EnergyModel):
                 f"this model sees {self.frames} frames and makes up to {most} more, but was given {past} frames and "
                 f"asked for {horizon}"
             )
-        out = super().forecast(data, most, samples, fix=fix, chunk=chunk)
+        out = super().forecast(data, most, samples, **options)
         return {
             name: value[:, :, :horizon] if name in (WHOLE, *self.observed) else value for name, value in out.items()
         }

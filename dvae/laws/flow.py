@@ -69,10 +69,6 @@ class QRFlowLaw(Prior):
         self.register_buffer("location", torch.zeros(size))
         self.register_buffer("whitening", torch.eye(size))
 
-    def extra_repr(self) -> str:
-        """Sizes, for printing."""
-        return f"size={self.size}, layers={len(self.bias)}"
-
     def factors(self) -> tuple[Tensor, Tensor]:
         """Q and R of every layer, (L, D, D) each.
 
