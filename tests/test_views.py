@@ -345,3 +345,16 @@ def test_volumes_that_cannot_be_right_are_refused():
     with pytest.raises(ValueError, match="changes the volume of a frame that nothing scores"):
         Views(Scaled(), FirstFrame("s"))
     assert Views(FirstFrame("s"), Scaled()).log_det({"x": people(B, T, 3)}).shape == (B,)
+
+
+def test_what_a_scaled_model_makes_goes_back_and_it_is_fitted_by_the_bound_of_the_data():
+    x, model, plain = people(B, T, 3), seeing(Scaled()), seeing(None)
+    future = seeded(plain.forecast, x * FACTORS, 3, 2, draw_emission=True)["x"]
+    torch.testing.assert_close(seeded(model.forecast, x, 3, 2, draw_emission=True)["x"], future / FACTORS)
+    added = FACTORS.abs().log().sum().item()
+    ours, theirs = (
+        dvae.fit(m, data, data, steps=2, validate_every=1, log_every=1, progress=False)
+        for m, data in ((model, x), (plain, x * FACTORS))
+    )
+    assert ours.best_bound == pytest.approx(theirs.best_bound + added)
+    assert ours.series("loss")[1] == pytest.approx([loss - added for loss in theirs.series("loss")[1]])
