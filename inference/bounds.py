@@ -196,6 +196,17 @@ def site_log_prob(fn: Any, value: Tensor) -> Tensor:
     return _over_entries(fn.steps(value).log_prob(value), fn)
 
 
+def log_densities(trace: Any) -> dict[str, Tensor]:
+    """Of the sample sites of a trace, energies apart: see `site_log_prob`."""
+    sites = sites_of(trace).items()
+    return {n: site_log_prob(s["fn"], s["value"]) for n, s in sites if n == LOG_DET or not isinstance(s["fn"], Unit)}
+
+
+def total(logs: Mapping[str, Tensor]) -> Tensor:
+    """(B,), the sum over variables and steps."""
+    return sum(log.sum(-1) if log.dim() == 2 else log for log in logs.values())  # type: ignore[return-value]
+
+
 def _over_entries(entries: Tensor, fn: Sequence) -> Tensor:
     mask = fn.rollout.mask(fn.name)
     # where, not a product: an entry that does not count may be infinite
@@ -349,14 +360,8 @@ def importance_mean(
 
 
 def _log_weights(model: DynamicalVAE, batch: AnyBatch, options: Mapping[str, Any]) -> Tensor:
-    joint, sites = map(sites_of, _traces(model, model.guide, (batch,), options))
-
-    def total(table: Mapping[str, Mapping[str, Any]]) -> Tensor:
-        counts = (site for name, site in table.items() if name == LOG_DET or not isinstance(site["fn"], Unit))
-        parts = (site_log_prob(site["fn"], site["value"]) for site in counts)
-        return sum(part.sum(-1) if part.dim() == 2 else part for part in parts)  # type: ignore[return-value]
-
-    return total(joint) - total(sites)
+    joint, drawn = map(log_densities, _traces(model, model.guide, (batch,), options))
+    return total(joint) - total(drawn)
 
 
 def _khat(log_weights: Tensor) -> Tensor:

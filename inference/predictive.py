@@ -18,7 +18,6 @@ worse score, by the less the more particles there are, and not at all where both
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from pyro import poutine
@@ -28,7 +27,7 @@ from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
 from ..views import LOG_DET
-from .bounds import ImportanceBound, importance_mean, require_likelihood, site_log_prob, sites_of
+from .bounds import ImportanceBound, importance_mean, log_densities, require_likelihood, sites_of, total
 
 
 @alone
@@ -81,17 +80,9 @@ def predictive_bound(
         known = {n: v[:, :observed] if model.generative.local(n) else v for n, v in drawn.items()}
         seen = poutine.trace(poutine.condition(model.guide, data=known)).get_trace(repeat(past, count))
         local = [n for n in model.generative.variables if model.generative.local(n)]
-        future = {n: log[:, observed:] for n, log in _logs(joint).items() if n in local}
-        return _total(future) + _total(_logs(seen)) - _total(_logs(proposed))
+        future = {n: log[:, observed:] for n, log in log_densities(joint).items() if n in local}
+        return total(future) + total(log_densities(seen)) - total(log_densities(proposed))
 
     with model._evaluating():
         found = importance_mean(log_weights, size, particles, chunk)
     return replace(found, bound=found.bound + log_det[:, observed:].sum(1).to(found.bound))
-
-
-def _logs(trace: Any) -> dict[str, Tensor]:
-    return {name: site_log_prob(site["fn"], site["value"]) for name, site in sites_of(trace).items()}
-
-
-def _total(logs: dict[str, Tensor]) -> Tensor:
-    return torch.stack([log.sum(-1) if log.dim() == 2 else log for log in logs.values()]).sum(0)
