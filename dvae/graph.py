@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from rich.table import Table
 
-__all__ = ["Audit", "analytic_kl", "audit", "markov_boundary"]
-
 # ----------------------------------------------------------------------------------------------- d-separation
 
 

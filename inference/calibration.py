@@ -29,8 +29,6 @@ from .result import Result, Table, canvas, progress_bar
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Calibration", "calibrate"]
-
 LOG_JOINT = "log joint"
 
 

@@ -28,8 +28,6 @@ from .result import Result, Table, as_they_are, canvas, progress_bar
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["STATISTICS", "Check", "PredictiveChecks", "Statistic", "predictive_checks"]
-
 
 @dataclass(frozen=True)
 class Statistic:

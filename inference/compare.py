@@ -27,8 +27,6 @@ from .result import progress_bar
 from .scores import Measure, Scores, proper
 from .teacher_forced import bounds, information, length_of, variances
 
-__all__ = ["compare"]
-
 _PAIRS = 4096  # sequences times contrasts to hold at once
 
 

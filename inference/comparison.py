@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["Comparison", "Contender", "Estimate"]
-
 ACTIVE = 0.01
 """Variance over the data above which the posterior mean of a latent's coordinate counts as active (Burda et al.)."""
 

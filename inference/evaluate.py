@@ -31,8 +31,6 @@ from .references import nearest_neighbours, zero_velocity
 from .result import progress_bar
 from .scores import KL, LOG_SCORE, TEACHER_FORCED, Measure, Metric, Scores, clip_means, proper
 
-__all__ = ["evaluate"]
-
 Forecaster = Callable[[slice], Tensor]  # which windows -> (K, B, H, D)
 
 

@@ -23,8 +23,6 @@ from .uncertainty import clustered_variance, linearised, student_interval
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Evaluation", "Row", "Score"]
-
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
 """By the direction that is better."""
 

@@ -21,24 +21,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = [
-    "average_displacement_error",
-    "average_pairwise_distance",
-    "continuous_ranked_probability_score",
-    "energy_score",
-    "final_displacement_error",
-    "frechet_distance",
-    "frechet_pseudo_values",
-    "gaussian_frechet_distance",
-    "median_average_displacement_error",
-    "median_final_displacement_error",
-    "median_multimodal_average_displacement_error",
-    "median_multimodal_final_displacement_error",
-    "multimodal_average_displacement_error",
-    "multimodal_final_displacement_error",
-    "variogram_score",
-]
-
 Array = Tensor | np.ndarray
 
 

@@ -5,8 +5,6 @@ from torch import Tensor
 
 from ..data import HeldOutWindows
 
-__all__ = ["multimodal_note", "multimodal_truths", "nearest_neighbours", "zero_velocity"]
-
 _EXACT = "donot_use_mm_for_euclid_dist"
 
 

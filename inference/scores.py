@@ -20,8 +20,6 @@ from torch import Tensor
 from ..data import Batch, HeldOutWindows
 from . import metrics
 
-__all__ = ["CRPS", "ENERGY", "VARIOGRAM", "Measure", "Metric", "Scores", "clip_means", "paired", "proper"]
-
 
 @dataclass(frozen=True)
 class Metric:

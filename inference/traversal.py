@@ -15,8 +15,6 @@ from ..turns import alone
 from .checks import decode
 from .held import on_device_of, reproducibly
 
-__all__ = ["Traversal", "traverse"]
-
 
 @dataclass(frozen=True, eq=False)
 class Traversal:

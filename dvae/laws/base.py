@@ -151,6 +151,3 @@ def renamed(name: str) -> str:
     """
     name = re.sub(r"^priors\.([^.]+)\.", r"generator.\1.law.", name)
     return re.sub(r"^(generator|encoder)\.([^.]+)\.head\.", r"\1.\2.law.", name)
-
-
-__all__ = ["Law", "LawSpec", "Parameters", "Shape", "renamed"]
