@@ -112,8 +112,7 @@ def _random(svi: SVI) -> dict[str, Tensor]:
 
 def _gathered(svi: SVI, value: Tensor) -> Tensor:
     """The values (N,) of every process, (processes, N), on the CPU."""
-    gathered = svi.fabric.all_gather(value)
-    assert isinstance(gathered, Tensor)
+    gathered: Any = svi.fabric.all_gather(value)
     return gathered.reshape(svi.fabric.world_size, -1).cpu()  # one process gets no leading axis
 
 
