@@ -1,7 +1,10 @@
 """GSPS: the factorization, futures drawn together, energies in the shared loop, control, presets."""
 
+import json
+import shutil
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,12 +13,13 @@ from pyro import poutine
 import dvae
 from dvae import motion
 from dvae.cli import main
+from dvae.inference.checkpoints import CheckpointError
 from dvae.inference.metrics import average_pairwise_distance
 from dvae.models.gsps import PRESETS, GSPSModel, part_by_part
 from dvae.models.registry import configured, judge
 from dvae.motion import energies
 from dvae.motion.body import LIMBS, body_parts
-from dvae.motion.judges.pose_prior import PosePriorModel
+from dvae.motion.judges.pose_prior import PosePriorModel, load_pose_prior
 from dvae.networks import GraphConv
 from dvae.runs import directory as runs
 from dvae.testing import FactorizationContract
@@ -394,6 +398,17 @@ def test_forecasts_of_a_run_share_a_part_that_is_fixed(tmp_path, walkers):
     legs = [motion.WALKER.names.index(name) for name in motion.WALKER.names if "Knee" in name or "Foot" in name]
     assert alike[legs].all()
     assert not alike.all()
+
+
+def test_a_prior_of_format_1_is_taken_with_a_word_of_warning(prior_run, tmp_path):
+    run = Path(shutil.copytree(prior_run, tmp_path / "prior"))
+    config = json.loads((run / "config.json").read_text())
+    config["protocol"] = config.pop("schema")["protocol"]
+    (run / "config.json").write_text(json.dumps(config))
+    with pytest.warns(UserWarning, match="format 1, which does not tell its skeleton: no more is checked than"):
+        load_pose_prior(run, motion.WALKER, heading=config["method"]["heading"])
+    with pytest.warns(match="format 1"), pytest.raises(CheckpointError, match="holds the weights of another model"):
+        load_pose_prior(run, motion.HUMANEVA, heading=config["method"]["heading"])
 
 
 def test_a_fitted_pose_prior_is_taken_along(windows, prior_run):
