@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from functools import cache
-from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
+
+from typing_extensions import override
 
 from ..options import nearest, tuples
 
@@ -50,22 +51,23 @@ class Registry(Mapping[str, type[Any]]):
     """
 
     def __init__(self, own: Mapping[str, str], group: str) -> None:
-        self._own, self._others = dict(own), {entry.name: entry for entry in entry_points(group=group)}
-        if twice := self._own.keys() & self._others.keys():
-            name = twice.pop()
-            raise ValueError(f"the entry point {self._others[name].value} has the name of a method that exists: {name}")
+        self._entries = {name: EntryPoint(name, place, group) for name, place in own.items()}
+        for entry in entry_points(group=group):
+            if entry.name in own:
+                raise ValueError(f"the entry point {entry.value} has a name that is taken in {group}: {entry.name}")
+            self._entries[entry.name] = entry
 
+    @override
     def __getitem__(self, name: str) -> type[Any]:
-        if name in self._others:
-            return self._others[name].load()  # type: ignore[no-any-return]
-        module, _, kind = self._own[name].partition(":")
-        return getattr(import_module(module), kind)  # type: ignore[no-any-return]
+        return self._entries[name].load()  # type: ignore[no-any-return]
 
+    @override
     def __iter__(self) -> Iterator[str]:
-        yield from (*self._own, *self._others)
+        return iter(self._entries)
 
+    @override
     def __len__(self) -> int:
-        return len(self._own) + len(self._others)
+        return len(self._entries)
 
 
 @cache

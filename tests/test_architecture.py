@@ -54,6 +54,13 @@ def imports(module, path):
                 yield from (f"{target}.{alias.name}" for alias in node.names)
 
 
+def named(path):
+    """What a module names by strings such as "dvae.models.vae:VAE", to be imported when it is asked for."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Constant) and re.fullmatch(r"dvae(\.\w+)+:\w+", str(node.value)):
+            yield node.value.replace(":", ".")
+
+
 def layer(module):
     return max(rank for name, rank in LAYERS.items() if f"{module}.".startswith(f"{name}."))
 
@@ -62,7 +69,7 @@ def test_imports_run_one_way():
     for module, path in sources().items():
         if module == "dvae.__init__":  # the façade shows all of them
             continue
-        for target in imports(module, path):
+        for target in (*imports(module, path), *named(path)):
             assert layer(target) <= layer(module), f"{module} imports {target}"
 
 
@@ -85,6 +92,18 @@ def test_the_core_has_no_name_for_a_joint():
             assert not {*words(path)} & {"joints", "pose", "poses", "skeleton", "limb", "limbs", "bone", "bones"}, (
                 module
             )
+
+
+def test_registries_alone_name_motion():
+    """The one exception: what is known by name is imported when its name is given."""
+    naming = {module: {target for target in named(path) if "motion" in target} for module, path in sources().items()}
+    assert {module: targets for module, targets in naming.items() if targets} == {
+        "dvae.models.registry": {
+            "dvae.motion.judges.pose_prior.PosePrior",
+            "dvae.motion.judges.action_classifier.ActionClassifier",
+        },
+        "dvae.runs.kinds": {"dvae.motion.protocols.Poses", "dvae.motion.dataset.MotionData"},
+    }
 
 
 def definitions(path):
