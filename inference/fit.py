@@ -164,7 +164,8 @@ def fit(
         stages: objectives one after the other, in place of `objective`; their steps are those of the run.
         out: run directory for checkpoints and `log.jsonl` (see `checkpoints`).
         resume: continue the run in `out` from its last checkpoint up to `steps`.
-        config: what is run, in JSON's types, for `config.json`; the training options are added to it.
+        config: what is run, in JSON's types, for `config.json`, to which the training options are added; a resumed run
+            keeps its own where none is given.
         trackers: further receivers of the log's rows.
         callbacks: hooks after steps, after validations and at the end.
         **options: fields of `Training`, such as steps=2000, batch_size=32, learning_rate=1e-3.
@@ -196,7 +197,7 @@ def fit(
         raise ValueError("patience counts validations; give validation data, or leave patience out")
     fingerprint = train.fingerprint if isinstance(train, Fingerprinted) else None
     record = {"training_data": fingerprint} if isinstance(fingerprint, str) else {}
-    run = _directory(out, resume, record)
+    run = run_directory(out, resume, record)
     record |= recorded(training, svi.plan)
     with ExitStack() as stack:
         stack.callback(model.eval)
@@ -210,7 +211,7 @@ def fit(
         history, receivers = InMemory(), list[Tracker]()
         if first:
             if run is not None:
-                run.write_config((run.config if resume else {}) | record | dict(config or {}))
+                run.write_config((run.config if resume and config is None else dict(config or {})) | record)
                 log = JSONLines(run.path / "log.jsonl")
                 history = InMemory(log.read() if resume else [])
                 receivers = [log]
@@ -234,7 +235,7 @@ def fit(
     return result
 
 
-def _directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapping[str, Any]) -> Run | None:
+def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapping[str, Any]) -> Run | None:
     """The run directory, refused where `fit` would lose a run, find none, or go on with data known to be others."""
     run = None if out is None else Run(out)
     if resume and (run is None or not run.exists):

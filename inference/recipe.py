@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import nn
@@ -13,7 +13,7 @@ from torch import nn
 from ..data import Source
 from ..options import check
 from ..schema import Schema, SchemaError
-from .fit import Fit, fit
+from .fit import Fit, fit, run_directory
 from .objectives import Objective
 from .schedules import Schedule
 from .training import Stage
@@ -56,12 +56,19 @@ class Recipe:
                 self-feeding are the recipe's.
 
         Raises:
-            ValueError: other steps than the recipe's, which are laid out over its own.
+            ValueError: other steps than the recipe's, which are laid out over its own, or a self-feeding.
+            CheckpointError: when `out` holds a run and `resume` is False.
         """
         steps = sum(stage.steps for stage in self.stages)
         if options.get("steps", steps) != steps:
             raise ValueError(f"this recipe is of {steps} steps, not {options['steps']}; ask the method for another")
+        if options.get("self_feeding", 0.0) != 0.0:
+            raise ValueError(
+                f"self-feeding is an option of the method, which tells its recipe; instead of self_feeding="
+                f"{options['self_feeding']} here write dvae.method(…, self_feeding=…)"
+            )
         if not resume:
+            run_directory(options.get("out"), False, {})  # which is refused before what may take long
             with torch.random.fork_rng():
                 self.prepare(model)
         options |= {"steps": steps, "self_feeding": self.feeding}
@@ -99,11 +106,6 @@ class Trainable:
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """How the model is trained on these data, in so many steps."""
         raise NotImplementedError
-
-    @property
-    def selects(self) -> Literal["bound", "loss"]:
-        """What tells the best weights (see `Evidence`)."""
-        return "bound"
 
     def check(self) -> None:
         """Refuses options that do not fit together, before any data are read.

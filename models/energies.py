@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from ..data import Source
-from ..laws.priors import VampLaw
 from ..motion import Heading, Skeleton, Windows, energies
 from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
 from ..motion.judges.pose_prior import PosePriorModel, fit_pose_prior, load_pose_prior
@@ -84,14 +83,11 @@ class EnergyMethod(PoseMethod):
         return schema
 
     def start(self, model: EnergyModel, windows: Windows) -> None:
-        """Has a model take the limits of the angles, the pose prior, and the starts of pseudo-sequences.
+        """Has a model take the limits of the angles and the pose prior.
 
         Raises:
             ValueError: a pose prior of another skeleton.
         """
-        for law in model.modules():
-            if isinstance(law, VampLaw):
-                law.start_at({WHOLE: model.turned(windows.sample(law.components, torch.default_generator)["x"])})
         if model.limits is not None:
             limits = estimate_angle_limits(windows.poses(), windows.skeleton, self.angle_quantile)
             model.angle_low.copy_(limits.low)

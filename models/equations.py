@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from typing_extensions import override
+
 from ..networks import Attention, Dense, Linear, NetworkSpec, Recurrent
 from ..options import Size, nearest
 from ..program.model import DynamicalVAE
@@ -44,6 +46,12 @@ class Equations(LatentMethod):
                     f"{name} reads {lag[0][:20]} steps away; a lag is at most 999, or write {{<t}} for any"
                 )
 
+    @override
+    def sizes(self) -> dict[str, int]:
+        """Sizes of all variables; the data tell their own."""
+        return {name: self.latents.get(name, self.latent) for name in self.equations()[0].variables}
+
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """One kind for every factor."""
         kinds: dict[str, NetworkSpec] = {
@@ -58,10 +66,7 @@ class Equations(LatentMethod):
             )
         return {"default": kinds[self.network]}
 
+    @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model; `residual` holds where p(x_t | ...) reads x_{t-1}."""
-        given = Schema.of(data).sizes
-        generative, inference = self.equations()
-        latents = {name: self.latents.get(name, self.latent) for name in generative.variables if name not in given}
-        sizes = {**latents, **given}
-        return DynamicalVAE(generative, inference, sizes, self.networks(), self.laws())
+        """The model; `residual` holds where p(x_t | ...) reads x_{t-1}, and gradients flow through fed means."""
+        return DynamicalVAE(**self.described(Schema.of(data).sizes))

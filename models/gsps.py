@@ -26,7 +26,7 @@ from itertools import accumulate
 from math import prod
 from operator import mul
 from string import ascii_lowercase
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -46,39 +46,16 @@ from ..program.batch import AnyBatch
 from ..program.rollout import Rollout
 from ..views import WHOLE, History, Parts
 from .energies import EnergyMethod, EnergyModel
+from .poses import table
 
-PRESETS: dict[str, dict[str, Any]] = {
-    "human36m": {
-        "coefficients": 10,
-        "width": 256,
-        "draws": (10, 10),
-        "diversity": (8.0, 25.0),
-        "diversity_scale": (100.0, 300.0),
-        "pseudo_minimum": 0.1,
-        "pool_stride": 20,
-        "heading": False,
+PRESETS = table(
+    "coefficients width draws diversity diversity_scale pseudo_minimum pool_stride heading",
+    {
+        "human36m": (10, 256, (10, 10), (8.0, 25.0), (100.0, 300.0), 0.1, 20, False),
+        "humaneva": (8, 256, (10, 10), (5.0, 10.0), (15.0, 50.0), 0.01, 15, False),
+        "": (8, 128, (4, 4), (2.0, 4.0), (15.0, 50.0), 0.02, 10, True),
     },
-    "humaneva": {
-        "coefficients": 8,
-        "width": 256,
-        "draws": (10, 10),
-        "diversity": (5.0, 10.0),
-        "diversity_scale": (15.0, 50.0),
-        "pseudo_minimum": 0.01,
-        "pool_stride": 15,
-        "heading": False,
-    },
-    "": {
-        "coefficients": 8,
-        "width": 128,
-        "draws": (4, 4),
-        "diversity": (2.0, 4.0),
-        "diversity_scale": (15.0, 50.0),
-        "pseudo_minimum": 0.02,
-        "pool_stride": 10,
-        "heading": True,
-    },
-}
+)
 """Skeleton to options: the paper's; and for others, at 30 frames a second, 15 observed and 60 predicted frames."""
 
 
@@ -129,6 +106,7 @@ class GSPS(EnergyMethod):
                     f"{name} is {values}; expected one number, or one for each of the parts {', '.join(self.parts)}"
                 )
 
+    @override
     def equations(self) -> tuple[Factorization, Factorization]:
         """The generative model and the guide; here half of the steps count as observed."""
         generative = part_by_part(self.names, lambda length: max(1, length // 2))
@@ -153,6 +131,7 @@ class GSPS(EnergyMethod):
             return (max(2, int(prod(value) ** (1 / count))),) * count
         return (sum(value) / count,) * count
 
+    @override
     def build(self, data: Any) -> GSPSModel:
         """The model for such windows.
 
@@ -162,19 +141,15 @@ class GSPS(EnergyMethod):
         schema = self.poses(data)
         return GSPSModel(self.suited(schema), schema.skeleton, schema.protocol.observed, schema.frames)
 
+    @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
         """One stage that minimises the weighted energies."""
         method = self.suited(train)
         stages = [Stage(steps, method.objective())]
         return Recipe(method.scored(train), validation, stages, prepare=partial(method.start, windows=train))
 
-    @property
-    def selects(self) -> Literal["bound", "loss"]:
-        """There is no likelihood."""
-        return "loss"
-
     def objective(self) -> Objective:
-        """The weighted energies, summed; in `Evidence`'s unit, per frame.
+        """The weighted energies, summed; in `Evidence`'s unit, per frame. There is no likelihood, and no bound.
 
         Raises:
             ValueError: weights that are still open, which the skeleton decides.
@@ -184,7 +159,7 @@ class GSPS(EnergyMethod):
         weights = {name: getattr(self, name) for name in WEIGHTS}
         diversity = _each(self.diversity, self.parts)
         weights |= {f"diversity_{name}": weight for name, weight in zip(self.names, diversity, strict=True)}
-        return Evidence(energy_weights={name: weight for name, weight in weights.items() if weight})
+        return Evidence(energy_weights={name: weight for name, weight in weights.items() if weight}, select="loss")
 
 
 HISTORY = "h"

@@ -60,46 +60,21 @@ from ..schema import Schema
 from ..views import WHOLE
 from .energies import EnergyMethod, EnergyModel
 from .method import SHAPES, LatentMethod, start_priors
+from .poses import table
 
-HUMANEVA: dict[str, Any] = {
-    "reconstruction": 10.0,
-    "multimodal": 5.0,
-    "diversity": (0.1, 0.2),
-    "diversity_scale": (15.0, 50.0),
-    "limb": 100.0,
-    "angles": 1.0,
-    "pose_prior": 0.001,
-    "kl_local": 0.5,
-    "kl_static": 7.5,
-    "pose_width": 8,
-    "samples": 10,
-    "decoder": 256,
-    "pseudo_minimum": 0.01,
-    "pool_stride": 15,
-    "heading": False,
-}
-PRESETS: dict[str, dict[str, Any]] = {
-    "humaneva": HUMANEVA,
-    "human36m": HUMANEVA
-    | {
-        "reconstruction": 20.0,
-        "multimodal": 10.0,
-        "diversity_scale": (100.0, 300.0),
-        "pose_prior": 0.01,
-        "kl_static": 12.5,
-        "pseudo_minimum": 0.1,
-        "pool_stride": 20,
+ENERGIES = table(
+    "reconstruction multimodal diversity diversity_scale limb angles pose_prior kl_local kl_static pseudo_minimum",
+    {
+        "humaneva": (10.0, 5.0, (0.1, 0.2), (15.0, 50.0), 100.0, 1.0, 0.001, 0.5, 7.5, 0.01),
+        "human36m": (20.0, 10.0, (0.1, 0.2), (100.0, 300.0), 100.0, 1.0, 0.01, 0.5, 12.5, 0.1),
+        "": (10.0, 5.0, (0.1, 0.2), (15.0, 50.0), 100.0, 1.0, 0.001, 0.03, 7.5, 0.02),
     },
-    "": HUMANEVA
-    | {
-        "kl_local": 0.03,
-        "samples": 6,
-        "decoder": 128,
-        "pseudo_minimum": 0.02,
-        "pool_stride": 10,
-        "heading": True,
-    },
-}
+)
+NETWORKS = table(
+    "pose_width samples decoder pool_stride heading",
+    {"humaneva": (8, 10, 256, 15, False), "human36m": (8, 10, 256, 20, False), "": (8, 6, 128, 10, True)},
+)
+PRESETS = {skeleton: options | NETWORKS[skeleton] for skeleton, options in ENERGIES.items()}
 """Skeleton to options: the paper's; and for others, at 30 frames a second, 15 observed and 60 predicted frames."""
 
 PARTS = ("lower", "upper")
@@ -184,11 +159,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             if values is not None and len(values) != len(PARTS):
                 raise ValueError(f"{name} is {values}; expected one number for each of {', '.join(PARTS)}")
 
-    @property
     @override
-    def selects(self) -> Literal["bound", "loss"]:
-        return "bound" if self.loss == "evidence" else "loss"
-
     def equations(self) -> tuple[Factorization, Factorization]:
         """The generative model and the guide."""
         p, q = self.generative, self.inference
@@ -198,10 +169,12 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             p, q = (text.replace(", w)", ")") for text in (p.replace("p(w) ", ""), q.replace("q(w | x_{1:T}) ", "")))
         return Factorization.parse(p), Factorization.parse(q)
 
+    @override
     def sizes(self) -> dict[str, int]:
         """Sizes of w and z."""
-        return {**({"w": self.static} if self.static else {}), "z": self.latent}
+        return {**({"w": self.static} if self.static else {}), **super().sizes()}
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """The paper's networks, or LSTMs; `build` shares the features of poses."""
         poses = {"x": NodeGraph(self.pose_width, coordinates=3)} if self.pose_width else {}
@@ -221,6 +194,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             found["q(w)"] = graph if self.summary == "graph" else pooled
         return found
 
+    @override
     def build(self, data: Any) -> DynamicalVAE:
         """The model; without a skeleton there are no energies, and x are numbers, not poses (`pose_width`).
 
@@ -228,37 +202,29 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             ValueError: windows with a root, of which there are energies or headings.
         """
         schema = Schema.of(data)
-        if not isinstance(schema, Poses):
-            return self._finished(super().build(schema), self.frames or FRAMES)
-        method, observed = self.suited(schema), schema.protocol.observed
-        if method.loss == "evidence" and not method.heading:
-            return method._finished(super(HiTDVAE, method).build(schema), observed)
-        self.poses(schema)
-        sizes = {**method.sizes(), **schema.sizes}
-        laws: dict[str, Any] = dict(method.laws())
-        if method.selects == "loss":
-            laws["p(x)"] = replace(laws["p(x)"], fitted="scale")
-        networks = method.networks()
-        model = HiTModel(method, schema.skeleton, observed, *method.equations(), sizes, networks, laws)
-        return method._finished(model, observed)
-
-    def _finished(self, model: Any, observed: int) -> Any:
-        """The model, whose factors share their features of poses, and which feeds itself as the options say."""
-        if self.pose_width:
+        method, observed = self, self.frames or FRAMES
+        if isinstance(schema, Poses):
+            method, observed = self.suited(schema), schema.protocol.observed
+        described = method.described(schema.sizes)
+        if isinstance(schema, Poses) and (method.loss == "best-of-many" or method.heading):
+            self.poses(schema)
+            if method.loss == "best-of-many":
+                described["laws"]["p(x)"] = replace(described["laws"]["p(x)"], fitted="scale")
+            model: DynamicalVAE = HiTModel(method, schema.skeleton, observed, **described)
+        else:
+            model = DynamicalVAE(**described)
+        if method.pose_width:
             for side in (model.generator, model.encoder):
                 share("x", *(conditional.network for conditional in side.values() if conditional.network is not None))
         if self.standardise:
             model.standardise(WHOLE)
-        model.feeding = SelfFeeding(
-            0.0, self.feeding_passes or None, self.feeding_gradient, 0 if self.feed_observed else observed
-        )
+        kept = 0 if self.feed_observed else observed
+        model.feeding = SelfFeeding(0.0, self.feeding_passes or None, self.feeding_gradient, kept)
         return model
 
     @override
     def suited(self, data: Any) -> HiTDVAE:
-        """With loss="evidence" windows are turned only if `heading` says so, as bounds of
-        turned windows are of no other model.
-        """
+        """With loss="evidence" windows are turned only if asked for: their bounds are of no other model."""
         schema = Poses.of(data, self.name)
         suited = replace(self, frames=self.frames or schema.protocol.observed)
         if self.loss == "evidence":
@@ -267,6 +233,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             return replace(suited, heading=bool(self.heading), **open_)
         return super(HiTDVAE, suited).suited(schema)
 
+    @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """One stage of the paper's objective, or of the evidence, with warm-up and self-feeding over its shares."""
         method = self.suited(train) if self.loss == "best-of-many" else self
@@ -276,6 +243,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         stages = [Stage(steps, method.objective())]
         return Recipe(batches, validation, stages, self._feeding(steps), partial(method.start, windows=train))
 
+    @override
     def _feeding(self, steps: int) -> Schedule | float:
         """Over the paper's shares of the run."""
         if not self.self_feeding:
@@ -285,13 +253,11 @@ class HiTDVAE(EnergyMethod, LatentMethod):
     @override
     def start(self, model: Any, windows: Any) -> None:
         """With mean and spread of 1024 windows' poses, where a learned scale of x starts."""
+        start_priors(model, windows)
         if isinstance(model, EnergyModel):
             super().start(model, windows)
-        else:
-            start_priors(model, windows)
         if self.standardise:
-            x = windows.sample(1024, torch.default_generator)["x"]
-            model.units[WHOLE].fit(model.turned(x) if isinstance(model, EnergyModel) else x)
+            model.units[WHOLE].fit(model.read(windows.sample(1024, torch.default_generator))[WHOLE])
             if self.emission == "fixed":
                 nn.init.zeros_(model.generator[WHOLE].law.log_scale)
 

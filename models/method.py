@@ -8,7 +8,7 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from torch import nn
+from typing_extensions import override
 
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe, Trainable
@@ -31,15 +31,41 @@ class Method(Trainable):
     """A method of the literature; a subclass is one file of this package, and its fields are its options.
 
     It has four hooks: `equations`, `suited` (options that are left open, chosen for the data), `build` (the model) and
-    `train` (the recipe).
+    `train` (the recipe). Most models follow from their equations, `sizes`, `networks` and `laws`.
+
+    Args:
+        latent: size of z.
     """
 
     generative: ClassVar[str]
     inference: ClassVar[str]
 
+    latent: Size | None = 16
+
     def equations(self) -> tuple[Factorization, Factorization]:
         """The generative model and the guide."""
         return Factorization.parse(self.generative), Factorization.parse(self.inference)
+
+    def sizes(self) -> dict[str, int]:
+        """Sizes of the latents."""
+        return {"z": self.latent or 0}
+
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        """Networks by factor."""
+        raise NotImplementedError(
+            f"{type(self).__name__} says nothing of its networks; give it `def networks(self)` that returns them by "
+            'factor, such as {"default": Recurrent(64)}, or a `build` of its own'
+        )
+
+    def laws(self) -> Mapping[str, LawSpec]:
+        """Laws by factor; normal where nothing is said."""
+        return {}
+
+    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        """What a `DynamicalVAE` is built from, for data of these sizes."""
+        generative, inference = self.equations()
+        given = {"generative": generative, "inference": inference, "sizes": {**self.sizes(), **sizes}}
+        return {**given, "network": self.networks(), "laws": self.laws()}
 
 
 @dataclass(frozen=True)
@@ -49,7 +75,6 @@ class LatentMethod(Method):
     A subclass gives `networks`, and `sizes` and `laws` where these are other ones.
 
     Args:
-        latent: size of z.
         emission: distribution of x: "fixed" (normal, one learned scale per coordinate), "unit" (normal, variance 1),
             "normal" (scale read from the parents) or "student" (Student t).
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1, an offset, one step
@@ -77,17 +102,7 @@ class LatentMethod(Method):
     free_bits: Amount = 0.0
     self_feeding: Share = 0.0
 
-    def sizes(self) -> dict[str, int]:
-        """Sizes of the latents."""
-        return {"z": self.latent}
-
-    def networks(self) -> Mapping[str, NetworkSpec]:
-        """Networks by factor."""
-        raise NotImplementedError(
-            f"{type(self).__name__} says nothing of its networks; give it `def networks(self)` that returns them by "
-            'factor, such as {"default": Recurrent(64)}, or a `build` of its own'
-        )
-
+    @override
     def laws(self) -> Mapping[str, LawSpec]:
         """Laws by factor: that of x, and of static latents without parents, where `prior` is not "standard".
 
@@ -117,13 +132,14 @@ class LatentMethod(Method):
             )
         return laws | {f"p({name})": priors[self.prior] for name in latents}
 
+    @override
     def build(self, data: Any) -> DynamicalVAE:
         """The model of these equations."""
-        sizes = {**self.sizes(), **Schema.of(data).sizes}
-        model = DynamicalVAE(*self.equations(), sizes, self.networks(), self.laws())
+        model = DynamicalVAE(**self.described(Schema.of(data).sizes))
         model.feeding = SelfFeeding(0.0, gradient=False)
         return model
 
+    @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """One stage that minimises the negative evidence, with warm-up, free bits and self-feeding as the options say.
 
@@ -147,8 +163,8 @@ class LatentMethod(Method):
         return Ramp(0.0, self.self_feeding, steps=max(steps // 3, 1), delay=steps // 10)
 
 
-def start_priors(model: nn.Module, train: Any) -> None:
-    """Has the pseudo-sequences of Vamp priors start at windows of the training data."""
+def start_priors(model: DynamicalVAE, train: Any) -> None:
+    """Has the pseudo-sequences of Vamp priors start at windows of the training data, as the model sees them."""
     for law in model.modules():
         if isinstance(law, VampLaw):
-            law.start_at(train.sample(law.components, torch.default_generator))
+            law.start_at(model.read(train.sample(law.components, torch.default_generator)))

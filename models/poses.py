@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
+
+from typing_extensions import override
 
 from ..motion import Skeleton
 from ..motion.protocols import Poses
 from .method import Method
+
+
+def table(options: str, rows: Mapping[str, Sequence[Any]]) -> dict[str, dict[str, Any]]:
+    """Presets from rows of values, by skeleton, under the names of their options."""
+    return {skeleton: dict(zip(options.split(), values, strict=True)) for skeleton, values in rows.items()}
 
 
 @dataclass(frozen=True)
@@ -22,6 +29,7 @@ class PoseMethod(Method):
         """What options that are None stand for, with poses of this skeleton."""
         return self.presets.get(skeleton.name, self.presets[""])
 
+    @override
     def suited(self, data: Any) -> Self:
         """With the options that are left open chosen for the skeleton of these data."""
         return self.filled(self.preset(Poses.of(data, self.name).skeleton))

@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import inf, sqrt
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -32,7 +32,6 @@ from ..motion import HUMAN36M, PROTOCOLS, Clip, Heading, Skeleton, Windows
 from ..motion.control import bend
 from ..motion.data import defect
 from ..motion.protocols import Poses
-from ..networks import NetworkSpec
 from ..options import Amount, Share, Size
 from ..program.batch import CHUNK, AnyBatch, in_chunks, repeat, rows
 from ..program.model import DynamicalVAE
@@ -70,30 +69,18 @@ class TrajectoryMethod(PoseMethod):
     rotate: bool = True
     heading: bool | None = None
 
-    def sizes(self) -> dict[str, int]:
-        """Size of the latent."""
-        return {"z": self.latent or 0}
-
-    def networks(self) -> Mapping[str, NetworkSpec]:
-        """Networks by factor."""
-        raise NotImplementedError(f"{type(self).__name__} says nothing of its networks")
-
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
         """Where left and right are unknown, so are headings."""
         found = super().preset(skeleton)
         return found if skeleton.left and skeleton.right else {**found, "heading": False}
 
-    @property
     @override
-    def selects(self) -> Literal["bound", "loss"]:
-        """Beta is part of the model, which the bound does not know."""
-        return "loss"
-
     def laws(self) -> Mapping[str, LawSpec]:
         """x is normal with variance 1/2, minus whose log-density is the squared error."""
         return {"p(x)": FixedNormal(scale=sqrt(0.5))}
 
+    @override
     def build(self, data: Any) -> DynamicalVAE:
         """The model for windows with a root and one observed frame.
 
@@ -126,11 +113,14 @@ class TrajectoryMethod(PoseMethod):
         return method._built(TrajectoryModel, 3 * skeleton.joints, method, skeleton, frames)
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
-        sizes = {**self.sizes(), **dict.fromkeys((WHOLE, FIRST, GIVEN, REST), size)}
-        return kind(*arguments, *self.equations(), sizes, self.networks(), self.laws())
+        return kind(*arguments, **self.described(dict.fromkeys((WHOLE, FIRST, GIVEN, REST), size)))
 
+    @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
-        """Minimises squared errors and the weighted KL, on windows that are turned anyhow, with some paths given."""
+        """Minimises squared errors and the weighted KL, on windows that are turned anyhow, with some paths given.
+
+        The best weights are those of the lowest loss: beta is part of the model, which the bound does not know.
+        """
         beta = self.suited(train).beta
         assert beta is not None
         turned = train.with_protocol(replace(train.protocol, rotate=self.rotate))

@@ -35,30 +35,13 @@ from ..networks import CosineDecoder, CosineEncoder, NetworkSpec
 from ..networks.base import share_modules
 from ..notation import Factorization
 from ..options import Extra, Layers, Range, Size
+from .poses import table
 from .trajectories import TrajectoryMethod
 
-PRESETS: dict[str, dict[str, Any]] = {
-    "human36m": {
-        "latent": 512,
-        "beta": 0.01,
-        "components": 0,
-        "width": 256,
-        "feedforward": 512,
-        "layers": 2,
-        "dropout": 0.1,
-        "heading": False,
-    },
-    "": {
-        "latent": 32,
-        "beta": 0.001,
-        "components": 15,
-        "width": 32,
-        "feedforward": 128,
-        "layers": 1,
-        "dropout": 0.0,
-        "heading": True,
-    },
-}
+PRESETS = table(
+    "latent beta components width feedforward layers dropout heading",
+    {"human36m": (512, 0.01, 0, 256, 512, 2, 0.1, False), "": (32, 0.001, 15, 32, 128, 1, 0.0, True)},
+)
 """Skeleton to options: the paper's; and for others what learns in minutes on a processor."""
 
 

@@ -185,8 +185,8 @@ def sweep(
             f"{len(failed)} of {len(results)} runs failed, the same command tries them again\n"
             + "\n".join(map(str, failed))
         )
-    then = "compare" if all(each.selects == "bound" for each in chosen) else "evaluate"
-    OUT.print(f"all {len(results)} runs have ended; {then} them with: dvae {then} {out}/*", soft_wrap=True)
+    then = f"score their forecasts with: dvae evaluate {out}/*, and bounds, where all have one: dvae compare {out}/*"
+    OUT.print(f"all {len(results)} runs have ended; {then}", soft_wrap=True)
 
 
 @contextmanager

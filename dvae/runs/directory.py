@@ -41,7 +41,7 @@ class Config:
         method: with its options.
         schema: of the data.
         kind: of the data.
-        data: where they were (`Recorded`).
+        data: where they were, as they `recorded` it.
         training: how it was fitted.
     """
 
@@ -50,6 +50,12 @@ class Config:
     kind: str
     data: Any
     training: Training
+
+    def written(self) -> dict[str, Any]:
+        """It in the present format and JSON's types, but for the training, which `fit` adds."""
+        schema = {"kind": self.schema.kind, **self.schema.config()}
+        data = {"kind": self.kind, **asdict(self.data)}
+        return {"format": FORMAT, "method": self.method.config(), "schema": schema, "data": data}
 
 
 @dataclass
@@ -130,17 +136,10 @@ def fit_run(
             prior are longer than the windows.
     """
     training = training or Training()
-    if training.self_feeding != 0:
-        raise ValueError(
-            f"self-feeding is an option of the method here; instead of Training(self_feeding={training.self_feeding}) "
-            f"write dvae.method({method.name!r}, self_feeding=…)"
-        )
     train = data.windows("train")
     method = method.suited(train)
     recipe = method.train(train, data.windows("validation"), training.steps)
-    schema = {"kind": data.schema.kind, **data.schema.config()}
-    config = {"format": FORMAT, "method": method.config(), "schema": schema}
-    config["data"] = {"kind": data.kind, **asdict(data.recorded())}
+    config = Config(method, data.schema, data.kind, data.recorded(), training).written()
     with torch.random.fork_rng():
         torch.manual_seed(training.seed)
         model = method.build(data.schema)
@@ -174,8 +173,8 @@ def resume(
     training = replace(run.config.training, self_feeding=0.0, **options)
     train, validation = run.data.windows("train"), run.data.windows("validation")
     recipe = run.method.train(train, validation, training.steps)
-    more: dict[str, Any] = {"out": path, "trackers": trackers, "callbacks": callbacks, **vars(training)}
-    found: Fit = recipe.fit(run.model, resume=True, **more)
+    more: dict[str, Any] = {"out": path, "config": run.config.written(), "trackers": trackers, **vars(training)}
+    found: Fit = recipe.fit(run.model, resume=True, callbacks=callbacks, **more)
     return found
 
 

@@ -14,13 +14,6 @@ DATA = Registry({"motion": "dvae.motion.dataset:MotionData"}, "dvae.data")
 """Kinds of schemas and of data, by the name that a config gives them."""
 
 
-class Recorded(Protocol):
-    """Where data were: a dataclass of JSON's types, which a run keeps."""
-
-    path: str
-    fingerprint: str
-
-
 class Dataset(Protocol):
     """Data that runs are fitted on, such as `dvae.motion.MotionData`."""
 
@@ -28,7 +21,7 @@ class Dataset(Protocol):
     described: ClassVar[str]
     """The kind of their schema."""
     source: ClassVar[type[Any]]
-    """What `recorded` is."""
+    """What `recorded` is: a dataclass of JSON's types with at least a path and a fingerprint, which a run keeps."""
 
     @property
     def location(self) -> str:
@@ -46,7 +39,7 @@ class Dataset(Protocol):
         """The sequences of "train", "validation" or "test"."""
 
     def recorded(self) -> Any:
-        """Where they are, as `Recorded`."""
+        """Where they are."""
 
     @classmethod
     def reopened(cls, source: Any, schema: Any, path: str | os.PathLike[str] | None = None) -> Self:
@@ -61,7 +54,7 @@ def opened(
     Args:
         run: its directory.
         kind: of the data.
-        source: where they were, as `Recorded`.
+        source: where they were, as they `recorded` it.
         schema: of them.
         where: they lie now.
 

@@ -38,7 +38,7 @@ from ..inference.result import Plain, Table, reason
 from ..inference.schedules import clamp
 from ..inference.signals import Signals
 from ..inference.svi import State
-from ..inference.trackers import LARGEST_LOG, row_of
+from ..inference.trackers import LARGEST_LOG, JSONLines, row_of
 from ..inference.training import Training
 from ..models.method import Method
 from ..options import flat
@@ -61,6 +61,7 @@ class Outcome:
         status: "finished", "stopped early", "interrupted" or "failed".
         step: the last step.
         best_bound: the best validation bound, in nats per frame, as in `Fit`.
+        best: what is best, where, in words.
         seconds: that this sweep spent on the run; 0 where an earlier one has finished it.
         error: why it failed.
     """
@@ -71,6 +72,7 @@ class Outcome:
     status: str
     step: int = 0
     best_bound: float | None = None
+    best: str = ""
     seconds: float = 0.0
     error: str = ""
 
@@ -78,10 +80,7 @@ class Outcome:
         if self.status == "failed":
             return f"{self.path.name} failed: {self.error}"
         how = f"in {_clock(self.seconds)}" if self.seconds else "by an earlier sweep"
-        bound = "" if self.best_bound is None else f", best bound {self.best_bound:.3f} nats a frame"
-        if self.best_bound is not None and self.method.selects == "loss":
-            bound = f", lowest validation loss {-self.best_bound:.4f}"
-        return f"{self.path.name} {self.status} at step {self.step} {how}{bound}"
+        return ", ".join(filter(None, [f"{self.path.name} {self.status} at step {self.step} {how}", self.best]))
 
 
 class SweepInterrupted(KeyboardInterrupt):
@@ -227,8 +226,13 @@ def _fit(run: _Run) -> tuple[Outcome, list[str]]:
         except Exception as failure:  # of any type, and it may not survive the way to the sweep's process
             status, error = "failed", f"{type(failure).__name__}: {reason(failure)}"
         seconds = time.monotonic() - begin
-    result = Outcome(run.path, run.method, run.training.seed, status, ended.step, ended.best_bound, seconds, error)
+    result = _outcome(run, replace(ended, status=status), seconds=seconds, error=error)
     return result, [str(warning.message) for warning in caught]
+
+
+def _outcome(run: _Run, fit: Fit, **more: Any) -> Outcome:
+    found = fit.status, fit.step, fit.best_bound, fit.best
+    return Outcome(run.path, run.method, run.training.seed, *found, **more)
 
 
 class _Leased:
@@ -342,7 +346,8 @@ def _earlier(run: _Run) -> Outcome | None:
         )
     if state["status"] not in ENDED:
         return None
-    return Outcome(run.path, run.method, run.training.seed, state["status"], state["step"], state["best_bound"])
+    found = {name: state[name] for name in ("status", "step", "best_step", "best_bound")}
+    return _outcome(run, Fit(JSONLines(run.path / "log.jsonl").read(), run=run.path, **found))
 
 
 def _options(method: Trainable, schema: Schema, training: Training, fingerprint: str) -> dict[str, Any]:

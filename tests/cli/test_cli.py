@@ -1,5 +1,6 @@
 """The command line, as a user meets it: what works, what is refused and how, what a signal leaves behind."""
 
+import copy
 import json
 import os
 import pickle
@@ -389,7 +390,7 @@ def test_a_method_with_an_objective_of_its_own_resumes(people, tmp_path, monkeyp
 
 
 def test_self_feeding_is_told_by_the_method_alone(people, tmp_path):
-    with pytest.raises(ValueError, match=r"instead of Training\(self_feeding=0.5\) write dvae.method\('vrnn', self_"):
+    with pytest.raises(ValueError, match=r"instead of self_feeding=0\.5 here write dvae\.method\(…, self_feeding=…\)"):
         runs.fit_run(dvae.method("vrnn"), MotionData.open(people), tmp_path / "run", dvae.Training(self_feeding=0.5))
 
 
@@ -514,6 +515,19 @@ def test_a_run_of_format_1_is_used_on_other_data_while_its_own_are_there(capsys,
     (run / "config.json").write_text(json.dumps(config))
     assert "gone.npz is not here" in failure(capsys, *other)
     assert main([*other[:3], str(people), *other[4:], "--samples", "1"]) == 0
+
+
+def test_a_run_of_format_1_is_resumed_as_one_of_the_present_format(run):
+    before = json.loads((run / "config.json").read_text())
+    former = copy.deepcopy(before)
+    del former["format"], former["data"]["kind"]
+    former["protocol"] = former.pop("schema")["protocol"]
+    (run / "config.json").write_text(json.dumps(former))
+    steps = json.loads((run / "state.json").read_text())["step"]
+    assert main(["resume", str(run), "--steps", str(steps + 1)]) == 0
+    after = json.loads((run / "config.json").read_text())
+    assert after.keys() == before.keys()
+    assert all(after[name] == before[name] for name in ("format", "method", "schema", "data", "training_data"))
 
 
 def test_data_of_other_joints_are_refused(capsys, run, tmp_path):

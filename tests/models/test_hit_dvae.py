@@ -333,8 +333,8 @@ def test_every_ablation_is_fitted_loaded_and_forecasts(walkers, tmp_path, ablati
     training = dvae.Training(steps=4, validate_every=2, batch_size=2, progress=False, accelerator="cpu")
     result = runs.fit_run(method, walkers, tmp_path / "run", training)
     rows = [row for row in result.history if any(name.startswith("validation/") for name in row)]
-    assert all(("validation/loss" in row) == (method.selects == "loss") for row in rows)
-    assert ("validation loss" in result.best) == (method.selects == "loss")
+    assert all(("validation/loss" in row) == (method.loss == "best-of-many") for row in rows)
+    assert ("validation loss" in result.best) == (method.loss == "best-of-many")
     loaded = runs.load(tmp_path / "run")
     assert loaded.method == replace(method.suited(walkers.windows("train")))
     assert configured(loaded.method.config()) == loaded.method

@@ -4,6 +4,7 @@ import copy
 import json
 import math
 import re
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import ClassVar
@@ -14,6 +15,7 @@ import torch
 import dvae
 from dvae import motion
 from dvae.data import Sequences
+from dvae.inference.checkpoints import CheckpointError
 from dvae.models import registry
 from dvae.models.dkf import Gated
 from dvae.models.method import LatentMethod
@@ -259,6 +261,18 @@ def test_a_recipe_is_of_its_own_steps():
     recipe = method.train(Sequences({"x": torch.randn(4, 6, 3)}), steps=2)
     with pytest.raises(ValueError, match="this recipe is of 2 steps, not 5; ask the method"):
         recipe.fit(method.build({"x": 3}), steps=5)
+
+
+def test_a_recipe_refuses_what_it_cannot_do_before_it_prepares_the_model(tmp_path):
+    method = dvae.method("vae", latent=2, warm_up=1)
+    model, options = method.build({"x": 3}), {"batch_size": 2, "progress": False, "out": tmp_path / "run"}
+    recipe = method.train(Sequences({"x": torch.randn(4, 6, 3)}), steps=2)
+    recipe.fit(model, **options)
+    recipe = replace(recipe, prepare=lambda model: pytest.fail("the model is prepared"))
+    with pytest.raises(CheckpointError, match="already holds a run; continue it with resume=True"):
+        recipe.fit(model, **options)
+    with pytest.raises(ValueError, match=r"is an option of the method.* instead of self_feeding=0\.3 here"):
+        recipe.fit(model, self_feeding=0.3, **options | {"out": None})
 
 
 def test_options_of_the_loss_reach_it():
@@ -556,7 +570,7 @@ def test_entry_points_add_methods_and_cannot_replace_any(monkeypatch):
         assert dvae.methods()["other"].name == "dkf"
         dvae.methods.cache_clear()
         monkeypatch.setattr(registry, "entry_points", points("elsewhere:DKF", "dkf"))
-        with pytest.raises(ValueError, match="entry point elsewhere:DKF has the name of a method that exists: dkf"):
+        with pytest.raises(ValueError, match=r"elsewhere:DKF has a name that is taken in dvae\.methods: dkf"):
             dvae.methods()
     finally:
         dvae.methods.cache_clear()

@@ -227,6 +227,8 @@ def test_a_method_that_the_data_complete_goes_on_too(data, tmp_path):
     first, again = (sweep([method], data, tmp_path, [0], TRAINING, jobs=1) for _ in range(2))
     assert [outcome.status for outcome in (*first, *again)] == ["finished"] * 2
     assert again[0].seconds == 0
+    assert first[0].best == again[0].best
+    assert first[0].best.startswith("lowest validation loss")  # as the objective selects
 
 
 def test_ctrl_c_in_a_sweep_of_one_job_is_the_sweeps(data, tmp_path):
@@ -323,5 +325,5 @@ def test_runs_on_a_dask_cluster_are_those_of_this_machine(swept, data, people, t
 
 
 def test_a_result_reads_as_a_line(tmp_path):
-    result = Outcome(tmp_path / "vae-seed0", VAE, 0, "stopped early", 300, -1.25, 61.4)
-    assert str(result) == "vae-seed0 stopped early at step 300 in 0:01:01, best bound -1.250 nats a frame"
+    result = Outcome(tmp_path / "vae-seed0", VAE, 0, "stopped early", 300, -1.25, "the best", 61.4)
+    assert str(result) == "vae-seed0 stopped early at step 300 in 0:01:01, the best"
