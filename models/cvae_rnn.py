@@ -61,10 +61,11 @@ class CVAERNN(TrajectoryMethod):
         if not self.hidden:
             raise ValueError("hidden is empty; a perceptron has at least one layer")
 
+    @override
     def sizes(self) -> dict[str, int]:
-        """Size of w."""
         return {"w": self.latent or 0}
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """Summaries, and the decoder; guide and decoder share that of y."""
         return {
@@ -72,12 +73,14 @@ class CVAERNN(TrajectoryMethod):
             "p(x)": Decoder(self.summary, self.hidden, self.width),
         }
 
+    @override
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         model = super()._built(kind, size, *arguments)
         share_modules([model.encoder["w"].network.summaries, model.generator["x"].network.summaries], GIVEN)
         model.feeding = SelfFeeding(1.0, gradient=True)
         return model
 
+    @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
         """As others, with self-feeding at 1: the model never reads what it has not made."""
         return replace(super().train(train, validation, steps), feeding=1.0)

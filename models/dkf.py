@@ -128,6 +128,7 @@ class DKF(LatentMethod):
     decoder: tuple[Size, ...] = (32, 64)
     transition: tuple[Size, ...] = ()
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """A gated transition, a perceptron for the data, a backward network for the guide."""
         extract = {"z": (*self.embed_latent, self.width)}
@@ -137,6 +138,7 @@ class DKF(LatentMethod):
             "q(z)": Recurrent(self.width, embed=self.embed, extract=extract, hidden=self.hidden, mean=True),
         }
 
+    @override
     def laws(self) -> Mapping[str, LawSpec]:
         """The gated transition has its own."""
         return {**super().laws(), **({} if self.transition else {"p(z)": GatedNormal()})}

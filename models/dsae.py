@@ -121,10 +121,11 @@ class DSAE(LatentMethod):
     width: Size = 64
     decoder: tuple[Size, ...] = (32, 64)
 
+    @override
     def sizes(self) -> dict[str, int]:
-        """Sizes of w and z."""
         return {"w": self.static, "z": self.latent}
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """Recurrent networks for everything but the data."""
         return {

@@ -75,10 +75,12 @@ class KVAE(LatentMethod):
     learn_noise: bool = False
     phases: bool = True
 
+    @override
     def sizes(self) -> dict[str, int]:
         """The size of a, the only latent that is drawn."""
         return {"a": self.auxiliary}
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """The Kalman filter, and perceptrons frame by frame."""
         return {
@@ -87,6 +89,7 @@ class KVAE(LatentMethod):
             "q(a)": Dense(self.hidden),
         }
 
+    @override
     def laws(self) -> Mapping[str, LawSpec]:
         """The filter's prediction has a full covariance."""
         return {**super().laws(), "p(a)": Triangular()}

@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from typing_extensions import override
+
 from ..networks import NetworkSpec, Recurrent
 from ..options import Size
 from .method import LatentMethod
@@ -36,6 +38,7 @@ class CausalRVAE(LatentMethod):
     width: Size = 64
     hidden: tuple[Size, ...] = ()
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """A recurrent state for each variable and direction."""
         return {"default": Recurrent(self.width, hidden=self.hidden, separate=True)}

@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+from typing_extensions import override
+
 from ..networks import NetworkSpec, Recurrent
 from ..networks.recurrent import tie
 from ..options import Extra, Size
@@ -41,6 +43,7 @@ class SRNN(LatentMethod):
     hidden: tuple[Size, ...] = (32,)
     decoder: tuple[Size, ...] = (64,)
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """A recurrent network for each factor; `build` ties their forward states."""
         around = Recurrent(self.width, embed=self.embed, hidden=self.hidden)
@@ -50,6 +53,7 @@ class SRNN(LatentMethod):
             "q(z)": replace(around, stack=True),
         }
 
+    @override
     def build(self, data: Any) -> DynamicalVAE:
         """The model, with one h_t for its three factors."""
         model = super().build(data)

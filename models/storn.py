@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from typing_extensions import override
+
 from ..networks import NetworkSpec, Recurrent
 from ..options import Extra, Size
 from .method import LatentMethod
@@ -40,6 +42,7 @@ class STORN(LatentMethod):
     embed_latent: Extra = 32
     hidden: tuple[Size, ...] = (32,)
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """A recurrent network for the guide, another for the data."""
         layers = {"x": self.embed, "z": self.embed_latent}

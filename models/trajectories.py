@@ -190,6 +190,7 @@ class TrajectoryModel(DynamicalVAE):
 
     @alone
     @torch.no_grad()
+    @override
     def forecast(
         self,
         batch: AnyBatch,

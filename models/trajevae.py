@@ -92,8 +92,8 @@ class TrajeVAE(TrajectoryMethod):
         """Without the cosine transform there are no coefficients."""
         return {**super().preset(skeleton), **({} if self.cosine else {"components": 0})}
 
+    @override
     def equations(self) -> tuple[Factorization, Factorization]:
-        """The generative model and the guide."""
         p = self.generative
         if not self.learned_prior:
             p = "p(z_t) p(x_t | z_{1:T}, y_{1:T}, s)"
@@ -103,6 +103,7 @@ class TrajeVAE(TrajectoryMethod):
             masks = {"1:C": partial(_slow, components=self.components)}
         return Factorization.parse(p, masks), Factorization.parse(self.inference)
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """The transformers; the model has them share what they share."""
         shape: dict[str, Any] = {
@@ -120,12 +121,14 @@ class TrajeVAE(TrajectoryMethod):
             found["p(z)"] = encoder
         return {**found, "p(x)": CosineDecoder(hidden=2 * shape["width"], **shape)}
 
+    @override
     def laws(self) -> Mapping[str, LawSpec]:
         """The decoder makes poses; normal latents, of which those beyond `components` are noise that nothing reads."""
         latent: LawSpec = SlowNormal(steps=self.components) if self.components else Normal()
         emission = FixedNormal(scale=sqrt(0.5), project=False)
         return {"p(x)": emission, "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
 
+    @override
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         model = super()._built(kind, size, *arguments)
         guide, decoder = model.encoder["z"].network, model.generator["x"].network

@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from typing_extensions import override
+
 from ..networks import Dense, NetworkSpec
 from ..options import Size
 from .method import LatentMethod
@@ -33,6 +35,7 @@ class VAE(LatentMethod):
 
     hidden: tuple[Size, ...] = (32,)
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """Perceptrons, frame by frame."""
         return {"q(z)": Dense(self.hidden), "p(x)": Dense(self.hidden[::-1])}

@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from typing_extensions import override
+
 from ..networks import NetworkSpec, Recurrent
 from ..networks.recurrent import tie
 from ..options import Size
@@ -42,11 +44,13 @@ class VRNN(LatentMethod):
     embed_latent: tuple[Size, ...] = (16, 32)
     hidden: tuple[Size, ...] = ()
 
+    @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """One kind for each factor; `build` ties them."""
         extract = {"x": self.embed, "z": self.embed_latent}
         return {"default": Recurrent(self.width, extract=extract, hidden=self.hidden, apart=True)}
 
+    @override
     def build(self, data: Any) -> DynamicalVAE:
         """The model, with one h_t for its three factors."""
         model = super().build(data)
