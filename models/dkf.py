@@ -76,31 +76,24 @@ class GatedTransition(Network):
 
 @dataclass(frozen=True)
 class GatedNormal:
-    """A normal on the features of `Gated`.
-
-    Args:
-        min_scale: the scale stays above it.
-    """
-
-    min_scale: float = 1e-3
+    """A normal on the features of `Gated`, whose scale stays above .001."""
 
     def build(self, shape: Shape) -> GatedLaw:
         """The law of a variable, from features (..., 2 D)."""
-        return GatedLaw(self, shape.size)
+        return GatedLaw(shape.size)
 
 
 class GatedLaw(Gaussian):
     """What `GatedNormal` describes."""
 
-    def __init__(self, spec: GatedNormal, size: int):
+    def __init__(self, size: int):
         super().__init__()
-        self.min_variance = spec.min_scale**2
         self.variance = nn.Linear(size, size)
 
     @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         mean, proposal = features.chunk(2, dim=-1)
-        return mean, torch.sqrt(functional.softplus(self.variance(proposal)) + self.min_variance)
+        return mean, torch.sqrt(functional.softplus(self.variance(proposal)) + 1e-6)
 
 
 @dataclass(frozen=True)

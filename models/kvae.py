@@ -149,16 +149,12 @@ class Kalman:
         components: K.
         width: of the recurrent state.
         learn_noise: whether Q and R are learned, from their starts on.
-        transition_noise, emission_noise, initial: variances: of Q, R and of z_1.
     """
 
     latent: int = 4
     components: int = 3
     width: int = 50
     learn_noise: bool = False
-    transition_noise: float = 0.08
-    emission_noise: float = 0.03
-    initial: float = 20.0
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> KalmanNetwork:
         """The network of a factor p(a_t | a_{<t}), for a of dimension `size`."""
@@ -187,10 +183,7 @@ class KalmanNetwork(Network):
         self.A = nn.Parameter(torch.eye(latent).repeat(count, 1, 1))
         self.B = nn.Parameter(0.05 * torch.randn(count, latent, size))
         self.C = nn.Parameter(0.05 * torch.randn(count, size, latent))
-        for name, start, n in (
-            ("log_noise", spec.transition_noise, latent),
-            ("log_emission", spec.emission_noise, size),
-        ):
+        for name, start, n in (("log_noise", 0.08, latent), ("log_emission", 0.03, size)):
             value = torch.full((n,), math.log(start))
             if spec.learn_noise:
                 setattr(self, name, nn.Parameter(value))
@@ -236,7 +229,7 @@ class KalmanNetwork(Network):
                 "fit with precision='bf16-mixed' or '32-true'"
             )
         noise = self.log_noise.exp().diag()
-        covariance = self.spec.initial * torch.eye(len(noise), dtype=noise.dtype, device=noise.device)
+        covariance = 20.0 * torch.eye(len(noise), dtype=noise.dtype, device=noise.device)
         return noise.new_zeros(batch, len(noise)), covariance.expand(batch, -1, -1), noise
 
     def mixed(self, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:

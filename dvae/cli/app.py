@@ -111,27 +111,17 @@ def _meant(given: Sequence[str]) -> Iterator[str]:
     from ..models.registry import judges, methods
 
     name, *rest = given
-    loose = [
-        word
-        for before, word in zip(["", *rest], rest, strict=False)
-        if not word.startswith("-") and (name == "sweep" or not before.startswith("-"))
-    ]
-    hints = [get_type_hints(called)]
-    hints += [
-        get_type_hints(kind) for kind in (hints[0].get("training"), *methods().values()) if name in ("fit", "sweep")
-    ]
-    choices = {option: _choices(hint) for each in reversed(hints) for option, hint in each.items() if _choices(hint)}
-    names = {"fit": [*methods(), *judges()], "data": choices.get("action", [])}.get(name, [])
-    for word in loose[:1] if not set(names) & set(rest) else []:
-        if meant := nearest(word, names):
-            yield f"{word!r} is unknown{meant}"
-    for option, word in pairwise(rest):
-        known = choices.get(option.removeprefix("--").replace("-", "_"), []) if option.startswith("--") else []
-        if known and word not in known and (meant := nearest(word, known)):
-            yield f"{option} {word!r} is unknown{meant}"
-    for word in loose if name == "sweep" else []:
-        if word not in choices["method"] and (meant := nearest(word, choices["method"])):
-            yield f"{word!r} is unknown{meant}"
+    hints = get_type_hints(called)
+    if name in ("fit", "sweep"):
+        for kind in (hints["training"], *methods().values()):
+            hints = get_type_hints(kind) | hints
+    choices = {option: _choices(hint) for option, hint in hints.items()}
+    names = {"fit": [*methods(), *judges()], "sweep": choices.get("method"), "data": choices.get("action")}.get(name)
+    for before, word in pairwise(["", *rest]):
+        option = before if before.startswith("--") else ""
+        known = choices.get(option.removeprefix("--").replace("-", "_")) if option else names
+        if known and word not in known and not word.startswith("-") and (meant := nearest(word, known)):
+            yield f"{option} {word!r} is unknown{meant}".lstrip()
 
 
 def _choices(hint: Any) -> list[str]:

@@ -233,7 +233,7 @@ def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
 
 def _windows_of(loaded: runs.Loaded, data: str | None, clip: str | None) -> motion.Windows:
     """The test windows of a run's data or of others, or all windows of one clip, of any split."""
-    opened = data_of(loaded, data)
+    opened = data_of(data, loaded)
     if clip is None:
         return opened.windows("test")  # type: ignore[no-any-return]
     chosen = motion.MotionSet([_clip(opened.motion, clip)], opened.motion.skeleton, opened.path)
@@ -251,7 +251,8 @@ def _forecasts(
     fix: Sequence[str] = (),
 ) -> motion.Forecasts:
     """Futures of some of the windows; those of a window share one draw of what is fixed."""
-    free = {*(loaded.model.view.parts or ()), *_statics(loaded.model)}
+    model = loaded.model
+    free = {*(model.view.parts or ()), *(name for name in model.latents if not model.generative.local(name))}
     if unknown := [name for name in fix if name not in free]:
         raise UsageError(
             f"--fix {' '.join(unknown)}: {loaded.path} has "
@@ -265,17 +266,13 @@ def _forecasts(
         whole = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # parts are fixed as a whole
         parts = []
         for part in past.split(64):
-            once = loaded.model.forecast({"x": part}, whole, 1) if fix else {}
+            once = model.forecast({"x": part}, whole, 1) if fix else {}
             held = {"fix": {name: once[name][0] for name in fix}} if fix else {}
-            made = loaded.model.forecast({"x": part}, whole, samples, **held)["x"][:, :, :horizon]
+            made = model.forecast({"x": part}, whole, samples, **held)["x"][:, :, :horizon]
             parts.append(windows.positions(made).numpy())
             del made  # with many samples the largest thing here
     positions = [np.concatenate(parts, axis=1), *(windows.positions(frames).numpy() for frames in (past, future))]
     return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], *positions)
-
-
-def _statics(model: Any) -> list[str]:
-    return [name for name in model.latents if not model.generative.local(name)]
 
 
 def _alike(futures: motion.Forecasts) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,33 +23,54 @@ from ..inference.evaluation import Evaluation
 from ..models.trajectories import TrajectoryModel
 from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
+from . import opening
 from .console import ERROR, OUT, UsageError, at_least, check_files, save_figure
 from .futures import joint_names
-from .opening import (
-    config_without_seed,
-    data_of,
-    load_run,
-    names,
-    note_unfinished,
-    on_the_same_data,
-    own,
-    record,
-    rows,
-    unfinished,
-)
+
+
+@dataclass(frozen=True)
+class Control:
+    """What methods that take trajectories (trajevae, cvae-rnn) are told.
+
+    Args:
+        joints: joints whose paths are given to the runs.
+        exchange: begin each window with the pose of another one, whose given joints are so many metres from its own at
+            most (in the paper .01).
+        temperature: of the latents' scale; 0 for motion at the mean of the prior.
+    """
+
+    joints: tuple[str, ...] | None = None
+    exchange: float | None = None
+    temperature: float | None = None
+
+    def windows(self, windows: motion.Windows, loaded: Sequence[runs.Loaded]) -> Any:
+        """The windows as the runs are given them."""
+        if self == Control():
+            return windows
+        for each in loaded:
+            if not isinstance(each.model, TrajectoryModel):
+                raise UsageError(
+                    f"--joints, --exchange and --temperature are for methods that take trajectories; {each.path} holds "
+                    f"{each.method.name}"
+                )
+        given = windows.given(joint_names(self.joints or ()))
+        return given if self.exchange is None else motion.Exchanged(given, self.exchange)
+
+    def __str__(self) -> str:
+        parts = ["", *joint_names(self.joints or ())]
+        parts += [] if self.exchange is None else [f"exchanged-{self.exchange:g}"]
+        return "-".join(parts if self.temperature is None else [*parts, f"temperature-{self.temperature:g}"])
 
 
 def evaluate(
     run: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    control: Control,
     data: str | None = None,
     samples: int = 50,
     bound_particles: int = 0,
     log_score_particles: int = 0,
     pose_prior: Path | None = None,
     classifier: tuple[Path, ...] = (),
-    joints: tuple[str, ...] | None = None,
-    exchange: float | None = None,
-    temperature: float | None = None,
     seed: int = 0,
     batch_size: int = 32,
     out: Path | None = None,
@@ -62,16 +83,13 @@ def evaluate(
 
     Args:
         run: run directories, fitted on the same data under the same protocol.
+        control: what methods that take trajectories are told.
         data: where the data lie now, if the path in the runs no longer leads there; or other data of the same joints.
         samples: forecasts of each window, K.
         bound_particles: particles of the importance-weighted bound; 0 leaves it out.
         log_score_particles: particles of the log density of the future under the forecasts; 0 leaves it out.
         pose_prior: run of a pose-prior, by which to score the poses of the forecasts.
         classifier: runs of action-classifiers of different labels, by which to score what the forecasts show.
-        joints: joints whose paths are given to the runs, for methods that take some (trajevae, cvae-rnn).
-        exchange: begin each window with the pose of another one, whose given joints are so many metres from its own at
-            most (in the paper .01).
-        temperature: of the latents' scale, for such methods; 0 for motion at the mean of the prior.
         seed: of the draws.
         batch_size: windows forecast at once.
         out: file to write instead of evaluation.json in each run.
@@ -80,33 +98,28 @@ def evaluate(
     at_least(1, samples=samples, batch_size=batch_size)
     at_least(0, bound_particles=bound_particles, log_score_particles=log_score_particles)
     check_files(out, figure, ".json")
-    loaded, opened = on_the_same_data(run, data)
-    note_unfinished(loaded)
-    given = None if (joints, exchange, temperature) == (None, None, None) else joint_names(joints or ())
-    if given is not None:
-        _check_that_paths_are_taken(loaded)
-    called, windows = dict(zip(names(loaded), loaded, strict=True)), opened.windows("test")
+    loaded, opened = opening.on_the_same_data(run, data)
+    opening.note_unfinished(loaded)
+    called, windows = dict(zip(opening.names(loaded), loaded, strict=True)), opened.windows("test")
+    given = control.windows(windows, loaded)
     classifiers = _classifiers(classifier, data, loaded[0])
     prior = None if pose_prior is None else _pose_prior(pose_prior, data, windows.skeleton)
-    if given is not None:
-        windows = windows.given(given)
+    own, temperature = opening.own(loaded[0], opened), control.temperature
     result = evaluate_models(
         {name: each.model for name, each in called.items()},
-        windows if exchange is None else motion.Exchanged(windows, exchange),
+        given,
         scores=partial(motion.scores, pose_prior=prior, classifiers=classifiers),
         samples=samples,
         seed=seed,
         batch_size=batch_size,
         bound_particles=bound_particles,
         log_score_particles=log_score_particles,
-        training_windows=opened.windows("train+validation") if own(loaded[0], opened) else None,
+        training_windows=opened.windows("train+validation") if own else None,
         configs={name: Run(each.path).config for name, each in called.items()},
         options={} if temperature is None else {"temperature": temperature},
     )
-    kind = "-".join([record("evaluation", loaded[0], opened), *(given or ())])
-    kind += "" if exchange is None else f"-exchanged-{exchange:g}"
-    kind += "" if temperature is None else f"-temperature-{temperature:g}"
-    _keep(result, [out] if out is not None else [each.path / f"{kind}.json" for each in loaded], figure)
+    name = f"{opening.record('evaluation', loaded[0], opened)}{control}.json"
+    _keep(result, [each.path / name for each in loaded] if out is None else [out], figure)
 
 
 def _keep(result: Comparison | Evaluation, paths: Sequence[Path], figure: Path | None) -> None:
@@ -117,15 +130,6 @@ def _keep(result: Comparison | Evaluation, paths: Sequence[Path], figure: Path |
         ERROR.print(f"wrote {path}")
     if figure is not None:
         save_figure(result.plot(), figure)
-
-
-def _check_that_paths_are_taken(loaded: Sequence[runs.Loaded]) -> None:
-    for each in loaded:
-        if not isinstance(each.model, TrajectoryModel):
-            raise UsageError(
-                f"--joints, --exchange and --temperature are for methods that take trajectories; {each.path} holds "
-                f"{each.method.name}"
-            )
 
 
 def criticise(
@@ -163,13 +167,13 @@ def criticise(
     at_least(1, simulations=simulations, draws=draws, ranked_steps=ranked_steps, batch_size=batch_size)
     at_least(19, samples=samples)
     check_files(out, figure, ".json")
-    loaded = load_run(run, data)
-    note_unfinished([loaded])
-    opened, model = data_of(loaded, data), loaded.model
+    loaded = opening.load_run(run, data)
+    opening.note_unfinished([loaded])
+    opened, model = opening.data_of(data, loaded), loaded.model
     windows = opened.windows("test")
     steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
     document: dict[str, Any] = {}
-    path = out or run / f"{record('criticism', loaded, opened)}.json"
+    path = out or run / f"{opening.record('criticism', loaded, opened)}.json"
     if model.context:
         ERROR.print(
             f"no calibration: sequences are simulated from nothing, but {loaded.method.name} starts from a pose"
@@ -244,11 +248,11 @@ def compare(
     at_least(1, particles=particles, estimates=estimates, samples=samples, batch_size=batch_size, stride=stride)
     at_least(0, contrasts=contrasts)
     check_files(out, figure, ".json")
-    loaded, opened = on_the_same_data(run, data)
-    if stopped := unfinished(loaded):
+    loaded, opened = opening.on_the_same_data(run, data)
+    if stopped := opening.unfinished(loaded):
         raise ValueError("\n".join(stopped))
     protocol = opened.protocol if stride is None else replace(opened.protocol, test_stride=stride)
-    shown = rows(loaded)
+    shown = opening.rows(loaded)
     result = compare_models(
         {name: [each.model for each in row] for name, row in shown.items()},
         motion.windows(opened.motion, protocol, "test"),
@@ -260,7 +264,7 @@ def compare(
         draw_emission=draw_emission,
         seed=seed,
         batch_size=batch_size,
-        configs={name: config_without_seed(row[0]) for name, row in shown.items()},
+        configs={name: opening.config_without_seed(row[0]) for name, row in shown.items()},
     )
     _keep(result, [] if out is None else [out], figure)
 
@@ -288,6 +292,6 @@ def _classifiers(paths: Sequence[Path], data: str | None, judged: runs.Loaded) -
                 f"--classifier {path} was fitted on other data or under another protocol ({there}) than the runs "
                 f"({here}); it may have seen test clips"
             )
-        note_unfinished([loaded])
+        opening.note_unfinished([loaded])
         found[loaded.model.label] = loaded.model
     return found

@@ -26,13 +26,8 @@ def load_run(path: Path, data: str | None) -> runs.Loaded:
     return loaded
 
 
-def data_of(run: runs.Loaded, path: str | None) -> Any:
-    """The data of a run or, where a path leads to others, these under the protocol of the run."""
-    return _opened([run], path)
-
-
-def _opened(alike: Sequence[runs.Loaded], path: str | None) -> Any:
-    """`data_of` runs of one schema, opened once."""
+def data_of(path: str | None, *alike: runs.Loaded) -> Any:
+    """The data of runs of one schema or, where a path leads to others, these under the protocol of the runs."""
     if path is None:
         return alike[0].data
     found = alike[0].on(path)
@@ -58,7 +53,7 @@ def on_the_same_data(paths: Sequence[Path], path: str | None) -> tuple[list[runs
                 f"{other.path} has other test windows ({there}) than {first.path} ({here}); give runs of the same data "
                 "and protocol"
             )
-    return loaded, _opened(loaded, path)
+    return loaded, data_of(path, *loaded)
 
 
 def own(run: runs.Loaded, opened: Any) -> bool:
