@@ -56,8 +56,7 @@ def forecast(
     futures.save(out)
     frames = futures.forecasts.shape[2]
     ERROR.print(f"wrote {out}: {samples} futures of {frames} frames for each of {len(windows)} windows")
-    if figure is not None:
-        _save_futures(futures, figure)
+    _save_futures(futures, figure)
 
 
 def complete(
@@ -108,31 +107,27 @@ def complete(
     positions = windows.positions(windows.all()["x"]).numpy()
     chosen = _liveliest(positions, window)
     pose, truth = positions[chosen, 0], positions[chosen, 1:]
-    given = {joint: truth[:, windows.skeleton.find(joint)] for joint in joint_names(joints)}
-    if paths is not None:
-        given |= _drawn(paths, windows.skeleton, given)
-    length = None if given else len(truth)
+    given = _told(joint_names(joints), truth, paths, windows.skeleton)
+    how: dict[str, Any] = {"exact": exact, "temperature": temperature, "progress": True}
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        done = loaded.model.complete(pose, given, length, samples, exact=exact, temperature=temperature, progress=True)
-    truth = truth[: done.positions.shape[1]]
-    motions = motion.Forecasts(
-        windows.skeleton, [windows.keys[chosen]], done.positions[:, None], pose[None, None], truth[None]
-    )
+        done = loaded.model.complete(pose, given, None if given else len(truth), samples, **how)
+    before_and_after = pose[None, None], truth[None, : done.positions.shape[1]]
+    motions = motion.Forecasts(windows.skeleton, [windows.keys[chosen]], done.positions[:, None], *before_and_after)
     motions.save(out)
     OUT.print(str(done))
     ERROR.print(f"wrote {out}: window {chosen}, {_title(motions)}")
-    if figure is not None:
-        _save_futures(motions, figure, given)
+    _save_futures(motions, figure, given)
 
 
-def _drawn(paths: Path, skeleton: motion.Skeleton, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The paths of a file, of joints that are not given already."""
-    drawn = motion.read_paths(paths)
+def _told(joints: Sequence[str], truth: Any, paths: Path | None, skeleton: motion.Skeleton) -> dict[str, Any]:
+    """Paths by joint: the true ones of some joints, and those of a file, of other joints."""
+    given = {joint: truth[:, skeleton.find(joint)] for joint in joints}
+    drawn = {} if paths is None else motion.read_paths(paths)
     if twice := set(map(skeleton.find, given)) & set(map(skeleton.find, drawn)):
         names = ", ".join(skeleton.names[joint] for joint in twice)
         raise UsageError(f"{names} is named by --joints, and {paths} has a path of it; say which by leaving one out")
-    return drawn
+    return given | drawn
 
 
 def animate(
@@ -186,8 +181,7 @@ def animate(
     now = futures.observed[0], futures.forecasts[:, 0], futures.truth[0]
     _play(out, futures.skeleton, *now, fixed=_alike(futures), every=every, title=_title(futures))
     ERROR.print(f"wrote {out}: window {chosen}, {_title(futures)}")
-    if figure is not None:
-        _save_futures(futures, figure)
+    _save_futures(futures, figure)
 
 
 def _stored(source: str, clip: str | None, window: int | None, samples: int | None) -> tuple[int, motion.Forecasts]:
@@ -296,8 +290,10 @@ def _title(futures: motion.Forecasts) -> str:
     return f"{split}/{clip} from frame {start}: {len(futures.forecasts)} futures"
 
 
-def _save_futures(futures: motion.Forecasts, path: Path, paths: Mapping[str, Any] | None = None) -> None:
-    """A figure of the first window's futures, and of the paths that joints were given."""
+def _save_futures(futures: motion.Forecasts, path: Path | None, paths: Mapping[str, Any] | None = None) -> None:
+    """A figure of the first window's futures, and of the paths that joints were given, if it is asked for."""
+    if path is None:
+        return
     from matplotlib.figure import Figure
 
     from ..motion.plot import futures as draw

@@ -13,13 +13,11 @@ import numpy as np
 import tyro
 
 from .. import files, motion
-from ..inference.calibration import Calibration, calibrate
+from ..inference.calibration import calibrate
 from ..inference.checkpoints import Run
-from ..inference.checks import PredictiveChecks, predictive_checks
+from ..inference.checks import predictive_checks
 from ..inference.compare import compare as compare_models
-from ..inference.comparison import Comparison
 from ..inference.evaluate import evaluate as evaluate_models
-from ..inference.evaluation import Evaluation
 from ..models.trajectories import TrajectoryModel
 from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
@@ -122,7 +120,7 @@ def evaluate(
     _keep(result, [each.path / name for each in loaded] if out is None else [out], figure)
 
 
-def _keep(result: Comparison | Evaluation, paths: Sequence[Path], figure: Path | None) -> None:
+def _keep(result: Any, paths: Sequence[Path], figure: Path | None) -> None:
     """Prints a result, and writes it to files."""
     OUT.print(result.table())
     for path in paths:
@@ -193,22 +191,13 @@ def criticise(
     _add(document, "predictive", checks, path, figure, "checks")
 
 
-def _add(
-    document: dict[str, Any],
-    part: str,
-    result: Calibration | PredictiveChecks,
-    path: Path,
-    figure: Path | None,
-    drawn: str,
-) -> None:
+def _add(document: dict[str, Any], part: str, result: Any, path: Path, figure: Path | None, drawn: str) -> None:
     """Prints a part of the criticism, and writes what there is of it."""
-    OUT.print(result.table())
+    _keep(result, [], figure and figure.with_stem(f"{figure.stem}-{drawn}"))
     document[part] = result.document()
     with files.written(path) as file:
         file.write((json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
     ERROR.print(f"wrote {path}: {part}")
-    if figure is not None:
-        save_figure(result.plot(), figure.with_stem(f"{figure.stem}-{drawn}"))
 
 
 def compare(

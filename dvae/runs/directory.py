@@ -242,9 +242,6 @@ def reading_config(path: str | os.PathLike[str]) -> Iterator[None]:
         what = f"it lacks {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
         raise CheckpointError(
             f"{Path(path) / CONFIG} does not tell method, schema, data and training of a run "
-            f"({_shortened(what)}); it is damaged, or was not written by `dvae fit` with these methods"
+            f"({what[:400]}{'…' * (len(what) > 400)}); it is damaged, or was not written by `dvae fit` with these "
+            "methods"
         ) from error
-
-
-def _shortened(text: str) -> str:
-    return text if len(text) <= 400 else f"{text[:400]}…"

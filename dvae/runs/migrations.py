@@ -33,17 +33,13 @@ def upgraded(config: Mapping[str, Any], run: Path, data: str | os.PathLike[str] 
         KeyError: what every format has is missing.
     """
     version = config.get("format", 1)
-    if version == 1:
-        return _from_1(config, run, data)
-    if version != FORMAT:
+    if version == FORMAT:
+        return config
+    if version != 1:
         raise CheckpointError(
             f"{run} is a run of format {version!r}, and this version of dvae reads formats up to {FORMAT}; install a "
             "newer one"
         )
-    return config
-
-
-def _from_1(config: Mapping[str, Any], run: Path, data: str | os.PathLike[str] | None) -> Mapping[str, Any]:
     name = config["method"]["method"]
     kind = judges()[name] if name in judges() else methods()[name]
     aside = {option.name for option in fields(LatentMethod)} - {option.name for option in fields(kind)}
