@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -45,10 +45,10 @@ class CVAERNN(TrajectoryMethod):
         hidden: widths of perceptrons; the last is that of a summary in the decoder.
     """
 
-    name: ClassVar[str] = "cvae-rnn"
-    source: ClassVar[str] = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
-    generative: ClassVar[str] = "p(w) p(x_t | x_{<t}, y_{1:T}, w, s)"
-    inference: ClassVar[str] = "q(w | r_{1:T}, y_{1:T}, s)"
+    name = "cvae-rnn"
+    source = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
+    generative = "p(w) p(x_t | x_{<t}, y_{1:T}, w, s)"
+    inference = "q(w | r_{1:T}, y_{1:T}, s)"
 
     latent: Size | None = 256
     beta: Amount | None = 0.1

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -109,10 +109,10 @@ class DKF(LatentMethod):
         transition: widths of a perceptron for p(z_t | z_{t-1}) in place of the gated transition.
     """
 
-    name: ClassVar[str] = "dkf"
-    source: ClassVar[str] = "Krishnan, Shalit and Sontag, 2015, arXiv 1511.05121"
-    generative: ClassVar[str] = "p(z_t | z_{t-1}) p(x_t | z_t)"
-    inference: ClassVar[str] = "q(z_t | z_{t-1}, x_{t:T})"
+    name = "dkf"
+    source = "Krishnan, Shalit and Sontag, 2015, arXiv 1511.05121"
+    generative = "p(z_t | z_{t-1}) p(x_t | z_t)"
+    inference = "q(z_t | z_{t-1}, x_{t:T})"
 
     width: Size = 64
     embed: Extra = 64

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -112,10 +112,10 @@ class DSAE(LatentMethod):
         decoder: widths of the decoder.
     """
 
-    name: ClassVar[str] = "dsae"
-    source: ClassVar[str] = "Li and Mandt, 2018, arXiv 1803.02991"
-    generative: ClassVar[str] = "p(w) p(z_t | z_{<t}) p(x_t | z_t, w)"
-    inference: ClassVar[str] = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
+    name = "dsae"
+    source = "Li and Mandt, 2018, arXiv 1803.02991"
+    generative = "p(w) p(z_t | z_{<t}) p(x_t | z_t, w)"
+    inference = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
 
     static: Size = 16
     width: Size = 64

@@ -124,25 +124,17 @@ class EnergyModel(DynamicalVAE):
         skeleton: of poses whose root was dropped, D = 3 (J - 1).
         observed: O, frames before the present.
         views: of the windows, once these are turned.
-        *arguments, **options: of `DynamicalVAE`.
+        **options: of `DynamicalVAE`.
     """
 
     extras: ClassVar[tuple[str, ...]] = ("pseudo", "valid")
     angle_low: Tensor
     angle_high: Tensor
 
-    def __init__(
-        self,
-        method: Any,
-        skeleton: Skeleton,
-        observed: int,
-        *arguments: Any,
-        views: Sequence[View] = (),
-        **options: Any,
-    ):
+    def __init__(self, method: Any, skeleton: Skeleton, observed: int, views: Sequence[View] = (), **options: Any):
         turned = (WHOLE, *(name for view in views for name in view.parts or ()))
         heading = Heading(skeleton, observed, turned=turned) if method.heading else None
-        super().__init__(*arguments, view=Views(*([heading] if heading else []), *views), **options)
+        super().__init__(view=Views(*([heading] if heading else []), *views), **options)
         self.method, self.skeleton, self.frames, self.heading = method, skeleton, observed, heading
         self.limits: tuple[str, ...] | None = None
         if method.angles:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 from typing_extensions import override
 
@@ -28,8 +28,8 @@ class Equations(LatentMethod):
         latents: sizes of the latents, where they differ from `latent`.
     """
 
-    name: ClassVar[str] = "equations"
-    source: ClassVar[str] = "your own"
+    name = "equations"
+    source = "your own"
 
     # options here, where other methods have constants
     generative: str = "p(z_t | z_{t-1}) p(x_t | z_t)"  # type: ignore[misc]

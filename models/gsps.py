@@ -26,7 +26,7 @@ from itertools import accumulate
 from math import prod
 from operator import mul
 from string import ascii_lowercase
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -77,11 +77,11 @@ class GSPS(EnergyMethod):
         history: weight of the squared error in the observed frames.
     """
 
-    name: ClassVar[str] = "gsps"
-    source: ClassVar[str] = "Mao, Liu and Salzmann, 2021, arXiv 2108.08422"
-    generative: ClassVar[str] = "p(a) p(lower_t | h_{1:O}, a) p(b) p(upper_t | h_{1:O}, lower_{1:T}, b)"
-    inference: ClassVar[str] = "q(a) q(b)"
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    name = "gsps"
+    source = "Mao, Liu and Salzmann, 2021, arXiv 2108.08422"
+    generative = "p(a) p(lower_t | h_{1:O}, a) p(b) p(upper_t | h_{1:O}, lower_{1:T}, b)"
+    inference = "q(a) q(b)"
+    presets = PRESETS
     latent: Size = 64
     parts: tuple[str, ...] = ("lower", "upper")
     coefficients: Size | None = None
@@ -180,27 +180,22 @@ class GSPSModel(EnergyModel):
         length: T, frames that they make.
     """
 
-    def __init__(self, method: GSPS, skeleton: Skeleton, observed: int, length: int):
+    def __init__(self, method: Any, skeleton: Skeleton, observed: int, length: int):
         joints = body_parts(skeleton, method.parts)
         count = skeleton.joints - 1
         parts = {name: [3 * joint + axis for joint in held for axis in range(3)] for name, held in joints.items()}
         codes = _codes(list(parts))
-        everything = {HISTORY: range(count), **joints}
-        assert method.coefficients is not None
-        assert method.width is not None
+        everything, shape = {HISTORY: range(count), **joints}, (method.coefficients, method.width, method.blocks)
         super().__init__(
             method,
             skeleton,
             observed,
-            part_by_part(list(parts), lambda _: observed),
-            None,
-            {HISTORY: 3 * count, **dict.fromkeys(codes, method.latent), **{name: len(p) for name, p in parts.items()}},
-            network={
-                f"p({name})": GraphConv(everything, name, length, method.coefficients, method.width, method.blocks)
-                for name in parts
-            },
-            laws={f"p({name})": Delta() for name in parts},
             views=(History(HISTORY), Parts(parts)),
+            generative=part_by_part(list(parts), lambda _: observed),
+            inference=None,
+            sizes={HISTORY: 3 * count, **dict.fromkeys(codes, method.latent), **{n: len(p) for n, p in parts.items()}},
+            network={f"p({name})": GraphConv(everything, name, length, *shape) for name in parts},
+            laws={f"p({name})": Delta() for name in parts},
         )
         self.length = length
         self.draws = dict(zip(codes, _each(method.draws, method.parts), strict=True))
@@ -215,13 +210,10 @@ class GSPSModel(EnergyModel):
         return super().guide(batch, **self._drawing(batch, options))
 
     def _drawing(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> dict[str, Any]:
-        """The options, with several draws where there is a truth to score futures by."""
-        return {**({"draws": self.draws} if self._whole(batch, options) else {}), **options}
-
-    def _whole(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> bool:
-        """Whether the program is asked for no more than what the batch holds."""
-        given = batch[WHOLE] if isinstance(batch, Mapping) and WHOLE in batch else None
-        return given is not None and given.shape[1] == self.length and options.get("length") is None
+        """The options, with several draws where the batch holds whole windows, a truth to score futures by."""
+        given = batch.get(WHOLE) if isinstance(batch, Mapping) else None
+        whole = given is not None and given.shape[1] == self.length and options.get("length") is None
+        return {**({"draws": self.draws} if whole else {}), **options}
 
     @override
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
@@ -299,7 +291,6 @@ def _codes(parts: Sequence[str]) -> list[str]:
     return [code for code, _ in zip(free, parts, strict=False)]
 
 
-def _each(values: Sequence[Any] | None, parts: Sequence[str]) -> Sequence[Any]:
+def _each(values: Sequence[Any], parts: Sequence[str]) -> Sequence[Any]:
     """One value for each part, from one for all of them."""
-    assert values is not None
     return tuple(values) * len(parts) if len(values) == 1 else values

@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -117,11 +117,11 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             of training, after the first 4 %: the paper's 80 and 20 of 500 epochs.
     """
 
-    name: ClassVar[str] = "hit-dvae"
-    source: ClassVar[str] = "Bie et al., 2022, arXiv 2204.01565"
-    generative: ClassVar[str] = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
-    inference: ClassVar[str] = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    name = "hit-dvae"
+    source = "Bie et al., 2022, arXiv 2204.01565"
+    generative = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
+    inference = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
+    presets = PRESETS
     residual: Share = 0.5
     self_feeding: Share = 1.0
     warm_up: Delay | None = None
@@ -296,8 +296,8 @@ class HiTModel(EnergyModel):
     Energies are of whole sequences, T times the paper's means, so that `Evidence` weighs them as the paper does.
     """
 
-    def __init__(self, method: HiTDVAE, skeleton: Skeleton, observed: int, *arguments: Any, **options: Any):
-        super().__init__(method, skeleton, observed, *arguments, **options)
+    def __init__(self, method: HiTDVAE, skeleton: Skeleton, observed: int, **options: Any):
+        super().__init__(method, skeleton, observed, **options)
         joints = body_parts(skeleton, PARTS) if method.diversity else {}
         self.coordinates = {part: [3 * j + axis for j in held for axis in range(3)] for part, held in joints.items()}
 

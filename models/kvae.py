@@ -26,7 +26,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
@@ -62,10 +62,10 @@ class KVAE(LatentMethod):
             validation bound is .9 nats a frame above that of training all at once, standard error .25.)
     """
 
-    name: ClassVar[str] = "kvae"
-    source: ClassVar[str] = "Fraccaro et al., 2017, arXiv 1710.05741"
-    generative: ClassVar[str] = "p(a_t | a_{<t}) p(x_t | a_t)"
-    inference: ClassVar[str] = "q(a_t | x_t)"
+    name = "kvae"
+    source = "Fraccaro et al., 2017, arXiv 1710.05741"
+    generative = "p(a_t | a_{<t}) p(x_t | a_t)"
+    inference = "q(a_t | x_t)"
 
     latent: Annotated[int, Range(1, 256)] = 8
     auxiliary: Annotated[int, Range(1, 256)] = 16

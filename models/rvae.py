@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 from typing_extensions import override
 
@@ -30,10 +29,10 @@ class CausalRVAE(LatentMethod):
         hidden: widths of a perceptron between these and each distribution.
     """
 
-    name: ClassVar[str] = "rvae-causal"
-    source: ClassVar[str] = "Leglaive et al., 2020, arXiv 1910.10942"
-    generative: ClassVar[str] = "p(z_t) p(x_t | z_{<=t})"
-    inference: ClassVar[str] = "q(z_t | z_{<t}, x_{t:T})"
+    name = "rvae-causal"
+    source = "Leglaive et al., 2020, arXiv 1910.10942"
+    generative = "p(z_t) p(x_t | z_{<=t})"
+    inference = "q(z_t | z_{<t}, x_{t:T})"
 
     width: Size = 64
     hidden: tuple[Size, ...] = ()
@@ -53,6 +52,6 @@ class NonCausalRVAE(CausalRVAE):
         hidden: widths of a perceptron between these and each distribution.
     """
 
-    name: ClassVar[str] = "rvae-noncausal"
-    generative: ClassVar[str] = "p(z_t) p(x_t | z_{1:T})"
-    inference: ClassVar[str] = "q(z_t | z_{<t}, x_{1:T})"
+    name = "rvae-noncausal"
+    generative = "p(z_t) p(x_t | z_{1:T})"
+    inference = "q(z_t | z_{<t}, x_{1:T})"

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 from typing_extensions import override
 
@@ -33,10 +33,10 @@ class SRNN(LatentMethod):
         decoder: widths of the decoder.
     """
 
-    name: ClassVar[str] = "srnn"
-    source: ClassVar[str] = "Fraccaro et al., 2016, arXiv 1605.07571"
-    generative: ClassVar[str] = "p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)"
-    inference: ClassVar[str] = "q(z_t | z_{t-1}, x_{1:T})"
+    name = "srnn"
+    source = "Fraccaro et al., 2016, arXiv 1605.07571"
+    generative = "p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)"
+    inference = "q(z_t | z_{t-1}, x_{1:T})"
 
     width: Size = 64
     embed: Extra = 64

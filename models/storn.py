@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 from typing_extensions import override
 
@@ -32,10 +31,10 @@ class STORN(LatentMethod):
         hidden: widths of the perceptron after the guide's state.
     """
 
-    name: ClassVar[str] = "storn"
-    source: ClassVar[str] = "Bayer and Osendorfer, 2014, arXiv 1411.7610"
-    generative: ClassVar[str] = "p(z_t) p(x_t | x_{<t}, z_{<=t})"
-    inference: ClassVar[str] = "q(z_t | x_{<=t})"
+    name = "storn"
+    source = "Bayer and Osendorfer, 2014, arXiv 1411.7610"
+    generative = "p(z_t) p(x_t | x_{<t}, z_{<=t})"
+    inference = "q(z_t | x_{<=t})"
 
     width: Size = 64
     embed: Extra = 64

@@ -121,10 +121,9 @@ class TrajectoryMethod(PoseMethod):
 
         The best weights are those of the lowest loss: beta is part of the model, which the bound does not know.
         """
-        beta = self.suited(train).beta
-        assert beta is not None
+        method: Any = self.suited(train)
         turned = train.with_protocol(replace(train.protocol, rotate=self.rotate))
-        stages = [Stage(steps, Evidence(kl_weight=beta, select="loss"))]
+        stages = [Stage(steps, Evidence(kl_weight=method.beta, select="loss"))]
         return Recipe(turned.given(self.keep), validation and validation.given(self.keep), stages)
 
 
@@ -161,16 +160,14 @@ class TrajectoryModel(DynamicalVAE):
         method: with no option left open.
         skeleton: of the poses.
         frames: T of the motions that it is fitted to; None if that is not known.
-        *arguments, **options: of `DynamicalVAE`.
+        **options: of `DynamicalVAE`.
     """
 
-    def __init__(
-        self, method: TrajectoryMethod, skeleton: Skeleton, frames: int | None, *arguments: Any, **options: Any
-    ):
+    def __init__(self, method: TrajectoryMethod, skeleton: Skeleton, frames: int | None, **options: Any):
         seen: list[View] = [FirstFrame(FIRST, also=(GIVEN,)), Rest(method.complement)]
         if method.heading:
             seen.append(Heading(skeleton, pose=FIRST, turned=(FIRST, GIVEN, REST, WHOLE)))
-        super().__init__(*arguments, view=Views(*seen), **options)
+        super().__init__(view=Views(*seen), **options)
         self.method, self.skeleton, self.frames = method, skeleton, frames
 
     @override

@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from math import sqrt
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -61,12 +61,12 @@ class TrajeVAE(TrajectoryMethod):
         cosine: False to leave out the cosine transform, so that z has one value for each frame.
     """
 
-    name: ClassVar[str] = "trajevae"
-    source: ClassVar[str] = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
-    generative: ClassVar[str] = "p(z_t | y_{1:T}, s) p(x_t | z_{1:T}, s)"
-    inference: ClassVar[str] = "q(z_t | r_{1:T}, s)"
+    name = "trajevae"
+    source = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
+    generative = "p(z_t | y_{1:T}, s) p(x_t | z_{1:T}, s)"
+    inference = "q(z_t | r_{1:T}, s)"
 
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    presets = PRESETS
 
     components: Extra | None = None
     width: Size | None = None
@@ -106,15 +106,8 @@ class TrajeVAE(TrajectoryMethod):
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """The transformers; the model has them share what they share."""
-        shape: dict[str, Any] = {
-            "width": self.width,
-            "feedforward": self.feedforward,
-            "heads": self.heads_count,
-            "layers": self.layers,
-            "dropout": self.dropout,
-            "cosine": self.cosine,
-            "components": self.components,
-        }
+        shared = ("width", "feedforward", "layers", "dropout", "cosine", "components")
+        shape: dict[str, Any] = {"heads": self.heads_count, **{name: getattr(self, name) for name in shared}}
         encoder = CosineEncoder(**shape)
         found: dict[str, NetworkSpec] = {"q(z)": encoder}
         if self.learned_prior:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 from typing_extensions import override
 
@@ -28,10 +27,10 @@ class VAE(LatentMethod):
         hidden: widths of the encoder; the decoder has them in reverse.
     """
 
-    name: ClassVar[str] = "vae"
-    source: ClassVar[str] = "Kingma and Welling, 2014, arXiv 1312.6114"
-    generative: ClassVar[str] = "p(z_t) p(x_t | z_t)"
-    inference: ClassVar[str] = "q(z_t | x_t)"
+    name = "vae"
+    source = "Kingma and Welling, 2014, arXiv 1312.6114"
+    generative = "p(z_t) p(x_t | z_t)"
+    inference = "q(z_t | x_t)"
 
     hidden: tuple[Size, ...] = (32,)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from typing_extensions import override
 
@@ -34,10 +34,10 @@ class VRNN(LatentMethod):
         hidden: widths of a perceptron between these and each distribution.
     """
 
-    name: ClassVar[str] = "vrnn"
-    source: ClassVar[str] = "Chung et al., 2015, arXiv 1506.02216"
-    generative: ClassVar[str] = "p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})"
-    inference: ClassVar[str] = "q(z_t | x_{<=t}, z_{<t})"
+    name = "vrnn"
+    source = "Chung et al., 2015, arXiv 1506.02216"
+    generative = "p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})"
+    inference = "q(z_t | x_{<=t}, z_{<t})"
 
     width: Size = 64
     embed: tuple[Size, ...] = (64,)
