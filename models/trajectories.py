@@ -396,20 +396,18 @@ class TrajectoryModel(DynamicalVAE):
         data = self._whole(self.read(batch), len(known))
         known = torch.cat([known, known.new_zeros(data[GIVEN].shape[1] - len(known), known.shape[1])])
         bones = self.skeleton.limbs(data[FIRST][0]).norm(dim=-1)
+
+        def means(z: Tensor) -> Tensor:
+            rollout = self._rollout(self.generative, self.generator, data, data[GIVEN].shape[1], 1)
+            rollout.mean_emission = (WHOLE,)
+            rollout.values[self.latents[0]] = z
+            return rollout.draw(WHOLE)
+
         with self._evaluating():
             with torch.no_grad():
                 scale = self.generator[self.latents[0]](data, 1, len(known))[1]
-            x, corrections = bend(
-                lambda z: self._means(data, z), latents, scale, data[GIVEN][0], known, self.skeleton, bones, **options
-            )
+            x, corrections = bend(means, latents, scale, data[GIVEN][0], known, self.skeleton, bones, **options)
         return self.shown({WHOLE: x}, data)[WHOLE], corrections
-
-    def _means(self, data: Mapping[str, Tensor], latents: Tensor) -> Tensor:
-        """Means of x (S, T, D) given latents."""
-        rollout = self._rollout(self.generative, self.generator, data, data[GIVEN].shape[1], 1)
-        rollout.mean_emission = (WHOLE,)
-        rollout.values[self.latents[0]] = latents
-        return rollout.draw(WHOLE)
 
     def _warn_of_stretching(self, motion: Tensor, pose: Tensor) -> None:
         """Warns where more than one bone of twenty is more than a tenth too long or too short."""

@@ -19,7 +19,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -302,9 +302,9 @@ def _named(methods: Mapping[str, Method] | Sequence[Method]) -> dict[str, Method
         named = {}
         for method in methods:
             alike = [other for other in methods if other.name == method.name]
-            options = [option.name for option in fields(method)]
-            varied = [name for name in options if len({repr(getattr(other, name)) for other in alike}) > 1]
-            name = "-".join([method.name, *(_label(option, getattr(method, option)) for option in varied)])
+            varied = {n: v for n, v in vars(method).items() if len({repr(vars(other)[n]) for other in alike}) > 1}
+            labels = (f"z{v}" if n == "latent" else f"{n.replace('_', '-')}={v}" for n, v in varied.items())
+            name = "-".join([method.name, *labels])
             if name in named:
                 raise ValueError(f"{name} is given twice; the methods of a sweep differ in their options")
             named[name] = method
@@ -312,10 +312,6 @@ def _named(methods: Mapping[str, Method] | Sequence[Method]) -> dict[str, Method
         if not re.fullmatch(r"[\w.=+-]+", name):
             raise ValueError(f"{name!r} is no name for a directory; name the methods: sweep({{'a': …, 'b': …}}, …)")
     return named
-
-
-def _label(option: str, value: Any) -> str:
-    return f"z{value}" if option == "latent" else f"{option.replace('_', '-')}={value}"
 
 
 def _earlier(run: _Run) -> Outcome | None:
@@ -352,13 +348,8 @@ def _earlier(run: _Run) -> Outcome | None:
 
 def _options(method: Trainable, schema: Schema, training: Training, fingerprint: str) -> dict[str, Any]:
     """All that makes a run what it is, by what to call it. The method tells the self-feeding of the training."""
-    same = replace(training, self_feeding=0.0, progress=True)
-    return {
-        **method.config(),
-        **dict(flat(schema.config(), "data's ")),
-        **{option.name: getattr(same, option.name) for option in fields(same) if option.name != "self_feeding"},
-        "data's fingerprint": fingerprint,
-    }
+    told = {name: value for name, value in vars(training).items() if name not in ("self_feeding", "progress")}
+    return {**method.config(), **told, **dict(flat(schema.config(), "data's ")), "data's fingerprint": fingerprint}
 
 
 class _Log:
