@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import fields, make_dataclass
 from functools import reduce
 from operator import or_
@@ -178,7 +178,7 @@ def sweep(
             each.check()
         how = Training(**vars(training))
     opened = MotionData.open(data, protocol, skip_bad)
-    with _cluster(scheduler):
+    with nullcontext() if scheduler is None else _cluster(scheduler):
         results = sweep_methods(chosen, opened, out, seeds, how, jobs)
     if failed := [result for result in results if result.status == "failed"]:
         raise RuntimeError(
@@ -200,11 +200,8 @@ def _reported() -> Iterator[None]:
 
 
 @contextmanager
-def _cluster(scheduler: str | None) -> Iterator[None]:
-    """Within it, joblib runs on the workers of a dask scheduler, if there is one."""
-    if scheduler is None:
-        yield
-        return
+def _cluster(scheduler: str) -> Iterator[None]:
+    """Within it, joblib runs on the workers of a dask scheduler."""
     try:
         from distributed import Client
     except ImportError as error:

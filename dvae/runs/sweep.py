@@ -392,54 +392,36 @@ class _Progress:
     """A line as each run ends. Meanwhile, a live table of the runs; away from a terminal, a line as each starts."""
 
     def __init__(self, runs: Sequence[_Run], training: Training) -> None:
-        self.console = Plain(stderr=True, quiet=not training.progress)
+        self.console = Plain(stderr=True, quiet=not training.progress, force_jupyter=False)
         self.steps, self.total = training.steps, len(runs)
         self.logs = {run.path: _Log(run.path) for run in runs}
-        live = self.console.is_terminal and not self.console.is_jupyter
-        self._live = Live(console=self.console, auto_refresh=False, transient=True) if live else None
-        self._lock, self._closed = threading.Lock(), threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
+        # away from a terminal nothing is drawn, but the logs are looked at all the same
+        self.live = Live(console=self.console, get_renderable=self._look, refresh_per_second=2, transient=True)
 
     def __enter__(self) -> _Progress:
-        if self._live is not None:
-            self._live.start()
-        self._thread.start()
+        self.live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._closed.set()
-        self._thread.join()
-        if self._live is not None:
-            self._live.stop()
+        self.live.stop()
 
     def end(self, result: Outcome) -> None:
         """Shows a result, unless it is that of a run that has not begun."""
-        with self._lock:
-            self._look()
-            log = self.logs.pop(result.path, None)
-            if result.status != "interrupted" or (log is not None and log.begin is not None):
-                style = "red" if result.status == "failed" else None
-                self.console.print(str(result), style=style, highlight=False, soft_wrap=True)
-            self._refresh()
+        self.live.refresh()
+        log = self.logs.pop(result.path, None)
+        if result.status != "interrupted" or (log is not None and log.begin is not None):
+            style = "red" if result.status == "failed" else None
+            self.console.print(str(result), style=style, highlight=False, soft_wrap=True)
+        self.live.refresh()
 
-    def _watch(self) -> None:
-        while not self._closed.wait(0.5):
-            with self._lock:
-                self._look()
-
-    def _look(self) -> None:
-        for log in self.logs.values():
-            if log.look() and self._live is None:
+    def _look(self) -> Table:
+        """Reads what is new in the logs, and draws the table."""
+        logs = list(self.logs.values())
+        for log in logs:
+            if log.look() and not self.console.is_terminal:
                 self.console.print(f"{log.name} {log.begins}", highlight=False, soft_wrap=True)
-        self._refresh()
-
-    def _refresh(self) -> None:
-        if self._live is not None:
-            self._live.update(self._table(), refresh=True)
-
-    def _table(self) -> Table:
-        running = [log for log in self.logs.values() if log.begin is not None]
-        ended, waiting = self.total - len(self.logs), len(self.logs) - len(running)
+        running = [log for log in logs if log.begin is not None]
+        ended, waiting = self.total - len(logs), len(logs) - len(running)
         table = Table(caption=f"{ended} of {self.total} runs ended, {waiting} waiting", caption_justify="left")
         table.add_column("run", overflow="fold")
         for name in ("step", "bound (nats a frame)", "elapsed"):
