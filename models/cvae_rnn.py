@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -68,10 +67,7 @@ class CVAERNN(TrajectoryMethod):
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         """Summaries, and the decoder; guide and decoder share that of y."""
-        return {
-            "q(w)": Summaries(self.summary, self.hidden),
-            "p(x)": Decoder(self.summary, self.hidden, self.width),
-        }
+        return {"q(w)": Summaries(self.summary, self.hidden), "p(x)": Decoder(self.summary, self.hidden, self.width)}
 
     @override
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
@@ -128,10 +124,7 @@ class Summary(nn.Module):
 
     def forward(self, first: Tensor, sequence: Tensor) -> Tensor:
         """The summary of s (B, D) and a sequence (B, T, D)."""
-        return once(self, [first, sequence], partial(self._mean, first, sequence))
-
-    def _mean(self, first: Tensor, sequence: Tensor) -> Tensor:
-        return self.network(torch.cat([first[:, None], sequence], 1))[0].mean(1)
+        return once(self, [first, sequence], lambda: self.network(torch.cat([first[:, None], sequence], 1))[0].mean(1))
 
 
 @dataclass(frozen=True)

@@ -103,14 +103,8 @@ class EnergyMethod(PoseMethod):
         method: Any = self
         if not method.multimodal:
             return windows
-        truths = PseudoTruths(
-            windows,
-            threshold=method.pseudo_threshold,
-            minimum=method.pseudo_minimum,
-            most=method.pseudo_most,
-            stride=method.pool_stride,
-            heading=bool(method.heading),
-        )
+        limits = {name: getattr(self, f"pseudo_{name}") for name in ("threshold", "minimum", "most")}
+        truths = PseudoTruths(windows, **limits, stride=method.pool_stride, heading=bool(method.heading))
         return WithPseudoTruths(windows, truths)
 
 

@@ -47,11 +47,7 @@ class SRNN(LatentMethod):
     def networks(self) -> Mapping[str, NetworkSpec]:
         """A recurrent network for each factor; `build` ties their forward states."""
         around = Recurrent(self.width, embed=self.embed, hidden=self.hidden)
-        return {
-            "p(z)": around,
-            "p(x)": replace(around, hidden=self.decoder),
-            "q(z)": replace(around, stack=True),
-        }
+        return {"p(z)": around, "p(x)": replace(around, hidden=self.decoder), "q(z)": replace(around, stack=True)}
 
     @override
     def build(self, data: Any) -> DynamicalVAE:

@@ -446,15 +446,11 @@ class Completion:
         lines = [f"{samples} motions of {frames} frames"]
         for joint, errors in self.errors.items():
             missed = errors[np.isfinite(errors)]
-            share = np.mean(missed < 0.01)
-            lines.append(
-                f"  {joint}: off its path by {missed.mean():.3f} m (mean), within 1 cm in {share:.0%} of frames"
-            )
+            near = f"within 1 cm in {np.mean(missed < 0.01):.0%} of frames"
+            lines.append(f"  {joint}: off its path by {missed.mean():.3f} m (mean), {near}")
         if self.corrections is not None:
-            mean, most = self.corrections.mean(), self.corrections.max()
-            lines.append(
-                f"  beyond what the model makes: joints corrected by {mean:.3f} m (mean), {most:.3f} m at most"
-            )
+            moved = f"{self.corrections.mean():.3f} m (mean), {self.corrections.max():.3f} m at most"
+            lines.append(f"  beyond what the model makes: joints corrected by {moved}")
         return "\n".join(lines)
 
 

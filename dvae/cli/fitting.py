@@ -20,9 +20,9 @@ from ..inference.recipe import Trainable
 from ..inference.schedules import Schedule
 from ..inference.trackers import TensorBoard
 from ..inference.training import Training
+from ..models import registry
 from ..models.method import LatentMethod
 from ..models.registry import judges, methods
-from ..models.registry import method as method_by_name
 from ..models.trajectories import TrajectoryMethod
 from ..motion.dataset import SIMULATED, MotionData
 from ..runs import directory as runs
@@ -173,7 +173,7 @@ def sweep(
     given = {name: value for name, value in vars(model).items() if value is not None}
     with arguments():
         sizes: list[dict[str, int]] = [{"latent": size} for size in latent] or [{}]
-        chosen = [method_by_name(name, **given, **size) for name in method for size in sizes]
+        chosen = [registry.method(name, **given, **size) for name in method for size in sizes]
         for each in chosen:
             each.check()
         how = Training(**vars(training))

@@ -10,8 +10,8 @@ import tyro
 
 from ..graph import audit
 from ..inference.result import Table
+from ..models import registry
 from ..models.registry import judges, methods
-from ..models.registry import method as method_by_name
 from ..notation import Factorization
 from .console import OUT, UsageError, arguments, at_least, check_figure, save_figure
 
@@ -53,7 +53,7 @@ def show(
         raise UsageError("give the name of a method or two equations, not both")
     if method is not None:
         with arguments():
-            kind = method_by_name(method)
+            kind = registry.method(method)
         if _asks_for_equations(kind):
             raise UsageError(f"{method} has no equations of its own; give --generative and --inference")
         pair = kind.equations()

@@ -172,10 +172,9 @@ def resume(
     run = load(path, data)
     training = replace(run.config.training, self_feeding=0.0, **options)
     train, validation = run.data.windows("train"), run.data.windows("validation")
-    recipe = run.method.train(train, validation, training.steps)
-    more: dict[str, Any] = {"out": path, "config": run.config.written(), "trackers": trackers, **vars(training)}
-    found: Fit = recipe.fit(run.model, resume=True, callbacks=callbacks, **more)
-    return found
+    recipe = run.config.method.train(train, validation, training.steps)
+    told = {"out": path, "config": run.config.written(), "trackers": trackers, "callbacks": callbacks}
+    return recipe.fit(run.model, resume=True, **told, **vars(training))
 
 
 @alone
