@@ -239,9 +239,10 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         method = self.suited(train) if self.loss == "best-of-many" else self
         if self.warm_up is None:
             method = replace(method, warm_up=round(0.04 * steps))
-        batches = method.scored(train) if self.loss == "best-of-many" else train
         stages = [Stage(steps, method.objective())]
-        return Recipe(batches, validation, stages, self._feeding(steps), partial(method.start, windows=train))
+        return Recipe(
+            method.scored(train), validation, stages, self._feeding(steps), partial(method.start, windows=train)
+        )
 
     @override
     def _feeding(self, steps: int) -> Schedule | float:

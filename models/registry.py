@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import UserDict
+from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -39,7 +40,7 @@ JUDGES = {
 """What is fitted as methods are, and judges what they make."""
 
 
-class Registry(Mapping[str, type[Any]]):
+class Registry(UserDict[str, Any]):
     """Names to classes, each imported when it is asked for.
 
     Args:
@@ -51,23 +52,15 @@ class Registry(Mapping[str, type[Any]]):
     """
 
     def __init__(self, own: Mapping[str, str], group: str) -> None:
-        self._entries = {name: EntryPoint(name, place, group) for name, place in own.items()}
+        super().__init__({name: EntryPoint(name, place, group) for name, place in own.items()})
         for entry in entry_points(group=group):
             if entry.name in own:
                 raise ValueError(f"the entry point {entry.value} has a name that is taken in {group}: {entry.name}")
-            self._entries[entry.name] = entry
+            self[entry.name] = entry
 
     @override
     def __getitem__(self, name: str) -> type[Any]:
-        return self._entries[name].load()  # type: ignore[no-any-return]
-
-    @override
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
-
-    @override
-    def __len__(self) -> int:
-        return len(self._entries)
+        return self.data[name].load()  # type: ignore[no-any-return]
 
 
 @cache

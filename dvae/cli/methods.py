@@ -22,10 +22,8 @@ def list_methods() -> None:
     for column in ("method", "equations", "source"):
         table.add_column(column)
     for name, kind in methods().items():
-        equations = (
-            "--generative and --inference" if _asks_for_equations(kind) else f"{kind.generative}\n{kind.inference}"
-        )
-        table.add_row(name, equations, kind.source)
+        pair = f"{kind.generative}\n{kind.inference}"
+        table.add_row(name, "--generative and --inference" if _asks_for_equations(kind) else pair, kind.source)
     for name, judge in judges().items():
         table.add_row(name, "a judge of what methods make", judge.source)
     OUT.print(table, highlight=False)
