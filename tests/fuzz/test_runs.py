@@ -217,7 +217,7 @@ def use(call: str, run: Path, data: Path) -> None:
     elif call == "forecast":
         futures.forecast(run, run / "futures.npz", samples=1, horizon=2, data=str(data))
     else:
-        judging.evaluate((run,), samples=1, data=str(data))
+        judging.evaluate((run,), judging.Control(), samples=1, data=str(data))
 
 
 @limited(SHARE)
