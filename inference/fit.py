@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Callback(Protocol):
+class Callback:
     """Hooks of `fit`. Subclass it and define those you need."""
 
     def on_step(self, state: State) -> None:
@@ -195,7 +195,8 @@ def fit(
     held_out = None if validation is None else sequences(validation)
     if training.patience is not None and held_out is None:
         raise ValueError("patience counts validations; give validation data, or leave patience out")
-    fingerprint = train.fingerprint if isinstance(train, Fingerprinted) else None
+    # a hash of all the data, for a run that is kept
+    fingerprint = train.fingerprint if out is not None and isinstance(train, Fingerprinted) else None
     record = {"training_data": fingerprint} if isinstance(fingerprint, str) else {}
     run = run_directory(out, resume, record)
     record |= recorded(training, svi.plan)

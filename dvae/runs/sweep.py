@@ -29,10 +29,11 @@ from uuid import uuid4
 import torch
 from joblib import Parallel, delayed
 from rich.live import Live
+from typing_extensions import override
 
 from .. import files
 from ..inference.checkpoints import Run
-from ..inference.fit import Fit, Interrupted
+from ..inference.fit import Callback, Fit, Interrupted
 from ..inference.recipe import Trainable
 from ..inference.result import Plain, Table, reason
 from ..inference.schedules import clamp
@@ -235,7 +236,7 @@ def _outcome(run: _Run, fit: Fit, **more: Any) -> Outcome:
     return Outcome(run.path, run.method, run.training.seed, *found, **more)
 
 
-class _Leased:
+class _Leased(Callback):
     """A callback that stops the run when the lease is gone, or the process that started this one."""
 
     def __init__(self, lease: Path) -> None:
@@ -256,14 +257,11 @@ class _Leased:
             return True
         return os.getppid() != self.above
 
+    @override
     def on_step(self, state: State) -> None:
         if time.monotonic() > self.next:  # not at every step: the file system may be far away
             self.next = time.monotonic() + 0.5
             self.check()
-
-    def on_validation(self, state: State) -> None: ...
-
-    def on_end(self, state: State) -> None: ...
 
 
 @contextmanager
