@@ -19,7 +19,7 @@ from matplotlib.patches import FancyBboxPatch
 from .pages import DOCS
 
 ROOT = DOCS.parent / "dvae"
-EVERYWHERE = {"command", "files", "options", "turns", "units", "schema", "relations"}
+EVERYWHERE = {"command", "files", "options", "turns", "units", "schema", "relations", "lazy"}
 """Small modules that many use and nobody looks for."""
 
 WALK = {
@@ -38,7 +38,7 @@ SAYS = {
     "runs": "directories of fits",
     "testing": "tests for your models",
     "models": "one file a paper",
-    "oracle": "models whose evidence is known",
+    "oracle": "models of known evidence",
     "notation": "equations to factorizations",
     "graph": "who depends on whom",
     "drawing": "pictures of graphs",
@@ -142,7 +142,7 @@ def main(out: Path = DOCS / "img" / "house.png") -> None:
     graph = imports()
     figure = Figure(figsize=(9, 1.0 * len(storeys(graph)) + 0.6), layout="constrained")
     draw(graph, figure.subplots())
-    figure.savefig(out, dpi=130)
+    figure.savefig(out, dpi=130, bbox_inches="tight")
 
 
 if __name__ == "__main__":
