@@ -31,14 +31,24 @@ REAL = Path(os.environ.get("DVAE_SHARED_DATA", ROOT.parent / "shared" / "data"))
 
 
 @pytest.fixture(scope="session")
-def real() -> Callable[[str], Any]:
-    """Real motion by its file, read once; a test that asks for some is skipped where it is absent."""
+def shared() -> Callable[[str], Path]:
+    """A file of the real motion capture; a test that asks for one is skipped where it is absent."""
+
+    def found(file: str) -> Path:
+        if not (REAL / file).is_file():
+            pytest.skip(f"{file} of the real motion capture is not beside the project")
+        return REAL / file
+
+    return found
+
+
+@pytest.fixture(scope="session")
+def real(shared: Callable[[str], Path]) -> Callable[[str], Any]:
+    """Real motion by its file, read once."""
 
     @cache
     def read(file: str) -> Any:
-        if not (REAL / file).is_file():
-            pytest.skip(f"{file} of the real motion capture is not beside the project")
-        return dvae.motion.read_motion(REAL / file)
+        return dvae.motion.read_motion(shared(file))
 
     return read
 

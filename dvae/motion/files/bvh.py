@@ -1,0 +1,216 @@
+"""BVH, Biovision's hierarchy: a tree of joints with offsets and channels, then a row of numbers for each frame.
+
+Read as animation programs do: a joint's turns are about its own axes in the order of its channels, and a joint with
+channels of position, which any may have, is placed by these in place of its offset. Ends are joints of their own,
+named after what ends. Known readers refuse files in circulation, such as those with one row more than they announce.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...files import written
+from ..rotations import from_matrix, to_matrix
+from .recording import Recording, check_joints, check_size, numbers, read_lines
+
+END = "End"
+_AXES = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
+
+
+@dataclass
+class _Joint:
+    name: str
+    parent: int
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    channels: list[int] = field(default_factory=list)  # places in _AXES
+
+
+def read_bvh(path: str | Path) -> Recording:
+    """Read a BVH file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is none, or damaged; the message has the line.
+    """
+    path = Path(path)
+    lines = read_lines(path)
+    joints, line = _hierarchy(path, lines)
+    frames, seconds, line = _header(path, lines, line)
+    channels = sum(len(joint.channels) for joint in joints)
+    values = numbers(" ".join(lines[line:]), f"{path}: the frames from line {line + 1}")
+    rows, rest = divmod(len(values), channels) if channels else (0, 0)
+    if rest or abs(rows - frames) > 1 or not rows:
+        raise ValueError(
+            f"{path}: {len(values):,} numbers follow, which are no {frames:,} frames of {channels} channels each"
+        )
+    check_size(path, rows, len(joints))
+    values = values.reshape(rows, channels)
+    places = torch.empty(rows, len(joints), 3, dtype=torch.float64)
+    turns = torch.eye(3, dtype=torch.float64).repeat(rows, len(joints), 1, 1)
+    orders: dict[str, list[tuple[int, list[int]]]] = {}
+    first = 0
+    for place, joint in enumerate(joints):
+        places[:, place] = torch.from_numpy(joint.offset)
+        for channel, axis in enumerate(joint.channels, first):
+            if axis < 3:
+                places[:, place, axis] = torch.from_numpy(values[:, channel])
+        turning = [(channel, axis - 3) for channel, axis in enumerate(joint.channels, first) if axis >= 3]
+        order = "".join("xyz"[axis] for _, axis in turning)
+        orders.setdefault(order, []).append((place, [channel for channel, _ in turning]))
+        first += len(joint.channels)
+    for order, found in orders.items():
+        if order:
+            which, columns = [place for place, _ in found], [columns for _, columns in found]
+            angles = torch.from_numpy(np.deg2rad(values[:, columns]))
+            turns[:, which] = to_matrix(angles, f"euler-{order}") if len(order) == 3 else _few(angles, order)
+    names, parents = [joint.name for joint in joints], [joint.parent for joint in joints]
+    offsets = np.stack([joint.offset for joint in joints])
+    fps = 1 / seconds
+    fps = float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else fps
+    return Recording.turned(names, parents, offsets, places, turns, fps=fps)
+
+
+def write_bvh(
+    path: str | Path,
+    names: list[str],
+    parents: list[int],
+    offsets: np.ndarray,
+    rotations: np.ndarray,
+    root: np.ndarray,
+    fps: float,
+    order: str = "zyx",
+) -> None:
+    """Write a BVH file in centimetres, as animation programs expect them; it replaces an older one once it is whole.
+
+    A joint from which nothing hangs becomes an end, whose own turn and name are not written.
+
+    Args:
+        names, parents: of the joints, the root first.
+        offsets: (J, 3) of the rest pose in metres.
+        rotations: (F, J, 4), local quaternions w x y z.
+        root: (F, 3), place of the root in metres.
+        fps: frames per second.
+        order: of the turns.
+
+    Raises:
+        ValueError: a name has white space or a brace, or names repeat.
+    """
+    for name in names:
+        if not name or any(letter.isspace() or letter in "{}" for letter in name):
+            raise ValueError(f"{path}: {name!r} is no name for a joint of a BVH file: no white space, no braces")
+    children: list[list[int]] = [[] for _ in names]
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            children[parent].append(joint)
+    lines, written_joints = ["HIERARCHY"], []
+    turns = " ".join(f"{axis.upper()}rotation" for axis in order)
+
+    def describe(joint: int, depth: int) -> None:
+        tab = "\t" * depth
+        offset = " ".join(f"{100 * value:.6f}" for value in (offsets[joint] if depth else np.zeros(3)))
+        ends = depth > 0 and not children[joint]
+        lines.extend([f"{tab}{'End Site' if ends else ('JOINT ' if depth else 'ROOT ') + names[joint]}", f"{tab}{{"])
+        lines.append(f"{tab}\tOFFSET {offset}")
+        if not ends:
+            written_joints.append(joint)
+            lines.append(f"{tab}\tCHANNELS {'3 ' if depth else '6 Xposition Yposition Zposition '}{turns}")
+        for child in children[joint]:
+            describe(child, depth + 1)
+        lines.append(f"{tab}}}")
+
+    describe(parents.index(-1), 0)
+    angles = from_matrix(to_matrix(torch.from_numpy(rotations).double(), "quaternion"), f"euler-{order}").numpy()
+    rows = np.concatenate([100 * root, np.rad2deg(angles[:, written_joints]).reshape(len(root), -1)], 1)
+    lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / fps:.8f}"]
+    with written(path) as file:
+        file.write(("\n".join(lines) + "\n").encode())
+        np.savetxt(file, rows, fmt="%.6f")
+
+
+def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
+    """The joints, parents first, and the line after MOTION."""
+    joints: list[_Joint] = []
+    open_: list[int] = []  # joints whose braces are open, the last one inmost
+    named = False  # a joint was named, and its brace is to come
+
+    def wrong(number: int, expected: str) -> ValueError:
+        return ValueError(f"{path}: line {number} is {lines[number - 1].strip()[:60]!r}, expected {expected}")
+
+    for number, line in enumerate(lines, 1):
+        word, _, rest = line.strip().partition(" ") if "\t" not in line.strip() else line.strip().partition("\t")
+        kind, rest = word.upper(), rest.strip()
+        if not word or (kind == "HIERARCHY" and not joints):
+            continue
+        if kind == "MOTION":
+            if open_ or named or not joints:
+                raise wrong(number, "the hierarchy to be whole before")
+            return joints, number
+        if kind in ("ROOT", "JOINT", "END"):
+            if named or (kind == "ROOT") == bool(joints) or (kind != "ROOT" and not open_):
+                raise wrong(number, "one ROOT, and JOINT or End Site within its braces")
+            parent = open_[-1] if open_ else -1
+            name = rest if kind != "END" else joints[parent].name + END
+            if any(joint.name == name for joint in joints):
+                same = sum(joint.name.startswith(name) for joint in joints)
+                if kind != "END":
+                    raise wrong(number, f"a name of its own; there is another joint {name!r}")
+                name += str(same + 1)
+            joints.append(_Joint(name, parent))
+            check_joints(path, len(joints))
+            named = True
+        elif kind == "{":
+            if not named:
+                raise wrong(number, "ROOT, JOINT or End Site before a brace")
+            open_.append(len(joints) - 1)
+            named = False
+        elif kind == "}":
+            if not open_ or named:
+                raise wrong(number, "a brace that was opened")
+            open_.pop()
+        elif kind == "OFFSET" and open_ and not named:
+            found = numbers(rest, f"{path}: line {number}")
+            if len(found) != 3:
+                raise wrong(number, "three numbers")
+            joints[open_[-1]].offset = found
+        elif kind == "CHANNELS" and open_ and not named:
+            count, *channels = rest.lower().split()
+            unknown = [channel for channel in channels if channel not in _AXES]
+            if unknown or not count.isdecimal() or len(channels) != len(set(channels)) or str(len(channels)) != count:
+                raise wrong(number, "their number and as many of Xposition ... Zrotation, each once")
+            joints[open_[-1]].channels = [_AXES.index(channel) for channel in channels]
+        else:
+            raise wrong(number, "ROOT, JOINT, End Site, OFFSET, CHANNELS, MOTION or a brace")
+    raise ValueError(f"{path}: no BVH file: it has no line MOTION")
+
+
+def _header(path: Path, lines: list[str], line: int) -> tuple[int, float, int]:
+    """Number of frames, seconds from one to the next, and the line at which they begin."""
+    found: list[float] = []
+    for expected in ("frames:", "frame time:"):
+        while line < len(lines) and not lines[line].strip():
+            line += 1
+        text = " ".join(lines[line].lower().split()) if line < len(lines) else ""
+        said = text.removeprefix(expected) if text.startswith(expected) else ""
+        value = numbers(said, f"{path}: line {line + 1}")
+        if len(value) != 1:
+            raise ValueError(f"{path}: line {line + 1} is {text[:60]!r}, expected {expected.capitalize()} and a number")
+        found.append(value[0])
+        line += 1
+    frames, seconds = found
+    if frames != int(frames) or frames < 1 or not 1e-6 < seconds < 1e3:
+        raise ValueError(f"{path}: {frames:g} frames, {seconds:g} s each, are no recording")
+    return int(frames), seconds, line
+
+
+def _few(angles: torch.Tensor, order: str) -> torch.Tensor:
+    """Matrices of turns about one or two axes, or about one of them twice."""
+    found = torch.eye(3, dtype=angles.dtype)
+    for place, axis in enumerate(order):
+        vector = torch.zeros(*angles.shape[:-1], 3, dtype=angles.dtype)
+        vector[..., "xyz".index(axis)] = angles[..., place]
+        found = found @ to_matrix(vector, "vector")
+    return found

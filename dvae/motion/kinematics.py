@@ -1,0 +1,118 @@
+"""Kinematics: from rotations of joints to positions, and back.
+
+A rest pose is where each joint is from its parent while nothing is turned, (J, 3) in metres. Rotations are local: of a
+joint against its parent, and of the root against the world; the turn of a joint moves what hangs from it.
+
+What positions do not say is how a bone is turned about itself where one joint alone hangs from it; it is turned as
+little as possible against its parent.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import roma
+import torch
+from torch import Tensor
+
+from .skeleton import Skeleton, rotate_about_up
+
+TIE = 1e-6
+"""Weight of the parent's turn beside unit vectors, where these leave the turn about themselves open."""
+
+
+def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Tensor) -> tuple[Tensor, Tensor]:
+    """Where joints are: one product of matrices for each generation of the tree, over all poses at once.
+
+    Args:
+        parents: index of each joint's parent, -1 for the root.
+        rotations: (..., J, 3, 3), local.
+        offsets: of a rest pose in metres, (J, 3); or (..., J, 3), where it changes.
+        root: place of the root (..., 3); that of the rest pose is not read.
+
+    Returns:
+        positions (..., J, 3), and turns against the world (..., J, 3, 3).
+    """
+    generations = [[list(parents).index(-1)]]
+    while below := [joint for joint, parent in enumerate(parents) if parent in generations[-1]]:
+        generations.append(below)
+    turned, placed = [rotations[..., generations[0], :, :]], [root[..., None, :]]
+    for before, joints in pairwise(generations):
+        above = [before.index(parents[joint]) for joint in joints]
+        turn = turned[-1][..., above, :, :]
+        placed.append(placed[-1][..., above, :] + (turn @ offsets[..., joints, :, None]).squeeze(-1))
+        turned.append(turn @ rotations[..., joints, :, :])
+    places = torch.tensor([joint for joints in generations for joint in joints]).argsort()
+    return torch.cat(placed, -2)[..., places, :], torch.cat(turned, -3)[..., places, :, :]
+
+
+def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
+    """Local rotations of which `forward` makes poses as near as bones of these lengths allow.
+
+    Each joint is turned by Procrustes' rotation of the unit vectors to the joints that hang from it; exactly onto
+    one that hangs from it alone, and then as little as possible against its parent. An end has its parent's turn.
+
+    Args:
+        positions: (..., J, 3).
+        offsets: of a rest pose, (J, 3).
+
+    Returns:
+        (..., J, 3, 3).
+    """
+    shape = (*positions.shape[:-2], 3, 3)
+    unturned = torch.eye(3, dtype=positions.dtype, device=positions.device).expand(shape)
+    world: dict[int, Tensor] = {-1: unturned}
+    local: dict[int, Tensor] = {}
+    for joint in skeleton.order:
+        above = world[skeleton.parents[joint]]
+        below = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
+        below = [child for child in below if offsets[child].norm() > 0]
+        world[joint] = above
+        if below:
+            rest = torch.nn.functional.normalize(offsets[below], dim=-1)
+            seen = torch.nn.functional.normalize(positions[..., below, :] - positions[..., joint, None, :], dim=-1)
+            found = roma.special_procrustes(seen.transpose(-1, -2) @ rest + TIE * above)
+            world[joint] = _swing(found @ rest[0], seen[..., 0, :]) @ found if len(below) == 1 else found
+        local[joint] = above.transpose(-1, -2) @ world[joint]
+    return torch.stack([local[joint] for joint in range(skeleton.joints)], -3)
+
+
+def _swing(start: Tensor, end: Tensor) -> Tensor:
+    """The smallest rotation (..., 3, 3) from one unit vector to another that is not its opposite."""
+    axis = torch.linalg.cross(start, end)
+    zero = torch.zeros_like(axis[..., 0])
+    x, y, z = axis.unbind(-1)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    cosine = (start * end).sum(-1)[..., None, None]
+    found: Tensor = torch.eye(3, dtype=start.dtype, device=start.device) + skew + skew @ skew / (1 + cosine)
+    return found
+
+
+def rest(skeleton: Skeleton, positions: Tensor, rounds: int = 10) -> Tensor:
+    """A rest pose for poses of one body: the mean of them all, seen from the front, with bones of their mean lengths.
+
+    Where several joints hang from one, they are as far from each other as in the poses (generalised Procrustes
+    analysis, Gower 1975).
+
+    Args:
+        positions: (N, J, 3).
+
+    Returns:
+        (J, 3), the root's 0.
+    """
+    joints = [joint for joint, parent in enumerate(skeleton.parents) if parent >= 0]
+    parents = [skeleton.parents[joint] for joint in joints]
+    facing = positions
+    if skeleton.left and skeleton.right:
+        facing = rotate_about_up(positions, -skeleton.heading(positions)[..., None], skeleton.up)
+    found = torch.zeros_like(positions[0])
+    found[joints] = (facing[:, joints] - facing[:, parents]).mean(0)
+    for joint in range(skeleton.joints):
+        below = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
+        if len(below) > 1:
+            seen = positions[:, below] - positions[:, joint, None]
+            for _ in range(rounds):
+                turn = roma.special_procrustes(seen.transpose(-1, -2) @ found[below])
+                found[below] = (seen @ turn).mean(0)
+    lengths = positions.new_zeros(skeleton.joints)
+    lengths[joints] = skeleton.bone_lengths(positions).mean(0)
+    return torch.nn.functional.normalize(found, dim=-1) * lengths[:, None]

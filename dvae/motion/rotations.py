@@ -1,0 +1,91 @@
+"""Rotations in the forms that files and models use, to and from matrices.
+
+Everything is right-handed, acts on columns, is batched over leading dimensions and differentiable; the conversions are
+roma's (Brégier 2021, arXiv 2103.16317), whose gradients are finite at no turn and at half a turn too.
+
+| form | numbers | |
+|---|---|---|
+| `matrix` | 9 | row after row |
+| `quaternion` | 4 | w x y z; of the two for one rotation, see `continuous` |
+| `vector` | 3 | axis times angle in radians, the exponential map |
+| `6d` | 6 | the matrix's first column, then its second (Zhou et al. 2019, arXiv 1812.07035); any two vectors are read |
+| `euler-zyx`, ... | 3 | radians, turns about axes that turn along, the first of them first; any order |
+"""
+
+import re
+
+import roma
+import torch
+from torch import Tensor
+
+SIZES = {"matrix": 9, "quaternion": 4, "vector": 3, "6d": 6}
+_EULER = re.compile(r"euler-([xyz])(?!\1)([xyz])(?!\2)([xyz])")
+
+
+def size(form: str) -> int:
+    """Numbers of a rotation in a form.
+
+    Raises:
+        ValueError: an unknown form.
+    """
+    if form not in SIZES and not _EULER.fullmatch(form):
+        raise ValueError(f"rotations have no form {form!r}; expected {', '.join(SIZES)}, or euler- and axes as in zyx")
+    return SIZES.get(form, 3)
+
+
+def to_matrix(values: Tensor, form: str) -> Tensor:
+    """Matrices (..., 3, 3) of rotations (..., `size(form)`); quaternions and 6d of any length are taken.
+
+    Raises:
+        ValueError: an unknown form, or another number of numbers.
+
+    Example:
+        >>> to_matrix(torch.tensor([0.0, 0.0, torch.pi / 2]), "vector").round()[0]
+        tensor([ 0., -1.,  0.])
+    """
+    if values.shape[-1] != size(form):
+        raise ValueError(f"a rotation as {form} has {size(form)} numbers, got {tuple(values.shape)}")
+    if form == "matrix":
+        return values.unflatten(-1, (3, 3))
+    if form == "quaternion":
+        return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(values, dim=-1)))
+    if form == "vector":
+        return roma.rotvec_to_rotmat(values)
+    if form == "6d":
+        return roma.special_gramschmidt(values.unflatten(-1, (2, 3)).transpose(-1, -2))
+    return roma.euler_to_rotmat(form[-3:].upper(), values)
+
+
+def from_matrix(rotations: Tensor, form: str) -> Tensor:
+    """Rotations (..., 3, 3) in a form, (..., `size(form)`).
+
+    Raises:
+        ValueError: an unknown form, or no matrices.
+    """
+    if rotations.shape[-2:] != (3, 3):
+        raise ValueError(f"expected matrices (..., 3, 3), got {tuple(rotations.shape)}")
+    size(form)
+    if form == "matrix":
+        return rotations.flatten(-2)
+    if form == "quaternion":
+        return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(rotations))
+    if form == "vector":
+        return roma.rotmat_to_rotvec(rotations)
+    if form == "6d":
+        return rotations[..., :2].transpose(-1, -2).flatten(-2)
+    return roma.rotmat_to_euler(form[-3:].upper(), rotations)
+
+
+def continuous(quaternions: Tensor, dim: int = -3) -> Tensor:
+    """The same rotations by quaternions (..., 4) of which each lies nearer to the one before than its opposite does.
+
+    Args:
+        quaternions: of unit length.
+        dim: of time; of (F, J, 4), the first.
+    """
+    with torch.no_grad():
+        opposite = (quaternions * quaternions.roll(1, dim)).sum(-1, keepdim=True) < 0
+        opposite = opposite.movedim(dim, 0)
+        opposite[:1] = False  # the first has none before it
+        signs = 1 - 2 * (opposite.cumsum(0) % 2).movedim(0, dim).to(quaternions.dtype)
+    return quaternions * signs

@@ -1,0 +1,199 @@
+"""BVH files: what animation programs would show, there and back, and what is damaged."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvae.motion.files.bvh import read_bvh, write_bvh
+
+SAMPLES = {
+    "bvh/indian_13.bvh": (1996, 57),
+    "bvh/martial_04.bvh": (1317, 57),
+    "bvh/salsa_10.bvh": (1198, 57),
+    "01_01.bvh": (2752, 38),
+    "01_03.bvh": (4511, 38),
+    "Boxing_Toes.bvh": (3070, 26),  # a row more than it announces
+}
+DEBIAN = Path("/usr/share/assimp/models/BVH")
+"""Where Debian's package assimp-testmodels puts its samples."""
+
+SMALL = """HIERARCHY
+ROOT hip
+{
+  OFFSET 1 2 3
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT a knee
+  {
+    OFFSET 0 -10 0
+    CHANNELS 4 Xrotation Xposition Yposition Zposition
+    End Site
+    {
+      OFFSET 0 -5 0
+    }
+  }
+  JOINT arm
+  {
+    OFFSET 3 0 0
+    CHANNELS 2 Yrotation Zrotation
+    End Site
+    {
+      OFFSET 1 0 0
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.0333333
+0 0 0 0 0 0   0 0 -10 0    0 0
+5 6 7 90 0 0  90 1 -11 2   90 90
+"""
+
+
+def turn(axis, degrees):
+    """About one axis, (F, 3, 3), written out."""
+    cos, sin = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    first, second = {"X": (1, 2), "Y": (2, 0), "Z": (0, 1)}[axis]
+    found = np.eye(3)[None].repeat(len(cos), 0)
+    found[:, first, first], found[:, second, second] = cos, cos
+    found[:, first, second], found[:, second, first] = -sin, sin
+    return found
+
+
+def played(text):
+    """Positions (F, J, 3) by the letter of the format: token for token, joint for joint."""
+    head, _, frames = text.partition("MOTION")
+    words, values = head.split(), np.array(frames.split()[5:], float)
+    joints, above, place = [], [], 1
+    while place < len(words):
+        word = words[place]
+        if word in ("ROOT", "JOINT", "End"):
+            joints.append({"parent": above[-1] if above else None, "channels": []})
+        elif word == "{":
+            above.append(len(joints) - 1)
+        elif word == "}":
+            above.pop()
+        elif word == "OFFSET":
+            joints[above[-1]]["offset"] = np.array(words[place + 1 : place + 4], float)
+        elif word == "CHANNELS":
+            joints[above[-1]]["channels"] = words[place + 2 : place + 2 + int(words[place + 1])]
+        place += 1
+    values = values.reshape(-1, sum(len(joint["channels"]) for joint in joints))
+    column = 0
+    for joint in joints:
+        at, turned = joint["offset"][None].repeat(len(values), 0), np.eye(3)[None].repeat(len(values), 0)
+        for channel in joint["channels"]:
+            if channel.endswith("position"):
+                at[:, "XYZ".index(channel[0])] = values[:, column]
+            else:
+                turned = turned @ turn(channel[0], values[:, column])
+            column += 1
+        parent = None if joint["parent"] is None else joints[joint["parent"]]
+        joint["at"] = at if parent is None else parent["at"] + np.einsum("fij,fj->fi", parent["turned"], at)
+        joint["turned"] = turned if parent is None else parent["turned"] @ turned
+    return np.stack([joint["at"] for joint in joints], 1)
+
+
+@pytest.fixture(params=SAMPLES)
+def sample(request, shared):
+    if "/" in request.param:
+        return shared(f"cmu_raw/{request.param}"), SAMPLES[request.param]
+    if not (DEBIAN / request.param).is_file():
+        pytest.skip(f"{request.param} of Debian's assimp-testmodels is not installed")
+    return DEBIAN / request.param, SAMPLES[request.param]
+
+
+def test_samples_are_read_as_the_format_says(sample):
+    path, (frames, joints) = sample
+    read = read_bvh(path)
+    assert read.positions.shape == (frames, joints, 3)
+    np.testing.assert_allclose(read.positions, played(path.read_text()), atol=1e-9)
+    assert read.rotations.shape == (frames, joints, 4)
+
+
+def test_samples_are_written_and_read_back_to_a_tenth_of_a_millimetre(sample, tmp_path):
+    read = read_bvh(sample[0])  # in centimetres, or in units of 5.6
+    write_bvh(
+        tmp_path / "a.bvh",
+        read.names,
+        read.parents,
+        read.offsets / 100,
+        read.rotations,
+        read.positions[:, 0] / 100,
+        read.fps,
+    )
+    again = read_bvh(tmp_path / "a.bvh")
+    order = [again.names.index(name) for name in read.names]
+    np.testing.assert_allclose(again.positions[:, order], read.positions, atol=1e-3)
+    assert again.fps == read.fps
+
+
+def test_any_joint_may_be_placed_and_turned_about_any_axes(tmp_path):
+    (tmp_path / "a.bvh").write_text(SMALL)
+    read = read_bvh(tmp_path / "a.bvh")
+    assert read.names == ["hip", "a knee", "a kneeEnd", "arm", "armEnd"]
+    assert read.fps == 30
+    np.testing.assert_allclose(read.positions[0], [[0, 0, 0], [0, -10, 0], [0, -15, 0], [3, 0, 0], [4, 0, 0]])
+    # the hip at (5, 6, 7) turned by 90 degrees about z: x to y, y to -x
+    hip, knee = np.array([5, 6, 7]), np.array([16, 7, 9])  # placed at (1, -11, 2), in place of its offset
+    np.testing.assert_allclose(read.positions[1, 1], knee, atol=1e-9)
+    np.testing.assert_allclose(read.positions[1, 2], knee + np.array([0, 0, -5]), atol=1e-9)  # its y looks along z
+    np.testing.assert_allclose(read.positions[1, 4], hip + np.array([-1, 3, 0]), atol=1e-9)
+
+
+def test_what_is_written_has_the_layout_that_animation_programs_import(tmp_path):
+    (tmp_path / "a.bvh").write_text(SMALL.replace("a knee", "knee"))
+    read = read_bvh(tmp_path / "a.bvh")
+    write_bvh(tmp_path / "b.bvh", read.names, read.parents, read.offsets, read.rotations, read.positions[:, 0], 25.0)
+    lines = [line.strip() for line in (tmp_path / "b.bvh").read_text().splitlines()]
+    assert lines[:5] == [
+        "HIERARCHY",
+        "ROOT hip",
+        "{",
+        "OFFSET 0.000000 0.000000 0.000000",
+        "CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation",
+    ]
+    assert lines.count("CHANNELS 3 Zrotation Yrotation Xrotation") == 2
+    assert lines.count("End Site") == 2
+    assert lines.count("{") == lines.count("}") == 5
+    motion = lines.index("MOTION")
+    assert lines[motion + 1 : motion + 3] == ["Frames: 2", "Frame Time: 0.04000000"]
+    assert [len(line.split()) for line in lines[motion + 3 :]] == [12, 12]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("MOTION", "", "line 26 is 'Frames: 2'"),
+        ("Frames: 2", "Frames: 200", "no 200 frames of 12 channels"),
+        ("Frames: 2", "Frames: -2", "no recording"),
+        ("Frames: 2", "Frames: many", "'many' is no number"),
+        ("0.0333333", "0", "no recording"),
+        ("0.0333333", "nan", "'nan' is no number"),
+        ("OFFSET 3 0 0", "OFFSET 3 0", "expected three numbers"),
+        ("OFFSET 3 0 0", "OFFSET 3 0 inf", "line 17: 'inf' is no number"),
+        ("CHANNELS 2 ", "CHANNELS 3 ", "expected their number"),
+        ("CHANNELS 2 Yrotation", "CHANNELS 2 Zrotation", "each once"),
+        ("5 6 7 90", "5 6 7 x", "'x' is no number"),
+        ("5 6 7 90", "5 6 90", "no 2 frames"),
+        ("JOINT arm", "JOINT hip", "another joint 'hip'"),
+        ("JOINT arm\n  {", "JOINT arm", "line 16"),
+        ("ROOT", "JOINT", "one ROOT"),
+        ("HIERARCHY", "<html>", "expected ROOT"),
+    ],
+)
+def test_what_is_damaged_is_refused_with_its_place(old, new, message, tmp_path):
+    path = tmp_path / "a.bvh"
+    path.write_text(SMALL.replace(old, new, 1))
+    with pytest.raises(ValueError, match=message) as error:
+        read_bvh(path)
+    assert str(path) in str(error.value)
+
+
+def test_channels_without_end_take_no_memory(tmp_path):
+    joints = "JOINT j{}\n{{\nOFFSET 0 1 0\n"
+    tree = "".join(joints.format(j) for j in range(900)) + "}\n" * 900
+    head = f"HIERARCHY\nROOT r\n{{\nOFFSET 0 0 0\nCHANNELS 1 Xposition\n{tree}}}\nMOTION\n"
+    (tmp_path / "a.bvh").write_text(head + "Frames: 100000\nFrame Time: 0.1\n" + "0\n" * 100_000)
+    with pytest.raises(ValueError, match="90,100,000 places"):
+        read_bvh(tmp_path / "a.bvh")
