@@ -9,7 +9,7 @@ roma's (Brégier 2021, arXiv 2103.16317), whose gradients are finite at no turn 
 | `quaternion` | 4 | w x y z; of the two for one rotation, see `continuous` |
 | `vector` | 3 | axis times angle in radians, the exponential map |
 | `6d` | 6 | the matrix's first column, then its second (Zhou et al. 2019, arXiv 1812.07035); any two vectors are read |
-| `euler-zyx`, ... | 3 | radians, turns about axes that turn along, the first of them first; any order |
+| `euler-zyx`, ... | 3 | radians, about axes that turn along, the first of them first; read with any number of axes |
 """
 
 import re
@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 
 SIZES = {"matrix": 9, "quaternion": 4, "vector": 3, "6d": 6}
-_EULER = re.compile(r"euler-([xyz])(?!\1)([xyz])(?!\2)([xyz])")
+_EULER = re.compile(r"euler-[xyz]+")
+_WHOLE = re.compile(r"euler-([xyz])(?!\1)([xyz])(?!\2)([xyz])")
 
 
 def size(form: str) -> int:
@@ -30,7 +31,7 @@ def size(form: str) -> int:
     """
     if form not in SIZES and not _EULER.fullmatch(form):
         raise ValueError(f"rotations have no form {form!r}; expected {', '.join(SIZES)}, or euler- and axes as in zyx")
-    return SIZES.get(form, 3)
+    return SIZES.get(form, len(form) - len("euler-"))
 
 
 def to_matrix(values: Tensor, form: str) -> Tensor:
@@ -53,7 +54,7 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
         return roma.rotvec_to_rotmat(values)
     if form == "6d":
         return roma.special_gramschmidt(values.unflatten(-1, (2, 3)).transpose(-1, -2))
-    return roma.euler_to_rotmat(form[-3:].upper(), values)
+    return roma.euler_to_rotmat(form.removeprefix("euler-").upper(), values)
 
 
 def from_matrix(rotations: Tensor, form: str) -> Tensor:
@@ -64,7 +65,9 @@ def from_matrix(rotations: Tensor, form: str) -> Tensor:
     """
     if rotations.shape[-2:] != (3, 3):
         raise ValueError(f"expected matrices (..., 3, 3), got {tuple(rotations.shape)}")
-    size(form)
+    if form not in SIZES and not _WHOLE.fullmatch(form):
+        size(form)
+        raise ValueError(f"not every rotation is one as {form}; expected three axes, no two alike in a row")
     if form == "matrix":
         return rotations.flatten(-2)
     if form == "quaternion":

@@ -89,7 +89,8 @@ def test_quaternions_are_made_continuous_without_a_change_of_rotation():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: rotations.size("euler-xxy"), "no form 'euler-xxy'"),
+        (lambda: rotations.size("euler-abc"), "no form 'euler-abc'"),
+        (lambda: rotations.from_matrix(torch.eye(3), "euler-xxy"), "not every rotation"),
         (lambda: rotations.to_matrix(torch.zeros(2, 5), "6d"), "6d has 6 numbers, got \\(2, 5\\)"),
         (lambda: rotations.from_matrix(torch.zeros(2, 9), "6d"), "expected matrices"),
     ],

@@ -15,9 +15,8 @@ import torch
 
 from ...files import written
 from ..rotations import from_matrix, to_matrix
-from .recording import Recording, check_joints, check_size, numbers, read_lines
+from .recording import END, Recording, check_joints, check_size, numbers, read_lines
 
-END = "End"
 _AXES = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
 
 
@@ -66,7 +65,7 @@ def read_bvh(path: str | Path) -> Recording:
         if order:
             which, columns = [place for place, _ in found], [columns for _, columns in found]
             angles = torch.from_numpy(np.deg2rad(values[:, columns]))
-            turns[:, which] = to_matrix(angles, f"euler-{order}") if len(order) == 3 else _few(angles, order)
+            turns[:, which] = to_matrix(angles, f"euler-{order}")
     names, parents = [joint.name for joint in joints], [joint.parent for joint in joints]
     offsets = np.stack([joint.offset for joint in joints])
     fps = 1 / seconds
@@ -106,25 +105,26 @@ def write_bvh(
     for joint, parent in enumerate(parents):
         if parent >= 0:
             children[parent].append(joint)
-    lines, written_joints = ["HIERARCHY"], []
+    lines, turning = ["HIERARCHY"], []
     turns = " ".join(f"{axis.upper()}rotation" for axis in order)
 
-    def describe(joint: int, depth: int) -> None:
+    waiting = [(parents.index(-1), 0)]
+    while waiting:
+        joint, depth = waiting.pop()
         tab = "\t" * depth
+        if joint < 0:
+            lines.append(f"{tab}}}")
+            continue
         offset = " ".join(f"{100 * value:.6f}" for value in (offsets[joint] if depth else np.zeros(3)))
         ends = depth > 0 and not children[joint]
-        lines.extend([f"{tab}{'End Site' if ends else ('JOINT ' if depth else 'ROOT ') + names[joint]}", f"{tab}{{"])
-        lines.append(f"{tab}\tOFFSET {offset}")
+        name = "End Site" if ends else ("JOINT " if depth else "ROOT ") + names[joint]
+        lines += [f"{tab}{name}", f"{tab}{{", f"{tab}\tOFFSET {offset}"]
         if not ends:
-            written_joints.append(joint)
+            turning.append(joint)
             lines.append(f"{tab}\tCHANNELS {'3 ' if depth else '6 Xposition Yposition Zposition '}{turns}")
-        for child in children[joint]:
-            describe(child, depth + 1)
-        lines.append(f"{tab}}}")
-
-    describe(parents.index(-1), 0)
+        waiting += [(-1, depth), *((child, depth + 1) for child in reversed(children[joint]))]
     angles = from_matrix(to_matrix(torch.from_numpy(rotations).double(), "quaternion"), f"euler-{order}").numpy()
-    rows = np.concatenate([100 * root, np.rad2deg(angles[:, written_joints]).reshape(len(root), -1)], 1)
+    rows = np.concatenate([100 * root, np.rad2deg(angles[:, turning]).reshape(len(root), -1)], 1)
     lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / fps:.8f}"]
     with written(path) as file:
         file.write(("\n".join(lines) + "\n").encode())
@@ -204,13 +204,3 @@ def _header(path: Path, lines: list[str], line: int) -> tuple[int, float, int]:
     if frames != int(frames) or frames < 1 or not 1e-6 < seconds < 1e3:
         raise ValueError(f"{path}: {frames:g} frames, {seconds:g} s each, are no recording")
     return int(frames), seconds, line
-
-
-def _few(angles: torch.Tensor, order: str) -> torch.Tensor:
-    """Matrices of turns about one or two axes, or about one of them twice."""
-    found = torch.eye(3, dtype=angles.dtype)
-    for place, axis in enumerate(order):
-        vector = torch.zeros(*angles.shape[:-1], 3, dtype=angles.dtype)
-        vector[..., "xyz".index(axis)] = angles[..., place]
-        found = found @ to_matrix(vector, "vector")
-    return found

@@ -21,6 +21,10 @@ MOST_PLACES = 2**24
 """Frames times joints of a recording: as long."""
 
 
+END = "End"
+"""Of the name of a joint at which a last bone ends."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """One recording as its file has it.

@@ -1,0 +1,284 @@
+"""ASF/AMC, Acclaim's skeletons and motions, and the exponential-map text that the CMU benchmark made of them.
+
+A bone of an ASF file has a direction, a length and axes of its own, about which its AMC rows turn it: by C M C^-1
+against its parent, where C are its axes and M the turn that a row has, the first angle first. Here a joint stands where
+its bone begins and has the bone's name; where a last bone ends stands one more.
+
+A unit is 1 / (45/100) inch where the file says `length 0.45` (the frequently asked questions of mocap.cs.cmu.edu).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..rotations import from_matrix, to_matrix
+from .recording import END, Recording, check_joints, check_size, numbers, read_lines
+
+INCH = 0.0254
+FPS = 120.0
+"""Of CMU's recordings, whose files do not say."""
+
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Bone:
+    """One bone: its parent's name, its vector in the file's unit, its axes (3, 3), and those of its turns."""
+
+    parent: str
+    vector: Vector
+    axes: Tensor
+    turns: str
+
+
+def joints_of(bones: Mapping[str, Bone]) -> tuple[list[str], list[int], np.ndarray]:
+    """Names, parents and offsets (J, 3) of the joints at which bones begin and the last ones end, depth first."""
+    below: dict[str, list[str]] = {"root": []}
+    for name, bone in bones.items():
+        below[name] = []
+        below[bone.parent].append(name)
+    names: list[str] = []
+    parents, offsets = [], []
+    waiting: list[tuple[str, int, Vector]] = [("root", -1, (0.0, 0.0, 0.0))]
+    while waiting:
+        name, parent, offset = waiting.pop()
+        place = len(names)
+        names.append(name)
+        parents.append(parent)
+        offsets.append(offset)
+        if name in below:
+            vector = bones[name].vector if name in bones else (0.0, 0.0, 0.0)
+            waiting += [(child, place, vector) for child in reversed(below[name] or [name + END])]
+    return names, parents, np.array(offsets)
+
+
+def read_asf(path: str | Path) -> tuple[dict[str, Bone], float, bool, str]:
+    """Bones, metres of a unit, whether angles are in degrees, and the channels of the root.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is none, or damaged.
+    """
+    path = Path(path)
+    found: dict[str, dict[str, list[str]]] = {}
+    parent_of: dict[str, str] = {}
+    section = ""
+    bone: dict[str, list[str]] = {}
+    said: dict[str, list[str]] = {}
+    for number, line in enumerate(read_lines(path), 1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        if words[0].startswith(":"):
+            section, bone = words[0].lower(), {}
+        elif section in (":units", ":root"):
+            said[words[0].lower()] = words[1:]
+        elif section == ":bonedata":
+            if words[0] == "begin":
+                bone = {}
+            elif words[0] == "end":
+                if not {"name", "direction", "length"} <= bone.keys() or not bone["name"]:
+                    raise ValueError(f"{path}: line {number} ends a bone without name, direction and length")
+                found[bone["name"][0]] = bone
+                check_joints(path, 2 * len(found))
+            else:
+                bone[words[0].lower()] = words[1:]
+        elif section == ":hierarchy" and words[0] not in ("begin", "end"):
+            parent_of |= dict.fromkeys(words[1:], words[0])
+    if not found:
+        raise ValueError(f"{path}: no ASF file: it has no :bonedata")
+    degrees = said.get("angle", ["deg"])[:1] != ["rad"]
+
+    def values(words: Sequence[str], count: int, what: str) -> np.ndarray:
+        read = numbers(" ".join(words[:count]), f"{path}: {what}")
+        if len(read) != count:
+            raise ValueError(f"{path}: {what} has {len(read)} numbers, expected {count}")
+        return read
+
+    bones = {}
+    for name in _ordered(path, parent_of):
+        if name not in found:
+            raise ValueError(f"{path}: the hierarchy has {name[:60]!r}, which is no bone")
+        bone = found[name]
+        length = values(bone["length"], 1, f"length of {name}")[0]
+        direction = length * values(bone["direction"], 3, f"direction of {name}")
+        axis = bone.get("axis", ["0", "0", "0", "XYZ"])
+        angles, order = values(axis, 3, f"axis of {name}"), "".join(axis[3:4]).lower() or "xyz"
+        turns = "".join(channel[1].lower() for channel in bone.get("dof", []) if channel.lower() in ("rx", "ry", "rz"))
+        if len(turns) != len(bone.get("dof", [])) or sorted(order) != ["x", "y", "z"]:
+            raise ValueError(f"{path}: {name} has axes {order!r} and turns {bone.get('dof')}, expected rx, ry or rz")
+        axes = _turned(torch.from_numpy(np.deg2rad(angles) if degrees else angles), order)
+        bones[name] = Bone(parent_of[name], tuple(direction.tolist()), axes, turns)
+    unit = values(said.get("length", ["1"]), 1, "length")[0]
+    if not 1e-6 < unit < 1e6:
+        raise ValueError(f"{path}: length {unit:g}, expected that of a unit against an inch")
+    order = " ".join(said.get("order", ["TX", "TY", "TZ", "RX", "RY", "RZ"])).lower()
+    if sorted(order.split()) != ["rx", "ry", "rz", "tx", "ty", "tz"]:
+        raise ValueError(f"{path}: the root's order is {order[:60]!r}, expected TX to RZ once each")
+    return bones, INCH / unit, degrees, order
+
+
+def read_amc(path: str | Path, skeleton: str | Path | None = None) -> Recording:
+    """Read an AMC file.
+
+    Args:
+        path: the file.
+        skeleton: its ASF file; by default the one beside it whose name begins its own (02.asf of 02_01.amc), or that
+            stands there alone.
+
+    Raises:
+        FileNotFoundError: there is no such file, or no ASF file beside it.
+        ValueError: the file is none, or damaged, or of another skeleton; the message has the frame.
+    """
+    path = Path(path)
+    skeleton = Path(skeleton) if skeleton else _skeleton_of(path)
+    bones, metres, degrees, order = read_asf(skeleton)
+    names, parents, offsets = joints_of(bones)
+    columns = {"root": 6} | {name: len(bone.turns) for name, bone in bones.items() if bone.turns}
+    values: dict[str, list[str]] = {name: [] for name in columns}
+    frames = 0
+    for number, line in enumerate(read_lines(path), 1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        if words[0].startswith(":"):
+            degrees = {":degrees": True, ":radians": False}.get(words[0].lower(), degrees)
+        elif len(words) == 1 and words[0].isdecimal():
+            short = [name for name, rows in values.items() if len(rows) != frames * columns[name]]
+            if short:
+                raise ValueError(f"{path}: frame {frames} has no row for {short[0]}, of {skeleton}")
+            frames += 1
+            check_size(path, frames, len(names))
+        elif len(words) - 1 != columns.get(words[0]) or len(values[words[0]]) != (frames - 1) * columns[words[0]]:
+            raise ValueError(
+                f"{path}: line {number} is {line.strip()[:60]!r}, expected one row a frame for each bone of "
+                f"{skeleton}, with an angle for each of its turns"
+            )
+        else:
+            values[words[0]] += words[1:]
+    read = {}
+    for name, count in columns.items():
+        if not frames or len(values[name]) != frames * count:
+            raise ValueError(f"{path}: frame {frames} has no row for {name}, of {skeleton}")
+        read[name] = torch.from_numpy(numbers(" ".join(values[name]), f"{path}: {name}").reshape(frames, count))
+    channels = order.split()
+    root = read["root"]
+    place = root[:, [channels.index(f"t{axis}") for axis in "xyz"]]
+    turning = [column for column, channel in enumerate(channels) if channel[0] == "r"]
+    turns = torch.eye(3, dtype=torch.float64).repeat(frames, len(names), 1, 1)
+
+    def radians(angles: Tensor) -> Tensor:
+        return torch.deg2rad(angles) if degrees else angles
+
+    turns[:, 0] = _turned(radians(root[:, turning]), "".join(channels[column][1] for column in turning))
+    for name, bone in bones.items():
+        if bone.turns:
+            turns[:, names.index(name)] = bone.axes @ _turned(radians(read[name]), bone.turns) @ bone.axes.mT
+    places = torch.from_numpy(offsets).repeat(frames, 1, 1)
+    places[:, 0] = place
+    return Recording.turned(names, parents, offsets, places, turns, fps=FPS, metres=metres, up="y")
+
+
+SUBJECT_02 = {
+    "lhipjoint": ("root", 1.65674, -1.80282, 0.62477),
+    "rhipjoint": ("root", -1.6107, -1.80282, 0.62476),
+    "lowerback": ("root", 0.01961, 2.0545, -0.14112),
+    "lfemur": ("lhipjoint", 2.5972, -7.13576, 0),
+    "ltibia": ("lfemur", 2.49236, -6.8477, 0),
+    "lfoot": ("ltibia", 0.19704, -0.54136, 2.14581),
+    "ltoes": ("lfoot", 0, 0, 1.11249),
+    "rfemur": ("rhipjoint", -2.59502, -7.12977, 0),
+    "rtibia": ("rfemur", -2.4678, -6.78024, 0),
+    "rfoot": ("rtibia", -0.23024, -0.63258, 2.13368),
+    "rtoes": ("rfoot", 0, 0, 1.11569),
+    "upperback": ("lowerback", 0.01021, 2.06436, -0.05921),
+    "thorax": ("upperback", 0.00151, 2.06805, 0.00804),
+    "lowerneck": ("thorax", 0.00713, 1.56711, 0.14968),
+    "lclavicle": ("thorax", 3.54205, 0.90436, -0.17364),
+    "rclavicle": ("thorax", -3.49802, 0.75994, -0.32616),
+    "upperneck": ("lowerneck", 0.03429, 1.56041, -0.10006),
+    "head": ("upperneck", 0.01305, 1.6256, -0.05265),
+    "lhumerus": ("lclavicle", 4.86513, 0, 0),
+    "lradius": ("lhumerus", 3.35554, 0, 0),
+    "lwrist": ("lradius", 1.67777, 0, 0),
+    "lhand": ("lwrist", 0.66117, 0, 0),
+    "lthumb": ("lwrist", 0.5412, 0, 0.5412),
+    "lfingers": ("lhand", 0.53306, 0, 0),
+    "rhumerus": ("rclavicle", -5.02649, 0, 0),
+    "rradius": ("rhumerus", -3.36431, 0, 0),
+    "rwrist": ("rradius", -1.68216, 0, 0),
+    "rhand": ("rwrist", -0.73041, 0, 0),
+    "rthumb": ("rwrist", -0.59786, 0, 0.59786),
+    "rfingers": ("rhand", -0.58887, 0, 0),
+}
+"""Parent and vector of the bones of CMU's subject 02, on whom the benchmark puts everybody, in 1 / .45 inch."""
+
+
+def read_expmap(path: str | Path) -> Recording:
+    """Read exponential maps as in the CMU benchmark: a row of 117 numbers for each frame, place and rotation vectors.
+
+    The file's vectors act on rows, and are negated here. Its first row is no frame but a pose at rest, and is left out.
+    Its rotation of the root composes the angles of the AMC file in the wrong order (z x y, not z y x), which tilts who
+    faces away from +z; the angles are taken out and composed again.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is none, or damaged.
+    """
+    path = Path(path)
+    text = " ".join(read_lines(path)).replace(",", " ")
+    values = numbers(text, str(path))
+    bones = {name: Bone(parent, (x, y, z), torch.eye(3), "") for name, (parent, x, y, z) in SUBJECT_02.items()}
+    names, parents, offsets = joints_of(bones)
+    rows, rest = divmod(len(values), 3 + 3 * len(names))
+    if rest or rows < 2:
+        raise ValueError(f"{path}: {len(values):,} numbers are no rows of {3 + 3 * len(names)}, a pose at rest first")
+    check_size(path, rows, len(names))
+    read = torch.from_numpy(values).reshape(rows, -1, 3)[1:]
+    turns = to_matrix(-read[:, 1:], "vector")
+    z, x, y = from_matrix(turns[:, 0], "euler-zxy").unbind(-1)
+    other = y.abs() > pi / 2  # of the two triples for a rotation, AMC files have that whose y, in the middle, is small
+    z, x, y = torch.where(other, pi + z, z), torch.where(other, pi - x, x), torch.where(other, pi + y, y)
+    turns[:, 0] = to_matrix(torch.stack([z, y, x], -1), "euler-zyx")
+    places = torch.from_numpy(offsets).repeat(rows - 1, 1, 1)
+    places[:, 0] = read[:, 0]
+    return Recording.turned(names, parents, offsets, places, turns, fps=FPS, metres=INCH / 0.45, up="y")
+
+
+def _turned(angles: Tensor, axes: str) -> Tensor:
+    """Turns (..., 3, 3) about fixed axes in this order, by angles (..., n) in radians."""
+    return to_matrix(angles.flip(-1), f"euler-{axes[::-1]}")
+
+
+def _ordered(path: Path, parent_of: Mapping[str, str]) -> Iterator[str]:
+    """The bones in the order of the file.
+
+    Raises:
+        ValueError: they do not all hang from the root.
+    """
+    reached = {"root"}
+    for name, parent in parent_of.items():
+        if parent not in reached:
+            raise ValueError(
+                f"{path}: {name[:60]!r} hangs from {parent[:60]!r}, which has no place in the hierarchy before"
+            )
+        reached.add(name)
+        yield name
+
+
+def _skeleton_of(path: Path) -> Path:
+    beside = sorted(path.parent.glob("*.asf"))
+    own = [file for file in beside if path.stem.startswith(file.stem)]
+    if len(own or beside) != 1:
+        raise FileNotFoundError(
+            f"{path}: which skeleton? Expected its ASF file beside it, such as 02.asf for 02_01.amc"
+        )
+    return (own or beside)[0]

@@ -1,0 +1,161 @@
+"""ASF/AMC and exponential maps: the same motion in both, as it stands in the archive of positions."""
+
+import numpy as np
+import pytest
+
+from dvae.motion.files.amc import read_amc, read_asf, read_expmap
+
+JOINTS = [
+    "root",
+    "lfemur",
+    "ltibia",
+    "lfoot",
+    "ltoes",
+    "rfemur",
+    "rtibia",
+    "rfoot",
+    "rtoes",
+    "upperback",
+    "thorax",
+    "lowerneck",
+    "upperneck",
+    "head",
+    "headEnd",
+    "lhumerus",
+    "lradius",
+    "lhand",
+    "rhumerus",
+    "rradius",
+    "rhand",
+]
+"""Where the joints of the archive stand, in its order."""
+
+ASF = """:version 1.10
+:units
+  length 1
+  angle deg
+:root
+  order TX TY TZ RX RY RZ
+  axis XYZ
+:bonedata
+  begin
+    id 1
+    name thigh
+    direction 0 -1 0
+    length 4
+    axis 0 0 90 XYZ
+    dof rx
+  end
+  begin
+    name shin
+    direction 0 -1 0
+    length 3
+    axis 0 0 0 XYZ
+  end
+:hierarchy
+  begin
+    root thigh
+    thigh shin
+  end
+"""
+AMC = ":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 0 0 0 0 0\nthigh 0\n2\nroot 1 2 3 0 90 0\nthigh 90\n"
+
+
+def seen(recording):
+    return recording.metres * recording.positions[:, [recording.names.index(joint) for joint in JOINTS]]
+
+
+@pytest.mark.parametrize(
+    ("read", "file", "key"),
+    [
+        (read_amc, "asfamc/02_01.amc", ("train", "walking_1")),
+        (read_expmap, "expmap/train_walking_1.txt", ("train", "walking_1")),
+        (read_expmap, "expmap/train_walking_extra_22.txt", ("train", "walking_extra_22")),  # turns, and faces away
+        (read_expmap, "expmap/test_running_1.txt", ("test", "running_1")),
+    ],
+)
+def test_motion_is_that_of_the_archive_to_a_tenth_of_a_millimetre(read, file, key, shared, real):
+    positions = real("cmu/cmu8.npz")[key].positions
+    found = read(shared(f"cmu_raw/{file}"))
+    assert (found.fps, found.up) == (120, "y")
+    every_fourth = seen(found)[::4]
+    assert every_fourth.shape == positions.shape
+    np.testing.assert_allclose(every_fourth, positions, atol=1e-4)
+
+
+def test_a_bone_turns_about_its_own_axes_and_carries_what_hangs_from_it(tmp_path):
+    (tmp_path / "a.asf").write_text(ASF)
+    (tmp_path / "a_1.amc").write_text(AMC)
+    found = read_amc(tmp_path / "a_1.amc")
+    assert found.names == ["root", "thigh", "shin", "shinEnd"]
+    assert found.metres == 0.0254
+    np.testing.assert_allclose(found.positions[0], [[0, 0, 0], [0, 0, 0], [0, -4, 0], [0, -7, 0]], atol=1e-9)
+    # its x axis is the world's y, about which it turns by 90 degrees, and so nowhere; then the root does
+    np.testing.assert_allclose(found.positions[1], [[1, 2, 3], [1, 2, 3], [1, -2, 3], [1, -5, 3]], atol=1e-9)
+    (tmp_path / "a.asf").write_text(ASF.replace("0 0 90 XYZ", "0 0 0 XYZ"))
+    found = read_amc(tmp_path / "a_1.amc")  # -y about x to -z, and that about y to -x
+    np.testing.assert_allclose(found.positions[1], [[1, 2, 3], [1, 2, 3], [-3, 2, 3], [-6, 2, 3]], atol=1e-9)
+    (tmp_path / "r.amc").write_text(AMC.replace("DEGREES", "RADIANS").replace("90", str(np.pi / 2)))
+    np.testing.assert_allclose(read_amc(tmp_path / "r.amc").positions, found.positions, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("asf", ":bonedata", ":nothing", "no :bonedata"),
+        ("asf", "root thigh", "head thigh", "'thigh' hangs from 'head'"),
+        ("asf", "thigh shin", "thigh foot", "'foot', which is no bone"),
+        ("asf", "length 4", "length four", "length of thigh: 'four' is no number"),
+        ("asf", "direction 0 -1 0", "direction 0 -1", "direction of thigh has 2 numbers"),
+        ("asf", "direction 0 -1 0\n", "", "line 15 ends a bone without"),
+        ("asf", "dof rx", "dof rx tx", "expected rx, ry or rz"),
+        ("asf", "order TX", "order RX", "expected TX to RZ"),
+        ("asf", "length 1\n", "length 0\n", "length 0"),
+        ("amc", "thigh 90", "thigh 90 1", "line 8 is 'thigh 90 1'"),
+        ("amc", "thigh 90", "thigh x", "thigh: 'x' is no number"),
+        ("amc", "thigh 90", "", "frame 2 has no row for thigh"),
+        ("amc", "thigh 0\n", "", "frame 1 has no row for thigh"),
+        ("amc", "thigh 0", "knee 0", "line 5 is 'knee 0'"),
+        ("amc", "1\nroot", "root", "line 3"),
+    ],
+)
+def test_what_is_damaged_is_refused_with_its_place(file, old, new, message, tmp_path):
+    texts = {"asf": ASF, "amc": AMC}
+    texts[file] = texts[file].replace(old, new, 1)
+    for name, text in texts.items():
+        (tmp_path / f"a.{name}").write_text(text)
+    with pytest.raises(ValueError, match=message) as error:
+        read_amc(tmp_path / "a.amc")
+    assert str(tmp_path / f"a.{file}") in str(error.value)
+
+
+def test_a_chain_of_many_bones_is_no_matter(tmp_path):
+    bone = "begin\nname b{}\ndirection 0 1 0\nlength 1\nend\n"
+    chain = "".join(f"{'b' + str(i - 1) if i else 'root'} b{i}\n" for i in range(499))
+    text = ":bonedata\n" + "".join(bone.format(i) for i in range(499)) + ":hierarchy\nbegin\n" + chain
+    (tmp_path / "a.asf").write_text(text)
+    (tmp_path / "a.amc").write_text("1\nroot 0 0 0 0 0 0\n")
+    assert read_amc(tmp_path / "a.amc").positions[0, -1].tolist() == [0, 499, 0]
+    (tmp_path / "a.asf").write_text(text + "".join(f"b498 c{i}\n" for i in range(2)))
+    with pytest.raises(ValueError, match="'c0', which is no bone"):
+        read_asf(tmp_path / "a.asf")
+
+
+def test_which_skeleton_is_asked_where_none_or_several_could_be(tmp_path):
+    (tmp_path / "02_01.amc").write_text(AMC)
+    with pytest.raises(FileNotFoundError, match="which skeleton"):
+        read_amc(tmp_path / "02_01.amc")
+    for name in ("01.asf", "02.asf"):
+        (tmp_path / name).write_text(ASF if name == "02.asf" else "")
+    assert len(read_amc(tmp_path / "02_01.amc").positions) == 2
+    (tmp_path / "walk.amc").write_text(AMC)
+    with pytest.raises(FileNotFoundError, match="which skeleton"):
+        read_amc(tmp_path / "walk.amc")
+    assert len(read_amc(tmp_path / "walk.amc", tmp_path / "02.asf").positions) == 2
+
+
+@pytest.mark.parametrize("text", ["", "1 2 3", "0 " * 117, "0 " * 233 + "x", "0 " * 233 + "nan"])
+def test_what_are_no_exponential_maps_is_refused(text, tmp_path):
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(ValueError, match=r"no rows of 117|no number"):
+        read_expmap(tmp_path / "a.txt")
