@@ -111,8 +111,8 @@ def settle(recording: Recording, metres: float | None = None, up: str | None = N
         ValueError: no unit fits.
     """
     name, found = ("as given", metres) if metres is not None else unit(recording)
-    axis, upwards = upright(recording)
-    axis, upwards = (up or recording.up, True) if up or recording.up else (axis, upwards)
+    said = up or recording.up
+    axis, upwards = (said, True) if said else upright(recording)
     turn, turned = np.eye(3), ""
     if axis == "x" or not upwards:  # a rotation that takes the person's axis to y
         turn = np.roll(np.eye(3), "yzx".index(axis), axis=1)[[0, 1, 2]]
