@@ -11,8 +11,8 @@ from .criticism import draw_traversal, statistics
 from .data import Clip, MotionSet
 from .dataset import MotionData
 from .exchange import Exchanged
+from .files import read_motion, read_paths, save
 from .forecasts import Forecasts, is_forecasts
-from .formats import read_motion, read_paths, save
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
 from .scoring import displacements, scores
 from .simulator import simulate

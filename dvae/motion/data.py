@@ -9,16 +9,23 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import InitVar, dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
 
 import numpy as np
+import torch
 from rich.console import Group, RenderableType
 
 from ..inference.result import Table  # which shows what files say as it is
+from .kinematics import inverse, rest
+from .rotations import continuous, from_matrix
 from .skeleton import Skeleton
 
 SMALLEST, TALLEST = 0.3, 3.0
 """Metres between which a body's largest extent must lie: room for a child, too narrow for another unit."""
+
+
+MOST_FRAMES = 20_000
+"""From which a rest pose is found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +38,8 @@ class Clip:
         positions: (F, J, 3) in metres, global.
         labels: what is known about it, as text.
         truth: what a simulator knows about it, as arrays; real clips have none.
+        rotations: (F, J, 4), of every joint against its parent, as quaternions w x y z; of files that have them, and
+            of `MotionSet.with_rotations`. An end, from which nothing hangs, has no turn that could be seen.
     """
 
     split: str
@@ -38,6 +47,7 @@ class Clip:
     positions: np.ndarray
     labels: Mapping[str, str] = field(default_factory=dict)
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
+    rotations: np.ndarray | None = None
 
     @property
     def key(self) -> tuple[str, str]:
@@ -70,6 +80,11 @@ def defect(clip: Clip, skeleton: Skeleton) -> str | None:
             f"{where} has NaN or infinite positions, or none that float32 can hold: {bad.sum()} joint positions in "
             f"{bad.any(axis=1).sum()} of {clip.frames} frames, first {skeleton.names[joint]} at frame {frame}"
         )
+    if clip.rotations is not None:
+        if clip.rotations.shape != (*positions.shape[:2], 4) or clip.rotations.dtype.kind != "f":
+            return f"{where} has rotations {clip.rotations.shape}, expected quaternions {(*positions.shape[:2], 4)}"
+        if not (np.abs(np.square(clip.rotations).sum(-1) - 1) < 1e-3).all():
+            return f"{where} has rotations that are no quaternions of unit length"
     extent = float(np.median((positions.max(axis=1) - positions.min(axis=1).astype(np.float64)).max(axis=1)))
     if not SMALLEST <= extent <= TALLEST:
         unit = "millimetres" if extent >= 300 else "centimetres" if extent >= 30 else "another unit"
@@ -116,7 +131,8 @@ class MotionSet:
                 continue
             positions = np.require(clip.positions, np.float32, ["C", "A", "W"])
             positions = positions.copy() if copy and np.may_share_memory(positions, clip.positions) else positions
-            single.append(Clip(clip.split, clip.name, positions, clip.labels, clip.truth))
+            turns = None if clip.rotations is None else clip.rotations.astype(np.float32)
+            single.append(Clip(clip.split, clip.name, positions, clip.labels, clip.truth, turns))
             del clip, positions
         if not single:
             dropped = f"; {len(skipped)} were skipped, the first: {skipped[0][2]}" if skipped else ""
@@ -146,12 +162,36 @@ class MotionSet:
         """The splits, in order of appearance."""
         return list(dict.fromkeys(clip.split for clip in self.clips))
 
+    def with_rotations(self) -> MotionSet:
+        """The same motion with the turns of joints too, and the rest pose that they turn.
+
+        Those that files have are kept. Elsewhere they are found by `kinematics.inverse`, for bones that have the mean
+        lengths of all clips; positions stay as they are.
+        """
+        if self.skeleton.rest and all(clip.rotations is not None for clip in self):
+            return self
+        skeleton = self.skeleton
+        if not skeleton.rest:
+            every = -(-sum(clip.frames for clip in self) // MOST_FRAMES)
+            some = torch.cat([torch.from_numpy(clip.positions)[::every] for clip in self])
+            skeleton = replace(skeleton, rest=tuple(rest(skeleton, some.double()).flatten().tolist()))
+
+        def turned() -> Iterator[Clip]:
+            for clip in self:
+                if not self.skeleton.rest or clip.rotations is None:
+                    turns = inverse(skeleton, torch.from_numpy(clip.positions).double(), skeleton.offsets)
+                    clip = replace(clip, rotations=continuous(from_matrix(turns, "quaternion")).numpy())
+                yield clip
+
+        return MotionSet(turned(), skeleton, self.name)  # type: ignore[arg-type]
+
     def fingerprint(self) -> str:
         """SHA-256 of the content: skeleton, and every clip's key, shape and bytes, in order."""
         digest = hashlib.sha256(repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up)).encode())
         for clip in self.clips:
             digest.update(repr((*clip.key, clip.positions.shape)).encode())
-            digest.update(clip.positions.astype("<f4", copy=False).tobytes())
+            for values in (clip.positions, clip.rotations):
+                digest.update(b"" if values is None else values.astype("<f4", copy=False).tobytes())
         return digest.hexdigest()
 
     def summary(self) -> list[dict[str, str | int | float]]:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 
 from ..options import check, tuples
 from .data import MotionSet
-from .formats import read_motion
+from .files import read_motion
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, named_protocol, windows
 from .simulator import simulate
 

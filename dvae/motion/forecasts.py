@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
-from .archive import archive, write_arrays
-from .formats import read_arrays
+from .files.archive import archive, write_arrays
+from .files.plain import read_arrays
 from .skeleton import FIELDS, Skeleton
 
 

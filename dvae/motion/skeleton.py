@@ -111,6 +111,8 @@ class Skeleton:
         fps: frames per second of the motion recorded on this skeleton.
         name: what to call it.
         lengths: reference bone lengths in metres in the order of `edges`; empty where people differ.
+        rest: where each joint is from its parent while nothing is turned, x y z after x y z, in metres, the root's
+            zero; empty where no rotations are known.
 
     Raises:
         ValueError: the joints do not form one tree, names repeat, or a side names a joint that is not there.
@@ -124,6 +126,7 @@ class Skeleton:
     fps: float = 30.0
     name: str = ""
     lengths: tuple[float, ...] = ()
+    rest: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         what = f"skeleton {brief(self.name)}"
@@ -135,6 +138,7 @@ class Skeleton:
             ("left", Integral, "whole numbers"),
             ("right", Integral, "whole numbers"),
             ("lengths", Real, "numbers"),
+            ("rest", Real, "numbers"),
         ):
             object.__setattr__(self, field, _values(getattr(self, field), kind, f"{what}: {field}", expected))
         joints = len(self.names)
@@ -169,6 +173,12 @@ class Skeleton:
             raise ValueError(f"{what}: {len(self.lengths)} bone lengths for {joints - 1} bones")
         if wrong := [length for length in self.lengths if not 0 <= length < 1e6]:
             raise ValueError(f"{what}: a bone is {brief(wrong[0])} m long")
+        if self.rest and len(self.rest) != 3 * joints:
+            raise ValueError(
+                f"{what}: the rest pose has {len(self.rest)} numbers, expected 3 for each of {joints} joints"
+            )
+        if wrong := [place for place in self.rest if not abs(place) < 1e6]:
+            raise ValueError(f"{what}: in the rest pose a joint is {brief(wrong[0])} m from its parent")
 
     @property
     def joints(self) -> int:
@@ -214,6 +224,20 @@ class Skeleton:
         tree = nx.DiGraph(self.edges)
         tree.add_node(self.root)
         return [joint for generation in nx.bfs_layers(tree, self.root) for joint in sorted(generation)]
+
+    @property
+    def offsets(self) -> Tensor:
+        """Of the rest pose, (J, 3), float64.
+
+        Raises:
+            ValueError: none is known.
+        """
+        if not self.rest:
+            raise ValueError(
+                f"skeleton {self.name!r} has no rest pose, without which rotations mean nothing; "
+                "MotionSet.with_rotations() finds both"
+            )
+        return torch.tensor(self.rest, dtype=torch.float64).reshape(-1, 3)
 
     @property
     def vertical(self) -> int:
@@ -330,7 +354,9 @@ class Skeleton:
             given = {field: fields[key] for field, key in FIELDS.items() if key in fields}
             # the file has one entry per joint, and a zero for the root
             bones = tuple(length for length, parent in zip(lengths, parents, strict=bool(lengths)) if parent != -1)
-            return cls(**{"name": path.absolute().parent.name, **given, "parents": parents, "lengths": bones})
+            rest = fields.get("rest_m", ())
+            named = {"name": path.absolute().parent.name, **given}
+            return cls(**{**named, "parents": parents, "lengths": bones, "rest": rest})
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
@@ -340,6 +366,8 @@ class Skeleton:
         if self.lengths:
             lengths = iter(self.lengths)
             fields["bone_lengths_m"] = [0.0 if parent == -1 else next(lengths) for parent in self.parents]
+        if self.rest:
+            fields["rest_m"] = self.rest
         with files.written(path) as file:
             file.write((json.dumps(fields, indent=2) + "\n").encode())
 

@@ -457,7 +457,7 @@ class TestPlain:
     def test_what_a_file_unpacks_to_is_limited_as_a_whole(self, tmp_path, monkeypatch):
         positions = people((9,))[0].positions
         np.savez_compressed(tmp_path / "a.npz", **{f"train/{i}": positions for i in range(4)})
-        monkeypatch.setattr("dvae.motion.archive.LARGEST", 2 * positions.nbytes)
+        monkeypatch.setattr("dvae.motion.files.archive.LARGEST", 2 * positions.nbytes)
         with pytest.raises(ValueError, match=r"a\.npz: it would unpack to [\d,]+ bytes, at most 7,344 are read"):
             read_motion(tmp_path / "a.npz", skeleton=WALKER)
 

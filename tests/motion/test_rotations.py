@@ -1,12 +1,14 @@
 """Rotations in every form, and kinematics: there and back."""
 
 import itertools
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from dvae.motion import WALKER, kinematics, rotations, simulate
+from dvae.motion import WALKER, MotionSet, Skeleton, kinematics, rotations, simulate
 
 EULER = ["euler-" + "".join(axes) for axes in itertools.product("xyz", repeat=3) if axes[0] != axes[1] != axes[2]]
 FORMS = [*rotations.SIZES, *EULER]
@@ -177,3 +179,44 @@ def test_a_rest_pose_faces_the_front_on_bones_of_mean_length():
     unturned = torch.eye(3, dtype=torch.float64).expand(1, people.skeleton.joints, 3, 3)
     standing, _ = kinematics.forward(people.skeleton.parents, unturned, offsets, torch.zeros(1, 3).double())
     assert abs(people.skeleton.heading(standing)).max() < 0.2
+
+
+def test_a_set_is_given_rotations_that_make_its_positions(tmp_path):
+    people = simulate(clips=3, frames=20, seed=1)
+    assert people.clips[0].rotations is None
+    with pytest.raises(ValueError, match="no rest pose"):
+        people.skeleton.offsets
+    found = people.with_rotations()
+    assert found.with_rotations() is found
+    assert found.fingerprint() != people.fingerprint()
+    one = MotionSet([clip for clip in people if clip is people.clips[0]], people.skeleton).with_rotations()
+    for clip, body in zip([*found, *one], [found] * 3 + [one], strict=True):
+        turns = rotations.to_matrix(torch.from_numpy(clip.rotations), "quaternion").double()
+        root = torch.from_numpy(clip.positions[:, body.skeleton.root]).double()
+        again, _ = kinematics.forward(body.skeleton.parents, turns, body.skeleton.offsets, root)
+        near = 0.03 if body is found else 1e-3  # three people of three sizes on one body; one on its own
+        torch.testing.assert_close(again, torch.from_numpy(clip.positions).double(), atol=10 * near, rtol=0)
+    found.skeleton.to_json(tmp_path / "skeleton.json")
+    assert Skeleton.from_json(tmp_path / "skeleton.json") == found.skeleton
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda turns: turns[:, :-1], r"rotations \(20, 16, 4\), expected quaternions \(20, 17, 4\)"),
+        (lambda turns: 2 * turns, "no quaternions of unit length"),
+        (lambda turns: np.nan * turns, "no quaternions of unit length"),
+    ],
+)
+def test_rotations_that_are_none_are_refused(change, message):
+    people = simulate(clips=1, frames=20, seed=1).with_rotations()
+    clip = people.clips[0]
+    with pytest.raises(ValueError, match=message):
+        MotionSet([replace(clip, rotations=change(clip.rotations))], people.skeleton)
+
+
+def test_rest_poses_that_are_none_are_refused():
+    with pytest.raises(ValueError, match="has 2 numbers, expected 3 for each of 17"):
+        replace(WALKER, rest=(0.0, 1.0))
+    with pytest.raises(ValueError, match="a joint is nan m"):
+        replace(WALKER, rest=(float("nan"),) * 51)

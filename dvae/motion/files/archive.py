@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from .skeleton import is_name
+from ..skeleton import is_name
 
 LARGEST = 4 * 2**30
 """Bytes that a file may unpack to."""

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from .. import files
+from ... import files
+from ..data import Clip, MotionSet
+from ..skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, read_text
 from .archive import archive, write_arrays
-from .data import Clip, MotionSet
-from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, read_text
 
 MOST_NUMBERS = 2**23
 """In a csv file of paths, blank rows included: a hundred thousand frames of twenty joints."""
