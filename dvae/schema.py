@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 from .options import Frames, Size, check
+from .views import View
 
 
 class SchemaError(ValueError):
@@ -18,7 +19,7 @@ class Schema:
     """Sequences of numbers. What is known of other kinds of data is added by a subclass.
 
     Args:
-        sizes: dimension of every variable of the data, context included, such as {"x": 48}.
+        sizes: dimension of every variable of the data, context included, such as {"x": 48}, as models see them.
         length: T, steps of a sequence; None where they differ, or nobody knows.
         observed: O, the steps that forecasts start from; None likewise.
 
@@ -34,6 +35,11 @@ class Schema:
 
     def __post_init__(self) -> None:
         check(self)
+
+    @property
+    def view(self) -> View:
+        """What models see of the data."""
+        return View()
 
     @classmethod
     def of(cls, data: Any, who: str = "this method") -> Self:

@@ -135,7 +135,8 @@ class LatentMethod(Method):
     @override
     def build(self, data: Any) -> DynamicalVAE:
         """The model of these equations."""
-        model = DynamicalVAE(**self.described(Schema.of(data).sizes))
+        schema = Schema.of(data)
+        model = DynamicalVAE(**self.described(schema.sizes), view=schema.view)
         model.feeding = SelfFeeding(0.0, gradient=False)
         return model
 

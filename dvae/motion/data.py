@@ -10,6 +10,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -168,6 +169,10 @@ class MotionSet:
         Those that files have are kept. Elsewhere they are found by `kinematics.inverse`, for bones that have the mean
         lengths of all clips; positions stay as they are.
         """
+        return self._turned
+
+    @cached_property
+    def _turned(self) -> MotionSet:
         if self.skeleton.rest and all(clip.rotations is not None for clip in self):
             return self
         skeleton = self.skeleton

@@ -105,7 +105,8 @@ class MotionData:
     @property
     def schema(self) -> Poses:
         """What is known of the windows without the clips."""
-        return Poses.under(self.protocol, self.motion.skeleton)
+        turned = self.protocol.representation != "positions"
+        return Poses.under(self.protocol, (self.motion.with_rotations() if turned else self.motion).skeleton)
 
     def recorded(self) -> Recordings:
         """Where the clips are; `reopened` reads it."""

@@ -26,7 +26,7 @@ def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Te
     Args:
         parents: index of each joint's parent, -1 for the root.
         rotations: (..., J, 3, 3), local.
-        offsets: of a rest pose in metres, (J, 3); or (..., J, 3), where it changes.
+        offsets: of a rest pose in metres, (J, 3); or any that broadcast against (..., J, 3).
         root: place of the root (..., 3); that of the rest pose is not read.
 
     Returns:

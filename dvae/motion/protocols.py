@@ -27,11 +27,15 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from ..options import Amount, Frames, Range, check, nearest, tuples
 from ..schema import Schema
+from ..views import View
 from .data import Clip, MotionSet
+from .rotations import continuous, from_matrix, to_matrix
 from .skeleton import Skeleton, rotate_about_up
+from .views import TURNS, Rotations
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,8 @@ class Protocol:
             alike. "subject": uniform split of the archive (a subject, in Human3.6M), then clip, then start.
         heading: turn every window about the up axis so that the last observed frame has heading zero.
         rotate: turn every drawn window about the up axis by a uniform angle.
+        representation: what models see of a window: positions, or the turns of joints in one of the forms of
+            `dvae.motion.rotations`. On their other side stand positions in either case.
 
     Raises:
         ValueError: a number of frames or a stride is below 1, or heading and rotate contradict each other.
@@ -74,6 +80,7 @@ class Protocol:
     sampling: Literal["clip", "length", "subject"] = "clip"
     heading: bool = False
     rotate: bool = False
+    representation: Literal["positions", "6d", "quaternion", "vector", "matrix"] = "positions"
 
     def __post_init__(self) -> None:
         try:
@@ -148,8 +155,20 @@ class Poses(Schema):
     @classmethod
     def under(cls, protocol: Protocol, skeleton: Skeleton, length: int | None = None) -> Self:
         """The schema of windows that a protocol cuts, or of others of this length."""
-        size = 3 * (skeleton.joints - (protocol.root == "drop"))
+        view = cls._view(protocol, skeleton)
+        size = view.size if isinstance(view, Rotations) else 3 * (skeleton.joints - (protocol.root == "drop"))
         return cls({"x": size}, length or protocol.length, protocol.observed, skeleton=skeleton, protocol=protocol)
+
+    @staticmethod
+    def _view(protocol: Protocol, skeleton: Skeleton) -> View:
+        if protocol.representation == "positions":
+            return View()
+        return Rotations(skeleton, protocol.representation, protocol.root == "relative")
+
+    @property
+    @override
+    def view(self) -> View:
+        return self._view(self.protocol, self.skeleton)
 
     @property
     def frames(self) -> int:
@@ -189,6 +208,7 @@ def windows(motion: MotionSet, protocol: Protocol, split: str, length: int | Non
     if unknown:
         raise ValueError(f"no split {unknown[0]!r}: expected train, validation, test or train+validation")
     chosen = {clip.key for name in split.split("+") for clip in parts[name]}
+    motion = motion if protocol.representation == "positions" else motion.with_rotations()
     return Windows([clip for clip in motion if clip.key in chosen], motion, protocol, split, length or protocol.length)
 
 
@@ -251,6 +271,9 @@ class Windows:
             self.skeleton.heading(torch.zeros(self.skeleton.joints, 3))  # says now if the skeleton has no sides
 
         self._frames = torch.cat([torch.from_numpy(clip.positions) for clip in self.clips])
+        self._turns = None
+        if protocol.representation != "positions":
+            self._turns = torch.cat([torch.from_numpy(clip.rotations) for clip in self.clips])
         frames = torch.tensor([clip.frames for clip in self.clips])
         self._first = frames.cumsum(0) - frames
         self._classes: dict[str, Tensor] = {}  # by variable, the class of every clip
@@ -297,8 +320,8 @@ class Windows:
 
     @property
     def size(self) -> int:
-        """Numbers per frame, D."""
-        return self.schema.sizes["x"]
+        """Numbers per frame, D = 3 J, or 3 (J - 1) without the root."""
+        return 3 * len(self.joints)
 
     def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw windows with replacement, as the protocol's `sampling` says: {"x": (B, T, D)} float32.
@@ -313,7 +336,10 @@ class Windows:
             joints = x.unflatten(-1, (-1, 3))
             angle = (2 * pi * turn).float()[:, None, None]
             x = rotate_about_up(joints, angle, self.skeleton.up).flatten(-2)
-        return self._batch(x, clips, generator)
+        batch = self._batch(x, clips, generator)
+        if self._turns is not None:
+            batch[TURNS] = self._turned(clips, starts, angle if self.protocol.rotate else None)
+        return batch
 
     def all(self, stride: int | None = None) -> dict[str, Tensor]:
         """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32."""
@@ -321,7 +347,10 @@ class Windows:
         x = torch.empty(len(clips), self.length, self.size)
         for block in torch.arange(len(clips)).split(512):  # so that memory holds the windows little more than once
             x[block] = self._cut(clips[block], starts[block])
-        return self._batch(x, clips, torch.Generator().manual_seed(0))
+        batch = self._batch(x, clips, torch.Generator().manual_seed(0))
+        if self._turns is not None:
+            batch[TURNS] = self._turned(clips, starts)
+        return batch
 
     def poses(self) -> Tensor:
         """Every frame of the clips, once, as a window that starts there has it: (N, D) float32."""
@@ -438,7 +467,9 @@ class Windows:
     @property
     def fingerprint(self) -> str:
         """SHA-256 of the protocol, the skeleton, the listed windows and the data they are cut from."""
-        digest = hashlib.sha256(repr((astuple(self.protocol), self.split, self.length)).encode())
+        protocol = astuple(self.protocol)  # with its last field where that is not what it always was
+        protocol = protocol if self._turns is not None else protocol[:-1]
+        digest = hashlib.sha256(repr((protocol, self.split, self.length)).encode())
         digest.update(repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up, self.keys)).encode())
         digest.update(self._frames.numpy().astype("<f4", copy=False).tobytes())
         for variable, classes in self._classes.items():
@@ -473,3 +504,16 @@ class Windows:
         if self.protocol.heading:
             joints = rotate_about_up(joints, -heading, self.skeleton.up)
         return joints.flatten(-2)
+
+    def _turned(self, clips: Tensor, starts: Tensor, angle: Tensor | None = None) -> Tensor:
+        """Turns (B, T, 4 J) of the joints in windows, whose root turns as the windows do."""
+        frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
+        turns, root = self._turns[frames], self.skeleton.root  # type: ignore[index]
+        if self.protocol.heading:
+            now = self._frames[frames[:, self.protocol.observed - 1]]
+            angle = -self.skeleton.heading(now)
+        if angle is not None:
+            axes = rotate_about_up(torch.eye(3).expand(len(frames), 3, 3), angle.reshape(-1, 1), self.skeleton.up).mT
+            world = to_matrix(turns[:, :, root], "quaternion")
+            turns[:, :, root] = continuous(from_matrix(axes[:, None] @ world, "quaternion"), dim=1)
+        return turns.flatten(-2)

@@ -1,4 +1,4 @@
-"""Views of motion: people who face one way."""
+"""Views of motion: people who face one way, and the turns of their joints in place of positions."""
 
 from __future__ import annotations
 
@@ -11,10 +11,16 @@ from typing_extensions import override
 
 from ..data import Batch
 from ..views import WHOLE, View
+from . import kinematics
+from .rotations import from_matrix, size, to_matrix
 from .skeleton import Skeleton, rotate_about_up
 
 HEADING = "heading"
 """Name in batches of the angles (B,) by which windows were turned, in radians."""
+BONES = "bones"
+"""Name in batches of the lengths (B, J - 1) of their bones, in metres, in the order of the skeleton's edges."""
+TURNS = "turns"
+"""Name in batches of the turns (B, T, 4 J) of all joints, quaternions w x y z one after the other."""
 
 
 @dataclass(frozen=True)
@@ -116,3 +122,93 @@ class Heading(View):
                     f"window {window} lacks {skeleton.names[telling[joint]]} in the pose by which this model turns it: "
                     "hips and shoulders tell a heading; leave the window out, or fit with heading=False"
                 )
+
+
+@dataclass(frozen=True)
+class Rotations(View):
+    """Turns of joints in place of positions, and bones that keep their lengths.
+
+    x is positions (B, T, D) in metres on either side of a model; what the model sees is first the root's place, where
+    x has it, then the turn of every joint from which others hang, in `form`. The turns are those that come with the
+    data; of data without, as of the past of a forecast, they are found (`kinematics.inverse`). Bones have the lengths
+    that they have in the data, on average, or in the rest pose, where there are none.
+
+    Densities are of these numbers, not of positions, which have other volumes and one dimension for each bone more:
+    bounds compare with those of models that see the same.
+
+    Args:
+        skeleton: with a rest pose.
+        form: of the turns, such as "6d"; see `dvae.motion.rotations`.
+        root: whether x has the root, D = 3 J; otherwise it is the origin, and D = 3 (J - 1).
+
+    Raises:
+        ValueError: an unknown form, or a skeleton without rest pose.
+    """
+
+    skeleton: Skeleton
+    form: str = "6d"
+    root: bool = False
+    names = (TURNS, BONES)
+
+    def __post_init__(self) -> None:
+        size(self.form)
+        assert len(self.skeleton.offsets)  # which says what to do where there are none
+
+    @property
+    def turning(self) -> list[int]:
+        """The joints from which others hang; the turns of all others cannot be seen."""
+        return sorted({parent for parent, _ in self.skeleton.edges})
+
+    @property
+    def size(self) -> int:
+        """Numbers of a frame that the model sees."""
+        return 3 * self.root + size(self.form) * len(self.turning)
+
+    @override
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        seen = dict(data)
+        turns = seen.pop(TURNS, None)
+        if WHOLE not in data or BONES in data:
+            return seen
+        x, skeleton = data[WHOLE], self.skeleton
+        if x.shape[-1] != 3 * (skeleton.joints - (not self.root)):
+            raise ValueError(
+                f"x has shape {tuple(x.shape)}; positions of the skeleton {skeleton.name!r} have "
+                f"{3 * (skeleton.joints - (not self.root))} numbers"
+            )
+        if WHOLE in data.get("mask", {}):
+            raise ValueError(
+                "a joint that is missing leaves the turns of others open; fit under a protocol whose representation is "
+                "positions, which may be masked"
+            )
+        positions = skeleton.with_root(x.unflatten(-1, (-1, 3)))
+        if turns is None:
+            found = kinematics.inverse(skeleton, positions, skeleton.offsets.to(x))[..., self.turning, :, :]
+        else:
+            turns = turns[:, : x.shape[1]].unflatten(-1, (-1, 4))  # of a past, no more than that
+            found = to_matrix(turns[..., self.turning, :], "quaternion").to(x)
+        place = [positions[..., skeleton.root, :]] if self.root else []
+        seen[WHOLE] = torch.cat([*place, from_matrix(found, self.form).flatten(-2)], -1)
+        seen[BONES] = (beside or {}).get(BONES, skeleton.bone_lengths(positions).mean(-2))
+        return seen
+
+    @override
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        data = dict(seen)
+        bones = data.pop(BONES, None)
+        if WHOLE not in seen:
+            return data
+        x, skeleton = seen[WHOLE], self.skeleton
+        offsets = skeleton.offsets.to(x)
+        if bones is not None:
+            children = [child for _, child in skeleton.edges]
+            lengths = bones.new_zeros(*bones.shape[:-1], skeleton.joints)
+            lengths[..., children] = bones
+            offsets = lengths[..., None, :, None] * torch.nn.functional.normalize(offsets, dim=-1)  # (B, 1, J, 3)
+        place = x[..., :3] if self.root else torch.zeros_like(x[..., :3])
+        turns = torch.eye(3).to(x).repeat(*x.shape[:-1], skeleton.joints, 1, 1)
+        turns[..., self.turning, :, :] = to_matrix(
+            x[..., 3 * self.root :].unflatten(-1, (len(self.turning), -1)), self.form
+        )
+        positions, _ = kinematics.forward(skeleton.parents, turns, offsets, place)
+        return {**data, WHOLE: (positions if self.root else skeleton.without_root(positions)).flatten(-2)}
