@@ -96,7 +96,7 @@ class TrajectoryMethod(PoseMethod):
                     f"sizes missing for {WHOLE}, 3 J of a pose; given are {', '.join(schema.sizes) or 'none'}"
                 )
             return self.filled(self.presets[HUMAN36M.name])._built(DynamicalVAE, schema.sizes[WHOLE])
-        protocol = schema.protocol
+        protocol = Poses.of(schema, self.name).protocol
         if (protocol.root, protocol.observed) != NEEDED:
             raise ValueError(
                 f"{self.name} moves a body through space from one pose on, but the protocol {protocol.name} has "

@@ -30,7 +30,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from ..options import Amount, Frames, Range, check, nearest, tuples
-from ..schema import Schema
+from ..schema import Schema, SchemaError
 from ..views import View
 from .data import Clip, MotionSet
 from .rotations import continuous, from_matrix, to_matrix
@@ -80,7 +80,7 @@ class Protocol:
     sampling: Literal["clip", "length", "subject"] = "clip"
     heading: bool = False
     rotate: bool = False
-    representation: Literal["positions", "6d", "quaternion", "vector", "matrix"] = "positions"
+    representation: Literal["positions", "6d", "quaternion", "vector"] = "positions"
 
     def __post_init__(self) -> None:
         try:
@@ -158,6 +158,22 @@ class Poses(Schema):
         view = cls._view(protocol, skeleton)
         size = view.size if isinstance(view, Rotations) else 3 * (skeleton.joints - (protocol.root == "drop"))
         return cls({"x": size}, length or protocol.length, protocol.observed, skeleton=skeleton, protocol=protocol)
+
+    @classmethod
+    @override
+    def of(cls, data: Any, who: str = "this method") -> Self:
+        """The schema of poses whose positions a model sees.
+
+        Raises:
+            SchemaError: nothing of which that is known, or turns of joints.
+        """
+        found = super().of(data, who)
+        if found.protocol.representation != "positions":
+            raise SchemaError(
+                f"{who} reads positions of joints, and under this protocol models see their turns as "
+                f"{found.protocol.representation}; choose one whose representation is positions"
+            )
+        return found
 
     @staticmethod
     def _view(protocol: Protocol, skeleton: Skeleton) -> View:

@@ -138,7 +138,8 @@ class Rotations(View):
 
     Args:
         skeleton: with a rest pose.
-        form: of the turns, such as "6d"; see `dvae.motion.rotations`.
+        form: of the turns: "6d", "quaternion" or "vector", of which any numbers are turns; see
+            `dvae.motion.rotations`.
         root: whether x has the root, D = 3 J; otherwise it is the origin, and D = 3 (J - 1).
 
     Raises:

@@ -1,0 +1,135 @@
+"""What models see of motion: turns of joints in place of positions, and back on bones that keep their lengths."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import dvae
+from dvae import motion
+from dvae.data import leaves
+from dvae.motion import kinematics, rotations
+from dvae.motion.views import BONES, TURNS, Rotations
+from dvae.schema import SchemaError
+
+FORMS = ["6d", "quaternion", "vector"]
+
+PROTOCOL = replace(motion.PROTOCOLS["simulated"], observed=5, predicted=7)
+
+
+@pytest.fixture(scope="module")
+def people_of_two_sizes():
+    return motion.simulate(clips=12, frames=30, seed=4)
+
+
+def windows(people, **options):
+    return motion.windows(people, replace(PROTOCOL, **options), "train")
+
+
+def small(data, method="vae"):
+    return dvae.method(method, latent=2).build(data)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("root", ["drop", "relative"])
+def test_what_is_seen_goes_back(people_of_two_sizes, form, root):
+    data = windows(people_of_two_sizes, representation=form, root=root)
+    batch = data.sample(6, torch.Generator().manual_seed(0))
+    model = small(data).double()
+    for given in (batch, {"x": batch["x"]}):  # turns that come with the data, and turns that are found
+        seen = model.read(given)
+        assert seen["x"].shape == (6, 12, model.sizes["x"])
+        assert model.read(seen) == seen  # once
+        again = model.shown({"x": seen["x"]}, seen)["x"]
+        torch.testing.assert_close(again, batch["x"].double(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("options", [{}, {"heading": True}, {"rotate": True}, {"rotate": True, "root": "relative"}])
+def test_turns_of_windows_are_those_of_their_positions(people_of_two_sizes, options):
+    data = windows(people_of_two_sizes, representation="6d", **options)
+    for batch in (data.sample(6, torch.Generator().manual_seed(0)), data.all()):
+        positions = data.positions(batch["x"]).double()
+        body = data.skeleton
+        turns = rotations.to_matrix(batch[TURNS].double().unflatten(-1, (-1, 4)), "quaternion")
+        offsets = torch.zeros(len(positions), 1, body.joints, 3, dtype=torch.float64)
+        children = [child for _, child in body.edges]
+        directions = torch.nn.functional.normalize(body.offsets, dim=-1)[children]
+        offsets[:, 0, children] = body.bone_lengths(positions).mean(1)[..., None] * directions
+        again, _ = kinematics.forward(body.parents, turns, offsets, positions[:, :, body.root])
+        torch.testing.assert_close(again, positions, atol=1e-5, rtol=0)
+        assert (leaves(batch)[TURNS][:, 1:] * batch[TURNS][:, :-1]).unflatten(-1, (-1, 4)).sum(-1).min() > 0.5
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("method", ["vae", "srnn", "hit-dvae"])
+def test_forecasts_keep_the_bones_of_the_past(people_of_two_sizes, method, form):
+    data = windows(people_of_two_sizes, representation=form, root="relative")
+    if method == "hit-dvae":
+        with pytest.raises(SchemaError, match=f"hit-dvae reads positions of joints, .* as {form}"):
+            small(data, method)
+        return
+    past = data.all()["x"][:, :5]
+    futures = small(data, method).forecast({"x": past}, horizon=9, samples=3)["x"]
+    assert futures.shape == (3, len(past), 9, data.size)
+    lengths = data.skeleton.bone_lengths(data.positions(past)).mean(1)
+    found = data.skeleton.bone_lengths(data.positions(futures))
+    torch.testing.assert_close(found, lengths[None, :, None].expand_as(found), atol=1e-5, rtol=0)
+
+
+def test_without_data_bones_are_those_of_the_rest_pose(people_of_two_sizes):
+    data = windows(people_of_two_sizes, representation="6d")
+    drawn = small(data).sample(4, 12)["x"]
+    found = data.skeleton.bone_lengths(data.positions(drawn))
+    children = [child for _, child in data.skeleton.edges]
+    rest = data.skeleton.offsets[children].norm(dim=-1).float()
+    torch.testing.assert_close(found, rest.expand_as(found), atol=1e-5, rtol=0)
+
+
+def test_the_past_does_not_see_turns_of_its_future(people_of_two_sizes):
+    data = windows(people_of_two_sizes, representation="6d")
+    model, batch = small(data), data.all()
+    changed = batch[TURNS].clone()
+    changed[:, 5:] = torch.randn_like(changed[:, 5:])
+    torch.manual_seed(0)
+    first = model.forecast({"x": batch["x"][:, :5], TURNS: batch[TURNS]}, horizon=4)["x"]
+    torch.manual_seed(0)
+    torch.testing.assert_close(model.forecast({"x": batch["x"][:, :5], TURNS: changed}, horizon=4)["x"], first)
+
+
+def test_a_model_of_turns_is_fitted_and_scored_in_metres(people_of_two_sizes):
+    protocol = replace(PROTOCOL, representation="6d")
+    train, test = (motion.windows(people_of_two_sizes, protocol, split) for split in ("train", "test"))
+    method = dvae.method("vae", latent=2, warm_up=2)
+    model = method.build(train)
+    result = method.train(train, None, steps=3).fit(model, batch_size=2, log_every=1, progress=False)
+    assert all(np.isfinite(row["loss"]) for row in result.history if "loss" in row)
+    table = dvae.evaluate(model, test, scores=motion.scores, samples=3, training_windows=train, progress=False)
+    positions = motion.windows(people_of_two_sizes, PROTOCOL, "test")
+    plain = dvae.evaluate(small(positions), positions, scores=motion.scores, samples=3, progress=False)
+    assert table["zero velocity"]["ADE"].mean == pytest.approx(plain["zero velocity"]["ADE"].mean)  # in the same metres
+    assert table["model"]["bone-length error"].mean < 0.02  # of the simulator's own, which breathe
+
+
+def test_a_run_of_turns_is_kept_with_its_rest_pose(people_of_two_sizes, tmp_path):
+    motion.save(tmp_path / "people.npz", people_of_two_sizes)
+    data = motion.MotionData.open(tmp_path / "people.npz", replace(PROTOCOL, representation="6d"))
+    training = dvae.Training(steps=2, batch_size=2, progress=False)
+    dvae.runs.directory.fit_run(dvae.method("vae", latent=2, warm_up=1), data, tmp_path / "run", training)
+    loaded = dvae.load(tmp_path / "run")
+    view = loaded.model.view
+    assert isinstance(view, Rotations)
+    assert view.skeleton == data.schema.skeleton
+    assert loaded.data.protocol.representation == "6d"
+
+
+def test_what_has_no_turns_is_refused(people_of_two_sizes):
+    data = windows(people_of_two_sizes, representation="6d")
+    model, batch = small(data), data.all()
+    with pytest.raises(ValueError, match="positions, which may be masked"):
+        model.read({"x": batch["x"], "mask": torch.ones_like(batch["x"], dtype=torch.bool)})
+    with pytest.raises(ValueError, match="have 48 numbers"):
+        model.read({"x": batch["x"][..., :-3]})
+    with pytest.raises(ValueError, match="no rest pose"):
+        Rotations(motion.WALKER)
+    assert BONES in model.read(batch)
