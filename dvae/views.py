@@ -5,7 +5,8 @@ data goes back through it where it is handed out (`DynamicalVAE.shown`): between
 sees it. Views of one kind of data are with that data, as `dvae.motion.Heading` is.
 
 Densities and bounds are of the data as they are given: where a view changes volume, its log-determinant is added to
-what a model says of what it sees. All views here keep volume.
+what a model says of what it sees. All views here keep volume. A view that is of other dimension than the data says what
+densities are of (`View.measured`).
 
 >>> view = dvae.views.Parts({"legs": [0, 2], "arms": [1]})
 >>> {name: value.tolist() for name, value in view({"x": torch.tensor([[[1.0, 2.0, 3.0]]])}).items()}
@@ -45,6 +46,8 @@ class View:
     """Data variables that are coordinates of x, in place of it."""
     history: str | None = None
     """Name of the context that is the data themselves."""
+    measured: str = ""
+    """What densities are of, where it is not the data as they are given; bounds of other things do not compare."""
 
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
         """Refuses a model that cannot have this view.
@@ -121,6 +124,7 @@ class Views(View):
         self.names = tuple(name for view in views for name in view.names)
         self.parts = next((view.parts for view in views if view.parts), None)
         self.history = next((view.history for view in views if view.history), None)
+        self.measured = ", ".join(view.measured for view in views if view.measured)
         firsts = [place for place, view in enumerate(views) if isinstance(view, FirstFrame)]
         if not all(view.keeps_volume for view in views[: max(firsts, default=0)]):
             raise ValueError(f"{self} changes the volume of a frame that nothing scores; let FirstFrame be the first")

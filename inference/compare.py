@@ -111,6 +111,14 @@ def compare(
         )
     contenders = _contenders(models)
     labelled = {label: model for label, _, model in _each(contenders)}
+    of: dict[str, str] = {}
+    for label, model in labelled.items():
+        of.setdefault(model.view.measured or "the data", label)
+    if len(of) > 1:
+        raise ValueError(
+            "bounds compare where they are densities of the same, but here are "
+            f"{' and '.join(f'those of {label}, of {what}' for what, label in of.items())}; evaluate compares forecasts"
+        )
     windows = data if isinstance(data, HeldOutWindows) else None
     batch = sequences(data).batch
     keys = list(windows.keys) if windows is not None else [("data", str(n), 0) for n in range(length_of(batch))]

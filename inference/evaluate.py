@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from ..data import HeldOutWindows
+from ..program.model import DynamicalVAE
 from ..program.protocols import Forecasting
 from ..turns import alone
 from .bounds import SequenceELBO, importance_bound
@@ -134,7 +135,14 @@ def evaluate(
         seed=seed,
         log_score_particles=log_score_particles,
         basis={name: value for measure in measures for name, value in measure.basis.items()},
-        notes=list(dict.fromkeys(measure.note for measure in measures if measure.note)),
+        notes=[
+            *dict.fromkeys(measure.note for measure in measures if measure.note),
+            *(
+                f"bounds of {name}: densities of {each.view.measured}"
+                for name, each in models.items()
+                if isinstance(each, DynamicalVAE) and each.likelihood and each.view.measured
+            ),
+        ],
         options=dict(options or {}),
     )
 

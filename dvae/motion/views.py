@@ -156,6 +156,11 @@ class Rotations(View):
         assert len(self.skeleton.offsets)  # which says what to do where there are none
 
     @property
+    def measured(self) -> str:  # type: ignore[override]
+        """What densities are of."""
+        return f"turns of joints ({self.form})"
+
+    @property
     def turning(self) -> list[int]:
         """The joints from which others hang; the turns of all others cannot be seen."""
         return sorted({parent for parent, _ in self.skeleton.edges})

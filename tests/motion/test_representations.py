@@ -133,3 +133,15 @@ def test_what_has_no_turns_is_refused(people_of_two_sizes):
     with pytest.raises(ValueError, match="no rest pose"):
         Rotations(motion.WALKER)
     assert BONES in model.read(batch)
+
+
+def test_bounds_of_turns_do_not_compare_with_those_of_positions(people_of_two_sizes):
+    turns, positions = windows(people_of_two_sizes, representation="6d"), windows(people_of_two_sizes)
+    models = {"turns": small(turns), "positions": small(positions)}
+    with pytest.raises(
+        ValueError, match=r"those of turns, of turns of joints \(6d\) and those of positions, of the data"
+    ):
+        dvae.compare(models, positions, particles=2, samples=0, progress=False)
+    table = dvae.evaluate(models, positions, samples=2, references=False, progress=False)
+    assert any("bounds of turns: densities of turns of joints (6d)" in note for note in table.notes)
+    assert not any("bounds of positions" in note for note in table.notes)
