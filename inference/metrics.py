@@ -4,8 +4,9 @@ The motion errors follow the evaluation code of DLow (Yuan and Kitani 2020, arXi
 Liu and Salzmann 2021, arXiv:2108.08422); the median versions are those of HiT-DVAE (Bie et al. 2022,
 arXiv:2204.01565). They reward the best (or the median) of K samples and are not proper: a forecaster gains by
 spreading its samples. The energy score (Gneiting and Raftery 2007, section 4.3), the variogram score
-(Scheuerer and Hamill 2015) and the CRPS stand beside them. The Fréchet distance compares two sets of motions by
-features of them, and has shapes of its own.
+(Scheuerer and Hamill 2015) and the CRPS stand beside them; and what asks for as much diversity and motion as there
+really is, the APDE and CMD of BeLFusion (Barquero, Escalera and Palmero 2023, arXiv:2211.14304). The Fréchet distance
+compares two sets of motions by features of them, and has shapes of its own.
 
 Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`,
 or `(..., M, T, D)` where M futures are admissible; the result has the leading shape `(...)`. Torch tensors
@@ -93,6 +94,50 @@ def median_multimodal_average_displacement_error(samples: Array, truths: Array) 
 def median_multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
     """MMFDEm: the FDEm to each of M admissible futures, averaged over them. Shapes as in MMADE."""
     return _per_window(lambda x, y: _median(_cross(x[:, -1:], y[:, -1:])).mean(), *_multimodal(samples, truths))
+
+
+def average_pairwise_distance_error(samples: Array, truths: Array) -> Tensor:
+    """APDE: |APD of the samples - APD of the M admissible futures| (BeLFusion).
+
+    Where the true future alone is admissible there is no diversity to compare with; paper and public code leave such
+    windows out of the mean, and the value is NaN.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truths: `(..., M, T, D)`, as for MMADE.
+
+    Returns:
+        `(...)`, in the unit of the data; NaN for M = 1.
+    """
+
+    def score(x: Tensor, y: Tensor) -> Tensor:
+        return (_pairwise(x) - _pairwise(y)).abs() if len(y) > 1 else x.new_tensor(torch.nan)
+
+    return _per_window(score, *_multimodal(samples, truths))
+
+
+def cumulative_motion_distance(motion: Array, real: Array) -> Tensor:
+    """CMD, the area between cumulative motion as forecast and at its real pace: sum_{t=1}^{T-1} (T - t) |M_t - M|.
+
+    M_t is what joints move by from frame t to t + 1 of the T predicted ones, the mean over joints, samples and windows,
+    and M the mean of true motion over frames too. It is sum_i sum_{t<=i} |M_t - M| (BeLFusion): what goes wrong early
+    counts in all later frames. True motion itself, which has no steady pace, is not at 0.
+
+    Args:
+        motion: `(..., T - 1)`, M_1 to M_{T-1}.
+        real: `(...)`, M.
+
+    Returns:
+        `(...)`, in the unit of the data.
+    """
+    motion, real = torch.as_tensor(motion), torch.as_tensor(real)
+    if motion.ndim != real.ndim + 1 or motion.shape[:-1] != real.shape or not motion.numel():
+        raise ValueError(
+            "motion (..., T - 1), T at least 2, needs a pace (...) of true motion, not "
+            f"{_shape(motion)} and {_shape(real)}"
+        )
+    frames = torch.arange(motion.shape[-1], 0, -1, device=motion.device)
+    return (frames * (motion - real[..., None]).abs()).sum(-1)
 
 
 def energy_score(samples: Array, truth: Array) -> Tensor:
@@ -231,10 +276,7 @@ def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tens
 def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tuple[float, ...]:
     """The Fréchet distance between features of true and generated windows, as a jackknife pseudo-value of each clip.
 
-    d + (1/w - 1) (d - d'), d' the distance without the clip and w the clip's share of the windows (Busing, Meijer and
-    van der Leeden 1999), moved by one constant so that their mean over windows is the distance as it is defined: the
-    mean of plain pseudo-values is one that is corrected for bias. Of a mean over windows, pseudo-values are the means
-    of the clips, so that the errors of both kinds of scores come from these alike.
+    See `_pseudo_values`.
 
     Args:
         real: `(N, F)`, of the true futures.
@@ -244,10 +286,47 @@ def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tu
     centre = real.mean(0)  # far from 0, second moments would cancel
     sets = _moments_without_clips(real[:, None] - centre, places), _moments_without_clips(generated - centre, places)
     distance = gaussian_frechet_distance(*sets[0], *sets[1])
+    return _pseudo_values(distance[0], distance[1:], places)
+
+
+def motion_pseudo_values(motion: Tensor, real: Tensor, classes: Tensor, places: Tensor) -> tuple[float, ...]:
+    """The CMD of a set of windows, as a jackknife pseudo-value of each clip (see `_pseudo_values`).
+
+    It is computed for each class of motion, and averaged with the classes' shares of the windows.
+
+    Args:
+        motion: `(N, T - 1)`, what joints move by in the forecasts of each window.
+        real: `(N,)`, and in its true future, over all frames.
+        classes: `(N,)`, whole numbers.
+        places: `(N,)`, the clip of every window, from 0 to C - 1.
+    """
+
+    def distance(kept: Tensor) -> Tensor:
+        groups = [kept & (classes == number) for number in classes[kept].unique()]
+        found = [rows.sum() * cumulative_motion_distance(motion[rows].mean(0), real[rows].mean()) for rows in groups]
+        return torch.stack(found).sum() / kept.sum()
+
+    clips = range(int(places.max()) + 1)
+    without = [distance(places != clip) for clip in clips] if len(clips) > 1 else []
+    return _pseudo_values(distance(places >= 0), torch.stack(without) if without else places.new_empty(0), places)
+
+
+def _pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> tuple[float, ...]:
+    """A distance of a whole set of windows as a jackknife pseudo-value of each clip.
+
+    d + (1/w - 1) (d - d'), d' the distance without the clip and w the clip's share of the windows (Busing, Meijer and
+    van der Leeden 1999), moved by one constant so that their mean over windows is the distance as it is defined: the
+    mean of plain pseudo-values is one that is corrected for bias. Of a mean over windows, pseudo-values are the means
+    of the clips, so that the errors of both kinds of scores come from these alike.
+
+    Args:
+        whole: d.
+        without: `(C,)`, d' of each of C > 1 clips.
+        places: `(N,)`, the clip of every window.
+    """
     shares = places.bincount().double() / len(places)
-    without = distance[1:] if len(shares) > 1 else distance
-    pseudo = distance[0] + (1 / shares - 1) * (distance[0] - without)
-    return tuple((pseudo - (shares * pseudo).sum() + distance[0]).tolist())
+    pseudo = whole + (1 / shares - 1) * (whole - (without if len(shares) > 1 else whole))
+    return tuple((pseudo - (shares * pseudo).sum() + whole).tolist())
 
 
 def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:

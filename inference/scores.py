@@ -58,6 +58,20 @@ def clip_means(values: Tensor, clips: Tensor) -> Sequence[float]:
     return (np.bincount(places, weights=values.double().numpy()) / np.bincount(places)).tolist()
 
 
+def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[float]:
+    """Of scores that are NaN of windows that do not count: the mean over windows is that over those that do.
+
+    R + N / M (s_c - R m_c) / n_c for each clip, s_c the sum over those m_c of its n_c windows that count, M of all N,
+    and R the mean over these M: a ratio of sums, linearised, so that errors are those of a ratio (Cochran 1977).
+    """
+    places, known = clips.numpy(), ~values.isnan().numpy()
+    windows, counted = np.bincount(places), np.bincount(places, weights=known)
+    sums = np.bincount(places, weights=values.nan_to_num().double().numpy())
+    ratio = sums.sum() / counted.sum()
+    found: list[float] = (ratio + (sums - ratio * counted) / windows * (len(places) / counted.sum())).tolist()
+    return found
+
+
 @dataclass(frozen=True)
 class Measure:
     """A score of free-running forecasts.

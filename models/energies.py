@@ -4,7 +4,8 @@ Several samples of a window are drawn together. The energies say that the best o
 best is near each pseudo ground truth, that the samples of a body part differ, that they keep the limbs' lengths, stay
 within the joints' angles, and look like poses to a prior. Source: GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422).
 
-Ours: a model may see every window turned so that the last observed pose faces one way, which helps on small sets.
+Ours: a model may see every window turned so that the last observed pose faces one way, which helps on small sets; and
+it may see and make directions of bones, whose lengths then stay. The energies are of positions in either case.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ import torch
 from torch import Tensor
 
 from ..data import Source
-from ..motion import Heading, Skeleton, Windows, energies
+from ..motion import Bones, Heading, Skeleton, Windows, energies
 from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
 from ..motion.judges.pose_prior import PosePriorModel, fit_pose_prior, load_pose_prior
 from ..motion.protocols import Poses
 from ..motion.truths import PseudoTruths, WithPseudoTruths
+from ..motion.views import LENGTHS
 from ..options import Amount, Count, Positive, Range, Size
 from ..program.model import DynamicalVAE
 from ..views import WHOLE, View, Views
@@ -46,6 +48,8 @@ class EnergyMethod(PoseMethod):
         pseudo_minimum: metres, mean over joints, that such a future keeps from the true one.
         pseudo_most: largest number of them for a window.
         pool_stride: frames between the windows that they are taken from.
+        bones: see and make the directions of bones, whose lengths are those that the observed frames have: no future of
+            this method stretches a bone. There is no density then and no bound, and windows have to be complete.
         heading: turn every window so that its last observed pose faces one way, and the futures back. Whatever reads
             the frames before then knows of that one, and bounds are those of turned windows, whose heading nothing
             scores: they compare with those of models that turn them too, and with no others.
@@ -66,6 +70,7 @@ class EnergyMethod(PoseMethod):
     pseudo_minimum: Amount | None = None
     pseudo_most: Size = 10
     pool_stride: Count | None = None
+    bones: bool = False
     heading: bool | None = None
 
     def poses(self, data: Any) -> Poses:
@@ -126,10 +131,11 @@ class EnergyModel(DynamicalVAE):
     angle_high: Tensor
 
     def __init__(self, method: Any, skeleton: Skeleton, observed: int, views: Sequence[View] = (), **options: Any):
-        turned = (WHOLE, *(name for view in views for name in view.parts or ()))
-        heading = Heading(skeleton, observed, turned=turned) if method.heading else None
-        super().__init__(view=Views(*([heading] if heading else []), *views), **options)
-        self.method, self.skeleton, self.frames, self.heading = method, skeleton, observed, heading
+        pieces = {name: places for view in views for name, places in (view.parts or {}).items()}
+        heading = Heading(skeleton, observed, turned=(WHOLE, *pieces)) if method.heading else None
+        bones = Bones(skeleton, observed, pieces) if method.bones else None
+        super().__init__(view=Views(*(view for view in (heading, bones) if view), *views), **options)
+        self.method, self.skeleton, self.frames, self.heading, self.bones = method, skeleton, observed, heading, bones
         self.limits: tuple[str, ...] | None = None
         if method.angles:
             self.limits = angle_names(skeleton)
@@ -141,7 +147,7 @@ class EnergyModel(DynamicalVAE):
         """The energies of the best sample, (B,) each; those of weight 0 are left out.
 
         Args:
-            samples: (S, B, T, D), as the networks see motion.
+            samples: (S, B, T, D), positions that are turned as the networks see motion.
             truth: (B, T, D), likewise.
             batch: with "pseudo" and "valid", where there are further futures.
             frames: those that count.
@@ -177,5 +183,10 @@ class EnergyModel(DynamicalVAE):
         return found
 
     def turned(self, x: Tensor) -> Tensor:
-        """Windows (..., T, D) as the networks see them."""
+        """Windows (..., T, D) turned as the networks see them."""
         return x if self.heading is None else self.heading.face(x)
+
+    def positions(self, values: Mapping[str, Tensor], data: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Positions (..., B, T, D), turned, from x or all its parts as the networks see them."""
+        lengths = {LENGTHS: data[LENGTHS]} if self.bones else {}
+        return self.view.inverse({**values, **lengths})

@@ -36,7 +36,7 @@ from typing_extensions import override
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
 from ..inference.training import Stage
-from ..laws import Delta
+from ..laws import Delta, Directions
 from ..motion import Skeleton, Windows, energies
 from ..motion.body import body_parts
 from ..networks import GraphConv
@@ -195,7 +195,7 @@ class GSPSModel(EnergyModel):
             inference=None,
             sizes={HISTORY: 3 * count, **dict.fromkeys(codes, method.latent), **{n: len(p) for n, p in parts.items()}},
             network={f"p({name})": GraphConv(everything, name, length, *shape) for name in parts},
-            laws={f"p({name})": Delta() for name in parts},
+            laws={f"p({name})": Directions(project=False) if method.bones else Delta() for name in parts},
         )
         self.length = length
         self.draws = dict(zip(codes, _each(method.draws, method.parts), strict=True))
@@ -222,7 +222,10 @@ class GSPSModel(EnergyModel):
             return {}
         if "mask" in data:
             raise ValueError("the energies are of whole windows; leave 'mask' out of the batch")
-        return self.energies(self.shown(rollout.values), data[HISTORY], data)
+        truth = self.positions({WHOLE: data[HISTORY]}, data)[WHOLE]
+        parts = {name: rollout.values[name].unflatten(0, (-1, len(truth))) for name in self.observed}
+        values = {name: value.flatten(0, 1) for name, value in self.positions(parts, data).items()}
+        return self.energies(values, truth, data)
 
     def energies(self, values: Mapping[str, Tensor], truth: Tensor, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The energies of futures that were drawn together, (B,) each; those of weight 0 are left out.

@@ -47,6 +47,7 @@ from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
 from ..inference.schedules import Ramp, Schedule
 from ..inference.training import Stage
+from ..laws import Directions
 from ..motion import Skeleton, energies
 from ..motion.body import body_parts
 from ..motion.protocols import Poses
@@ -87,7 +88,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
     """See the file. With loss="evidence" the energies do not apply.
 
     Args:
-        emission: as everywhere, but with loss="best-of-many" the "normal" and "student" do not apply.
+        emission: as everywhere, but with loss="best-of-many" the "normal" and "student" do not apply, and with `bones`
+            none does: x is a point.
         loss: "best-of-many" (the paper's) or "evidence" (the plain bound).
         samples: K, motions that are drawn for a window in training; with loss="evidence" there is one.
         kl_local: weight of the KL of z.
@@ -151,7 +153,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             raise ValueError(
                 f"emission={self.emission!r} needs loss='evidence'; with best-of-many it is 'fixed' or 'unit'"
             )
-        own = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run")
+        own = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run", "bones")
         if self.loss == "evidence" and (given := [name for name in own if getattr(self, name)]):
             raise ValueError(f"loss='evidence' has no {', '.join(given)}; these are of loss='best-of-many'")
         for name in ("diversity", "diversity_scale"):
@@ -203,13 +205,15 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         """
         schema = Schema.of(data)
         method, observed = self, self.frames or FRAMES
-        if isinstance(schema, Poses):
+        if self.bones or isinstance(schema, Poses):
+            schema = Poses.of(schema, self.name)
             method, observed = self.suited(schema), schema.protocol.observed
         described = method.described(schema.sizes)
         if isinstance(schema, Poses) and (method.loss == "best-of-many" or method.heading):
             self.poses(schema)
             if method.loss == "best-of-many":
-                described["laws"]["p(x)"] = replace(described["laws"]["p(x)"], fitted="scale")
+                fitted = replace(described["laws"]["p(x)"], fitted="scale")
+                described["laws"]["p(x)"] = Directions(residual=method.residual) if method.bones else fitted
             model: DynamicalVAE = HiTModel(method, schema.skeleton, observed, **described)
         else:
             model = DynamicalVAE(**described)
@@ -259,7 +263,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             super().start(model, windows)
         if self.standardise:
             model.units[WHOLE].fit(model.read(windows.sample(1024, torch.default_generator))[WHOLE])
-            if self.emission == "fixed":
+            if self.emission == "fixed" and not self.bones:
                 nn.init.zeros_(model.generator[WHOLE].law.log_scale)
 
     @override
@@ -312,9 +316,9 @@ class HiTModel(EnergyModel):
                 "loss='evidence'"
             )
         size = rollout.batch // rollout.draws
-        x = rollout.values[WHOLE]
-        truth, everything = x[:size], slice(None)
-        motions = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size))  # (K, B, T, D)
+        x, everything = rollout.values[WHOLE], slice(None)
+        made = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size))
+        truth, motions = (self.positions({WHOLE: each}, data)[WHOLE] for each in (x[:size], made))
         means = self.realism(motions, truth[:, 0], everything)
         method = self.method
         for part, weight, scale in zip(PARTS, method.diversity, method.diversity_scale, strict=True):

@@ -9,7 +9,7 @@ from dvae import motion
 from dvae.data import ArrayWindows
 from dvae.inference.predictive import predictive_bound
 from dvae.models.trajectories import Rest
-from dvae.motion import HUMANEVA, WALKER, Heading, rotate_about_up
+from dvae.motion import HUMANEVA, WALKER, Bones, Heading, rotate_about_up
 from dvae.networks import Recurrent
 from dvae.units import Units
 from dvae.views import LOG_DET, FirstFrame, History, Parts, View, Views
@@ -196,6 +196,108 @@ def test_windows_of_the_simulator_face_one_way():
     x = Heading(windows.skeleton, 15).face(windows.all()["x"])
     poses = windows.positions(x)[:, 14]
     assert windows.skeleton.heading(poses).abs().max() < 1e-5
+
+
+# ------------------------------------------------------------------------------------------------- bones
+
+BONES = {
+    "no root": (Bones(WALKER, 4), D),
+    "a root": (Bones(WALKER, 4), 3 * J),
+    "pieces": (Views(Bones(WALKER, 4, {"legs": LEGS, "arms": ARMS}), Parts({"legs": LEGS, "arms": ARMS})), D),
+    "turned": (Views(Heading(WALKER, 4, turned=TURNED), Bones(WALKER, 4)), D),
+}
+
+
+def rigid(frames, size, skeleton=WALKER):
+    """Poses (B, T, D) of people whose bones have a length each, joint by joint from the root."""
+    x, lengths = people(B, frames, skeleton.joints, 3), torch.rand(B, 1, skeleton.joints, 1, dtype=torch.float64) + 0.1
+    for joint in skeleton.order[1:]:
+        way = x[:, :, joint] / x[:, :, joint].norm(dim=-1, keepdim=True)
+        x[:, :, joint] = x[:, :, skeleton.parents[joint]] + lengths[:, :, joint] * way
+    return (x if size == 3 * skeleton.joints else skeleton.without_root(x - x[:, :, :1])).flatten(-2)
+
+
+def lengths_of(x, skeleton=WALKER):
+    return skeleton.bone_lengths(skeleton.with_root(x.unflatten(-1, (-1, 3))))
+
+
+@pytest.fixture(params=BONES)
+def bones_and_data(request):
+    view, size = BONES[request.param]
+    return view, rigid(6, size)
+
+
+def test_directions_of_bones_have_length_one_and_lead_back_to_rigid_people(bones_and_data):
+    view, x = bones_and_data
+    seen = view({"x": x})
+    whole = seen["x"] if "x" in seen else Parts({"legs": LEGS, "arms": ARMS}).inverse(seen)["x"]
+    joints = whole.unflatten(-1, (-1, 3))
+    bones = joints if joints.shape[2] < J else WALKER.without_root(joints)
+    torch.testing.assert_close(bones.norm(dim=-1), torch.ones_like(bones[..., 0]))
+    torch.testing.assert_close(view.inverse(seen)["x"], x)
+    again = view(seen)
+    assert all(torch.equal(again[name], seen[name]) for name in seen)
+
+
+def test_whatever_is_made_of_them_no_bone_is_stretched(bones_and_data):
+    """Any numbers (S, B, H, D) in the place of directions; a root stays where it is made."""
+    view, x = bones_and_data
+    seen = view({"x": x})
+    made = {name: people(2, B, 7, value.shape[-1]) for name, value in seen.items() if value.dim() == 3}
+    added = {name: value for name, value in seen.items() if value.dim() < 3}
+    back = view.inverse({**made, **added})
+    torch.testing.assert_close(lengths_of(back["x"]), lengths_of(x)[:, :1].expand(2, -1, 7, -1))
+    if x.shape[-1] == 3 * J:
+        torch.testing.assert_close(back["x"][..., :3], made["x"][..., :3])
+    if "legs" in back:
+        assert torch.equal(back["legs"], back["x"][..., LEGS])
+
+
+def test_lengths_are_the_means_over_the_observed_frames_that_are_no_padding():
+    x = people(B, 6, D)
+    lengths = lengths_of(x)
+    torch.testing.assert_close(Bones(WALKER, 4)({"x": x})["bone_lengths"], lengths[:, :4].mean(1))
+    steps = torch.tensor([2, 6, 3])
+    expected = torch.stack([lengths[n, : min(4, t)].mean(0) for n, t in enumerate(steps)])
+    torch.testing.assert_close(Bones(WALKER, 4)({"x": x, "lengths": steps})["bone_lengths"], expected)
+
+
+def test_directions_alone_have_no_density_and_need_both_ends():
+    x, view = rigid(5, D), Bones(WALKER, 3)
+    with pytest.raises(ValueError, match=r"no density of positions .* directions of bones: lengths are taken as given"):
+        view.log_det({"x": x})
+    with pytest.raises(ValueError, match="no density of positions"):
+        dvae.SequenceELBO().terms(build(view), x)
+    mask = torch.ones_like(x, dtype=torch.bool)
+    assert torch.equal(view({"x": x, "mask": {"x": mask}})["x"], view({"x": x})["x"])
+    mask[1, 2, 5] = False
+    with pytest.raises(ValueError, match="window 1 lacks entries of frame 3, but this model sees the directions of"):
+        view({"x": x, "mask": {"x": mask}})
+
+
+def test_a_model_of_directions_makes_rigid_people_and_has_no_bound():
+    torch.manual_seed(0)
+    equations = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
+    law = {"p(x)": dvae.laws.Directions(residual=0.5)}
+    model = dvae.DynamicalVAE(*equations, {"z": 2, "x": D}, Recurrent(4), law, view=Bones(WALKER, 4)).double().eval()
+    x = rigid(4, D)
+    future = seeded(model.forecast, x, 5, 3)["x"]
+    torch.testing.assert_close(lengths_of(future), lengths_of(x)[:, :1].expand(3, -1, 5, -1))
+    assert not model.likelihood
+    assert not dvae.SequenceELBO().terms(model, x).likelihood
+    with pytest.raises(ValueError, match="has no likelihood"):
+        dvae.importance_bound(model, x, 2)
+
+
+def test_a_part_that_hangs_from_another_does_not_tell_its_bones():
+    knee = [i for i in range(D) if i // 3 in (1, 2)]  # of the joints without the root: RKnee, RFoot
+    rest = [i for i in range(D) if i not in knee]
+    view, x = Bones(WALKER, 4, {"shank": knee, "rest": rest}), rigid(4, D)
+    seen = view({"x": x, "shank": x[..., knee]})
+    assert torch.equal(seen["shank"], seen["x"][..., knee])
+    assert torch.equal(view({"rest": x[..., rest]}, seen)["rest"], seen["x"][..., rest])
+    with pytest.raises(ValueError, match="shank alone does not tell that of RKnee, which hangs from RHip"):
+        view({"shank": x[..., knee]}, seen)
 
 
 # --------------------------------------------------------------------------------------------- views that change volume

@@ -5,12 +5,13 @@
 """
 
 from .base import Law, LawSpec, Shape, renamed
-from .families import Delta, FixedNormal, Normal, StandardNormal, StudentT
+from .families import Delta, Directions, FixedNormal, Normal, StandardNormal, StudentT
 from .flow import FlowDistribution, QRFlow
 from .priors import Flow, Mixture, Vamp
 
 __all__ = [
     "Delta",
+    "Directions",
     "FixedNormal",
     "Flow",
     "FlowDistribution",

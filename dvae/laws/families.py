@@ -232,6 +232,46 @@ class DeltaLaw(Law):
 
 
 @dataclass(frozen=True)
+class Directions:
+    """A point mass at unit vectors of three coordinates each, such as directions of bones (`dvae.motion.Bones`).
+
+    It has no density, as `Delta` has none.
+
+    Args:
+        project: a linear layer from features to vectors, which are then normalised; False takes the features
+            themselves.
+        residual: see `Law`; what is kept is added before vectors are normalised.
+    """
+
+    project: bool = True
+    residual: float = False
+
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
+        if shape.size % 3 or not (self.project or shape.features == shape.size):
+            raise ValueError(
+                f"Directions are of three coordinates each, and without projection the features themselves; "
+                f"{shape.name} has {shape.size} coordinates and the network gives {shape.features} features"
+            )
+        return DirectionsLaw(self, shape)
+
+
+class DirectionsLaw(DeltaLaw):
+    """What `Directions` describes."""
+
+    location_scale = False
+
+    def __init__(self, spec: Directions, shape: Shape):
+        super().__init__(spec.residual)
+        self.out = self.projection(shape.features, shape.size, shape.size) if spec.project else nn.Identity()
+
+    @override
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        vectors = self.moved(self.out(features), previous).unflatten(-1, (-1, 3))
+        return ((vectors * vectors.square().sum(-1, keepdim=True).clamp_min(1e-12).rsqrt()).flatten(-2),)
+
+
+@dataclass(frozen=True)
 class StandardNormal:
     """N(0, I), whatever the features: the law of a model's variable without parents, where nothing else is said."""
 

@@ -18,7 +18,7 @@ from .scoring import displacements, scores
 from .simulator import simulate
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
 from .truths import PseudoTruths, WithPseudoTruths
-from .views import Heading
+from .views import Bones, Heading
 
 __all__ = [
     "HUMAN36M",
@@ -27,6 +27,7 @@ __all__ = [
     "PROTOCOLS",
     "WALKER",
     "AngleLimits",
+    "Bones",
     "Clip",
     "Exchanged",
     "Forecasts",

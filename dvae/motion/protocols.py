@@ -98,6 +98,7 @@ class Protocol:
 
 _HUMAN36M: dict[str, Any] = {"train": ("S1", "S5", "S6", "S7", "S8"), "test": ("S9", "S11"), "sampling": "subject"}
 _STYLES: dict[str, Any] = {"split_by": "file_group", "train": ("A", "B"), "test": ("C",)}
+_TUNING: dict[str, Any] = {"split_by": "file_group", "train": ("A",), "test": ("B",)}
 _TRAJECTORIES: dict[str, Any] = {"root": "relative", "rotate": True}
 
 PROTOCOLS = {
@@ -115,6 +116,9 @@ PROTOCOLS = {
         ),
         Protocol("trajevae", 1, 100, 50, train_stride=25, test_stride=25, **_TRAJECTORIES, **_HUMAN36M),
         Protocol("bandai2-by-style", 15, 60, 30, train_stride=5, test_stride=15, **_STYLES),
+        Protocol(
+            "bandai2-tuning", 15, 60, 30, train_stride=5, test_stride=15, **{**_STYLES, "train": ("A",), "test": ("B",)}
+        ),
         Protocol("bandai2-trajectories", 1, 60, 30, train_stride=5, test_stride=15, **_TRAJECTORIES, **_STYLES),
         Protocol("bandai2-by-take", 15, 60, 30, train_stride=5, test_stride=15),
         Protocol("cmu8", 15, 60, 30, train_stride=5, test_stride=15),
@@ -124,7 +128,8 @@ PROTOCOLS = {
     )
 }
 """The presets by name. In `bandai2-by-style` all clips of groups A and B train, all of C test, whatever the
-file's own split; this reading gives the reference figures of the data's README."""
+file's own split; this reading gives the reference figures of the data's README. Options are chosen on `bandai2-tuning`,
+of groups A and B alone, so that group C stays unseen."""
 
 
 def named_protocol(name: str) -> Protocol:

@@ -6,6 +6,24 @@ relative to their own root, as in TrajeVAE's evaluation; "global ADE" and "globa
 in the world. Where the same joints' paths are given in all windows, "path error" is the mean distance of these joints
 from their paths, over all K futures.
 
+Two scores ask for as much diversity and motion as there really is (BeLFusion: Barquero, Escalera and Palmero 2023,
+arXiv:2211.14304). *APDE* is |APD of the futures - APD of the multimodal ground truth|, the mean over windows that share
+their last pose with another one. *CMD* (`metrics.cumulative_motion_distance`) is of what joints move by from frame to
+frame, for each class of motion and averaged by the classes' shares of the windows, as in the public code. A class is
+the label "content" of a clip; where clips have none, all windows are one class. The pace of a class is that of the true
+futures of the windows at hand, in the public code a constant for each of its data sets. CMD is a number of the whole
+set, with a jackknife over clips, and real motion, which has no steady pace, is not at 0.
+
+Bodies have limb stretch, limb jitter and limb-angle errors (SkeletonDiffusion: Curreli et al. 2025, arXiv:2501.06035,
+equation 13). With l_t the length of a limb in frame t of a future, and m that in the true one, its mean over frames,
+*limb stretch* is mean_t |l_t - m| / m and *limb jitter* mean_t |l_{t+1} - l_t| / m, and with "RMS" the root of the mean
+square; all are means over limbs and futures. The public code has |mean_t l_t - m| / m for the mean stretch, in which
+what lengths vary by about their mean does not count; ours is the paper's. The *limb-angle error* is the mean over
+frames and joints of the error of the angle between a limb and the next one, of the future with the least, in degrees:
+the mean angle error (MAE) of the public code. Ours: shares and not hundredths, of all limbs, where the code leaves out
+those at the pelvis and has angles along chains of its own choice. The *bone-length error* compares with the observed
+frames.
+
 A classifier adds two scores under its name (Bie et al. 2022, arXiv:2204.01565). *ACC* is the share of the K futures
 that it gives the window's true class. *FID* is the Fréchet distance between its features of the true futures and of all
 K generated ones of all windows together, a number of the whole set, whose standard error is a jackknife over clips
@@ -26,7 +44,7 @@ from ..data import Batch, HeldOutWindows
 from ..inference import metrics
 from ..inference.held import clip_places, on_device_of, reproducibly
 from ..inference.references import multimodal_note, multimodal_truths
-from ..inference.scores import ENERGY, VARIOGRAM, Measure, paired
+from ..inference.scores import ENERGY, VARIOGRAM, Measure, means_of_those_that_count, paired
 from .energies import pose_prior_energy
 from .exchange import Exchanged
 from .protocols import Windows
@@ -64,7 +82,8 @@ def scores(
         found += [replace(measure, name=f"global {measure.name}", headline=False) for measure in (_ADE, _FDE)]
     if windows.given_joints:
         found.append(_path_error(windows))
-    found.append(_bone_length_error(windows))
+    found += [_bone_length_error(windows), *_limbs(windows)]
+    found += [_cumulative_motion(windows)] if windows.protocol.predicted > 1 else []
     if pose_prior is not None:
         found.append(_pose_nll(pose_prior, windows.protocol.observed))
     judged = [_judged(name, classifier, windows) for name, classifier in sorted((classifiers or {}).items())]
@@ -87,6 +106,7 @@ _MULTIMODAL = {
     "MMFDE": metrics.multimodal_final_displacement_error,
     "MMADEm": metrics.median_multimodal_average_displacement_error,
     "MMFDEm": metrics.median_multimodal_final_displacement_error,
+    "APDE": metrics.average_pairwise_distance_error,
 }
 
 
@@ -125,7 +145,10 @@ def _multimodal(windows: HeldOutWindows, body: Callable[[Tensor], Tensor]) -> li
         return function
 
     shown = "MMADE", "MMFDE"
-    return [Measure(name, over(score), headline=name in shown, **shared) for name, score in _MULTIMODAL.items()]
+    *errors, diversity = (
+        Measure(name, over(score), headline=name in shown, **shared) for name, score in _MULTIMODAL.items()
+    )
+    return [*errors, *([replace(diversity, pool=means_of_those_that_count)] if lonely < len(truths) else [])]
 
 
 def _body(skeleton: Skeleton) -> Callable[[Tensor], Tensor]:
@@ -161,6 +184,74 @@ def _bone_length_error(windows: Windows | Exchanged) -> Measure:
         return found
 
     return Measure("bone-length error", function, "relative")
+
+
+def _limbs(windows: Windows | Exchanged) -> list[Measure]:
+    """Stretch and jitter of limbs, and errors of the angles between them."""
+    skeleton = windows.skeleton
+
+    def lengths(x: Tensor) -> Tensor:
+        found: Tensor = skeleton.bone_lengths(windows.positions(x))
+        return found
+
+    def of_errors(score: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
+        """The mean over limbs and futures of a score (B, K, limbs) of relative errors (B, K, T, limbs) of lengths."""
+
+        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+            return score(lengths(forecasts) / lengths(truth).mean(1)[:, None, None] - 1).mean((1, 2))
+
+        return function
+
+    scores: dict[str, Callable[[Tensor], Tensor]] = {
+        "limb stretch": lambda errors: errors.abs().mean(2),
+        "limb stretch RMS": lambda errors: errors.square().mean(2).sqrt(),
+    }
+    if windows.protocol.predicted > 1:
+        scores["limb jitter"] = lambda errors: errors.diff(dim=2).abs().mean(2)
+        scores["limb jitter RMS"] = lambda errors: errors.diff(dim=2).square().mean(2).sqrt()
+    found = [Measure(name, of_errors(score), "relative") for name, score in scores.items()]
+
+    ends = [child for _, child in skeleton.edges]
+    pairs = [(ends.index(parent), ends.index(child)) for parent, child in skeleton.edges if parent in ends]
+    first, second = ([pair[side] for pair in pairs] for side in (0, 1))
+
+    def angles(x: Tensor) -> Tensor:
+        limbs = skeleton.limbs(x)
+        u, v = limbs[..., first, :], limbs[..., second, :]
+        return torch.atan2(torch.linalg.cross(u, v).norm(dim=-1), (u * v).sum(-1)).rad2deg()
+
+    def angle_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        return (angles(forecasts) - angles(truth)[:, None]).abs().mean((2, 3)).amin(1)
+
+    return [*found, *([Measure("limb-angle error", angle_error, "degrees")] if pairs else [])]
+
+
+def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
+    """CMD, class by class."""
+    label = "content"
+    try:
+        labels = windows.labels(label)
+    except KeyError:
+        label, labels = "", [""] * len(windows)
+    names = sorted(set(labels))
+    classes = torch.tensor([names.index(each) for each in labels])
+    body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
+
+    def moved(x: Tensor) -> Tensor:
+        """What joints move by, (..., T - 1), of frames (..., T, D)."""
+        steps: Tensor = body(x).unflatten(-1, (-1, 3)).diff(dim=-3).norm(dim=-1)
+        return steps.mean(-1).double()
+
+    real = moved(windows.all()["x"][:, windows.protocol.observed :]).mean(-1)
+    what = f"of the windows of each {label}, {len(names)} in all" if label else "of all windows as one class"
+    return Measure(
+        "CMD",
+        lambda forecasts, *_: moved(forecasts).mean(1),
+        "m",
+        pool=lambda motion, clips: metrics.motion_pseudo_values(motion, real, classes, clips),
+        note=f"CMD: {what}, against the pace of their true futures",
+        basis={"CMD": {"label": label, "classes": names}},
+    )
 
 
 def _pose_nll(prior: Any, observed: int) -> Measure:

@@ -280,6 +280,20 @@ class Skeleton:
             bones: Tensor = (poses @ incidence).unflatten(-1, (-1, 3))
         return bones
 
+    def ends(self, limbs: Tensor) -> Tensor:
+        """Where limbs end when each begins where its parent ends and the root is the origin; the way back from `limbs`.
+
+        Args:
+            limbs: (..., J - 1, 3), as in `edges`.
+
+        Returns:
+            poses (..., 3 (J - 1)), without the root.
+        """
+        chains = _chains(self, limbs.dtype, limbs.device)
+        with torch.autocast(limbs.device.type, enabled=False):
+            poses: Tensor = limbs.flatten(-2) @ chains
+        return poses
+
     def directions(self, poses: Tensor) -> Tensor:
         """Unit vectors along the limbs: poses (..., D) -> (..., 3 (J - 1)), zero for a limb without length.
 
@@ -408,6 +422,15 @@ def differences(
     if size < 3 * joints:
         incidence = torch.cat([incidence[: skeleton.root], incidence[skeleton.root + 1 :]])
     return torch.kron(incidence, torch.eye(3, dtype=dtype, device=device))
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _chains(skeleton: Skeleton, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The inverse (D, D) of `differences` of the bones, D = 3 (J - 1): each joint is the sum of the bones before it."""
+    bones = differences(skeleton, tuple(skeleton.edges), 3 * (skeleton.joints - 1), torch.float64, torch.device("cpu"))
+    chains: Tensor = torch.linalg.inv(bones).round().to(device, dtype)
+    return chains
 
 
 def rotate_about_up(positions: Tensor, angle: Tensor, up: str) -> Tensor:

@@ -1,8 +1,9 @@
-"""Views of motion: people who face one way, and the turns of their joints in place of positions."""
+"""Views of motion: people who face one way, bones that keep their lengths, and turns in place of positions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -10,15 +11,16 @@ from torch import Tensor
 from typing_extensions import override
 
 from ..data import Batch
+from ..networks.base import valid_steps
 from ..views import WHOLE, View
 from . import kinematics
 from .rotations import from_matrix, size, to_matrix
-from .skeleton import Skeleton, rotate_about_up
+from .skeleton import Skeleton, inverse_lengths, rotate_about_up
 
 HEADING = "heading"
 """Name in batches of the angles (B,) by which windows were turned, in radians."""
-BONES = "bones"
-"""Name in batches of the lengths (B, J - 1) of their bones, in metres, in the order of the skeleton's edges."""
+LENGTHS = "bone_lengths"
+"""Name in batches of the lengths (B, J - 1) of windows' bones, in metres, in the order of `Skeleton.edges`."""
 TURNS = "turns"
 """Name in batches of the turns (B, T, 4 J) of all joints, quaternions w x y z one after the other."""
 
@@ -125,6 +127,115 @@ class Heading(View):
 
 
 @dataclass(frozen=True)
+class Bones(View):
+    """Unit vectors along the bones in place of positions; on the way back bones have the lengths they were seen with.
+
+    The direction of the bone that ends at a joint has that joint's place among the coordinates; a root that the
+    protocol keeps stays where it is. Whatever a model makes in place of directions is put to length, so that bones are
+    those of the person by construction.
+
+    This is no bijection. Lengths are taken as given, one for a bone and window, so that what they vary by within a
+    window is lost; and a direction has two degrees of freedom in three numbers, so that no density of positions follows
+    from one of directions: `log_det` refuses. A model sees so whose x is a function of its parents, as with
+    `laws.Directions`, and which learns from energies.
+
+    Args:
+        skeleton: of the poses.
+        frames: O; lengths are the means over the first O frames, or over those that there are.
+        pieces: coordinates of x that batches and forecasts hold under names of their own, as positions too.
+    """
+
+    skeleton: Skeleton
+    frames: int = 1
+    pieces: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    names = (LENGTHS,)
+
+    @override
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        held = {name: places for name, places in self.pieces.items() if name in data}
+        if LENGTHS in data or (WHOLE not in data and not held):
+            return dict(data)
+        self._check_complete(data)
+        x = data[WHOLE] if WHOLE in data else self._joined(data, held)
+        limbs = self.skeleton.limbs(x)
+        seen = self._rooted(limbs * inverse_lengths(limbs)[..., None], x)
+        found = self._named(data, seen)
+        if beside is not None:
+            return found
+        return found | {LENGTHS: self._mean(limbs[:, : self.frames].norm(dim=-1), data.get("lengths"))}
+
+    @override
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        data = dict(seen)
+        lengths = data.pop(LENGTHS, None)
+        if lengths is None or WHOLE not in data:
+            return data
+        made = data[WHOLE].unflatten(-1, (-1, 3))
+        kept = made.shape[-2] == self.skeleton.joints
+        bones = self.skeleton.without_root(made) if kept else made
+        bones = bones * (inverse_lengths(bones) * lengths[:, None])[..., None]
+        joints = self.skeleton.ends(bones).unflatten(-1, (-1, 3))
+        if kept:
+            joints = joints + made[..., self.skeleton.root, None, :]
+        return self._named(data, self._rooted(joints, data[WHOLE]))
+
+    @override
+    def log_det(self, data: Batch) -> Tensor:
+        raise ValueError(
+            "there is no density of positions where a model sees the directions of bones: lengths are taken as given, "
+            "and a direction has two degrees of freedom in three numbers; make x a function of its parents, with "
+            "laws.Directions(), and train by energies, or let the model see positions"
+        )
+
+    def _rooted(self, joints: Tensor, x: Tensor) -> Tensor:
+        """What all joints but the root have (..., J - 1, 3) as (..., D), with the root of x where it has one."""
+        if x.shape[-1] == 3 * self.skeleton.joints:
+            root = self.skeleton.root
+            own = x.unflatten(-1, (-1, 3))[..., root : root + 1, :]
+            joints = torch.cat([joints[..., :root, :], own, joints[..., root:, :]], -2)
+        return joints.flatten(-2)
+
+    def _named(self, values: Batch, x: Tensor) -> dict[str, Any]:
+        """The values, with this x wherever they hold x or a piece of it."""
+        pieces = {name: x[..., list(places)] for name, places in self.pieces.items() if name in values}
+        return {**values, **pieces, **({WHOLE: x} if WHOLE in values else {})}
+
+    def _joined(self, data: Batch, held: Mapping[str, Sequence[int]]) -> Tensor:
+        """The whole of pieces, 0 elsewhere; every bone of theirs begins at the root or in one of them."""
+        size = 1 + max(place for places in self.pieces.values() for place in places)
+        joints = [j for j in range(self.skeleton.joints) if j != self.skeleton.root or size == 3 * self.skeleton.joints]
+        there = {joints[place // 3] for places in held.values() for place in places} | {self.skeleton.root}
+        if loose := [joint for joint in there - {self.skeleton.root} if self.skeleton.parents[joint] not in there]:
+            names, parent = self.skeleton.names, self.skeleton.parents[loose[0]]
+            raise ValueError(
+                f"this model sees the directions of bones, but {', '.join(held)} alone does not tell that of "
+                f"{names[loose[0]]}, which hangs from {names[parent]}; give the part with {names[parent]} too"
+            )
+        some: Tensor = data[next(iter(held))]
+        whole = some.new_zeros(*some.shape[:-1], size)
+        for name, places in held.items():
+            whole[..., list(places)] = data[name]
+        return whole
+
+    def _mean(self, lengths: Tensor, steps: Tensor | None) -> Tensor:
+        """(B, J - 1) of (B, O, J - 1), over the frames that are no padding."""
+        if steps is None:
+            return lengths.mean(1)
+        valid = valid_steps(steps, lengths.shape[1])[..., None]
+        found: Tensor = (lengths * valid).sum(1) / valid.sum(1)
+        return found
+
+    def _check_complete(self, data: Batch) -> None:
+        for name, mask in data.get("mask", {}).items():
+            if name in (WHOLE, *self.pieces) and not mask.all():
+                window, frame, *_ = (~mask).nonzero()[0].tolist()
+                raise ValueError(
+                    f"window {window} lacks entries of frame {frame + 1}, but this model sees the directions of bones, "
+                    "of which both ends have to be there; fill them in before, or fit with bones=False"
+                )
+
+
+@dataclass(frozen=True)
 class Rotations(View):
     """Turns of joints in place of positions, and bones that keep their lengths.
 
@@ -149,7 +260,7 @@ class Rotations(View):
     skeleton: Skeleton
     form: str = "6d"
     root: bool = False
-    names = (TURNS, BONES)
+    names = (TURNS, LENGTHS)
 
     def __post_init__(self) -> None:
         size(self.form)
@@ -174,7 +285,7 @@ class Rotations(View):
     def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
         seen = dict(data)
         turns = seen.pop(TURNS, None)
-        if WHOLE not in data or BONES in data:
+        if WHOLE not in data or LENGTHS in data:
             return seen
         x, skeleton = data[WHOLE], self.skeleton
         if x.shape[-1] != 3 * (skeleton.joints - (not self.root)):
@@ -195,13 +306,13 @@ class Rotations(View):
             found = to_matrix(turns[..., self.turning, :], "quaternion").to(x)
         place = [positions[..., skeleton.root, :]] if self.root else []
         seen[WHOLE] = torch.cat([*place, from_matrix(found, self.form).flatten(-2)], -1)
-        seen[BONES] = (beside or {}).get(BONES, skeleton.bone_lengths(positions).mean(-2))
+        seen[LENGTHS] = (beside or {}).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
         return seen
 
     @override
     def inverse(self, seen: Batch) -> dict[str, Any]:
         data = dict(seen)
-        bones = data.pop(BONES, None)
+        bones = data.pop(LENGTHS, None)
         if WHOLE not in seen:
             return data
         x, skeleton = seen[WHOLE], self.skeleton

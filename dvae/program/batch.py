@@ -34,6 +34,7 @@ class Reader:
         extras: names of what else a batch may hold.
         made: those of the data that are functions of their parents, which a program is not given.
         whole: data of which all that a step has is one event.
+        density: whether the data have one, of which a view that changes volume has to tell.
     """
 
     sizes: Mapping[str, int]
@@ -44,6 +45,7 @@ class Reader:
     extras: tuple[str, ...]
     made: frozenset[str]
     whole: Collection[str]
+    density: bool
 
     def read(self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor]) -> dict[str, Any]:
         """The batch by name, in this precision, as the model sees it; what was read stays as it is.
@@ -75,7 +77,7 @@ class Reader:
             for name, seen in masks.items():
                 self._check_mask(name, seen, values)
         seen = self.view(values)
-        if whole in values and LOG_DET not in values and not self.view.keeps_volume:
+        if self.density and whole in values and LOG_DET not in values and not self.view.keeps_volume:
             seen[LOG_DET] = self.view.counted(values)
         seen = {name: value for name, value in seen.items() if name in values or name not in self.made}
         if "mask" in seen:  # of context too, which is told no more of it

@@ -122,6 +122,7 @@ class DynamicalVAE(nn.Module):
             self.extras,
             frozenset(name for name in self.view.parts or () if self.generator[name].law.deterministic),
             [name for name in self.observed if self.generator[name].whole],
+            self.likelihood,
         )
         self.units: Any = nn.ModuleDict()
 

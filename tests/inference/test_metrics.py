@@ -14,7 +14,9 @@ from dvae.inference import metrics
 from dvae.inference.metrics import (
     average_displacement_error,
     average_pairwise_distance,
+    average_pairwise_distance_error,
     continuous_ranked_probability_score,
+    cumulative_motion_distance,
     energy_score,
     final_displacement_error,
     frechet_distance,
@@ -24,6 +26,7 @@ from dvae.inference.metrics import (
     median_final_displacement_error,
     median_multimodal_average_displacement_error,
     median_multimodal_final_displacement_error,
+    motion_pseudo_values,
     multimodal_average_displacement_error,
     multimodal_final_displacement_error,
     variogram_score,
@@ -234,9 +237,63 @@ def test_crps_of_normal_draws_is_the_closed_form_at_every_number_of_them(count):
     assert abs(found.mean() - exact.mean()) < 4 * found.std() / math.sqrt(repeats)
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_apde_is_how_far_two_diversities_are_apart(count):
+    samples, truths = draw(2, count, 4, 3), draw(2, 5, 4, 3, seed=1)
+    found = average_pairwise_distance_error(samples, truths)
+    for n in range(2):
+        ours, theirs = (
+            [float((x[i] - x[j]).square().sum().sqrt()) for i in range(len(x)) for j in range(i)]
+            for x in (samples[n], truths[n])
+        )
+        assert found[n] == pytest.approx(abs((np.mean(ours) if ours else 0.0) - np.mean(theirs)))
+    assert (average_pairwise_distance_error(truths.flip(1) + 2.0, truths) < 1e-12).all()
+    assert average_pairwise_distance_error(samples, truths[:, :1]).isnan().all()
+
+
+def test_cmd_is_the_area_between_cumulative_motions():
+    """sum_{i<T} sum_{t<=i} |M_t - M|; 0 at the pace of real motion, and the earlier a deviation the more it counts."""
+    motion, real = draw(2, 6).abs(), draw(2, seed=1).abs()
+    found = cumulative_motion_distance(motion, real)
+    for n in range(2):
+        area = sum(abs(motion[n, t] - real[n]) for i in range(6) for t in range(i + 1))
+        assert found[n] == pytest.approx(float(area))
+    steady = real[:, None].expand(-1, 6)
+    assert cumulative_motion_distance(steady, real).tolist() == [0, 0]
+    early, late = (cumulative_motion_distance(steady + torch.eye(6)[t], real) for t in (0, 5))
+    torch.testing.assert_close(early, 6 * late)
+    with pytest.raises(ValueError, match=r"needs a pace .* not \(2, 6\) and \(6,\)"):
+        cumulative_motion_distance(motion, motion[0])
+
+
+def test_cmd_of_a_set_is_of_its_classes_and_leaves_out_clip_after_clip():
+    motion, real = draw(9, 5).abs(), draw(9, seed=1).abs()
+    classes, places = torch.tensor([0, 0, 0, 1, 1, 1, 1, 1, 2]), torch.tensor([0, 0, 1, 2, 2, 2, 3, 3, 4])
+
+    def by_hand(rows):
+        total = 0.0
+        for number in {int(classes[n]) for n in rows}:
+            own = [n for n in rows if classes[n] == number]
+            pace = sum(real[n] for n in own) / len(own)
+            means = [sum(motion[n, t] for n in own) / len(own) for t in range(5)]
+            total += len(own) / len(rows) * sum((5 - t) * abs(means[t] - pace) for t in range(5))
+        return float(total)
+
+    values = motion_pseudo_values(motion, real, classes, places)
+    shares = places.bincount() / 9
+    assert float(torch.tensor(values) @ shares) == pytest.approx(by_hand(range(9)))
+    own = [by_hand(range(9)) - by_hand([n for n in range(9) if places[n] != c]) for c in range(5)]
+    plain = [(1 / float(w) - 1) * d for w, d in zip(shares, own, strict=True)]
+    moved = [v - p for v, p in zip(values, plain, strict=True)]
+    assert moved == pytest.approx([moved[0]] * 5, rel=1e-5)  # by one constant
+    (alone,) = motion_pseudo_values(motion, real, classes, torch.zeros(9, dtype=torch.long))
+    assert alone == pytest.approx(by_hand(range(9)))
+
+
 def test_all_scores_are_public():
     of_features = {frechet_distance, frechet_pseudo_values, gaussian_frechet_distance}
-    public = {average_pairwise_distance, *of_features, *PAIRED, *MULTIMODAL}
+    of_motion = {average_pairwise_distance_error, cumulative_motion_distance, motion_pseudo_values}
+    public = {average_pairwise_distance, *of_features, *of_motion, *PAIRED, *MULTIMODAL}
     functions = inspect.getmembers(metrics, inspect.isfunction)
     found = {score for name, score in functions if score.__module__ == metrics.__name__ and not name.startswith("_")}
     assert found == public

@@ -12,7 +12,7 @@ from dvae import motion
 from dvae.data import ArrayWindows, Fingerprinted, HeldOutWindows, Listed, Sequences, Source, sequences
 from dvae.inference.evaluate import evaluate
 from dvae.inference.references import zero_velocity
-from dvae.inference.scores import ENERGY, Measure, paired, proper
+from dvae.inference.scores import ENERGY, Measure, clip_means, means_of_those_that_count, paired, proper
 from dvae.motion.judges.pose_prior import PosePriorModel
 from dvae.program.protocols import Forecasting, Program
 
@@ -59,6 +59,16 @@ def test_a_score_may_be_of_the_whole_set_and_say_nothing_of_some_clips():
     assert scores["most"].mean == pytest.approx(windows.x[:, 1].max().item())
     assert scores["some"].mean == pytest.approx((2 + 3 + 4 + 5) / 4)
     assert scores["some"].freedom == 1
+
+
+def test_windows_that_do_not_count_leave_the_mean_and_not_their_clip():
+    values = torch.tensor([1.0, torch.nan, 3.0, torch.nan, torch.nan, 8.0])
+    clips = torch.tensor([0, 0, 1, 2, 2, 3])
+    of_clips = torch.tensor(means_of_those_that_count(values, clips))
+    assert float(of_clips @ (clips.bincount() / 6.0)) == pytest.approx(4.0)  # (1 + 3 + 8) / 3
+    assert of_clips[2] == pytest.approx(4.0)  # says nothing, moves nothing
+    whole = torch.arange(6.0)
+    assert means_of_those_that_count(whole, clips) == pytest.approx(list(clip_means(whole, clips)))
 
 
 def test_notes_bases_and_true_futures_come_with_a_score():

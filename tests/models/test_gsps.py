@@ -400,6 +400,53 @@ def test_forecasts_of_a_run_share_a_part_that_is_fixed(tmp_path, walkers):
     assert not alike.all()
 
 
+@pytest.mark.parametrize("heading", [False, True])
+@pytest.mark.parametrize("parts", [("lower", "upper"), FIVE])
+def test_bones_of_futures_keep_the_lengths_that_were_seen(windows, parts, heading):
+    """Whatever the weights; and parts are coordinates of the positions, the first of which may be held."""
+    model = build(windows, bones=True, heading=heading, parts=parts, draws=(2,), diversity=(1.0,)).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.3 * torch.randn_like(parameter))
+    past = windows.all()["x"][:5, :15].double()
+
+    def lengths(x):
+        return windows.skeleton.bone_lengths(windows.positions(x))
+
+    free = model.forecast(past, 60, 3)
+    torch.testing.assert_close(lengths(free["x"]), lengths(past).mean(1)[:, None].expand(3, -1, 60, -1))
+    first = next(iter(model.view.parts))
+    assert torch.equal(free[first], free["x"][..., model.view.parts[first]])
+    held = model.forecast(past, 60, 3, fix={first: free[first][0]})
+    assert torch.equal(held[first], free[first][:1].expand(3, -1, -1, -1))
+    torch.testing.assert_close(lengths(held["x"]), lengths(free["x"]))
+
+
+@pytest.mark.parametrize("heading", [False, True])
+def test_energies_of_bones_are_of_positions(windows, heading):
+    """Those of the very futures in metres, turned, that the directions lead to; only limbs never cost."""
+    model, data = build(windows, bones=True, heading=heading).eval(), batch(windows)
+    trace = poutine.trace(model.model).get_trace(data)
+    trace.compute_log_prob()
+    values = trace.nodes["_RETURN"]["value"]
+    assert values["lower"].unflatten(-1, (-1, 3)).norm(dim=-1).sub(1).abs().max() < 1e-9
+    parts = {name: values[name].unflatten(0, (-1, 4)) for name in ("lower", "upper")}
+    lengths = windows.skeleton.limbs(data["x"][:, :15]).norm(dim=-1).mean(1)
+    whole = torch.cat(list(parts.values()), -1)
+    order = torch.tensor([place for places in model.view.parts.values() for place in places]).argsort()
+    futures = windows.skeleton.ends(whole[..., order].unflatten(-1, (-1, 3)) * lengths[:, None, :, None])
+    truth = model.turned(data["x"])  # whose lengths vary by rounding
+    expected = energies.best_of_many(futures[:, :, 15:], truth[:, 15:])
+    torch.testing.assert_close(-trace.nodes["reconstruction"]["log_prob"], expected, rtol=1e-5, atol=1e-5)
+    assert -trace.nodes["limb"]["log_prob"].min() < 1e-10
+    upper = futures[..., model.view.parts["upper"]][:, :, 15:].unflatten(0, (2, 3))  # draws of b, of a
+    scale = model.method.diversity_scale[1]
+    alike = torch.stack([energies.pairwise_diversity(upper[:, a], scale) for a in range(3)]).mean(0)
+    torch.testing.assert_close(-trace.nodes["diversity_upper"]["log_prob"], alike)
+    found = dvae.SequenceELBO().terms(model, data)
+    assert found.energies.keys() == dvae.SequenceELBO().terms(build(windows), data).energies.keys()
+
+
 def test_a_prior_of_format_1_is_taken_with_a_word_of_warning(prior_run, tmp_path):
     run = Path(shutil.copytree(prior_run, tmp_path / "prior"))
     config = json.loads((run / "config.json").read_text())

@@ -168,6 +168,51 @@ def test_the_loss_is_the_papers(windows):
     torch.testing.assert_close(objective(found, 0), L, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("heading", [False, True])
+def test_bones_keep_the_lengths_that_were_seen_and_energies_are_of_positions(windows, heading):
+    options = {"bones": True, "heading": heading}
+    model, batch = build(windows, **options).eval(), drawn(windows, **options)
+    past, skeleton = batch["x"][:, :15], windows.skeleton
+
+    def lengths(x):
+        return skeleton.bone_lengths(windows.positions(x))
+
+    future = model.forecast(past, 20, 2)["x"]
+    torch.testing.assert_close(lengths(future), lengths(past).mean(1)[:, None].expand(2, -1, 20, -1))
+    whole = model.reconstruct(batch["x"])["x"]
+    torch.testing.assert_close(lengths(whole), lengths(past).mean(1)[:, None].expand(1, -1, 75, -1))
+    objective = model.method.objective()
+    torch.manual_seed(1)
+    latents = poutine.trace(model.guide).get_trace(batch, draws=objective.draws).nodes
+    torch.manual_seed(1)
+    found, _ = terms(model, batch)
+    held = {name: latents[name]["value"] for name in ("z", "w")}
+    again = {"x": batch["x"].repeat(3, 1, 1)}
+    rollout = poutine.trace(poutine.condition(model.model, data=held)).get_trace(again).nodes["x"]["infer"]["run"]
+    made = rollout.parameters("x", rollout.values["x"])[0].unflatten(0, (3, 3))
+    assert made.unflatten(-1, (-1, 3)).norm(dim=-1).sub(1).abs().max() < 1e-9
+    limbs = made.unflatten(-1, (-1, 3)) * lengths(past).mean(1)[:, None, :, None]
+    expected = energies.best_of_many(skeleton.ends(limbs), model.turned(batch["x"]))
+    torch.testing.assert_close(found.energies["reconstruction"], expected, rtol=1e-5, atol=1e-5)
+    assert found.energies["limb"].max() < 1e-8
+
+
+def test_directions_of_bones_leave_no_bound(windows):
+    model, batch = build(windows, bones=True), drawn(windows)
+    found, objective = terms(model, batch, self_feeding=1.0)
+    assert not found.likelihood
+    objective(found, 10**6).backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.parameters() if p.requires_grad)
+    with pytest.raises(ValueError, match="has no likelihood"):
+        dvae.importance_bound(model, batch["x"], particles=2)
+    with pytest.raises(ValueError, match="loss='evidence' has no bones"):
+        dvae.method("hit-dvae", loss="evidence", bones=True)
+    with pytest.raises(ValueError, match="directions of bones, of which both ends have to be there"):
+        model.guide({"x": batch["x"], "mask": torch.rand_like(batch["x"]) < 0.5})
+    with pytest.raises(dvae.schema.SchemaError, match="hit-dvae"):
+        dvae.method("hit-dvae", bones=True).build({"x": 48})
+
+
 def test_the_density_fits_the_scale_and_energies_the_poses(windows):
     model, batch = build(windows), drawn(windows)
     found, objective = terms(model, batch, self_feeding=1.0)

@@ -10,7 +10,7 @@ import dvae
 from dvae import motion
 from dvae.data import leaves
 from dvae.motion import kinematics, rotations
-from dvae.motion.views import BONES, TURNS, Rotations
+from dvae.motion.views import LENGTHS, TURNS, Rotations
 from dvae.schema import SchemaError
 
 FORMS = ["6d", "quaternion", "vector"]
@@ -132,7 +132,7 @@ def test_what_has_no_turns_is_refused(people_of_two_sizes):
         model.read({"x": batch["x"][..., :-3]})
     with pytest.raises(ValueError, match="no rest pose"):
         Rotations(motion.WALKER)
-    assert BONES in model.read(batch)
+    assert LENGTHS in model.read(batch)
 
 
 def test_bounds_of_turns_do_not_compare_with_those_of_positions(people_of_two_sizes):
