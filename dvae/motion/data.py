@@ -60,6 +60,38 @@ class Clip:
         """Number of frames F."""
         return len(self.positions)
 
+    def between(self, start: int, end: int) -> Clip:
+        """Frames from one to before another."""
+        turns = None if self.rotations is None else self.rotations[start:end]
+        truth = {k: v[start:end] if v.shape[:1] == (self.frames,) else v for k, v in self.truth.items()}
+        return replace(self, positions=self.positions[start:end], rotations=turns, truth=truth)
+
+    def resampled(self, ratio: float) -> Clip:
+        """One frame for every so many: these frames where that is whole, else between them.
+
+        Positions are interpolated linearly and rotations along the shortest arc; what a simulator knows is left out.
+        """
+        if abs(ratio - round(ratio)) < 1e-6 and ratio >= 1:
+            every = round(ratio)
+            turns = None if self.rotations is None else self.rotations[::every]
+            return replace(self, positions=self.positions[::every], rotations=turns, truth={})
+        at = np.arange(int((self.frames - 1) / ratio + 1e-6) + 1) * ratio
+        before = np.minimum(at.astype(int), max(self.frames - 2, 0))
+        after = np.minimum(before + 1, self.frames - 1)
+        part = (at - before)[:, None, None]
+        positions = (1 - part) * self.positions[before] + part * self.positions[after]
+        turns = None if self.rotations is None else _between(self.rotations[before], self.rotations[after], part)
+        return replace(self, positions=positions.astype(self.positions.dtype), rotations=turns, truth={})
+
+
+def _between(first: np.ndarray, second: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Quaternions (..., 4) on the shortest arc between others (Shoemake 1985)."""
+    cosine = (first * second).sum(-1, keepdims=True)
+    second, cosine = np.where(cosine < 0, -second, second), np.abs(cosine).clip(max=1)
+    angle = np.maximum(np.arccos(cosine), 1e-6)  # below, sines and angles are one
+    found = (np.sin((1 - part) * angle) * first + np.sin(part * angle) * second) / np.sin(angle)
+    return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True), first.dtype)
+
 
 def defect(clip: Clip, skeleton: Skeleton) -> str | None:
     """Why a clip cannot be used with a skeleton, in a sentence that names the clip; None when it can."""
@@ -108,6 +140,7 @@ class MotionSet:
         name: what to call the set.
         copy: False takes over arrays that are float32 already, which nobody else may hold.
         skip_bad: leave out clips that cannot be used, and list them in `skipped`, as (split, name, reason).
+        said: how the files' units and axes were understood, for people to check.
 
     Raises:
         ValueError: a clip has NaN, wrong joints, a wrong shape or implausible units, two clips share a key,
@@ -120,6 +153,7 @@ class MotionSet:
     skipped: Sequence[tuple[str, str, str]] = field(default=(), init=False)
     copy: InitVar[bool] = True
     skip_bad: InitVar[bool] = False
+    said: str = field(default="", kw_only=True)
 
     def __post_init__(self, copy: bool, skip_bad: bool) -> None:
         single, skipped, what = [], [], self.name or "motion set"
@@ -188,7 +222,47 @@ class MotionSet:
                     clip = replace(clip, rotations=continuous(from_matrix(turns, "quaternion")).numpy())
                 yield clip
 
-        return MotionSet(turned(), skeleton, self.name)  # type: ignore[arg-type]
+        return MotionSet(turned(), skeleton, self.name, said=self.said)  # type: ignore[arg-type]
+
+    def resampled(self, fps: float) -> MotionSet:
+        """The same motion at another number of frames per second; see `Clip.resampled`.
+
+        Raises:
+            ValueError: a number that is none.
+        """
+        if not 0 < fps < 1e6:
+            raise ValueError(f"{fps} frames per second, expected more than 0")
+        ratio, skeleton = self.skeleton.fps / fps, replace(self.skeleton, fps=float(fps))
+        return MotionSet([clip.resampled(ratio) for clip in self], skeleton, self.name, said=self.said)
+
+    def divided(self, test: float = 0.2, shortest: int = 1) -> MotionSet:
+        """The same motion in splits "train" and "test", for recordings that nobody has divided.
+
+        The last part of every clip is test, where both parts have `shortest` frames; where no clip has, whole clips
+        are, the last ones. A clip of a split other than "all" has this before its own name.
+
+        Args:
+            test: the part, of every clip or of the clips.
+            shortest: frames that make a window.
+
+        Raises:
+            ValueError: no part of the whole.
+        """
+        if not 0 < test < 1:
+            raise ValueError(f"the part for test is {test}, expected more than 0 and less than 1")
+        found: list[Clip] = []
+        for clip in self:
+            name = clip.name if clip.split == "all" else f"{clip.split}-{clip.name}".replace("/", "-")
+            clip, held = replace(clip, split="train", name=name), round(test * clip.frames)
+            if min(held, clip.frames - held) >= shortest:
+                found.append(clip.between(0, clip.frames - held))
+                found.append(replace(clip.between(clip.frames - held, clip.frames), split="test"))
+            else:
+                found.append(clip)
+        if len(found) == len(self) > 1:
+            held = min(max(round(test * len(self)), 1), len(self) - 1)
+            found = [*found[:-held], *(replace(clip, split="test") for clip in found[-held:])]
+        return MotionSet(found, self.skeleton, self.name, said=self.said)
 
     def fingerprint(self) -> str:
         """SHA-256 of the content: skeleton, and every clip's key, shape and bytes, in order."""
@@ -238,6 +312,10 @@ class MotionSet:
         fact("skeleton", f"{self.skeleton.name}: {self.skeleton.joints} joints, {self.skeleton.up} up")
         fact("frames per second", f"{self.skeleton.fps:g}")
         fact("vertical extent", f"{extent:.2f} m (median)")
+        if self.said:
+            fact("read as", self.said)
+        if sum(clip.rotations is not None for clip in self):
+            fact("rotations", "of every joint")
         fact(
             "bone lengths",
             f"vary by at most {variation[worst].max():.2%} within a clip (sd / mean; {bone} in "

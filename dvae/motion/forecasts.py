@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
+from .data import Clip, MotionSet
 from .files.archive import archive, write_arrays
 from .files.plain import read_arrays
 from .skeleton import FIELDS, Skeleton
@@ -67,6 +68,20 @@ class Forecasts:
         future = self.forecasts[:samples, one]
         return Forecasts(self.skeleton, self.keys[one], future, self.observed[one], self.truth[one])
 
+    def motion(self) -> MotionSet:
+        """Every future after what was observed, as a clip named after its window and place among the samples."""
+        return MotionSet(
+            [
+                Clip(split, f"{clip}-{start}-{sample}".replace("/", "-"), np.concatenate([before, future]))
+                for (split, clip, start), before, futures in zip(
+                    self.keys, self.observed, self.forecasts.swapaxes(0, 1), strict=True
+                )
+                for sample, future in enumerate(futures)
+            ],
+            self.skeleton,
+            "forecasts",
+        )
+
     def save(self, path: str | Path) -> None:
         """Write an npz of plain arrays.
 
@@ -79,7 +94,7 @@ class Forecasts:
         for field, key in FIELDS.items():
             arrays[key] = np.array(getattr(self.skeleton, field), int if field in ("left", "right") else None)
         with files.written(path) as file:
-            write_arrays(file, arrays)
+            write_arrays(file, arrays.items())
 
     @classmethod
     def load(cls, path: str | Path) -> Forecasts:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import io
 import pickletools
 import re
+import shutil
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
@@ -83,21 +84,29 @@ def _limit(size: int) -> int:
     return min(LARGEST, max(SMALL, DENSEST * size))
 
 
-def write_arrays(file: BinaryIO, arrays: Mapping[str, np.ndarray]) -> None:
+def write_arrays(file: BinaryIO, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
     """Write an npz that `archive` reads, compressed where that may be: motion that hardly moves packs too well.
 
     Args:
         file: a new one, open for writing and reading.
-        arrays: the members by name.
+        arrays: the members by name, one at a time.
     """
-    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name, array in arrays:
+            with packed.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
     size = file.seek(0, io.SEEK_END)
-    with zipfile.ZipFile(file) as written:
-        unpacked = sum(info.file_size for info in written.infolist())
+    with zipfile.ZipFile(file) as packed:
+        unpacked = sum(info.file_size for info in packed.infolist())
     if unpacked > _limit(size):
         file.seek(0)
+        small = io.BytesIO(file.read())
+        file.seek(0)
         file.truncate()
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+        with zipfile.ZipFile(small) as packed, zipfile.ZipFile(file, "w") as stored:
+            for info in packed.infolist():
+                with packed.open(info) as source, stored.open(info.filename, "w", force_zip64=True) as member:
+                    shutil.copyfileobj(source, member, _CHUNK)
 
 
 def _members(file: zipfile.ZipFile, size: int) -> dict[str, Member]:

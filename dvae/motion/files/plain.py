@@ -1,4 +1,4 @@
-"""Reading and writing motion files: the `positions_3d` archive and plain npz.
+"""Archives of positions, read and written: `positions_3d`, plain npz, tables.
 
 The `positions_3d` archive is VideoPose3D's (Pavllo et al. 2019; `data_3d_h36m.npz`): an npz whose one member
 is a pickled dictionary split -> clip -> (F, J, 3). A pickle is a program, and numpy's `allow_pickle=True`
@@ -10,10 +10,10 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +21,16 @@ from ... import files
 from ..data import Clip, MotionSet
 from ..skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, read_text
 from .archive import archive, write_arrays
+from .recording import Recording, check_joints
+
+TURNS = ".rotations"
+"""At the end of a member's name: the rotations of the clip."""
+
+WHICH = (
+    "which skeleton? Put a skeleton.json beside it "
+    '({"joint_names": [...], "parents": [-1, 0, ...], "joints_left": [...], "joints_right": [...], '
+    '"up_axis": "y", "fps": 30}) or pass skeleton=, such as dvae.motion.HUMAN36M'
+)
 
 MOST_NUMBERS = 2**23
 """In a csv file of paths, blank rows included: a hundred thousand frames of twenty joints."""
@@ -32,54 +42,42 @@ _ARCHIVES = (
 """VideoPose3D's archives: subjects, joints, skeleton, and which of the joints make it up."""
 
 
-def read_motion(
-    path: str | Path,
-    skeleton: Skeleton | None = None,
-    labels: str | Path | None = None,
-    skip_bad: bool = False,
-    joints: Sequence[int] | None = None,
+def read_archive(
+    path: Path,
+    skeleton: Skeleton | None,
+    labels: str | Path | None,
+    skip_bad: bool,
+    joints: Sequence[int] | None,
+    metres: float | None = None,
+    up: str | None = None,
+    fps: float | None = None,
 ) -> MotionSet:
-    """Read a motion file.
-
-    An npz with the member `positions_3d` is VideoPose3D's archive; any other npz holds one (F, J, 3) array
-    per clip under the key "split/clip" (a key without a slash belongs to the split "all"). `skeleton.json`
-    and `labels.csv` (one row per clip with the columns split, clip and whatever is known) beside the file are
-    read too. VideoPose3D's archives of Human3.6M and HumanEva-I have no skeleton.json; they are known by their
-    subjects and joints.
+    """Read an npz of positions; see `read_motion`.
 
     Args:
-        path: the npz file.
-        skeleton: overrides skeleton.json.
-        labels: a csv file, instead of labels.csv.
-        skip_bad: leave out clips with NaN, wrong joints or units instead of raising; they are listed in
-            `skipped`.
         joints: which of the file's joints make up the skeleton, when it has more, such as `HUMAN36M_KEPT`.
-
-    Returns:
-        The clips in file order, in metres.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged, its pickle asks for anything but data, a clip is unusable, or no
-            skeleton is known; the message says which.
     """
-    path = Path(path)
     found = _read_clips(path)
     if skeleton is None:
         skeleton, kept = _skeleton_of(path, found)
         joints = kept if joints is None else joints
-    known = _read_labels(path, labels)
-    if known and not any((split, name) in known or (None, name) in known for split, name, _ in found):
-        raise ValueError(f"{_labels_of(path, labels)}: no row names a clip of {path} by (split, clip)")
+    skeleton = replace(skeleton, up=up or skeleton.up, fps=fps or skeleton.fps)
+    known = read_labels(path.with_name("labels.csv"), labels)
+    if known and not any((split, name) in known or (None, name) in known for split, name, _, _ in found):
+        file = Path(labels) if labels else path.with_name("labels.csv")
+        raise ValueError(f"{file}: no row names a clip of {path} by (split, clip)")
     found.reverse()
 
     def clips() -> Iterator[Clip]:
         while found:  # what was read is let go as soon as it is taken over
-            split, name, positions = found.pop()
+            split, name, positions, turns = found.pop()
             if joints is not None and positions.ndim == 3 and positions.shape[1] > max(joints):
-                positions = positions[:, list(joints)]
-            yield Clip(split, name, positions, known.get((split, name), known.get((None, name), {})))
-            del positions
+                positions, turns = positions[:, list(joints)], None
+            if metres is not None and positions.dtype.kind in "fiu":
+                positions = metres * positions
+            labelled = known.get((split, name), known.get((None, name), {}))
+            yield Clip(split, name, positions, labelled, rotations=turns if skeleton.rest else None)
+            del positions, turns
 
     return MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad)  # type: ignore[arg-type]
 
@@ -87,58 +85,73 @@ def read_motion(
 def save(path: str | Path, motion: MotionSet) -> None:
     """Write a plain npz, and beside it skeleton.json and (where there are labels) labels.csv, for `read_motion`.
 
-    Each takes the place of an older file, or of a link, once it is whole.
+    Each takes the place of an older file, or of a link, once it is whole. Rotations are members of their own, "split/
+    clip.rotations".
 
     Raises:
         OSError: one cannot be written; the error names it.
         ValueError: a clip's name has a slash, which would be read as part of the split, or is one that `read_motion`
             refuses.
     """
+    save_clips(path, iter(motion), lambda: motion.skeleton)
+
+
+def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], Skeleton]) -> None:
+    """What `save` does, of clips that are held one at a time.
+
+    Args:
+        path: the npz file.
+        clips: each asked for once.
+        skeleton: asked for after the last of them.
+    """
     path = Path(path)
-    if unnamed := [name for clip in motion for name in (clip.split, clip.name) if not is_name(name)]:
-        raise ValueError(f"{brief(unnamed[0])} is no name for a split and a clip: expected text that can be printed")
-    slashed = [clip.name for clip in motion if "/" in clip.name]
-    if slashed:
-        raise ValueError(f"clip name {slashed[0]!r} has a slash, which separates split and clip in the file")
-    arrays: dict[str, Any] = {f"{clip.split}/{clip.name}": clip.positions for clip in motion}
+    rows: list[dict[str, str]] = []
+
+    def members() -> Iterator[tuple[str, np.ndarray]]:
+        for clip in clips:
+            if unnamed := [name for name in clip.key if not is_name(name)]:
+                raise ValueError(
+                    f"{brief(unnamed[0])} is no name for a split and a clip: expected text that can be printed"
+                )
+            if "/" in clip.name or clip.name.endswith(TURNS):
+                raise ValueError(
+                    f"clip name {clip.name!r} has a slash, which separates split and clip in the file, or ends in "
+                    f"{TURNS}"
+                )
+            rows.append({**clip.labels, "split": clip.split, "clip": clip.name})
+            yield f"{clip.split}/{clip.name}", clip.positions
+            if clip.rotations is not None:
+                yield f"{clip.split}/{clip.name}{TURNS}", clip.rotations
+
     with files.written(path) as file:
-        write_arrays(file, arrays)
-    motion.skeleton.to_json(path.with_name("skeleton.json"))
-    columns = list(dict.fromkeys(name for clip in motion for name in clip.labels))
-    if columns:
+        write_arrays(file, members())
+    skeleton().to_json(path.with_name("skeleton.json"))
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    if len(columns) > 2:
         table = io.StringIO(newline="")
         writer = csv.DictWriter(table, ["split", "clip", *(c for c in columns if c not in ("split", "clip"))])
         writer.writeheader()
-        writer.writerows({**clip.labels, "split": clip.split, "clip": clip.name} for clip in motion)
+        writer.writerows(rows)
         with files.written(path.with_name("labels.csv")) as file:
             file.write(table.getvalue().encode())
 
 
-def _skeleton_of(path: Path, clips: Sequence[tuple[str, str, np.ndarray]]) -> tuple[Skeleton, tuple[int, ...] | None]:
+def _skeleton_of(path: Path, clips: Sequence[_Read]) -> tuple[Skeleton, tuple[int, ...] | None]:
     """The skeleton beside a file or of a known archive, and which of the file's joints make it up."""
     beside = path.with_name("skeleton.json")
     if beside.is_file():
         return Skeleton.from_json(beside), None
-    splits = {split for split, _, _ in clips}
-    counts = {positions.shape[1] for _, _, positions in clips if positions.ndim == 3}
+    splits = {split for split, *_ in clips}
+    counts = {positions.shape[1] for _, _, positions, _ in clips if positions.ndim == 3}
     for subjects, joints, skeleton, kept in _ARCHIVES:
         if splits and splits <= subjects and joints in counts:
             return skeleton, kept
-    raise ValueError(
-        f"{path}: which skeleton? Put a skeleton.json beside it "
-        '({"joint_names": [...], "parents": [-1, 0, ...], "joints_left": [...], "joints_right": [...], '
-        '"up_axis": "y", "fps": 30}) or pass skeleton=, such as dvae.motion.HUMAN36M'
-    )
+    raise ValueError(f"{path}: {WHICH}")
 
 
-def _labels_of(path: Path, labels: str | Path | None) -> Path:
-    """The file of labels that is given, or that stands beside the clips."""
-    return Path(labels) if labels else path.with_name("labels.csv")
-
-
-def _read_labels(path: Path, labels: str | Path | None) -> dict[tuple[str | None, str], dict[str, str]]:
-    """Rows by (split, clip); by (None, clip) where the file has no split column."""
-    file = _labels_of(path, labels)
+def read_labels(beside: Path, labels: str | Path | None) -> dict[tuple[str | None, str], dict[str, str]]:
+    """Rows by (split, clip), of a file that is given or stands beside; by (None, clip) where it has no split column."""
+    file = Path(labels) if labels else beside
     if not file.is_file():
         if labels:
             raise FileNotFoundError(f"{labels}: no such labels file")
@@ -260,12 +273,50 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
     return {joint: table[:, places] for joint, places in columns.items()}
 
 
-def _read_clips(path: Path) -> list[tuple[str, str, np.ndarray]]:
+def read_table(path: Path) -> Recording:
+    """Read a clip from a csv file of columns as in `read_paths`, with its skeleton.json beside it.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, or has other joints than the skeleton.
+    """
+    columns = _read_columns(path)
+    check_joints(path, len(columns))
+    if not (beside := path.with_name("skeleton.json")).is_file():
+        raise ValueError(f"{path}: {WHICH}")
+    skeleton = Skeleton.from_json(beside)
+    if set(columns) != set(skeleton.names):
+        differing = ", ".join(sorted(set(columns) ^ set(skeleton.names)))
+        raise ValueError(f"{path}: {beside} and the columns do not have the same joints: {differing[:600]}")
+    positions = np.stack([columns[name] for name in skeleton.names], 1)
+    return Recording(
+        skeleton.names, skeleton.parents, positions, fps=skeleton.fps, metres=1.0, up=skeleton.up, skeleton=skeleton
+    )
+
+
+def write_table(path: str | Path, names: Sequence[str], positions: np.ndarray) -> None:
+    """Write a clip (F, J, 3) as a csv file of columns such as LWrist_x, in metres, which `read_table` reads."""
+    table = io.StringIO(newline="")
+    writer = csv.writer(table)
+    writer.writerow(f"{name}_{axis}" for name in names for axis in "xyz")
+    writer.writerows([f"{value:.6f}" for value in row] for row in positions.reshape(len(positions), -1).tolist())
+    with files.written(path) as file:
+        file.write(table.getvalue().encode())
+
+
+_Read = tuple[str, str, np.ndarray, np.ndarray | None]
+"""Split, clip, positions, and rotations where there are."""
+
+
+def _read_clips(path: Path) -> list[_Read]:
     with archive(path) as members:
         if list(members) == ["positions_3d"]:
-            return members["positions_3d"].clips()
+            return [(*clip, None) for clip in members["positions_3d"].clips()]
         clips = []
+        turns = {name for name in members if name.endswith(TURNS) and name.removesuffix(TURNS) in members}
         for name, member in members.items():
             split, slash, clip = name.rpartition("/")
-            clips.append((split if slash else "all", clip, member.array()))
+            if name not in turns:
+                turned = members[name + TURNS].array() if name + TURNS in turns else None
+                clips.append((split if slash else "all", clip, member.array(), turned))
         return clips

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..kinematics import forward
 from ..rotations import continuous, from_matrix
-from ..skeleton import MOST_JOINTS
+from ..skeleton import MOST_JOINTS, Skeleton
 
 MOST_TEXT = 2**28
 """Bytes of a text file of motion: an hour of sixty joints at 60 Hz."""
@@ -38,6 +38,7 @@ class Recording:
         fps: frames per second, where the file says.
         metres: of a unit, where the file says.
         up: the axis that is, where the file says.
+        skeleton: of these joints, where it stands beside the file.
     """
 
     names: Sequence[str]
@@ -48,6 +49,7 @@ class Recording:
     fps: float | None = None
     metres: float | None = None
     up: str | None = None
+    skeleton: Skeleton | None = None
 
     @classmethod
     def turned(

@@ -1,9 +1,10 @@
-"""From what a file holds to metres, an up axis and sides: found in the recording, said, and checked."""
+"""From what files hold to metres, an up axis and sides: found in the recordings, said, and checked."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log
 
@@ -53,6 +54,8 @@ def upright(recording: Recording) -> tuple[str, bool]:
 
     Axes of files are right-handed; most have y or z upwards.
     """
+    if recording.up:
+        return recording.up, True
     tops = [place for place, name in enumerate(recording.names) if _TOP.search(name)]
     bottoms = [place for place, name in enumerate(recording.names) if _BOTTOM.search(name)]
     if tops and bottoms:
@@ -63,77 +66,107 @@ def upright(recording: Recording) -> tuple[str, bool]:
     return "xyz"[axis], bool(along[axis] > 0)
 
 
+def extent(recording: Recording) -> float:
+    """The body's largest extent along an axis, in the recording's unit: the median over frames."""
+    return float(np.median(np.ptp(recording.positions, axis=1).max(1)))
+
+
 def unit(recording: Recording) -> tuple[str, float]:
     """Name of the file's unit and its metres: what the file says, or that in which a person has a person's size.
 
     Raises:
         ValueError: there is none.
     """
-    extent = float(np.median(np.ptp(recording.positions, axis=1).max(1)))
     if recording.metres is not None:
         return "as the file says", recording.metres
-    fitting = {name: abs(log(max(extent, 1e-12) * metres / HEIGHT)) for name, metres in UNITS.items()}
+    size = extent(recording)
+    fitting = {name: abs(log(max(size, 1e-12) * metres / HEIGHT)) for name, metres in UNITS.items()}
     name = min(fitting, key=fitting.__getitem__)
-    if fitting[name] > log(WITHIN):
+    if not fitting[name] <= log(WITHIN):
         raise ValueError(
-            f"the body's largest extent is {extent:.4g} (median over frames), which is a person's in none of "
+            f"the body's largest extent is {size:.4g} (median over frames), which is a person's in none of "
             f"{', '.join(UNITS)}; give the metres of the file's unit"
         )
     return name, UNITS[name]
 
 
-@dataclass(frozen=True, eq=False)
-class Settled:
-    """A recording in metres, with y or z upwards.
+@dataclass(frozen=True)
+class World:
+    """How the units and axes of recordings that belong together are understood.
 
     Args:
-        recording: in these.
-        left, right: places of the joints on either side.
-        said: how the file's unit and axes were understood, for people to check.
+        unit: name of the files' unit.
+        metres: of one.
+        axis: along which people stand.
+        upwards: whether it points up.
     """
 
-    recording: Recording
-    left: tuple[int, ...]
-    right: tuple[int, ...]
-    said: str
+    unit: str
+    metres: float
+    axis: str
+    upwards: bool
+
+    @property
+    def up(self) -> str:
+        """The axis once settled: y or z. People who stand along x, or upside down, are turned to y."""
+        return self.axis if self.upwards and self.axis != "x" else "y"
+
+    def __str__(self) -> str:
+        turned = "" if self.up == self.axis and self.upwards else f", turned from {'' if self.upwards else '-'}"
+        return f"unit {self.unit} ({self.metres:.4g} m), {self.up} up{turned}{self.axis if turned else ''}"
 
 
-def settle(recording: Recording, metres: float | None = None, up: str | None = None) -> Settled:
-    """A recording in metres with y or z upwards.
+def understand(recordings: Mapping[str, Recording], metres: float | None = None, up: str | None = None) -> World:
+    """Unit and axes of recordings that belong together: what files say, or what most people in them show.
 
     Args:
-        recording: as a file has it.
-        metres: of the file's unit; by default as the file says, or as its person's size tells.
-        up: "y" or "z"; by default as the file says, or as its person stands. One who stands along x, or upside down,
-            is turned to y.
+        recordings: some of them, by what to call them.
+        metres: of the files' unit, instead.
+        up: "y" or "z", instead.
 
     Raises:
-        ValueError: no unit fits.
+        ValueError: no unit fits, or another one to each; or what is given is no unit or axis.
     """
-    name, found = ("as given", metres) if metres is not None else unit(recording)
-    said = up or recording.up
-    axis, upwards = (said, True) if said else upright(recording)
-    turn, turned = np.eye(3), ""
-    if axis == "x" or not upwards:  # a rotation that takes the person's axis to y
-        turn = np.roll(np.eye(3), "yzx".index(axis), axis=1)[[0, 1, 2]]
-        turn = turn if upwards else np.diag([1.0, -1.0, -1.0]) @ turn
-        turned = f", turned from {'' if upwards else '-'}{axis}"
-        axis = "y"
-    rotations, offsets = recording.rotations, recording.offsets
-    if rotations is not None and turned:
-        root = to_matrix(torch.from_numpy(rotations[:, 0]), "quaternion")
-        rotations = rotations.copy()
-        rotations[:, 0] = from_matrix(torch.from_numpy(turn) @ root, "quaternion").numpy()
-        rotations = continuous(torch.from_numpy(rotations)).numpy()
-    positions = found * (recording.positions @ turn.T)
-    settled = replace(
-        recording,
-        positions=positions,
-        rotations=rotations,
-        offsets=None if offsets is None else found * offsets,
+    if up not in (None, "y", "z"):
+        raise ValueError(f"the up axis is {up!r}, expected 'y' or 'z'")
+    if metres is not None and not 1e-6 < metres < 1e6:
+        raise ValueError(f"a unit of {metres} m, expected such as 0.01 for centimetres")
+    found: dict[tuple[str, float], str] = {} if metres is None else {("as given", metres): ""}
+    unknown = []
+    for name, recording in recordings.items() if metres is None else ():
+        try:
+            found.setdefault(unit(recording), name)
+        except ValueError as error:
+            unknown.append(f"{name}: {error}")
+    if not found:
+        raise ValueError(unknown[0])
+    if len({known for _, known in found}) > 1:
+        ((first, _), here), ((other, _), there), *_ = found.items()
+        raise ValueError(f"{here} looks as if in {first}, {there} in {other}; give the metres of the unit of all")
+    axis, upwards = (up, True) if up else Counter(map(upright, recordings.values())).most_common(1)[0][0]
+    return World(*next(iter(found)), axis, upwards)
+
+
+def settle(recording: Recording, world: World) -> Recording:
+    """A recording in metres, with y or z upwards."""
+    turn = np.eye(3)
+    if world.axis == "x" or not world.upwards:  # a rotation that takes the person's axis to y
+        turn = np.roll(np.eye(3), "yzx".index(world.axis), axis=1)
+        turn = turn if world.upwards else np.diag([1.0, -1.0, -1.0]) @ turn
+    return replace(
+        turned(recording, turn),
+        positions=world.metres * (recording.positions @ turn.T),
+        offsets=None if recording.offsets is None else world.metres * recording.offsets,
         metres=1.0,
-        up=axis,
+        up=world.up,
     )
-    extent = float(np.median(np.ptp(positions, axis=1).max(1)))
-    left, right = sides(recording.names)
-    return Settled(settled, left, right, f"unit {name} ({found:.4g} m), {axis} up{turned}, a person of {extent:.2f} m")
+
+
+def turned(recording: Recording, turn: np.ndarray) -> Recording:
+    """A recording whose world is turned by a matrix (3, 3)."""
+    rotations = recording.rotations
+    if rotations is not None and (turn != np.eye(3)).any():
+        root = torch.from_numpy(turn) @ to_matrix(torch.from_numpy(rotations[:, 0]), "quaternion")
+        rotations = np.concatenate([from_matrix(root, "quaternion").numpy()[:, None], rotations[:, 1:]], 1)
+        rotations = continuous(torch.from_numpy(rotations)).numpy()
+    return replace(recording, positions=recording.positions @ turn.T, rotations=rotations)

@@ -1,0 +1,392 @@
+"""Motion files of any kind, and folders of them, to one set of clips in metres."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..data import Clip, MotionSet, defect
+from ..matching import Kept
+from ..skeleton import Skeleton, brief, is_name
+from .amc import read_amc, read_expmap
+from .archive import LARGEST
+from .bvh import read_bvh
+from .markers import read_c3d
+from .plain import read_archive, read_labels, read_table
+from .recording import Recording
+from .settled import World, settle, sides, turned, understand
+from .smpl import is_amass, read_amass
+
+READERS: dict[str, Callable[[Path], Recording]] = {
+    ".bvh": read_bvh,
+    ".amc": read_amc,
+    ".c3d": read_c3d,
+    ".npz": read_amass,
+    ".csv": read_table,
+    ".txt": read_expmap,
+}
+"""By the end of a file's name, in the order in which a folder's files are taken for motion."""
+
+MOST_FILES = 100_000
+SAMPLE = 9
+"""Files of a folder from which its unit and axes are found."""
+
+SAME = 1e-3
+"""Metres within which two files have one rest pose."""
+
+LIKE = 1.6
+"""Factor within which bodies of one folder are; inches are 2.54 centimetres."""
+
+
+@dataclass(frozen=True)
+class File:
+    """A file of one recording, and what its clip is called."""
+
+    split: str
+    name: str
+    path: Path
+
+    def read(self) -> Recording:
+        """What it holds; the message of what is refused has the path."""
+        return READERS[self.path.suffix.lower()](self.path)
+
+
+def read_motion(
+    path: str | Path,
+    skeleton: Skeleton | None = None,
+    labels: str | Path | None = None,
+    skip_bad: bool = False,
+    joints: Sequence[int | str] | Mapping[str, str] | None = None,
+    onto: Skeleton | None = None,
+    metres: float | None = None,
+    up: str | None = None,
+    fps: float | None = None,
+) -> MotionSet:
+    """Read a motion file, or a folder of files of one kind and one skeleton.
+
+    | file | |
+    |---|---|
+    | `.bvh` | |
+    | `.amc` | with its `.asf` beside it |
+    | `.txt` | exponential maps as in the CMU benchmark |
+    | `.c3d` | markers; needs the extra `c3d` |
+    | `.csv` | one clip in metres, columns such as LWrist_x, LWrist_y, LWrist_z; `skeleton.json` beside it |
+    | `.npz` | AMASS: one clip, members `poses`, `trans`, `mocap_framerate` |
+    | `.npz` | VideoPose3D's archive: the member `positions_3d` |
+    | `.npz` | any other: an array (F, J, 3) in metres for each clip under "split/clip"; `skeleton.json` beside it |
+
+    A folder is read to its last subfolder, without following links: a clip's name is its file's, its split the
+    subfolder, or "all". A key of an npz without a slash belongs to the split "all", too. `labels.csv` (one row per
+    clip with the columns split, clip and whatever is known) beside the file, or in the folder, is read too.
+    VideoPose3D's archives of Human3.6M and HumanEva-I have no skeleton.json; they are known by their subjects and
+    joints.
+
+    Units and axes are as the file says, or found: a person has a person's size, and their head is above their feet.
+    `MotionSet.said` has what was found.
+
+    Args:
+        path: the file or folder.
+        skeleton: overrides the file's, or skeleton.json.
+        labels: a csv file, instead of labels.csv.
+        skip_bad: leave out clips with NaN, wrong joints or units instead of raising; they are listed in
+            `skipped`.
+        joints: those to keep, by place or name; or by name with a new one. Each hangs from its nearest ancestor that is
+            kept. Rotations are kept where no bone between kept joints bends.
+        onto: a known skeleton, such as `WALKER`, whose joints are found by what names mean; `joints` may say which is
+            which, {"name there": "name here"}.
+        metres: of the file's unit, instead of what is found.
+        up: the file's axis that is up, "y" or "z", instead of what is found.
+        fps: frames per second, instead of those that the file states; to change them, see `MotionSet.resampled`.
+
+    Returns:
+        The clips in file order, in metres.
+
+    Raises:
+        FileNotFoundError: there is no such file, or none in the folder.
+        ValueError: the file is damaged, its pickle asks for anything but data, a clip is unusable, files of a folder
+            differ in joints or frames per second, or no skeleton is known; the message says which.
+        RuntimeError: a c3d file, and the extra `c3d` is not installed.
+    """
+    path = Path(path)
+    files = find_files(path)
+    if not files:
+        places = [joint for joint in joints or () if isinstance(joint, int)] if onto is None else []
+        found = read_archive(path, skeleton, labels, skip_bad, places or None, metres, up, fps)
+        return found if places or (joints is None and onto is None) else _chosen(found, joints, onto)
+    known = read_labels((path if path.is_dir() else path.parent) / "labels.csv", labels)
+    reader = Reader(understand(sampled(files, skip_bad), metres, up), metres is not None, fps, skeleton, joints, onto)
+    collected = Collected(path.stem)
+    clips, unread, size = [], [], 0
+    for file in files:
+        try:
+            clip, own = reader(file)
+            if reason := collected.add(file.path, clip, own):
+                raise ValueError(reason)
+        except ValueError as error:
+            if not skip_bad:
+                raise
+            unread.append((file.split, file.name, str(error)))
+            continue
+        size += clip.positions.nbytes + (0 if clip.rotations is None else clip.rotations.nbytes)
+        if size > LARGEST:
+            raise ValueError(
+                f"{path}: it has more than {LARGEST:,} bytes of motion, up to {file.path}; `dvae data convert --fps` "
+                "makes it smaller, or give its folders one by one"
+            )
+        clips.append(replace(clip, labels=known.get(clip.key, known.get((None, clip.name), {}))))
+    if not clips:
+        raise ValueError(f"{path}: no file of it can be read; the first: {unread[0][2]}")
+    if not collected.skeleton.rest:
+        clips = [replace(clip, rotations=None) for clip in clips]
+    made = MotionSet(
+        clips, collected.skeleton, path.stem, copy=False, skip_bad=skip_bad, said=collected.said(reader.world)
+    )
+    object.__setattr__(made, "skipped", (*made.skipped, *unread))
+    return made
+
+
+def find_files(path: Path) -> list[File]:
+    """Files of one recording each: the path itself, or those of a folder; none if it is an archive of many clips.
+
+    Raises:
+        FileNotFoundError: there is nothing.
+        ValueError: a folder has files of several kinds; or their names are none for clips.
+    """
+    if not path.is_dir():
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file")
+        suffix = path.suffix.lower()
+        if suffix not in READERS or (suffix == ".npz" and not is_amass(path)):
+            return []
+        return [_named(File("all", path.stem, path))]
+    kinds: dict[str, list[File]] = {suffix: [] for suffix in READERS}
+    count = 0
+    for folder, inner, names in os.walk(path, followlinks=False):
+        inner.sort()
+        split = Path(folder).relative_to(path).as_posix()
+        for name in sorted(names):
+            file = Path(folder, name)
+            suffix = file.suffix.lower()
+            if suffix in kinds and not name.startswith(".") and name != "labels.csv" and not file.is_symlink():
+                kinds[suffix].append(File("all" if split == "." else split, file.stem, file))
+                count += 1
+                if count > MOST_FILES:
+                    raise ValueError(f"{path}: it has more than {MOST_FILES:,} files; give its folders one by one")
+    there = {suffix: files for suffix, files in kinds.items() if files}
+    sure = [suffix for suffix in there if suffix not in (".csv", ".txt")]  # of these, many are no motion
+    if len(sure) > 1:
+        counts = " and ".join(f"{len(there[suffix])} {suffix[1:]}" for suffix in sure)
+        raise ValueError(f"{path}: it has {counts} files; put each kind into a folder of its own")
+    if not there:
+        raise FileNotFoundError(f"{path}: no file in it is one of {', '.join(READERS)}")
+    return [_named(file) for file in there[next(iter(there))]]
+
+
+def _named(file: File) -> File:
+    if not all(is_name(name) for name in (file.split, file.name)):
+        raise ValueError(
+            f"{brief(str(file.path))} is no name for a split and a clip: expected text that can be printed"
+        )
+    return file
+
+
+def sampled(files: Sequence[File], skip_bad: bool = False) -> dict[str, Recording]:
+    """Some recordings of a folder, from its first file to its last."""
+    found, wrong = {}, None
+    for place in sorted({round(at) for at in np.linspace(0, len(files) - 1, min(SAMPLE, len(files)))}):
+        try:
+            found[str(files[place].path)] = files[place].read()
+        except ValueError as error:
+            if not skip_bad:
+                raise
+            wrong = error
+    if wrong is not None and not found:
+        raise wrong
+    return found
+
+
+@dataclass(frozen=True)
+class Reader:
+    """From a file of one recording to a clip and its skeleton, alike for all files of a folder; see `read_motion`.
+
+    Args:
+        world: how their units and axes are understood.
+        given: whether its unit goes before what a file says of its own.
+        resampled: frames per second of what is returned; by default the file's.
+    """
+
+    world: World
+    given: bool = False
+    fps: float | None = None
+    skeleton: Skeleton | None = None
+    joints: Sequence[int | str] | Mapping[str, str] | None = None
+    onto: Skeleton | None = None
+    resampled: float | None = None
+
+    def __call__(self, file: File) -> tuple[Clip, Skeleton]:
+        """The clip, and the skeleton of it alone.
+
+        Raises:
+            ValueError: the file cannot be used; the message has the path.
+        """
+        recording = file.read()
+        try:
+            return self._clip(file, recording)
+        except ValueError as error:
+            raise error if str(file.path) in str(error) else ValueError(f"{file.path}: {error}") from error
+
+    def _clip(self, file: File, recording: Recording) -> tuple[Clip, Skeleton]:
+        world = self.world
+        if recording.metres is not None and not self.given:
+            world = replace(world, unit="as the file says", metres=recording.metres)
+        settled = settle(recording, world)
+        fps = self.fps or settled.fps
+        if fps is None:
+            raise ValueError("it does not say its frames per second; give fps=")
+        known = self.skeleton or settled.skeleton
+        if known and known.joints != len(settled.names):
+            raise ValueError(f"it has {len(settled.names)} joints, skeleton {known.name!r} has {known.joints}")
+        if known:
+            alike = list(known.parents) == list(settled.parents)
+            settled = replace(settled, names=known.names, parents=known.parents)
+            settled = settled if alike else replace(settled, rotations=None, offsets=None)
+        empty = Clip(file.split, file.name, np.empty((0, 0, 3)))
+        clip, own = clip_of(settled, empty, fps, known, self.joints, self.onto)
+        if self.resampled and self.resampled != fps:
+            clip, own = clip.resampled(fps / self.resampled), replace(own, fps=float(self.resampled))
+        if reason := defect(clip, own):
+            raise ValueError(reason)
+        return clip, own
+
+
+def clip_of(
+    recording: Recording,
+    clip: Clip,
+    fps: float,
+    known: Skeleton | None,
+    joints: Sequence[int | str] | Mapping[str, str] | None,
+    onto: Skeleton | None,
+) -> tuple[Clip, Skeleton]:
+    """A clip of what a recording in metres holds, and its skeleton.
+
+    Args:
+        recording: in metres.
+        clip: what it is called, and what is known of it.
+        fps: frames per second.
+        known: the skeleton, where it is.
+        joints, onto: see `read_motion`.
+    """
+    recording = kept(recording, joints, onto)
+    known = onto or (known if joints is None else None)
+    left, right = (known.left, known.right) if known else sides(recording.names)
+    positions, rotations = recording.positions.astype(np.float32), None
+    rest: tuple[float, ...] = ()
+    if recording.rotations is not None and recording.offsets is not None:
+        rotations, offsets = recording.rotations.astype(np.float32), recording.offsets.copy()
+        offsets[list(recording.parents).index(-1)] = 0
+        rest = tuple(offsets.flatten().tolist())
+    tree = tuple(recording.names), tuple(recording.parents), left, right
+    own = Skeleton(*tree, recording.up or "y", float(fps), known.name if known else clip.name, rest=rest)
+    return replace(clip, positions=positions, rotations=rotations), own
+
+
+def kept(
+    recording: Recording, joints: Sequence[int | str] | Mapping[str, str] | None, onto: Skeleton | None
+) -> Recording:
+    """A recording in metres with some of its joints, or with those of a known skeleton and its axis upwards."""
+    if joints is None and onto is None:
+        return recording
+    names, parents = recording.names, recording.parents
+    if onto is None:
+        chosen = Kept.of(names, parents, joints or ())
+    else:
+        chosen = Kept.onto(names, onto, joints if isinstance(joints, Mapping) else None)
+    positions, rotations, offsets = chosen.motion(parents, recording.positions, recording.rotations)
+    made = replace(
+        recording, names=chosen.names, parents=chosen.parents, positions=positions, rotations=rotations, offsets=offsets
+    )
+    return upwards(made, onto.up) if onto is not None and onto.up != recording.up else made
+
+
+def upwards(recording: Recording, up: str) -> Recording:
+    """A recording whose other axis is up, turned about x."""
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y to z
+    return replace(turned(recording, turn if up == "z" else turn.T), up=up)
+
+
+class Collected:
+    """What clips of one folder have in common, taken in one at a time: they have the same joints and frames per second.
+
+    Args:
+        name: of the folder.
+    """
+
+    def __init__(self, name: str):
+        self._name, self._first = name, Path()
+        self._skeleton: Skeleton | None = None
+        self._size, self._alike, self._extents = 0.0, True, [0.0]
+
+    def add(self, path: Path, clip: Clip, skeleton: Skeleton) -> str | None:
+        """Takes a clip in, or says why it does not belong to those before."""
+        size = float(skeleton.bone_lengths(clip.positions[0].astype(np.float64)).sum())
+        own = float(np.median(np.ptp(clip.positions, axis=1).max(1)))
+        if self._skeleton is None:
+            self._first, self._skeleton, self._size, self._extents = path, skeleton, size, [own]
+            return None
+        first = self._skeleton
+        if set(first.names) != set(skeleton.names):
+            lacking = [name for name in first.names if name not in skeleton.names]
+            strange = [name for name in skeleton.names if name not in first.names]
+            said = [f"{verb} {', '.join(names[:8])}" for verb, names in (("lacks", lacking), ("has", strange)) if names]
+            return f"{path}: {' and '.join(said)}, other than {self._first}; joints= or onto= takes what they share"
+        if first.names != skeleton.names or (first.parents != skeleton.parents and clip.rotations is not None):
+            return f"{path}: its joints stand in another order or tree than those of {self._first}; give onto="
+        if first.fps != skeleton.fps:
+            return (
+                f"{path}: {skeleton.fps:g} frames per second, {self._first} has {first.fps:g}; give fps= if their "
+                "headers are wrong, or have `dvae data convert --fps` resample them"
+            )
+        if not 1 / LIKE < size / max(self._size, 1e-9) < LIKE:
+            return (
+                f"{path}: its body is {size / max(self._size, 1e-9):.2g} times that of {self._first}; if it is in "
+                "another unit, read it apart, by metres="
+            )
+        other, rest = np.array(first.rest), np.array(skeleton.rest)
+        self._alike &= other.shape == rest.shape and not (np.abs(other - rest) > SAME).any()
+        self._extents.append(own)
+        return None
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """Of all; without a rest pose where they have different ones."""
+        assert self._skeleton is not None
+        single = len(self._extents) == 1
+        name = self._skeleton.name if single or self._skeleton.name != self._first.stem else self._name
+        return replace(self._skeleton, name=name, rest=self._skeleton.rest if self._alike else ())
+
+    def said(self, world: World) -> str:
+        """How the files were understood."""
+        apart = "" if self._alike else "; rotations are left out, as rest poses differ"
+        return f"{world}, a person of {np.median(self._extents):.2f} m{apart}"
+
+
+def _chosen(
+    motion: MotionSet, joints: Sequence[int | str] | Mapping[str, str] | None, onto: Skeleton | None
+) -> MotionSet:
+    """Clips with some of their joints."""
+    skeleton, collected, clips = motion.skeleton, Collected(motion.name), []
+    offsets = skeleton.offsets.numpy() if skeleton.rest else None
+    for clip in motion:
+        turns = clip.rotations if skeleton.rest else None
+        whole = Recording(skeleton.names, skeleton.parents, clip.positions, turns, offsets, up=skeleton.up)
+        made, own = clip_of(whole, clip, skeleton.fps, skeleton, joints, onto)
+        if reason := collected.add(Path("/".join(clip.key)), made, own):
+            raise ValueError(f"{motion.name}: {reason}")
+        clips.append(made)
+    if not collected.skeleton.rest:
+        clips = [replace(clip, rotations=None) for clip in clips]
+    return MotionSet(clips, collected.skeleton, motion.name, copy=False, said=motion.said)

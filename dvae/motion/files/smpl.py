@@ -1,0 +1,179 @@
+"""AMASS's layout (Mahmood et al. 2019, arXiv 1904.03278): turns of SMPL's joints, read and written without its body.
+
+The files have no lengths of bones; these come from a body under a licence of its own, and the shape parameters `betas`.
+Without it, people are of one average body here: a height of 1.7 m, and segments by Drillis and Contini (1966), as
+figure 4.1 of Winter, Biomechanics and Motor Control of Human Movement, has them. So is the place of the pelvis but for
+a constant: SMPL adds its template's to `trans`. Files that are written here hold `offsets` too, and are read by them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ... import files
+from ..data import Clip, MotionSet
+from ..kinematics import inverse
+from ..matching import Kept, against_world, parts
+from ..rotations import from_matrix, to_matrix
+from ..skeleton import Skeleton
+from .archive import archive, write_arrays
+from .recording import Recording, check_size
+from .settled import sides
+
+_HEIGHT = 1.7
+_BODY = {  # joint, parent, offset in heights: left towards +x, y up, facing +z
+    "Pelvis": ("", 0, 0, 0),
+    "L_Hip": ("Pelvis", 0.0955, 0, 0),
+    "R_Hip": ("Pelvis", -0.0955, 0, 0),
+    "Spine1": ("Pelvis", 0, 0.072, 0),
+    "L_Knee": ("L_Hip", 0, -0.245, 0),
+    "R_Knee": ("R_Hip", 0, -0.245, 0),
+    "Spine2": ("Spine1", 0, 0.072, 0),
+    "L_Ankle": ("L_Knee", 0, -0.246, 0),
+    "R_Ankle": ("R_Knee", 0, -0.246, 0),
+    "Spine3": ("Spine2", 0, 0.072, 0),
+    "L_Foot": ("L_Ankle", 0, -0.039, 0.076),
+    "R_Foot": ("R_Ankle", 0, -0.039, 0.076),
+    "Neck": ("Spine3", 0, 0.072, 0),
+    "L_Collar": ("Spine3", 0.043, 0.072, 0),
+    "R_Collar": ("Spine3", -0.043, 0.072, 0),
+    "Head": ("Neck", 0, 0.052, 0),
+    "L_Shoulder": ("L_Collar", 0.0865, 0, 0),
+    "R_Shoulder": ("R_Collar", -0.0865, 0, 0),
+    "L_Elbow": ("L_Shoulder", 0.186, 0, 0),
+    "R_Elbow": ("R_Shoulder", -0.186, 0, 0),
+    "L_Wrist": ("L_Elbow", 0.146, 0, 0),
+    "R_Wrist": ("R_Elbow", -0.146, 0, 0),
+}
+JOINTS = tuple(_BODY)
+PARENTS = tuple(JOINTS.index(parent) if parent else -1 for parent, *_ in _BODY.values())
+OFFSETS = _HEIGHT * np.array([place for _, *place in _BODY.values()], float)
+"""Of the average body, standing with arms to the sides, (22, 3) in metres."""
+
+_FPS = ("mocap_framerate", "mocap_frame_rate")
+
+
+def is_amass(path: Path) -> bool:
+    """Whether a file is an npz in AMASS's layout."""
+    try:
+        with archive(path) as members:
+            return {"poses", "trans"} <= members.keys()
+    except (OSError, ValueError):  # whoever reads it says what is wrong with it
+        return False
+
+
+def read_amass(path: str | Path) -> Recording:
+    """Read an npz of AMASS: the 22 joints of the body, z up.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is none, or damaged.
+    """
+    path = Path(path)
+    with archive(path) as members:
+        if not {"poses", "trans"} <= members.keys():
+            raise ValueError(
+                f"{path}: no file of AMASS, which has poses and trans; an npz of many clips is read by itself, "
+                "not in a folder"
+            )
+        wanted = ("poses", "trans", "offsets", *_FPS)
+        found = {name: members[name].array() for name in wanted if name in members}
+    poses, places = found["poses"], found["trans"]
+    frames, numbers = len(places) if places.ndim else 0, 3 * len(JOINTS)
+    if not (poses.ndim == 2 and len(poses) == frames > 0 and poses.shape[1] >= numbers and places.shape == (frames, 3)):
+        raise ValueError(
+            f"{path}: poses {poses.shape}, trans {places.shape}, expected (frames, {numbers} or more) and (frames, 3)"
+        )
+    check_size(path, frames, len(JOINTS))
+    if "offsets" in found and found["offsets"].shape != (len(JOINTS), 3):
+        raise ValueError(f"{path}: offsets {found['offsets'].shape}, expected {(len(JOINTS), 3)}")
+    for name, values in found.items():
+        if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+            raise ValueError(f"{path}: {name} holds {values.dtype}, expected numbers, none NaN or infinite")
+        if (np.abs(values.astype(np.float64)) > 1e6).any():
+            raise ValueError(f"{path}: {name} holds {np.abs(values).max():g}, which is no metre, radian or rate")
+    rate = next((found[name] for name in _FPS if name in found), np.zeros(0))
+    fps = float(rate.reshape(-1)[0]) if rate.size == 1 else 0.0
+    if not fps > 0:
+        raise ValueError(f"{path}: it needs mocap_framerate, frames per second")
+    offsets = found.get("offsets", OFFSETS).astype(np.float64)
+    vectors = torch.from_numpy(poses[:, :numbers].astype(np.float64)).unflatten(-1, (-1, 3))
+    rest = torch.from_numpy(offsets).repeat(frames, 1, 1)
+    rest[:, 0] = torch.from_numpy(places.astype(np.float64))
+    return Recording.turned(JOINTS, PARENTS, offsets, rest, to_matrix(vectors, "vector"), fps, metres=1.0, up="z")
+
+
+def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
+    """Write a clip in AMASS's layout: poses (F, 156), trans, mocap_framerate, betas of zeros; and offsets.
+
+    Joints are found by what their names mean; those that a skeleton lacks are not turned. Where a bone between two of
+    them bends, all turns are found anew from positions, as by `MotionSet.with_rotations`.
+
+    Args:
+        path: the npz file.
+        clip: with rotations.
+        skeleton: with their rest pose.
+
+    Raises:
+        ValueError: no joint is the pelvis.
+    """
+    there = parts(skeleton.names)
+    meant = {name: there[part] for part, name in _named().items() if part in there}
+    if "Pelvis" not in meant:
+        raise ValueError(f"{path}: no joint is the pelvis; there are {', '.join(skeleton.names)[:600]}")
+    names = [name for name in JOINTS if name in meant]
+    above = [_above(name, names) for name in names]
+    parents = [names.index(parent) if parent else -1 for parent in above]
+    kept = Kept(tuple(meant[name] for name in names), tuple(names), tuple(parents))
+    positions, rotations, offsets = kept.motion(skeleton.parents, clip.positions.astype(np.float64), clip.rotations)
+    if rotations is None or offsets is None:  # a bone between these joints bends, in the back as a rule
+        tree = Skeleton(kept.names, kept.parents, *sides(names), skeleton.up, skeleton.fps)
+        single = MotionSet([Clip("", "", positions)], tree).with_rotations()
+        rotations, offsets = np.asarray(single.clips[0].rotations, np.float64), single.skeleton.offsets.numpy()
+    offsets[0] = 0
+    stood = _standing(names, parents)
+    tree = Skeleton(tuple(names), tuple(parents))
+    raised = inverse(tree, torch.from_numpy(stood)[None], torch.from_numpy(offsets))
+    raised = against_world(parents, raised)  # of each joint, from the rest pose to arms at the sides
+    world = against_world(parents, to_matrix(torch.from_numpy(rotations), "quaternion"))
+    places = torch.from_numpy(clip.positions[:, meant["Pelvis"]].astype(np.float64))
+    if skeleton.up == "y":
+        up = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+        world, places = up @ world, places @ up.T
+    world = world @ raised.mT
+    bones = (raised[:, [max(parent, 0) for parent in parents]] @ torch.from_numpy(offsets)[..., None])[0, ..., 0]
+    turns = torch.eye(3, dtype=torch.float64).repeat(len(world), len(JOINTS), 1, 1)
+    all_offsets = np.zeros_like(OFFSETS)
+    for place, (name, parent) in enumerate(zip(names, parents, strict=True)):
+        turns[:, JOINTS.index(name)] = world[:, place] if parent < 0 else world[:, parent].mT @ world[:, place]
+        all_offsets[JOINTS.index(name)] = bones[place]
+    poses = np.zeros((len(world), 156))
+    poses[:, : 3 * len(JOINTS)] = from_matrix(turns, "vector").flatten(1).numpy()
+    arrays = {"poses": poses, "trans": places.numpy(), "betas": np.zeros(16), "offsets": all_offsets}
+    arrays |= {"mocap_framerate": np.array(skeleton.fps), "gender": np.array("neutral")}
+    with files.written(path) as file:
+        write_arrays(file, arrays.items())
+
+
+def _named() -> dict[str, str]:
+    return {part: JOINTS[joint] for part, joint in parts(JOINTS).items()}
+
+
+def _above(name: str, names: Sequence[str]) -> str:
+    """The nearest ancestor among these names."""
+    parent = _BODY[name][0]
+    while parent and parent not in names:
+        parent = _BODY[parent][0]
+    return parent
+
+
+def _standing(names: Sequence[str], parents: Sequence[int]) -> np.ndarray:
+    """Places of some of the average body's joints."""
+    places: dict[str, np.ndarray] = {"": np.zeros(3)}
+    for (name, (parent, *_)), offset in zip(_BODY.items(), OFFSETS, strict=True):
+        places[name] = places[parent] + offset
+    return np.stack([places[name] for name in names])

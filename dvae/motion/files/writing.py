@@ -1,0 +1,199 @@
+"""Motion to files of every kind that is written: one file, or a folder of one for each clip."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+from ..data import Clip, MotionSet
+from ..skeleton import Skeleton, brief
+from .bvh import write_bvh
+from .plain import save, save_clips, write_table
+from .reading import Collected, File, Reader, find_files, read_motion, sampled, upwards
+from .recording import Recording
+from .settled import understand
+from .smpl import write_amass
+
+FORMATS = {"npz": ".npz", "bvh": ".bvh", "csv": ".csv", "amass": ".npz"}
+"""What is written, and how the names of its files end. Only `npz` holds many clips in one file."""
+
+
+def format_of(path: str | Path, format: str | None = None) -> str:
+    """The format of what is written to a path: what is told, or what the end of its name says.
+
+    Raises:
+        ValueError: neither does, or they contradict each other.
+    """
+    suffix = Path(path).suffix.lower()
+    if format is None:
+        format = suffix.removeprefix(".")
+    if format not in FORMATS or suffix not in ("", FORMATS[format]):
+        raise ValueError(
+            f"{path}: which format? Motion is written as {', '.join(FORMATS)}: end the name in one of "
+            f"{', '.join(dict.fromkeys(FORMATS.values()))}, or say the format of the files in a folder"
+        )
+    if format == "npz" and not suffix:
+        raise ValueError(f"{path}: an npz holds all clips in one file; end its name in .npz")
+    return format
+
+
+def write_motion(path: str | Path, motion: MotionSet, format: str | None = None) -> list[Path]:
+    """Write motion for other programs: as npz, BVH, csv or in AMASS's layout.
+
+    BVH is in centimetres and y up, and has one rigid body a clip: where there are no rotations, they are found as
+    `MotionSet.with_rotations` does, and bones have their mean lengths.
+
+    Args:
+        path: a file; or, where it has no ending, a folder, which gets a file "split/clip" for each clip.
+        motion: the clips; one alone for a file that is no npz of many.
+        format: one of `FORMATS`; by default as the name of the file ends.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        ValueError: the format is not known, several clips go to a file of one, or their names lead out of the folder.
+        OSError: a file cannot be written.
+    """
+    path, format = Path(path), format_of(path, format)
+    if format == "npz":
+        save(path, motion)
+        return [path]
+    if path.suffix and len(motion) > 1:
+        raise ValueError(
+            f"{path}: {format} holds one clip a file, and there are {len(motion)}; name a folder (without an ending) "
+            "and the format"
+        )
+    if format in ("bvh", "amass"):
+        motion = motion.with_rotations()
+    return [write_clip(_place(path, clip, format), clip, motion.skeleton, format) for clip in motion]
+
+
+def write_clip(path: Path, clip: Clip, skeleton: Skeleton, format: str) -> Path:
+    """Write one clip, with rotations where the format has them."""
+    if format == "csv":
+        write_table(path, skeleton.names, clip.positions)
+        skeleton.to_json(path.with_name("skeleton.json"))
+    elif format == "amass":
+        write_amass(path, clip, skeleton)
+    else:
+        recording = Recording(skeleton.names, skeleton.parents, clip.positions, clip.rotations, up=skeleton.up)
+        if skeleton.up != "y":  # as animation programs expect
+            recording = upwards(recording, "y")
+        assert recording.rotations is not None
+        names = [re.sub(r"[\s{}]+", "_", name) for name in skeleton.names]
+        root = recording.positions[:, skeleton.root]
+        offsets = skeleton.offsets.numpy()
+        write_bvh(path, names, list(skeleton.parents), offsets, recording.rotations, root, skeleton.fps)
+    return path
+
+
+def _place(path: Path, clip: Clip, format: str) -> Path:
+    """The file of a clip: the path itself, or one in this folder."""
+    if path.suffix:
+        return path
+    inner = Path("" if clip.split == "all" else clip.split, clip.name + FORMATS[format])
+    if inner.is_absolute() or ".." in inner.parts or Path(clip.name).name != clip.name:
+        raise ValueError(f"clip {brief('/'.join(clip.key))}: its name leads out of the folder {path}")
+    return path / inner
+
+
+def convert(
+    sources: list[Path],
+    out: Path,
+    format: str | None = None,
+    fps: float | None = None,
+    onto: Skeleton | None = None,
+    jobs: int = -1,
+    metres: float | None = None,
+    up: str | None = None,
+    recorded: float | None = None,
+    skip_bad: bool = False,
+) -> str:
+    """Write the motion of files or folders anew, clip by clip, on several cores.
+
+    Args:
+        sources: files and folders, see `read_motion`.
+        out: a file or a folder, see `write_motion`.
+        format: of what is written.
+        fps: frames per second of what is written; by default those of the files.
+        onto: a known skeleton to put it onto.
+        jobs: processes; -1 for one on each core.
+        metres, up: see `read_motion`.
+        recorded: frames per second of the files, where they are wrong about it.
+        skip_bad: leave out what cannot be used.
+
+    Returns:
+        What was written, in a sentence or several.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: see `read_motion` and `write_motion`.
+    """
+    from joblib import Parallel, delayed
+
+    format = format_of(out, format)
+    files = list(chain.from_iterable(_told(source, len(sources) > 1) for source in sources))
+    if not files:  # an archive
+        if len(sources) > 1:
+            raise ValueError(f"{sources[0]} is an archive of many clips, which is converted by itself")
+        motion = read_motion(sources[0], skip_bad=skip_bad, onto=onto, metres=metres, up=up, fps=recorded)
+        motion = motion if fps is None else motion.resampled(fps)
+        written = write_motion(out, motion, format)
+        return f"{len(motion)} clips in {len(written)} files; {len(motion.skipped)} skipped"
+    if out.suffix and format != "npz" and len(files) > 1:
+        raise ValueError(f"{out}: {format} holds one clip a file, and there are {len(files)}; name a folder")
+    keys = [(file.split, file.name) for file in files]
+    if len(set(keys)) < len(keys):
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"two files are clip {'/'.join(twice)}; put them into folders of different names")
+    world = understand(sampled(files, skip_bad), metres, up)
+    reader = Reader(world, metres is not None, recorded, onto=onto, resampled=fps)
+    collected, skipped = Collected(out.stem), []
+    work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="2*n_jobs", batch_size=1)
+    results = work(delayed(_converted)(reader, file, out, format, skip_bad) for file in files)
+
+    def clips() -> Iterator[Clip]:
+        for file, result in zip(files, results, strict=True):
+            reason = result if isinstance(result, str) else collected.add(file.path, *result)
+            if reason and not skip_bad:
+                raise ValueError(reason)
+            if reason:
+                skipped.append(reason)
+            else:
+                yield result[0]
+
+    if format == "npz":
+        save_clips(out, clips(), lambda: collected.skeleton)
+    else:
+        for _ in clips():
+            pass
+    if len(skipped) == len(files):
+        raise ValueError(f"no file can be read; the first: {skipped[0]}")
+    left = f"; {len(skipped)} skipped, the first: {skipped[0]}" if skipped else ""
+    return f"{len(files) - len(skipped)} clips; read as {collected.said(world)}{left}"
+
+
+def _told(source: Path, several: bool) -> list[File]:
+    """Files of a source; of several, each folder is part of the split."""
+    files = find_files(source)
+    if several and source.is_dir():
+        return [replace(f, split=source.name if f.split == "all" else f"{source.name}/{f.split}") for f in files]
+    return files
+
+
+def _converted(reader: Reader, file: File, out: Path, format: str, skip_bad: bool) -> tuple[Clip, Skeleton] | str:
+    """One file, read and, where each clip has a file, written: what it holds; or why it does not."""
+    try:
+        clip, skeleton = reader(file)
+        if format == "npz":
+            return clip, skeleton
+        motion = MotionSet([clip], skeleton, file.name, copy=False)
+        write_motion(_place(out, clip, format), motion, format)
+        return clip.between(0, 1), skeleton
+    except ValueError as error:
+        if not skip_bad:
+            raise
+        return str(error)
