@@ -1,27 +1,93 @@
-"""The command that looks into motion files."""
+"""The command that looks into motion files, converts them and gets some."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from .. import motion
 from ..motion.dataset import SIMULATED
-from .console import OUT
+from ..motion.files import writing
+from .console import ERROR, OUT, UsageError
+
+ONTO = {skeleton.name: skeleton for skeleton in (motion.WALKER, motion.HUMAN36M, motion.HUMANEVA)}
+"""Skeletons by name; others come from a skeleton.json."""
 
 
 def data(
-    action: Annotated[Literal["info"], tyro.conf.Positional],
-    file: Annotated[str, tyro.conf.Positional] = SIMULATED,
+    action: Annotated[Literal["info", "convert", "get"], tyro.conf.Positional],
+    files: Annotated[tuple[str, ...], tyro.conf.Positional] = (SIMULATED,),
+    out: Path | None = None,
+    format: Literal["npz", "bvh", "csv", "amass"] | None = None,
+    fps: float | None = None,
+    onto: str | None = None,
+    jobs: int = -1,
+    metres: float | None = None,
+    up: Literal["y", "z"] | None = None,
+    recorded: float | None = None,
+    url: str | None = None,
     skip_bad: bool = False,
 ) -> None:
-    """Say what a motion file holds: splits, clips, skeleton, how rigid its bones are, labels.
+    """Look into motion files, convert them, or get some.
+
+    info says what they hold: splits, clips, skeleton, how units and axes were understood, how rigid bones are, labels.
+    convert writes them anew: --out motion.npz holds all clips; a folder, with --format, gets a file for each.
+    get cmu downloads recordings of the CMU Graphics Lab into the folder --out, and checks them.
 
     Args:
         action: what to do.
-        file: an npz file, or "simulated".
+        files: motion files, or folders of them: npz, bvh, amc, c3d, csv, exponential maps; or "simulated". Of get: cmu.
+        out: of convert and get: the file or folder to write.
+        format: of convert: what to write; by default as the name of --out ends.
+        fps: of convert: frames per second of what is written.
+        onto: of convert: the skeleton to put the motion onto: walker, human36m, humaneva, or a skeleton.json.
+        jobs: of convert: processes; -1 for one on each core.
+        metres: of the files' unit, instead of what they show.
+        up: the files' axis that is up, instead of what they show.
+        recorded: frames per second of the files, where what they say is wrong.
+        url: of get: where the files lie, instead of their owner's site.
         skip_bad: leave out clips that cannot be used, and list them, instead of refusing the file.
     """
-    clips = motion.simulate() if file == SIMULATED else motion.read_motion(file, skip_bad=skip_bad)
-    OUT.print(clips.info())
+    if action == "info":
+        if out or format or fps or onto or url:
+            raise UsageError("--out, --format, --fps, --onto and --url are of convert and get; info writes nothing")
+        for file in files:
+            OUT.print(_read(file, metres, up, recorded, skip_bad).info())
+        return
+    if out is None:
+        raise UsageError(f"data {action} writes files; say where, by --out")
+    if action == "get":
+        from ..motion.files.getting import COLLECTIONS, get
+
+        if len(files) != 1 or files[0] not in COLLECTIONS:
+            raise UsageError(f"get what? Known is {', '.join(COLLECTIONS)}")
+        got = get(files[0], out, url)
+        ERROR.print(f"{len(got)} files of {files[0]} in {out}; dvae data info {out}", markup=False)
+        return
+    if url:
+        raise UsageError("--url is of get")
+    if files == (SIMULATED,):
+        people = motion.simulate() if fps is None else motion.simulate().resampled(fps)
+        said = f"{len(writing.write_motion(out, people, format))} files"
+    else:
+        told = {"metres": metres, "up": up, "recorded": recorded, "skip_bad": skip_bad}
+        paths = [Path(file) for file in files]
+        said = writing.convert(paths, out, format, fps, _skeleton(onto), jobs, **told)  # type: ignore[arg-type]
+    ERROR.print(f"wrote {out}: {said}", markup=False)
+
+
+def _read(file: str, metres: float | None, up: str | None, recorded: float | None, skip_bad: bool) -> motion.MotionSet:
+    if file == SIMULATED:
+        return motion.simulate()
+    return motion.read_motion(file, skip_bad=skip_bad, metres=metres, up=up, fps=recorded)
+
+
+def _skeleton(name: str | None) -> motion.Skeleton | None:
+    """A skeleton by its name or file."""
+    if name is None or name in ONTO:
+        return ONTO.get(name or "")
+    if not name.endswith(".json"):
+        raise UsageError(f"--onto {name}: expected {', '.join(ONTO)}, or the path of a skeleton.json")
+    return motion.Skeleton.from_json(name)

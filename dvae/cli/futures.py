@@ -33,13 +33,16 @@ def forecast(
 ) -> None:
     """Forecast the test windows, or those of one clip, many times each.
 
+    A name that ends in .bvh gets the first future of the window that moves most, after what was observed of it; one
+    without an ending is a folder, and gets a BVH file for every window and future: Blender opens these.
+
     The npz holds, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
     (windows, frames, joints, 3), `split`, `clip` and `start` of each window, and the skeleton. `dvae animate` plays
     it, `dvae.motion.Forecasts.load` reads it.
 
     Args:
         run: the run directory.
-        out: the npz file to write.
+        out: the npz file to write, a BVH file, or a folder of these.
         clip: name of a clip, or split/name where the name is not unique; of any split.
         horizon: frames to forecast; by default those of the protocol.
         samples: forecasts of each window.
@@ -49,13 +52,21 @@ def forecast(
         figure: save a figure of the first window's futures.
     """
     at_least(1, samples=samples, horizon=horizon)
-    check_files(out, figure, ".npz")
+    suffix = out.suffix.lower()
+    check_files(out if suffix else None, figure, ".npz", ".bvh")
     loaded = load_run(run, data)
     windows = _windows_of(loaded, data, clip)
-    futures = _forecasts(loaded, windows, range(len(windows)), samples, seed, horizon, fix)
-    futures.save(out)
+    chosen: Sequence[int] = range(len(windows))
+    if suffix == ".bvh":
+        chosen = [_liveliest(windows.positions(windows.all()["x"]).numpy(), None)]
+    futures = _forecasts(loaded, windows, chosen, samples, seed, horizon, fix)
+    if suffix == ".npz":
+        futures.save(out)
+    else:
+        motion.write_motion(out, (futures.window(0, 1) if suffix else futures).motion(), "bvh")
     frames = futures.forecasts.shape[2]
-    ERROR.print(f"wrote {out}: {samples} futures of {frames} frames for each of {len(windows)} windows")
+    said = f"the first of {samples} futures" if suffix == ".bvh" else f"{samples} futures"
+    ERROR.print(f"wrote {out}: {said} of {frames} frames for each of {len(chosen)} windows")
     _save_futures(futures, figure)
 
 

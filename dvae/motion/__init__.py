@@ -11,7 +11,7 @@ from .criticism import draw_traversal, statistics
 from .data import Clip, MotionSet
 from .dataset import MotionData
 from .exchange import Exchanged
-from .files import read_motion, read_paths, save
+from .files import read_motion, read_paths, save, write_motion
 from .forecasts import Forecasts, is_forecasts
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
 from .scoring import displacements, scores
@@ -52,4 +52,5 @@ __all__ = [
     "simulate",
     "statistics",
     "windows",
+    "write_motion",
 ]

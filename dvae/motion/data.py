@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -238,8 +239,9 @@ class MotionSet:
     def divided(self, test: float = 0.2, shortest: int = 1) -> MotionSet:
         """The same motion in splits "train" and "test", for recordings that nobody has divided.
 
-        The last part of every clip is test, where both parts have `shortest` frames; where no clip has, whole clips
-        are, the last ones. A clip of a split other than "all" has this before its own name.
+        The last part of every clip is test, where it and the rest have `shortest` frames; where no clip has, whole
+        clips are, the last ones. Of one clip alone, what is before is cut once more, so that some of it can be held out
+        for validation. A clip of a split other than "all" has this before its own name.
 
         Args:
             test: the part, of every clip or of the clips.
@@ -255,7 +257,11 @@ class MotionSet:
             name = clip.name if clip.split == "all" else f"{clip.split}-{clip.name}".replace("/", "-")
             clip, held = replace(clip, split="train", name=name), round(test * clip.frames)
             if min(held, clip.frames - held) >= shortest:
-                found.append(clip.between(0, clip.frames - held))
+                ends = [0, clip.frames - held]
+                if len(self) == 1 and ends[1] - held >= shortest:
+                    ends.insert(1, ends[1] - held)
+                parts = [clip.between(*ends) for ends in pairwise(ends)]
+                found += [replace(part, name=f"{name}-{n}" if n else name) for n, part in enumerate(parts)]
                 found.append(replace(clip.between(clip.frames - held, clip.frames), split="test"))
             else:
                 found.append(clip)

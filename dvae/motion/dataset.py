@@ -21,7 +21,29 @@ DEFAULT_PROTOCOLS = {
     "humaneva": "humaneva",
     "walker": "simulated",
 }
-"""Protocols by the name of the skeleton, where none is named."""
+"""Protocols by the name of the skeleton, where none is named, and its clips have their splits and frame rate."""
+
+
+def default_protocol(motion: MotionSet) -> Protocol:
+    """The protocol of the skeleton; or half a second observed and two predicted, of splits "train" and "test".
+
+    Windows for training start every sixth of a second, those of the test every half.
+    """
+    fps, splits = motion.skeleton.fps, set(motion.splits)
+    known = PROTOCOLS.get(DEFAULT_PROTOCOLS.get(motion.skeleton.name, ""))
+    if known and known.fps == fps and (known.split_by != "split" or splits & {*known.train, *known.test}):
+        return known
+
+    def frames(seconds: float) -> int:
+        return max(round(seconds * fps), 1)
+
+    return Protocol(f"{fps:g} Hz", frames(0.5), frames(2), fps, train_stride=frames(1 / 6), test_stride=frames(0.5))
+
+
+def divided(motion: MotionSet, protocol: Protocol) -> MotionSet:
+    """Motion in "train" and "test", where a protocol asks for these and nobody has divided it; see `MotionSet`."""
+    asks = (protocol.split_by, protocol.train, protocol.test) == ("split", ("train",), ("test",))
+    return motion.divided(shortest=protocol.length) if asks and not {"train", "test"} & {*motion.splits} else motion
 
 
 @dataclass(frozen=True)
@@ -69,24 +91,22 @@ class MotionData:
         """Reads a motion file, or simulates.
 
         Args:
-            path: of a file that `read_motion` reads, or "simulated" for `simulate()`.
-            protocol: one of `dvae.motion.PROTOCOLS` or its name; by default the one of the skeleton.
+            path: of a file or folder that `read_motion` reads, or "simulated" for `simulate()`.
+            protocol: one of `dvae.motion.PROTOCOLS` or its name; by default the one of the skeleton, or half a second
+                observed and two predicted, see `default_protocol`. Clips that are in neither split "train" nor "test"
+                are divided, see `MotionSet.divided`.
             skip_bad: leave out unusable clips instead of refusing the file.
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: a file that cannot be read, an unknown protocol, or none for the skeleton.
+            ValueError: a file that cannot be read, or an unknown protocol.
         """
         name = os.fspath(path)
         clips = simulate() if name == SIMULATED else read_motion(name, skip_bad=skip_bad)
-        if protocol is None:
-            if clips.skeleton.name not in DEFAULT_PROTOCOLS:
-                raise ValueError(
-                    f"{name}: which protocol? The skeleton {clips.skeleton.name!r} has none of its own; "
-                    f"choose one of {', '.join(PROTOCOLS)}"
-                )
-            protocol = DEFAULT_PROTOCOLS[clips.skeleton.name]
-        return cls(name, clips, named_protocol(protocol) if isinstance(protocol, str) else protocol, skip_bad)
+        if isinstance(protocol, str):
+            protocol = named_protocol(protocol)
+        protocol = protocol or default_protocol(clips)
+        return cls(name, divided(clips, protocol), protocol, skip_bad)
 
     def windows(self, split: str) -> Windows:
         """The windows of "train", "validation", "test" or "train+validation"."""

@@ -1,0 +1,56 @@
+"""Recordings that their owners let everybody download, checked by their SHA-256.
+
+CMU Graphics Lab Motion Capture Database, mocap.cs.cmu.edu: free for all uses; the data may not be resold. "The data
+used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217."
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+COLLECTIONS: dict[str, tuple[str, dict[str, str]]] = {
+    "cmu": (
+        "http://mocap.cs.cmu.edu/subjects/",
+        {
+            "02/02.asf": "c9f5ff45b4437b279f58b95dacf017afd3135373096274df69436a9354d796cf",
+            "02/02_01.amc": "1503c481f4726e640c77888f0c841dd3be0694684bcd32296cf53685c6fc1492",
+            "02/02_03.amc": "07df256876f0941ea464083162503790a05ffa021fd6d6d5b2c22ac98127762a",
+            "02/02_04.amc": "77a6885616eb91a76304149a42575cb8479ef9dd118b329e4d1de6046766491f",
+        },
+    ),
+}
+"""Name to the address of its folder, and its files with their SHA-256."""
+
+
+def get(name: str, out: str | Path, url: str | None = None) -> list[Path]:
+    """Download a collection's files that are not there yet; none that is not what it should be is kept.
+
+    Args:
+        name: of the collection, one of `COLLECTIONS`.
+        out: the folder; subfolders are as at the address.
+        url: of another copy.
+
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: an unknown name; or a file is not the one that is known.
+        OSError: a file cannot be had or written.
+    """
+    if name not in COLLECTIONS:
+        raise ValueError(f"no collection {name!r}; known: {', '.join(COLLECTIONS)}")
+    import pooch
+
+    address, files = COLLECTIONS[name]
+    address = (url or address).rstrip("/") + "/"
+    fetcher = pooch.create(path=out, base_url=address, registry={f: f"sha256:{digest}" for f, digest in files.items()})
+    pooch.get_logger().setLevel("WARNING")
+    found = []
+    for file in files:
+        try:
+            found.append(Path(fetcher.fetch(file)))
+        except ValueError as error:
+            raise ValueError(f"{address}{file}: it is not the file that is known ({error})") from None
+        except OSError as error:
+            raise OSError(f"{address}{file} cannot be had: {error}") from None
+    return found
