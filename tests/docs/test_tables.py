@@ -6,7 +6,7 @@ import shutil
 import networkx as nx
 import pytest
 
-from benchmarks.tables import audits, bounds, demo, family, gsps, hit_dvae, house, overview, pages, trajevae
+from benchmarks.tables import audits, bones, bounds, demo, family, gsps, hit_dvae, house, overview, pages, trajevae
 from dvae import Evaluation, motion
 from dvae.cli import main as command
 
@@ -96,6 +96,18 @@ def test_gsps(folder, page):
     assert [row[0] for row in scores[1:]] == ["zero velocity", "nearest neighbours", "gsps", "the same"]
     assert differences[2][:3] == ["the same", "0.000", "0.000"]
     assert float(control[2][1]) == 0 < float(control[2][2])
+
+
+def test_bones(folder, page):
+    small = ("--pose-prior", "0", "--draws", "2")
+    runs = tuple(fitted(folder, f"gsps-{bones}", "gsps", *small, f"--{bones}") for bones in ("no-bones", "bones"))
+    bones.main(runs, page, every=2, samples=2)
+    scores, differences = tables(page)
+    lengths = {row[0]: float(row[1].split()[0]) for row in scores[1:]}
+    assert lengths["gsps bones"] == 0 < 0.01 < lengths["gsps no bones"]
+    assert [row[0] for row in differences[1:]] == ["gsps bones minus gsps no bones"]
+    with pytest.raises(SystemExit, match="name each run without bones"):
+        bones.main(runs[1:], page)
 
 
 def test_hit_dvae(folder, page):

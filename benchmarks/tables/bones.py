@@ -1,0 +1,69 @@
+"""Writes the tables of docs/results/bones.md from runs, which it evaluates on every few of their test windows.
+
+The page says how the runs were fitted, each method without `bones` and then with it. What is found of a run is kept in
+its directory.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+import tyro
+
+import dvae
+from dvae import motion
+
+from .pages import DOCS, joined, scores, table, write
+
+METRICS = ("bone-length error", "limb stretch", "limb jitter", "ADE", "FDE", "APD", "MMADE", "limb-angle error", "CMD")
+COMPARED = ("ADE", "FDE", "APD", "limb-angle error")
+
+
+def evaluated(path: Path, every: int, samples: int) -> Path:
+    """The file with the scores of a run, on each so many-th of its test windows."""
+    file = path / f"{path.name}.json"
+    if not file.exists():
+        run = dvae.load(path)
+        test = run.data.windows("test")
+        some = test.with_protocol(replace(test.protocol, test_stride=every * test.protocol.test_stride))
+        options = {"samples": samples, "batch_size": 64, "training_windows": run.data.windows("train+validation")}
+        configs = {path.name: {"bones": run.method.bones}}
+        dvae.evaluate({path.name: run.model}, some, scores=motion.scores, configs=configs, **options).save(file)
+    return file
+
+
+def main(
+    runs: tyro.conf.Positional[tuple[Path, ...]],
+    page: Path = DOCS / "results" / "bones.md",
+    every: int = 4,
+    samples: int = 50,
+) -> None:
+    """Write the tables.
+
+    Args:
+        runs: directories; each run without bones, and then the same with them.
+        page: where.
+        every: the test windows that are scored, each so many-th.
+        samples: futures of each.
+    """
+    torch.set_num_threads(1)
+    evaluation, _ = joined([evaluated(path, every, samples) for path in runs])
+    names = [name for name, row in evaluation.rows.items() if row.config]
+    bones = [bool(evaluation.rows[name].config["bones"]) for name in names]
+    if not names or bones != [False, True] * (len(names) // 2):
+        sys.exit("name each run without bones, and behind it the same with them")
+    pairs = list(zip(names[::2], names[1::2], strict=True))
+    rows = [
+        [
+            f"{ours} minus {theirs}",
+            *(str(evaluation.difference(ours, theirs, metric)) for metric in COMPARED),
+            f"{100 * (evaluation[ours]['ADE'].mean / evaluation[theirs]['ADE'].mean - 1):+.1f} %",
+        ]
+        for theirs, ours in pairs
+    ]
+    write(page, scores(evaluation, METRICS), table(["", *COMPARED, "ADE, relative"], rows))
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
