@@ -5,8 +5,9 @@ data goes back through it where it is handed out (`DynamicalVAE.shown`): between
 sees it. Views of one kind of data are with that data, as `dvae.motion.Heading` is.
 
 Densities and bounds are of the data as they are given: where a view changes volume, its log-determinant is added to
-what a model says of what it sees. All views here keep volume. A view that is of other dimension than the data says what
-densities are of (`View.measured`).
+what a model says of what it sees. All views here keep volume. Two elsewhere are no bijections of positions: with
+`dvae.motion.Bones`, of which `log_det` refuses, a model has no density; with `dvae.motion.Rotations` densities are of
+turns, and the view says so (`View.measured`).
 
 >>> view = dvae.views.Parts({"legs": [0, 2], "arms": [1]})
 >>> {name: value.tolist() for name, value in view({"x": torch.tensor([[[1.0, 2.0, 3.0]]])}).items()}

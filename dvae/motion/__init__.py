@@ -18,7 +18,7 @@ from .scoring import displacements, scores
 from .simulator import simulate
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
 from .truths import PseudoTruths, WithPseudoTruths
-from .views import Bones, Heading
+from .views import Bones, Heading, Rotations
 
 __all__ = [
     "HUMAN36M",
@@ -37,6 +37,7 @@ __all__ = [
     "Poses",
     "Protocol",
     "PseudoTruths",
+    "Rotations",
     "Skeleton",
     "Windows",
     "WithPseudoTruths",
