@@ -1,4 +1,7 @@
-"""C3D, the markers of optical motion capture, read by ezc3d (Michaud and Begon 2021); the extra `c3d` installs it."""
+"""C3D, the markers of optical motion capture (The C3D File Format, Motion Lab Systems 2021), of which places are read.
+
+Known readers, in C and C++, end the whole process over a damaged file; what is read here is checked against them.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,15 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from .recording import Recording, check_joints, check_size
+from ... import files
+from .recording import MOST_TEXT, Recording, check_joints, check_size
 
 MOST_DISTANCES = 2**23
 """From which a tree is found: of a hundred markers, in 800 frames."""
 
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
+_BLOCK = 512
+_ORDERS = {84: "<", 86: ">"}  # Intel's and MIPS' bytes; DEC's numbers (85) are of the eighties
 
 
 def read_c3d(path: str | Path) -> Recording:
@@ -25,33 +31,68 @@ def read_c3d(path: str | Path) -> Recording:
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file is none, or damaged; or has no markers.
-        RuntimeError: ezc3d is not installed.
     """
     path = Path(path)
-    _check(path)
+    if not path.is_file():  # nor a pipe, which would never end
+        raise FileNotFoundError(f"{path}: no such file")
+    content = files.read(path, MOST_TEXT, links=True)
+    if len(content) < _BLOCK or content[1] != 0x50:
+        raise ValueError(f"{path}: no C3D file: its second byte is not 80")
     try:
-        import ezc3d
-    except ImportError:
-        raise RuntimeError(f"{path}: markers are read by ezc3d; pip install 'pyro-dvae[c3d]'") from None
-    try:
-        found = ezc3d.c3d(str(path))
-        points, said = found["data"]["points"], found["parameters"]["POINT"]
-        names = [str(name).strip() for name in said["LABELS"]["value"]]
-        unit, fps = str(said["UNITS"]["value"][0]).strip().lower(), float(said["RATE"]["value"][0])
-    except (RuntimeError, ValueError, KeyError, IndexError, TypeError, OSError, OverflowError, MemoryError) as error:
-        raise ValueError(f"{path}: damaged, or no C3D file ({str(error)[:200]!r})") from None
-    if unit not in METRES or not 0 < fps < 1e6:
+        parameters, order = _parameters(content)
+        markers, analog, first, last = struct.unpack_from(f"{order}4H", content, 2)
+        scale, start = struct.unpack_from(f"{order}fH", content, 12)
+        fps = struct.unpack_from(f"{order}f", content, 20)[0]
+    except (struct.error, IndexError, KeyError, UnicodeDecodeError):
+        raise ValueError(f"{path}: damaged: its parameters end early, or are none") from None
+    check_joints(path, markers)
+    kind = np.dtype(f"{order}f4" if scale < 0 else f"{order}i2")
+    row = 4 * markers + analog
+    there = max(len(content) - _BLOCK * (start - 1), 0) // (kind.itemsize * row) if row and start else 0
+    frames = there if last == 0xFFFF else last - first + 1  # more than fit into two bytes
+    if not 0 < frames <= there or not markers:
+        raise ValueError(f"{path}: it announces {markers} markers in {frames} frames and has room for {there}")
+    check_size(path, frames, markers)
+    unit = "".join(parameters.get("UNITS", [])[:1]).lower()
+    if unit not in METRES or not 0 < fps < 1e6 or not np.isfinite(scale):
         raise ValueError(f"{path}: markers in {unit[:40]!r} at {fps:g} Hz, expected one of {', '.join(METRES)}")
-    named = [place for place, name in enumerate(names[: points.shape[1]]) if name and not name.startswith("*")]
-    named = [place for place in named if names[place] not in names[:place]]
-    places = np.ascontiguousarray(points[:3, named].transpose(2, 1, 0))
+    numbers = np.frombuffer(content, kind, frames * row, _BLOCK * (start - 1)).reshape(frames, row)
+    values = numbers[:, : 4 * markers].reshape(frames, markers, 4).astype(np.float64)
+    places = values[..., :3] * (1 if scale < 0 else scale)
+    places[(values[..., 3] < 0) | (np.abs(places) > 1e9).any(-1) | ~np.isfinite(places).all(-1)] = np.nan
+    names = parameters.get("LABELS", [])[:markers]
     seen = np.isfinite(places).all(-1).any(0)
-    named, places = [place for place, is_seen in zip(named, seen, strict=True) if is_seen], places[:, seen]
-    if not named or not len(places):
+    kept = [n for n, name in enumerate(names) if name and name[0] != "*" and name not in names[:n] and seen[n]]
+    if not kept:
         raise ValueError(f"{path}: it has no markers with names that are seen")
-    order, parents = tree(places)
-    labels = [names[named[place]] for place in order]
-    return Recording(labels, parents, places[:, order], fps=fps, metres=METRES[unit])
+    order_of, parents = tree(places[:, kept])
+    chosen = [kept[place] for place in order_of]
+    return Recording([names[n] for n in chosen], parents, places[:, chosen], fps=fps, metres=METRES[unit])
+
+
+def _parameters(content: bytes) -> tuple[dict[str, list[str]], str]:
+    """Texts of the group POINT by name, and the order of bytes."""
+    at = _BLOCK * (content[0] - 1)
+    order = _ORDERS[content[at + 3]]
+    at, point = at + 4, None
+    found: dict[int, dict[str, list[str]]] = {}
+    while at >= 0 and content[at]:
+        size, group = struct.unpack_from("bb", content, at)
+        name = content[at + 2 : at + 2 + abs(size)].decode("latin1").strip().upper()
+        here = at + 2 + abs(size)
+        further = struct.unpack_from(f"{order}H", content, here)[0]
+        if group < 0:
+            point = -group if name == "POINT" else point
+        elif struct.unpack_from("b", content, here + 2)[0] == -1:  # text
+            sizes = list(content[here + 4 : here + 4 + content[here + 3]])
+            width, count = ([*sizes, 1, 1])[:2]
+            text = content[here + 4 + len(sizes) :][: width * count].decode("latin1")
+            texts = [text[n * width : (n + 1) * width].strip(" \0") for n in range(count)]
+            found.setdefault(group, {})[name] = texts
+        if not further:
+            break
+        at = here + further
+    return found[point or 0], order
 
 
 def tree(places: np.ndarray) -> tuple[list[int], list[int]]:
@@ -74,30 +115,3 @@ def tree(places: np.ndarray) -> tuple[list[int], list[int]]:
     order, above = breadth_first_order(minimum_spanning_tree(weights), middle, directed=False)
     at = {int(marker): place for place, marker in enumerate(order)}
     return order.tolist(), [at.get(int(above[marker]), -1) for marker in order]
-
-
-def _check(path: Path) -> None:
-    """Refuses, before a library in C++ opens it, what is no C3D file or announces more than it holds."""
-    if not path.is_file():  # nor a pipe, which would never end
-        raise FileNotFoundError(f"{path}: no such file")
-    with path.open("rb") as file:
-        head = file.read(512)
-    if len(head) < 512 or head[1] != 0x50:
-        raise ValueError(f"{path}: no C3D file: its second byte is not 80")
-    processor = 0
-    with path.open("rb") as file:
-        file.seek(512 * max(head[0] - 1, 0))
-        block = file.read(4)
-        processor = block[3] if len(block) == 4 else 0
-    if processor not in (84, 85, 86):
-        raise ValueError(f"{path}: damaged: its parameters are not in block {head[0]}")
-    order = ">" if processor == 86 else "<"
-    points, analogs, first, last = struct.unpack(f"{order}4H", head[2:10])
-    check_joints(path, points)
-    frames = last - first + 1  # of more than 65,535, this is what fits
-    if frames < 1 or not points:
-        raise ValueError(f"{path}: {points} markers in {frames} frames are no recording")
-    check_size(path, frames, points)
-    size, needed = path.stat().st_size, frames * (8 * points + 2 * analogs)
-    if needed > size:
-        raise ValueError(f"{path}: it announces {needed:,} bytes of markers and has {size:,}")

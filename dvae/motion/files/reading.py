@@ -73,7 +73,7 @@ def read_motion(
     | `.bvh` | |
     | `.amc` | with its `.asf` beside it |
     | `.txt` | exponential maps as in the CMU benchmark |
-    | `.c3d` | markers; needs the extra `c3d` |
+    | `.c3d` | markers |
     | `.csv` | one clip in metres, columns such as LWrist_x, LWrist_y, LWrist_z; `skeleton.json` beside it |
     | `.npz` | AMASS: one clip, members `poses`, `trans`, `mocap_framerate` |
     | `.npz` | VideoPose3D's archive: the member `positions_3d` |
@@ -109,7 +109,6 @@ def read_motion(
         FileNotFoundError: there is no such file, or none in the folder.
         ValueError: the file is damaged, its pickle asks for anything but data, a clip is unusable, files of a folder
             differ in joints or frames per second, or no skeleton is known; the message says which.
-        RuntimeError: a c3d file, and the extra `c3d` is not installed.
     """
     path = Path(path)
     files = find_files(path)
@@ -118,12 +117,13 @@ def read_motion(
         found = read_archive(path, skeleton, labels, skip_bad, places or None, metres, up, fps)
         return found if places or (joints is None and onto is None) else _chosen(found, joints, onto)
     known = read_labels((path if path.is_dir() else path.parent) / "labels.csv", labels)
-    reader = Reader(understand(sampled(files, skip_bad), metres, up), metres is not None, fps, skeleton, joints, onto)
+    some = sampled(files, skip_bad)
+    reader = Reader(understand(some, metres, up), metres is not None, fps, skeleton, joints, onto)
     collected = Collected(path.stem)
     clips, unread, size = [], [], 0
     for file in files:
         try:
-            clip, own = reader(file)
+            clip, own = reader(file, some.pop(str(file.path), None))
             if reason := collected.add(file.path, clip, own):
                 raise ValueError(reason)
         except ValueError as error:
@@ -227,13 +227,17 @@ class Reader:
     onto: Skeleton | None = None
     resampled: float | None = None
 
-    def __call__(self, file: File) -> tuple[Clip, Skeleton]:
+    def __call__(self, file: File, recording: Recording | None = None) -> tuple[Clip, Skeleton]:
         """The clip, and the skeleton of it alone.
+
+        Args:
+            file: which.
+            recording: what it holds, if it was read already.
 
         Raises:
             ValueError: the file cannot be used; the message has the path.
         """
-        recording = file.read()
+        recording = recording or file.read()
         try:
             return self._clip(file, recording)
         except ValueError as error:

@@ -166,7 +166,7 @@ def turned(recording: Recording, turn: np.ndarray) -> Recording:
     """A recording whose world is turned by a matrix (3, 3)."""
     rotations = recording.rotations
     if rotations is not None and (turn != np.eye(3)).any():
-        root = torch.from_numpy(turn) @ to_matrix(torch.from_numpy(rotations[:, 0]), "quaternion")
+        root = torch.from_numpy(turn) @ to_matrix(torch.from_numpy(rotations[:, 0]).double(), "quaternion")
         rotations = np.concatenate([from_matrix(root, "quaternion").numpy()[:, None], rotations[:, 1:]], 1)
         rotations = continuous(torch.from_numpy(rotations)).numpy()
     return replace(recording, positions=recording.positions @ turn.T, rotations=rotations)

@@ -1,0 +1,227 @@
+"""Recordings that somebody else made, of every format: read right, or refused in a sentence, whatever is in them."""
+
+import shutil
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from dvae.motion import MotionSet, read_motion, simulate, write_motion
+from dvae.motion.files.amc import SUBJECT_02
+from dvae.motion.skeleton import is_name
+
+from .engine import Isolated, fuzz, limited
+from .test_tables import edited
+
+SHARE = 3
+MUTATIONS = 500
+"""Of each format, at the least."""
+
+
+def bvh(folder):
+    people = simulate(1, 3).with_rotations()
+    write_motion(folder / "a.bvh", people)
+
+
+def amc(folder):
+    bones = [f"begin\nid {i}\nname b{i}\ndirection 0 1 0\nlength 5\naxis 0 0 9 XYZ\ndof rx ry\nend\n" for i in range(6)]
+    tree = "".join(f"{'b' + str(i - 1) if i else 'root'} b{i}\n" for i in range(6))
+    head = ":version 1.10\n:units\nlength 0.45\nangle deg\n:root\norder TX TY TZ RX RY RZ\naxis XYZ\n:bonedata\n"
+    (folder / "a.asf").write_text(f"{head}{''.join(bones)}:hierarchy\nbegin\n{tree}end\n")
+    frames = [f"{n}\nroot 0 1 {n} 2 3 4\n" + "".join(f"b{i} {n} 9\n" for i in range(6)) for n in range(1, 4)]
+    (folder / "a.amc").write_text(":FULLY-SPECIFIED\n:DEGREES\n" + "".join(frames))
+
+
+def expmap(folder):
+    row = ",".join(f"{0.1 * (n % 7):.3f}" for n in range(3 + 3 * (len(SUBJECT_02) + 8)))
+    (folder / "a.txt").write_text(f"{row}\n" * 3)
+
+
+def csv(folder):
+    write_motion(folder / "a.csv", MotionSet(simulate(1, 3).clips, simulate(1, 3).skeleton))
+
+
+def amass(folder):
+    write_motion(folder / "a.npz", MotionSet(simulate(1, 3).clips, simulate(1, 3).skeleton), "amass")
+
+
+def c3d(folder):
+    """Written by the letter of the format: a header, a group of parameters, three markers in four frames."""
+    labels, frames = [b"HEAD", b"HIP ", b"FOOT"], 4
+
+    def parameter(name, kind, sizes, content):
+        body = struct.pack("<bB", kind, len(sizes)) + bytes(sizes) + content + b"\0"
+        return struct.pack("<bb", len(name), 1) + name + struct.pack("<h", len(body) + 2) + body
+
+    group = struct.pack("<bb", 5, -1) + b"POINT" + struct.pack("<h", 3) + b"\0"
+    parameters = [
+        parameter(b"USED", 2, [], struct.pack("<h", 3)),
+        parameter(b"FRAMES", 2, [], struct.pack("<h", frames)),
+        parameter(b"SCALE", 4, [], struct.pack("<f", -1.0)),
+        parameter(b"RATE", 4, [], struct.pack("<f", 100.0)),
+        parameter(b"DATA_START", 2, [], struct.pack("<h", 3)),
+        parameter(b"UNITS", -1, [2, 1], b"mm"),
+        parameter(b"LABELS", -1, [4, 3], b"".join(labels)),
+        parameter(b"DESCRIPTIONS", -1, [1, 3], b"   "),
+    ]
+    block = b"\x01\x50\x01\x54" + group + b"".join(parameters) + b"\0\0"
+    head = struct.pack("<BB5HfHHf", 2, 0x50, 3, 0, 1, frames, 0, -1.0, 3, 0, 100.0)
+    places = [(0, 0, 1700, 0), (10, 0, 900, 0), (0, 20, 10, 0)]
+    data = b"".join(struct.pack("<4f", x + frame, y, z, 0) for frame in range(frames) for x, y, z, _ in places)
+    (folder / "a.c3d").write_bytes(head.ljust(512, b"\0") + block.ljust(512, b"\0") + data.ljust(512, b"\0"))
+
+
+SAMPLES = {"bvh": (bvh, "a.bvh"), "amc": (amc, "a.amc"), "asf": (amc, "a.asf"), "expmap": (expmap, "a.txt")}
+SAMPLES |= {"csv": (csv, "a.csv"), "amass": (amass, "a.npz"), "c3d": (c3d, "a.c3d")}
+
+
+def small(format, folder):
+    """A sample in a folder of its own, what of it is mutated, and what is read."""
+    make, name = SAMPLES[format]
+    make(folder)
+    return folder / name, folder / ("a.amc" if format == "asf" else name)
+
+
+@pytest.mark.parametrize("format", SAMPLES)
+def test_what_was_not_changed_is_read(format, tmp_path):
+    _, path = small(format, tmp_path)
+    assert read_motion(path).clips[0].frames == (4 if format == "c3d" else 2 if format == "expmap" else 3)
+
+
+def read_changed(example, directory):
+    content, changed, path = example
+    for file in (directory / changed).parent.iterdir():
+        (directory / "now").mkdir(exist_ok=True)
+        shutil.copyfile(file, directory / "now" / file.name)
+    where = directory / "now" / path
+    where.with_name(changed.name).write_bytes(content)
+    sentence = ""
+    try:
+        read_motion(where)
+    except (ValueError, FileNotFoundError) as error:  # nothing else
+        sentence = str(error)
+    assert not sentence or str(where.parent) in sentence, f"{sentence!r} does not name the file"
+    assert len(sentence) < 2500, f"{len(sentence)} characters"
+    assert is_name(sentence[:1000]), f"{sentence!r} has control characters"
+
+
+@pytest.fixture(scope="module")
+def isolated(tmp_path_factory):
+    with Isolated(read_changed, tmp_path_factory.mktemp("recordings")) as process:
+        yield process
+
+
+WORDS = [
+    b"0",
+    b"-1",
+    b"1e308",
+    b"1e-320",
+    b"nan",
+    b"inf",
+    b"9" * 30,
+    b"}",
+    b"{",
+    b"\n",
+    b" ",
+    b"\0",
+    b"\xff\xfe",
+    b"JOINT x\n",
+]
+
+
+def mutations(content, random):
+    """Bytes changed, cut, repeated; words put in the place of others; the end left away."""
+    text = content.split(b" ")
+    kind = random.integers(6)
+    if kind == 0:
+        found = bytearray(content)
+        for _ in range(random.integers(1, 8)):
+            found[random.integers(len(found))] = random.integers(256)
+        return bytes(found)
+    if kind == 1:
+        return content[: random.integers(len(content))]
+    if kind == 2:
+        start, end = sorted(random.integers(len(content), size=2))
+        return content[:start] + content[end:]
+    if kind == 3:
+        start, end = sorted(random.integers(len(content), size=2))
+        return content[:end] + content[start:end] * int(random.integers(1, 4)) + content[end:]
+    for _ in range(random.integers(1, 4)):
+        text[random.integers(len(text))] = WORDS[random.integers(len(WORDS))]
+    return b" ".join(text)
+
+
+@pytest.mark.parametrize("format", SAMPLES)
+def test_five_hundred_changed_files_are_read_or_refused(format, isolated, tmp_path):
+    changed, path = small(format, tmp_path)
+    content, random = changed.read_bytes(), np.random.default_rng(0)
+    for _ in range(MUTATIONS):
+        isolated((mutations(content, random), changed, path.name))
+
+
+edits = st.lists(
+    st.tuples(
+        st.floats(0, 1, exclude_max=True), st.integers(0, 12), st.one_of(st.binary(max_size=3), st.sampled_from(WORDS))
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
+@limited(SHARE)
+def test_edited_files_are_read_or_refused(isolated, tmp_path):
+    there = {}
+    for format in SAMPLES:
+        (tmp_path / format).mkdir()
+        changed, path = small(format, tmp_path / format)
+        there[format] = changed.read_bytes(), changed, path.name
+    examples = st.tuples(st.sampled_from(list(there)), edits)
+    fuzz(lambda of: isolated((edited(there[of[0]][0], of[1]), *there[of[0]][1:])), examples, SHARE)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"Frames: 3", b"Frames: 999999999999"),
+        (b"Frames: 3", b"Frames: 1e300"),
+        (b"OFFSET 0.0", b"OFFSET " + b"9" * 10**6),
+        (b"JOINT LHip", b"JOINT x\n{\n" * 5000),
+        (b"CHANNELS 6", b"CHANNELS " + b"9" * 10**5),
+    ],
+    ids=["frames", "fewer frames", "digits", "joints", "channels"],
+)
+def test_what_is_announced_takes_no_memory(old, new, isolated, tmp_path):
+    changed, path = small("bvh", tmp_path)
+    content = changed.read_bytes()
+    assert old in content
+    isolated((content.replace(old, new, 1), changed, path.name))
+    changed.write_bytes(content.replace(old, new, 1))
+    with pytest.raises(ValueError, match=r"a\.bvh"):
+        read_motion(changed)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("poses", np.zeros((3, 65)), r"poses \(3, 65\), trans \(3, 3\), expected"),
+        ("poses", np.zeros((2, 156)), r"poses \(2, 156\)"),
+        ("poses", np.zeros(3), "expected"),
+        ("poses", np.full((3, 66), np.nan), "poses holds float64, expected numbers, none NaN"),
+        ("poses", np.full((3, 66), "a"), "poses holds <U1"),
+        ("poses", np.full((3, 66), 1e30), "no metre, radian or rate"),
+        ("trans", np.zeros((0, 3)), r"trans \(0, 3\)"),
+        ("trans", np.full((3, 3), np.inf), "trans holds"),
+        ("offsets", np.zeros((3, 3)), r"offsets \(3, 3\), expected \(22, 3\)"),
+        ("offsets", np.zeros((22, 3)), "a person of"),
+        ("mocap_framerate", np.zeros(()), "needs mocap_framerate"),
+        ("mocap_framerate", np.array([30, 30]), "needs mocap_framerate"),
+        ("mocap_framerate", np.array("30"), "mocap_framerate holds"),
+    ],
+)
+def test_arrays_that_are_no_motion_are_refused(name, value, message, tmp_path):
+    path, _ = small("amass", tmp_path)
+    arrays = {**np.load(path), name: value}
+    np.savez(path, **arrays)
+    with pytest.raises(ValueError, match=rf"a\.npz: .*{message}"):
+        read_motion(path)

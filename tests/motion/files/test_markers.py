@@ -1,0 +1,40 @@
+"""C3D: what ezc3d writes, and the tree of markers."""
+
+import numpy as np
+import pytest
+
+from dvae.motion import read_motion
+from dvae.motion.files.markers import read_c3d, tree
+
+
+def test_markers_are_what_ezc3d_writes(tmp_path):
+    ezc3d = pytest.importorskip("ezc3d", reason="ezc3d is not installed")
+    random, names = np.random.default_rng(0), ["HEAD", "HIP", "LFOOT", "*1", "RFOOT"]
+    rest = np.array([[0, 0, 1700.0], [0, 0, 900], [100, 0, 10], [0, 0, 0], [-100, 0, 10]])
+    places = rest + random.normal(0, 5, (7, 5, 3))
+    file = ezc3d.c3d()
+    file["parameters"]["POINT"]["RATE"]["value"] = [250.0]
+    file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    file["parameters"]["POINT"]["LABELS"]["value"] = names
+    points = np.ones((4, 5, 7))
+    points[:3] = places.transpose(2, 1, 0)
+    file["data"]["points"] = points
+    file.write(str(tmp_path / "a.c3d"))
+    read = read_c3d(tmp_path / "a.c3d")
+    assert (sorted(read.names), read.fps, read.metres) == (sorted({*names} - {"*1"}), 250, 0.001)
+    expected = places[:, [names.index(name) for name in read.names]]
+    np.testing.assert_allclose(read.positions, expected, atol=1e-3)  # single precision
+    assert read_motion(tmp_path / "a.c3d").skeleton.up == "z"
+
+
+def test_markers_hang_from_those_that_move_with_them():
+    random = np.random.default_rng(0)
+    bodies = [random.normal(0, 0.3, (1, 4, 3)) for _ in range(2)]  # two rigid bodies that go their own ways
+    places = np.concatenate([body + random.normal(0, 1, (50, 1, 3)).cumsum(0) for body in bodies], 1)
+    places[3:9, 2] = np.nan
+    order, parents = tree(places)
+    assert sorted(order) == list(range(8))
+    assert parents[0] == -1
+    assert all(parent < place for place, parent in enumerate(parents))
+    crossing = [(order[parent] < 4) != (joint < 4) for joint, parent in zip(order, parents, strict=True) if parent >= 0]
+    assert sum(crossing) == 1

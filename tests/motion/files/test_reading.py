@@ -1,0 +1,325 @@
+"""Files of every kind and folders of them: one set of clips, in metres, with what was found out about them."""
+
+import io
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from dvae.motion import (
+    HUMAN36M,
+    WALKER,
+    Clip,
+    MotionData,
+    MotionSet,
+    read_motion,
+    save,
+    simulate,
+    write_motion,
+)
+from dvae.motion.files.recording import Recording
+from dvae.motion.files.settled import settle, sides, understand
+
+FORMATS = {"npz": "all.npz", "bvh": "folder", "csv": "folder", "amass": "folder"}
+
+
+@pytest.fixture(scope="module")
+def people():
+    return simulate(clips=3, frames=40, seed=1)
+
+
+@pytest.fixture
+def bvh(people, tmp_path):
+    """A folder of three clips."""
+    write_motion(tmp_path / "bvh", people, "bvh")
+    return tmp_path / "bvh"
+
+
+def printed(motion):
+    console = Console(file=io.StringIO(), width=200)
+    console.print(motion.info())
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_what_is_written_is_read_back(people, format, tmp_path):
+    # a tenth of a millimetre for files of positions. Bodies differ among people, and with rotations have the mean one
+    one = MotionSet(people.clips[:1], people.skeleton)
+    write_motion(tmp_path / FORMATS[format], one, format)
+    read = read_motion(tmp_path / FORMATS[format], onto=WALKER if format != "npz" else None)
+    assert (read.skeleton.names, read.skeleton.parents, read.skeleton.fps) == (WALKER.names, WALKER.parents, 30)
+    assert (read.skeleton.left, read.skeleton.up) == (WALKER.left, "y")
+    assert [clip.key for clip in read] == [clip.key for clip in one]
+    within = {"npz": 0, "csv": 1e-6, "bvh": 1e-2, "amass": 3e-2}[format]  # inverse kinematics is within a centimetre
+    if format == "amass":  # the place of the pelvis is SMPL's but for a constant
+        assert read_motion(tmp_path / FORMATS[format]).skeleton.joints == 22
+    np.testing.assert_allclose(read.clips[0].positions, one.clips[0].positions, atol=within)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_rigid_motion_is_the_same_in_bvh_to_a_tenth_of_a_millimetre(people, up, tmp_path):
+    """Written once, a body is rigid; there and back it is the same, whichever axis is up."""
+    write_motion(tmp_path / "a", MotionSet(people.clips[:1], people.skeleton), "bvh")
+    rigid = read_motion(tmp_path / "a", onto=replace(WALKER, up=up))
+    assert rigid.clips[0].rotations is not None
+    write_motion(tmp_path / "b", rigid, "bvh")
+    again = read_motion(tmp_path / "b", onto=replace(WALKER, up=up))
+    np.testing.assert_allclose(again.clips[0].positions, rigid.clips[0].positions, atol=1e-4)
+    assert again.skeleton.up == up
+    npz = save(tmp_path / "c.npz", rigid) or read_motion(tmp_path / "c.npz")
+    np.testing.assert_array_equal(npz.clips[0].rotations, rigid.clips[0].rotations)
+    assert npz.fingerprint() == rigid.fingerprint()
+
+
+@pytest.mark.data
+def test_real_clips_are_the_same_in_bvh_to_a_tenth_of_a_millimetre(real, shared, tmp_path):
+    bandai = real("bandai/bandai2.npz")
+    some = MotionSet(bandai.clips[::500], bandai.skeleton, "some")
+    write_motion(tmp_path / "a", some, "bvh")
+    rigid = read_motion(tmp_path / "a", onto=bandai.skeleton)
+    for clip in some:  # FK of IK is within a centimetre on bandai2
+        assert np.linalg.norm(rigid[clip.key].positions - clip.positions, axis=-1).max() < 0.01
+    write_motion(tmp_path / "b", rigid, "bvh")
+    again = read_motion(tmp_path / "b", onto=bandai.skeleton)
+    for clip in rigid:
+        np.testing.assert_allclose(again[clip.key].positions, clip.positions, atol=1e-4)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("file", "joints", "said"),
+    [
+        ("bvh/indian_13.bvh", 57, "centimetres"),
+        ("asfamc/02_01.amc", 38, "as the file says"),
+        ("expmap/test_running_1.txt", 38, "as the file says"),
+    ],
+)
+def test_samples_are_people_of_a_plausible_size(file, joints, said, shared, real):
+    read = read_motion(shared(f"cmu_raw/{file}"))
+    assert (read.skeleton.joints, read.skeleton.up, len(read)) == (joints, "y", 1)
+    assert said in read.said
+    assert read.said in printed(read)
+    assert len(read.skeleton.left) == len(read.skeleton.right) > 0
+    assert read_motion(shared(f"cmu_raw/{file}"), onto=WALKER).skeleton.names == WALKER.names
+    if not file.endswith("bvh"):  # 02_01, and another
+        onto = read_motion(shared(f"cmu_raw/{file}"), onto=real("cmu/cmu8.npz").skeleton).resampled(30)
+        key = ("train", "walking_1") if file.endswith("amc") else ("test", "running_1")
+        np.testing.assert_allclose(onto.clips[0].positions, real("cmu/cmu8.npz")[key].positions, atol=1e-4)
+
+
+@pytest.mark.parametrize("scale", [1.0, 100.0, 1000.0, 1 / 0.0254])
+@pytest.mark.parametrize("turn", ["y", "z", "-y", "x", "-z"])
+def test_units_and_axes_are_found_from_the_person(people, scale, turn):
+    turns = {"y": np.eye(3), "z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "-y": np.diag([-1.0, -1, 1])}
+    turns |= {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "-z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
+    positions = people.clips[0].positions.astype(float)
+    seen = Recording(WALKER.names, WALKER.parents, scale * positions @ np.array(turns[turn], float).T, fps=30)
+    world = understand({"a": seen})
+    assert world.metres == pytest.approx(1 / scale)
+    settled = settle(seen, world)
+    assert settled.up == ("z" if turn == "z" else "y")
+    vertical = 2 if turn == "z" else 1
+    heights = positions[..., 1]
+    np.testing.assert_allclose(settled.positions[..., vertical], heights, atol=1e-6)
+    bones = [np.linalg.det(places[0, [1, 4, 8]] - places[0, 0]) for places in (settled.positions, positions)]
+    np.testing.assert_allclose(*bones, atol=1e-9)  # of a mirrored person, the negative
+
+
+def test_what_is_given_goes_before_what_is_found(bvh, people):
+    read = read_motion(bvh, metres=0.02, fps=60)
+    assert "as given (0.02 m)" in read.said
+    assert read.skeleton.fps == 60
+    half = read_motion(bvh)
+    np.testing.assert_allclose(read.clips[0].positions, 2 * half.clips[0].positions, rtol=1e-5)
+    assert read_motion(bvh, up="z").skeleton.up == "z"
+    with pytest.raises(ValueError, match=r"shows a person of 1\d\d"):
+        read_motion(bvh, metres=1)
+    for wrong in ({"up": "x"}, {"metres": 0.0}):
+        with pytest.raises(ValueError, match="expected"):
+            read_motion(bvh, **wrong)
+    for path in (bvh / "train", bvh / "train" / "person_0000.bvh"):
+        assert read_motion(path).splits == ["all"]
+
+
+def test_a_unit_that_no_person_has_is_asked_for(tmp_path, people):
+    write_motion(tmp_path / "a.bvh", MotionSet(people.clips[:1], people.skeleton))
+    text = (tmp_path / "a.bvh").read_text().splitlines()
+    large = [
+        " ".join(["OFFSET", *(str(7 * float(v)) for v in line.split()[1:])]) if "OFFSET" in line else line
+        for line in text
+    ]
+    (tmp_path / "a.bvh").write_text("\n".join(large))
+    with pytest.raises(ValueError, match=r"a\.bvh: the body's largest extent is .* give the metres"):
+        read_motion(tmp_path / "a.bvh")
+
+
+def test_a_folder_is_read_to_its_last_subfolder_without_its_links(bvh, tmp_path):
+    (bvh / "train" / "deep").mkdir()
+    (bvh / "train" / "person_0000.bvh").rename(bvh / "train" / "deep" / "walk 1.BVH")
+    (bvh / "README.txt").write_text("not motion")
+    (bvh / ".hidden.bvh").write_text("not motion")
+    (bvh / "link.bvh").symlink_to(bvh / "train" / "person_0001.bvh")
+    (tmp_path / "other").mkdir()
+    (bvh / "linked").symlink_to(tmp_path / "other")
+    write_motion(tmp_path / "other", read_motion(bvh), "bvh")
+    (bvh / "labels.csv").write_text("split,clip,mood\ntrain/deep,walk 1,happy\n")
+    read = read_motion(bvh)
+    assert sorted(clip.key for clip in read) == [
+        ("test", "person_0002"),
+        ("train", "person_0001"),
+        ("train/deep", "walk 1"),
+    ]
+    assert read["train/deep", "walk 1"].labels["mood"] == "happy"
+    assert read.skeleton.name == "bvh"
+
+
+def test_files_of_a_folder_are_alike_or_it_is_said_which_is_not(bvh, tmp_path, people):
+    stranger = bvh / "train" / "stranger.bvh"
+    text = (bvh / "train" / "person_0000.bvh").read_text()
+    for old, new, message in (
+        ("JOINT LShoulder", "JOINT Wing", r"stranger\.bvh: lacks LShoulder and has Wing, other than .*person_0002"),
+        ("Frame Time: 0.03333333", "Frame Time: 0.01", r"stranger\.bvh: 100 frames per second, .* has 30"),
+    ):
+        stranger.write_text(text.replace(old, new))
+        with pytest.raises(ValueError, match=message):
+            read_motion(bvh)
+        read = read_motion(bvh, skip_bad=True)
+        assert len(read) == 3
+        assert [name for _, name, _ in read.skipped] == ["stranger"]
+    stranger.write_text("HIERARCHY")
+    with pytest.raises(ValueError, match="no line MOTION"):
+        read_motion(bvh)
+    stranger.unlink()
+    (bvh / "a.amc").write_text("")
+    with pytest.raises(ValueError, match="3 bvh and 1 amc files"):
+        read_motion(bvh)
+    (tmp_path / "nothing").mkdir()
+    with pytest.raises(FileNotFoundError, match="no file in it is one of"):
+        read_motion(tmp_path / "nothing")
+
+
+def test_bodies_of_a_folder_differ_in_rest_and_not_in_unit(bvh):
+    read = read_motion(bvh)  # three people
+    assert "rest poses differ" in read.said
+    assert not read.skeleton.rest
+    path = bvh / "train" / "person_0001.bvh"
+    lines = [
+        " ".join(["OFFSET", *(str(float(v) / 2.54) for v in line.split()[1:])]) if "OFFSET" in line else line
+        for line in path.read_text().splitlines()
+    ]
+    path.write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=r"in centimetres, .*person_0001.* in inches|in inches, .* in centimetres"):
+        read_motion(bvh)
+    with pytest.raises(ValueError, match=r"person_0001\.bvh: its body is 0\.\d+ times that of"):
+        read_motion(bvh, metres=0.01)
+
+
+@pytest.mark.parametrize("kind", ["npz", "bvh"])
+def test_joints_are_chosen_by_place_name_or_new_name(kind, people, tmp_path):
+    write_motion(tmp_path / "a.npz", people)
+    write_motion(tmp_path / "b", MotionSet(people.clips[:1], people.skeleton), "bvh")
+    path = tmp_path / ("a.npz" if kind == "npz" else "b")
+    whole = read_motion(path)
+    some = read_motion(path, joints=["Pelvis", "LHip", "LKnee"])
+    np.testing.assert_array_equal(
+        some.clips[0].positions, whole.clips[0].positions[:, [whole.skeleton.find(n) for n in some.skeleton.names]]
+    )
+    assert some.skeleton.parents == (-1, 0, 1)
+    named = read_motion(path, joints={"Pelvis": "hips", "LKnee": "left_knee", "RKnee": "right_knee"})
+    assert named.skeleton.names == ("hips", "left_knee", "right_knee")
+    assert (named.skeleton.left, named.skeleton.right) == ((1,), (2,))
+    onto = read_motion(path, onto=HUMAN36M)
+    assert (onto.skeleton.name, onto.skeleton.up, onto.skeleton.fps) == ("human36m", "z", 30)
+    heights = whole.clips[0].positions[:, whole.skeleton.find("Pelvis"), 1]
+    np.testing.assert_allclose(onto.clips[0].positions[:, 0, 2], heights, atol=1e-6)
+
+
+def test_sides_are_what_names_differ_in():
+    assert sides(["Hips", "LeftArm", "RightArm", "left", "Lowerback"]) == ((1,), (2,))
+    assert sides(["a", "lArm", "rArm", "leg_L", "leg_R"]) == ((1, 3), (2, 4))
+
+
+def test_motion_is_resampled_by_whole_frames_or_between_them(people):
+    turning = people.with_rotations()
+    clip = turning.clips[0]
+    half = turning.resampled(15)
+    np.testing.assert_array_equal(half.clips[0].positions, clip.positions[::2])
+    np.testing.assert_array_equal(half.clips[0].rotations, clip.rotations[::2])
+    assert half.skeleton.fps == 15
+    double = turning.resampled(60)
+    assert double.clips[0].frames == 2 * clip.frames - 1
+    np.testing.assert_allclose(double.clips[0].positions[::2], clip.positions, atol=1e-6)
+    np.testing.assert_allclose(
+        double.clips[0].positions[1::2], (clip.positions[1:] + clip.positions[:-1]) / 2, atol=1e-6
+    )
+    middle = clip.rotations[1:] + clip.rotations[:-1]  # half way on an arc
+    middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
+    np.testing.assert_allclose(double.clips[0].rotations[1::2], middle, atol=1e-6)
+    np.testing.assert_allclose(
+        turning.resampled(24).resampled(24).clips[0].positions, turning.resampled(24).clips[0].positions
+    )
+    single = MotionSet([clip.between(0, 1)], people.skeleton).resampled(100)
+    np.testing.assert_array_equal(single.clips[0].positions, clip.positions[:1])
+    for wrong in (0, -1, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="frames per second"):
+            people.resampled(wrong)
+
+
+def test_recordings_that_nobody_divided_are(people):
+    alone = MotionSet([Clip("all", "walk", people.clips[0].positions)], WALKER)
+    parts = alone.divided(0.25, 10)
+    assert [(clip.key, clip.frames) for clip in parts] == [
+        (("train", "walk"), 20),
+        (("train", "walk-1"), 10),
+        (("test", "walk"), 10),
+    ]
+    np.testing.assert_array_equal(np.concatenate([clip.positions for clip in parts]), alone.clips[0].positions)
+    both = MotionSet([Clip("a/b", "x", people.clips[0].positions), Clip("c", "x", people.clips[1].positions)], WALKER)
+    assert [clip.key for clip in both.divided(0.5)] == [
+        ("train", "a-b-x"),
+        ("test", "a-b-x"),
+        ("train", "c-x"),
+        ("test", "c-x"),
+    ]
+    assert [clip.key for clip in both.divided(0.5, 30)] == [("train", "a-b-x"), ("test", "c-x")]  # too short for parts
+    assert [clip.split for clip in alone.divided(0.5, 30)] == ["train"]
+    with pytest.raises(ValueError, match="the part for test is 1"):
+        alone.divided(1)
+
+
+def test_one_recording_of_ones_own_has_windows_of_every_split(tmp_path):
+    people = simulate(1, 700)
+    write_motion(tmp_path / "own.bvh", MotionSet([replace(people.clips[0], split="all")], people.skeleton))
+    opened = MotionData.open(tmp_path / "own.bvh")
+    assert (opened.protocol.observed, opened.protocol.predicted, opened.protocol.fps) == (15, 60, 30)
+    for split in ("train", "validation", "test"):
+        assert len(opened.windows(split))
+    again = MotionData.reopened(opened.recorded(), opened.schema)
+    assert (again.protocol, again.fingerprint) == (opened.protocol, opened.fingerprint)
+    assert MotionData.open().protocol.name == "simulated"  # divided by who made it
+    other = MotionSet(people.resampled(25).clips, people.resampled(25).skeleton)
+    save(tmp_path / "slow.npz", other)
+    assert MotionData.open(tmp_path / "slow.npz").protocol.predicted == 50
+
+
+def test_a_table_has_the_joints_of_its_skeleton(people, tmp_path):
+    write_motion(tmp_path / "a.csv", MotionSet(people.clips[:1], people.skeleton))
+    assert read_motion(tmp_path / "a.csv").skeleton.left == WALKER.left
+    fields = json.loads((tmp_path / "skeleton.json").read_text())
+    fields["joint_names"][3] = "RPaw"
+    (tmp_path / "skeleton.json").write_text(json.dumps(fields))
+    with pytest.raises(ValueError, match=r"a\.csv: .* do not have the same joints: RFoot, RPaw"):
+        read_motion(tmp_path / "a.csv")
+    (tmp_path / "skeleton.json").unlink()
+    with pytest.raises(ValueError, match=r"a\.csv: which skeleton"):
+        read_motion(tmp_path / "a.csv")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes with names")
+def test_pipes_in_a_folder_are_refused_and_not_waited_for(bvh):
+    os.mkfifo(bvh / "train" / "a.bvh")
+    with pytest.raises(FileNotFoundError, match=r"a\.bvh: no such file"):
+        read_motion(bvh)

@@ -1,0 +1,132 @@
+"""Motion written for other programs, and converted file by file on the command line."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dvae.cli import main
+from dvae.motion import HUMAN36M, WALKER, Clip, Forecasts, MotionSet, read_motion, simulate, write_motion
+from dvae.motion.files.plain import read_arrays
+from dvae.motion.files.smpl import JOINTS
+
+
+@pytest.fixture(scope="module")
+def people():
+    return simulate(clips=3, frames=12, seed=2)
+
+
+@pytest.fixture(scope="module")
+def recordings(people, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recordings")
+    write_motion(folder, people, "bvh")
+    return folder
+
+
+def test_formats_and_names_fit_each_other_or_are_refused(people, tmp_path):
+    for path, format, message in (
+        ("a.bvh", None, "holds one clip a file, and there are 3"),
+        ("a", None, "which format"),
+        ("a.fbx", None, "which format"),
+        ("a.csv", "bvh", "which format"),
+        ("a", "npz", "end its name in .npz"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_motion(tmp_path / path, people, format)
+    for split, name in (("..", "a"), ("/etc", "a"), ("a", "../../b"), ("a/../..", "b")):
+        away = MotionSet([replace(people.clips[0], split=split, name=name)], WALKER)
+        with pytest.raises(ValueError, match="leads out of the folder"):
+            write_motion(tmp_path / "inner", away, "csv")
+    assert not list(tmp_path.rglob("*.csv"))
+
+
+def test_what_has_z_up_is_written_with_y_up(people, tmp_path):
+    positions = people.clips[0].positions[..., [2, 0, 1]]  # cyclic, and so no mirror
+    standing = MotionSet([Clip("all", "a", positions)], replace(HUMAN36M, fps=30.0))
+    (path,) = write_motion(tmp_path / "a.bvh", standing)
+    read = read_motion(path)
+    assert read.skeleton.up == "y"
+    np.testing.assert_allclose(read.clips[0].positions[:, 0, 1], positions[:, 0, 2], atol=1e-5)
+
+
+def test_amass_has_the_members_that_its_readers_ask_for(people, tmp_path):
+    (path,) = write_motion(tmp_path / "a.npz", MotionSet(people.clips[:1], WALKER), "amass")
+    arrays = read_arrays(path)
+    assert arrays["poses"].shape == (12, 156)
+    assert arrays["trans"].shape == (12, 3)
+    assert arrays["mocap_framerate"] == 30
+    assert not arrays["betas"].any()
+    assert not arrays["poses"][:, 3 * len(JOINTS) :].any()
+    heights = people.clips[0].positions[:, 0, 1]
+    np.testing.assert_allclose(arrays["trans"][:, 2], heights, atol=1e-6)  # z up
+
+
+def test_a_forecast_is_a_clip_after_what_was_observed(people, tmp_path):
+    random = np.random.default_rng(0)
+    clip = people.clips[0].positions
+    future = np.stack([clip[4:], clip[4:] + random.normal(0, 1e-4, clip[4:].shape)])
+    forecasts = Forecasts(WALKER, [("test", "a/b", 7)], future[:, None], clip[None, :4], clip[None, 4:])
+    motion = forecasts.motion()
+    assert [clip.key for clip in motion] == [("test", "a-b-7-0"), ("test", "a-b-7-1")]
+    np.testing.assert_array_equal(motion.clips[0].positions, clip)
+    assert len(write_motion(tmp_path / "futures", motion, "bvh")) == 2
+
+
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_folder_is_converted_as_it_would_be_read(jobs, recordings, tmp_path, capsys):
+    told = ["--fps", "15", "--onto", "human36m", "--jobs", str(jobs)]
+    assert main(["data", "convert", str(recordings), "--out", str(tmp_path / "a.npz"), *told]) == 0
+    assert "3 clips; read as unit centimetres" in capsys.readouterr().err
+    read, whole = read_motion(tmp_path / "a.npz"), read_motion(recordings, onto=HUMAN36M).resampled(15)
+    assert [clip.key for clip in read] == [clip.key for clip in whole]
+    for clip in whole:
+        np.testing.assert_array_equal(read[clip.key].positions, clip.positions)
+    assert (read.skeleton.name, read.skeleton.up, read.skeleton.fps) == ("human36m", "z", 15)
+
+
+def test_every_format_is_converted_to_every_other(recordings, people, tmp_path):
+    before = recordings
+    for format in ("csv", "amass", "bvh"):
+        told = ["--out", str(tmp_path / format), "--format", format, "--jobs", "1"]
+        assert main(["data", "convert", str(before), *told]) == 0
+        before = tmp_path / format
+    last, first = read_motion(before, onto=WALKER), read_motion(recordings, onto=WALKER)
+    assert [clip.key for clip in last] == [clip.key for clip in first]
+    for (
+        clip
+    ) in first:  # but for the place of SMPL's pelvis, which is a constant; IK is within a centimetre, three times
+        pelvis = clip.positions[:, :1]
+        np.testing.assert_allclose(
+            last[clip.key].positions - last[clip.key].positions[:, :1], clip.positions - pelvis, atol=0.03
+        )
+
+
+def test_what_cannot_be_converted_is_said_or_skipped(recordings, tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    for file in recordings.rglob("*.bvh"):
+        (tmp_path / "in" / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "in" / "z.bvh").write_text("no motion")
+    told = [str(tmp_path / "in"), "--out", str(tmp_path / "out.npz"), "--jobs", "1"]
+    assert main(["data", "convert", *told]) == 1
+    assert "z.bvh" in capsys.readouterr().err
+    assert not (tmp_path / "out.npz").exists()
+    assert main(["data", "convert", *told, "--skip-bad"]) == 0
+    assert "3 clips" in capsys.readouterr().err
+    assert len(read_motion(tmp_path / "out.npz")) == 3
+    assert main(["data", "convert", *told[:1], "--out", str(tmp_path / "a.bvh")]) == 1
+    assert "name a folder" in capsys.readouterr().err
+    for wrong in (
+        ["convert", *told[:1]],
+        ["info", *told],
+        ["get", "cmu2", *told[1:3]],
+        ["convert", *told, "--url", "x"],
+    ):
+        assert main(["data", *wrong]) == 2
+
+
+def test_forecasts_of_a_run_are_bvh(run, tmp_path, capsys):
+    assert main(["forecast", str(run), "--out", str(tmp_path / "one.bvh"), "--samples", "2"]) == 0
+    assert "the first of 2 futures of 60 frames for each of 1 windows" in capsys.readouterr().err
+    assert read_motion(tmp_path / "one.bvh", onto=WALKER).clips[0].frames == 75
+    assert main(["forecast", str(run), "--out", str(tmp_path / "all"), "--samples", "2"]) == 0
+    assert len(list((tmp_path / "all").rglob("*.bvh"))) % 2 == 0
