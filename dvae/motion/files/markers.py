@@ -59,7 +59,8 @@ def read_c3d(path: str | Path) -> Recording:
     numbers = np.frombuffer(content, kind, frames * row, _BLOCK * (start - 1)).reshape(frames, row)
     values = numbers[:, : 4 * markers].reshape(frames, markers, 4).astype(np.float64)
     places = values[..., :3] * (1 if scale < 0 else scale)
-    places[(values[..., 3] < 0) | (np.abs(places) > 1e9).any(-1) | ~np.isfinite(places).all(-1)] = np.nan
+    hidden = (values[..., 3] < 0) | ~(np.abs(places) < 1e9).all(-1)
+    places = np.where(np.expand_dims(hidden, -1), np.nan, places)
     names = parameters.get("LABELS", [])[:markers]
     seen = np.isfinite(places).all(-1).any(0)
     kept = [n for n, name in enumerate(names) if name and name[0] != "*" and name not in names[:n] and seen[n]]

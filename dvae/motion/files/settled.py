@@ -24,8 +24,8 @@ WITHIN = 1.35
 _TOP = re.compile(r"head|neck|skull|face", re.IGNORECASE)
 _BOTTOM = re.compile(r"foot|toe|ankle|heel", re.IGNORECASE)
 _SIDES = {
-    "left": (r"left", r"^l(?=.)|(?<=[:_.\-])l(?=$|[:_.\-A-Z])"),
-    "right": (r"right", r"^r(?=.)|(?<=[:_.\-])r(?=$|[:_.\-A-Z])"),
+    "left": (r"left", r"(?<=[:_.\-])l(?=$|[:_.\-A-Z])", r"^l(?=.)"),
+    "right": (r"right", r"(?<=[:_.\-])r(?=$|[:_.\-A-Z])", r"^r(?=.)"),
 }
 """How names tell a side: by the word, or by its letter at the beginning or the end."""
 
@@ -33,7 +33,7 @@ _SIDES = {
 def sides(names: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Joints on the left and on the right, by names that differ in these words or letters alone."""
     found: dict[str, set[int]] = {"left": set(), "right": set()}
-    for way in range(2):
+    for way in range(3):
         plain = {
             side: {
                 re.sub(ways[way], "", name, count=1, flags=re.I).lower(): place
