@@ -49,7 +49,8 @@ def _check_file(path: Path | None, option: str, *suffixes: str) -> None:
     if path is not None and path.is_dir():
         raise UsageError(f"--{option} {path} is a directory; name a file")
     if path is not None and path.suffix.lower() not in (suffixes or (path.suffix.lower(),)):
-        raise UsageError(f"--{option} {path}: what is written is {suffixes[0][1:]}; end its name in {suffixes[0]}")
+        kinds = " or ".join(suffixes)
+        raise UsageError(f"--{option} {path}: the end of a name says what is written; end its name in {kinds}")
 
 
 def check_figure(path: Path | None, option: str) -> None:

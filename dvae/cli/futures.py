@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -55,11 +56,11 @@ def forecast(
     suffix = out.suffix.lower()
     check_files(out if suffix else None, figure, ".npz", ".bvh")
     loaded = load_run(run, data)
-    windows = _windows_of(loaded, data, clip)
+    windows = windows_of(loaded, data, clip)
     chosen: Sequence[int] = range(len(windows))
     if suffix == ".bvh":
         chosen = [_liveliest(windows.positions(windows.all()["x"]).numpy(), None)]
-    futures = _forecasts(loaded, windows, chosen, samples, seed, horizon, fix)
+    futures = draw_futures(loaded, windows, chosen, samples, seed, horizon, fix)
     if suffix == ".npz":
         futures.save(out)
     else:
@@ -114,7 +115,7 @@ def complete(
         raise UsageError(f"{run} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
     if exact and not (joints or paths):
         raise UsageError("--exact has motions follow paths; say which, by --joints or --paths")
-    windows = _windows_of(loaded, data, clip)
+    windows = windows_of(loaded, data, clip)
     positions = windows.positions(windows.all()["x"]).numpy()
     chosen = _liveliest(positions, window)
     pose, truth = positions[chosen, 0], positions[chosen, 1:]
@@ -155,11 +156,12 @@ def animate(
 ) -> None:
     """Play forecasts beside what happened, or a clip, as moving skeletons.
 
-    The page is one file that any browser shows, without a network: to play, to scrub, to turn with the mouse.
+    A page (.html) is one file that any browser shows, without a network: to play, to scrub, to turn with the mouse. A
+    film (.gif or .mp4) is the same from the front, for slides and messages.
 
     Args:
         source: a run directory, a file that `dvae forecast` wrote, a motion file, or "simulated".
-        out: the html file to write.
+        out: the file to write; the end of its name is its kind, html, gif or mp4.
         clip: name of a clip, or split/name where the name is not unique. Without it, futures are those of any test
             window, and a motion file shows its first clip.
         window: which of the windows of futures, from 0; by default the one that moves most.
@@ -172,12 +174,14 @@ def animate(
     """
     at_least(1, samples=samples, every=every)
     at_least(0, window=window)
-    check_files(out, figure, ".html", ".htm")
+    check_files(out, figure, ".html", ".gif", ".mp4", ".htm")
+    if out.suffix.lower() == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise UsageError("an mp4 needs imageio-ffmpeg: pip install 'pyro-dvae[video]'; or end the name in .gif")
     if Path(source).is_dir():
         loaded = load_run(Path(source), data)
-        windows = _windows_of(loaded, data, clip)
+        windows = windows_of(loaded, data, clip)
         chosen = _liveliest(windows.positions(windows.all()["x"]).numpy(), window)
-        futures = _forecasts(loaded, windows, [chosen], samples or 5, seed, fix=fix)
+        futures = draw_futures(loaded, windows, [chosen], samples or 5, seed, fix=fix)
     elif fix:
         raise UsageError(f"--fix is about the futures that a run draws; {source} is no run directory")
     elif data is not None:
@@ -215,9 +219,14 @@ def _play_clip(source: str, name: str | None, every: int | None, out: Path) -> N
 
 
 def _play(out: Path, *motions: Any, **options: Any) -> None:
-    from ..motion.plot import animate, save_html
+    if out.suffix.lower() in (".gif", ".mp4"):
+        from ..motion.film import save_film
 
-    save_html(animate(*motions, **options), out)
+        save_film(out, *motions, **options)
+    else:
+        from ..motion.plot import animate, save_html
+
+        save_html(animate(*motions, **options), out)
 
 
 def joint_names(given: Sequence[str]) -> list[str]:
@@ -236,7 +245,7 @@ def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
     return found[0]
 
 
-def _windows_of(loaded: runs.Loaded, data: str | None, clip: str | None) -> motion.Windows:
+def windows_of(loaded: runs.Loaded, data: str | None, clip: str | None) -> motion.Windows:
     """The test windows of a run's data or of others, or all windows of one clip, of any split."""
     opened = data_of(data, loaded)
     if clip is None:
@@ -246,7 +255,7 @@ def _windows_of(loaded: runs.Loaded, data: str | None, clip: str | None) -> moti
     return motion.windows(chosen, anywhere, "test")
 
 
-def _forecasts(
+def draw_futures(
     loaded: runs.Loaded,
     windows: motion.Windows,
     chosen: Sequence[int],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from math import ceil, pi
 from os import PathLike
@@ -167,6 +168,96 @@ def futures(
     return ax
 
 
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """People who move side by side, in metres as the viewer sees them: x to the right, y away from the viewer, z up.
+
+    Attributes:
+        skeleton: the tree.
+        names: of the P people; a truth is the first of them.
+        colours: of each, from `now` on.
+        motion: (P, O + H, J, 3), each about a place of their own; NaN after the end of a truth that ends early.
+        now: the last observed frame.
+        shown: the frames to show, `now` among them.
+        fixed: joints that move alike in all samples.
+        truth: whether there is one.
+    """
+
+    skeleton: Skeleton
+    names: list[str]
+    colours: list[str]
+    motion: np.ndarray
+    now: int
+    shown: range
+    fixed: frozenset[int]
+    truth: bool
+
+    @property
+    def low(self) -> np.ndarray:
+        """(3,), the least coordinates of anybody."""
+        return np.nanmin(self.motion, (0, 1, 2))  # type: ignore[no-any-return]
+
+    @property
+    def high(self) -> np.ndarray:
+        """(3,), the largest coordinates of anybody."""
+        return np.nanmax(self.motion, (0, 1, 2))  # type: ignore[no-any-return]
+
+    @property
+    def places(self) -> np.ndarray:
+        """(P, 3), where to stand so that nobody is in another's way."""
+        return _places(len(self.motion), np.maximum(self.high - self.low + 0.4, SPACING))
+
+    @property
+    def milliseconds(self) -> float:
+        """From one shown frame to the next, at the motion's own speed."""
+        return 1000 * self.shown.step / self.skeleton.fps
+
+    def seconds(self, frame: int) -> float:
+        """From the last observed frame to another."""
+        return (frame - self.now) / self.skeleton.fps
+
+    def shared(self, person: int) -> frozenset[int]:
+        """The joints of a person that move as in all other samples."""
+        return frozenset() if self.truth and person == 0 else self.fixed
+
+
+def staged(
+    skeleton: Skeleton,
+    observed: Any,
+    samples: Any = None,
+    truth: Any = None,
+    *,
+    names: Sequence[str] = (),
+    fixed: Collection[int] = (),
+    every: int | None = None,
+    view: float = pi / 5,
+) -> Scene:
+    """People for an animation; see `animate` for its arguments and what it refuses."""
+    if samples is None:
+        motion = np.asarray(observed)
+        observed, samples, names = motion[:1], motion[None, 1:], names or [""]
+    past, future, real = _checked(skeleton, observed, samples, truth)
+    alike = frozenset(map(int, fixed))
+    names = names or [f"sample {k + 1}" for k in range(len(future))]
+    every = max(1, round(skeleton.fps / 25)) if every is None else every
+    if len(names) != len(future):
+        raise ValueError(f"{len(names)} names for {len(future)} samples; give each its own")
+    if strangers := alike - set(range(skeleton.joints)):
+        raise ValueError(f"fixed names joints {sorted(strangers)}; they go from 0 to {skeleton.joints - 1}")
+    if every < 1:
+        raise ValueError(f"every is {every}; show each frame with 1, each second one with 2")
+    if not all(np.isfinite(positions).all() for positions in (past, future, *([] if real is None else [real]))):
+        raise ValueError("observed, samples or truth have NaN or infinite positions, which cannot be drawn")
+    people = list(zip(names, map(to_hex, _colours(len(future))), future, strict=True))
+    if real is not None:
+        people.insert(0, ("truth", TRUTH, real))
+    called, colours, aheads = map(list, zip(*people, strict=True))
+    motion = _seen(skeleton, past, aheads, future.shape[1], view)
+    now = len(past) - 1
+    shown = range(now % every, motion.shape[1], every)
+    return Scene(skeleton, called, colours, motion, now, shown, alike, real is not None)
+
+
 def animate(
     skeleton: Skeleton,
     observed: Any,
@@ -208,39 +299,17 @@ def animate(
         ValueError: the shapes do not fit each other or the skeleton, there is nothing to draw, a position is not
             finite, or names, fixed or every do not fit the motion.
     """
-    if samples is None:
-        motion = np.asarray(observed)
-        observed, samples, names = motion[:1], motion[None, 1:], names or [""]
-    past, future, real = _checked(skeleton, observed, samples, truth)
-    fixed = set(map(int, fixed))
-    names = names or [f"sample {k + 1}" for k in range(len(future))]
-    every = max(1, round(skeleton.fps / 25)) if every is None else every
-    if len(names) != len(future):
-        raise ValueError(f"{len(names)} names for {len(future)} samples; give each its own")
-    if strangers := fixed - set(range(skeleton.joints)):
-        raise ValueError(f"fixed names joints {sorted(strangers)}; they go from 0 to {skeleton.joints - 1}")
-    if every < 1:
-        raise ValueError(f"every is {every}; show each frame with 1, each second one with 2")
-
-    people = list(zip(names, map(to_hex, _colours(len(future))), future, strict=True))
-    if real is not None:
-        people.insert(0, ("truth", TRUTH, real))
-    if not all(np.isfinite(positions).all() for positions in (past, *(ahead for _, _, ahead in people))):
-        raise ValueError("observed, samples or truth have NaN or infinite positions, which cannot be drawn")
-    motion = _seen(skeleton, past, [ahead for _, _, ahead in people], future.shape[1], view)
-    low, high = np.nanmin(motion, (0, 1, 2)), np.nanmax(motion, (0, 1, 2))
-    places = _places(len(people), np.maximum(high - low + 0.4, SPACING))
-    gap = np.full((*motion.shape[:2], 1, 3), np.nan)
-    motion = np.concatenate([motion + places[:, None, None], gap], axis=2).astype(np.float32)
+    stage = staged(skeleton, observed, samples, truth, names=names, fixed=fixed, every=every, view=view)
+    low, high, places = stage.low, stage.high, stage.places
+    gap = np.full((*stage.motion.shape[:2], 1, 3), np.nan)
+    motion = np.concatenate([stage.motion + places[:, None, None], gap], axis=2).astype(np.float32)
 
     drawn = []
-    for k, (_, colour, ahead) in enumerate(people):
-        shared = set() if ahead is real else fixed
-        drawn.append((k, colour, _polylines(skeleton, set(range(skeleton.joints)) - shared), 6))
-        if shared:
-            drawn.append((k, FIXED, _polylines(skeleton, shared), 9))
-    now = len(past) - 1
-    shown = range(now % every, motion.shape[1], every)
+    for k, colour in enumerate(stage.colours):
+        drawn.append((k, colour, _polylines(skeleton, set(range(skeleton.joints)) - stage.shared(k)), 6))
+        if stage.shared(k):
+            drawn.append((k, FIXED, _polylines(skeleton, stage.shared(k)), 9))
+    now, shown = stage.now, stage.shown
 
     def traces(frame: int) -> list[dict[str, Any]]:
         """What changes from frame to frame."""
@@ -255,12 +324,12 @@ def animate(
 
     first = traces(shown[0])
     for trace, (k, _, _, width) in zip(first, drawn, strict=True):
-        trace |= {"mode": "lines", "name": _literal(people[k][0]), "hoverinfo": "skip"}
+        trace |= {"mode": "lines", "name": _literal(stage.names[k]), "hoverinfo": "skip"}
         trace["line"]["width"] = width
     floors = np.unique(places[:, 2]) + low[2]
     labels = [
         {"text": _literal(name), "font": {"size": 14}, "showarrow": False, "x": x, "y": y, "z": z + high[2] + MARGIN}
-        for (name, _, _), (x, y, z) in zip(people, places, strict=True)
+        for name, (x, y, z) in zip(stage.names, places, strict=True)
     ]
     low, high = low + places.min(0) - MARGIN, high + places.max(0) + MARGIN
     scene, fill = _scene(low, high)
@@ -273,8 +342,8 @@ def animate(
             "showlegend": False,
             "margin": {"l": 0, "r": 0, "t": 40 if title else 0, "b": 110},
             "scene": {**scene, "annotations": labels},
-            **_player({str(f): (f - now) / skeleton.fps for f in shown}, 1000 * every / skeleton.fps),
-            "meta": {"milliseconds": 1000 * every / skeleton.fps, "high": fill},
+            **_player({str(f): stage.seconds(f) for f in shown}, stage.milliseconds),
+            "meta": {"milliseconds": stage.milliseconds, "high": fill},
         },
     )
 
