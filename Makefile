@@ -1,4 +1,4 @@
-# make demo    simulated people: fit two methods, print the table, save demo/futures.png
+# make demo    simulated people: fit two methods, print the table, save demo/futures.png and demo/report.html
 # make test    lint, types, tests, and some of these once more as on another processor
 # make quick   lint, types, and the tests that are not slow
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again

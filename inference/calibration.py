@@ -11,13 +11,14 @@ from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
 from pyro import poutine
 from scipy import fft, special
 from torch import Tensor
+from typing_extensions import override
 
 from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LOG_JOINT = "log joint"
+
+_MOST = 2**24  # simulations times draws, or quantities, that are read from a file
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -210,6 +213,30 @@ class Calibration(Result):
     def to_json(self) -> str:
         """`document` as text."""
         return json.dumps(self.document(), indent=1, allow_nan=False)
+
+    @classmethod
+    @override
+    def from_json(cls, text: str) -> Self:
+        """What `to_json` wrote, with the ranks of each quantity in their order, since they alone are kept.
+
+        Raises:
+            ValueError: text that is not such a document, or one of more ranks than memory should be asked for.
+        """
+        try:
+            document = json.loads(text)
+            quantities, draws, simulations = (document[name] for name in ("quantities", "draws", "simulations"))
+            counts = np.array([each["rank_counts"] for each in quantities.values()], dtype=np.int64)
+            if counts.ndim != 2 or counts.shape[1] != draws + 1 or (counts < 0).any():
+                raise ValueError(f"expected counts of the ranks 0 to {draws} for every quantity")
+            if (counts.astype(float).sum(1) != simulations).any() or simulations * max(draws, len(counts)) > _MOST:
+                raise ValueError(
+                    f"the counts of a quantity do not add up to {simulations} simulations, or are too many"
+                )
+            ranks = np.stack([np.repeat(np.arange(draws + 1), row) for row in counts], 1)
+            said = {name: document[name] for name in ("length", "seed", "equations")}
+            return cls(ranks, tuple(quantities), draws, **said)
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+            raise ValueError(f"this is not a calibration written by Calibration.to_json: {error!r}") from error
 
     @property
     def _title(self) -> str:

@@ -20,6 +20,7 @@ LAYERS = {
     "dvae.motion": 2,
     "dvae.models": 3,
     "dvae.runs": 4,
+    "dvae.report": 4,
     "dvae.testing": 4,
     "dvae.cli": 5,
     "dvae.command": 6,
@@ -27,7 +28,7 @@ LAYERS = {
 # Motion is an application: beside itself, the methods and commands for it import it, and nothing else does.
 MOTION = re.compile(
     r"dvae\.motion\b|dvae\.models\.(energies|gsps|hit_dvae|poses|trajectories|trajevae|cvae_rnn)$"
-    r"|dvae\.cli\.(data|fitting|futures|judging)$"
+    r"|dvae\.cli\.(data|fitting|futures|judging|report)$"
 )
 
 

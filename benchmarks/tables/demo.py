@@ -1,9 +1,10 @@
 """Two methods on simulated people, from equations to scored forecasts, in a few minutes on a laptop.
 
-`make demo` runs it. It prints the table of scores and saves demo/futures.png. Everything here is the public
-interface; copy what you need.
+`make demo` runs it. It prints the table of scores, and saves demo/futures.png and demo/report.html. Everything here is
+the public interface; copy what you need.
 """
 
+import shutil
 from pathlib import Path
 
 import torch
@@ -12,45 +13,53 @@ from matplotlib.figure import Figure
 from rich import print
 
 import dvae
+from dvae.cli import main as command
+from dvae.inference.checkpoints import Run
 from dvae.motion.plot import futures
+from dvae.runs.directory import fit_run
 
 STEPS = {"hit-dvae": 400, "srnn": 700}
 RATES = {"hit-dvae": 3e-3, "srnn": 1e-3}
 
 
 def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips: int = 160) -> None:
-    """Fit, score and draw.
+    """Fit, score, draw and report.
 
     Args:
-        out: where the scores and the picture go.
+        out: where people, runs, scores, picture and page go, in place of those of an earlier demonstration.
         share: of the steps of training.
         samples: futures of a window that are scored.
         clips: of simulated people.
     """
-    people = dvae.motion.simulate(clips=clips, frames=150, seed=0)
-    protocol = dvae.motion.PROTOCOLS["simulated"]
-    train, validation, test = (
-        dvae.motion.windows(people, protocol, split) for split in ("train", "validation", "test")
-    )
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(out / "runs", ignore_errors=True)
+    dvae.motion.save(out / "people.npz", dvae.motion.simulate(clips=clips, frames=150, seed=0))
+    data = dvae.motion.MotionData.open(out / "people.npz", "simulated")
+    protocol, test = data.protocol, data.windows("test")
 
-    models = {}
-    for name in RATES:
+    runs = {name: out / "runs" / name for name in RATES}
+    for name, run in runs.items():
         steps = max(round(share * STEPS[name]), 1)
         loss = {"loss": "evidence"} if name == "hit-dvae" else {}  # its paper's takes longer
         method = dvae.method(name, latent=8, self_feeding=1.0, warm_up=steps // 3, **loss)
         print(f"\n[bold]{name}[/bold]  {method.generative}   {method.inference}", method.source)
-        torch.manual_seed(0)
-        models[name] = method.build(train)
-        recipe = method.train(train, validation, steps)
-        result = recipe.fit(models[name], batch_size=32, learning_rate=RATES[name], decay=0.5)
+        training = dvae.Training(steps=steps, batch_size=32, learning_rate=RATES[name], decay=0.5)
+        result = fit_run(method, data, run, training)
         print(f"best validation bound: {result.best_bound:.2f} nats a frame at step {result.best_step}")
 
-    training = dvae.motion.windows(people, protocol, "train+validation")
-    evaluation = dvae.evaluate(models, test, scores=dvae.motion.scores, samples=samples, training_windows=training)
+    models = {name: dvae.load(run).model for name, run in runs.items()}
+    evaluation = dvae.evaluate(
+        models,
+        test,
+        scores=dvae.motion.scores,
+        samples=samples,
+        training_windows=data.windows("train+validation"),
+        configs={name: Run(run).config for name, run in runs.items()},
+    )
     print(evaluation)
 
-    out.mkdir(exist_ok=True)
-    evaluation.save(out / "evaluation.json")
+    for folder in (out, *runs.values()):
+        evaluation.save(folder / "evaluation.json")
     x = test.all()["x"][:1]
     past, future = test.positions(x).split([protocol.observed, protocol.predicted], dim=1)
     figure = Figure(figsize=(9, 2.6 * len(models)), layout="constrained")
@@ -61,6 +70,8 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
         axes.set_title(name, fontsize=9)
     figure.savefig(out / "futures.png", dpi=150)
     print(f"saved {out / 'futures.png'} and {out / 'evaluation.json'}")
+    if command(["report", *map(str, runs.values()), "--out", str(out / "report.html")]):
+        raise SystemExit("the report failed")
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ WALK = {
 
 SAYS = {
     "cli": "the program dvae",
+    "report": "pages on fits",
     "runs": "directories of fits",
     "testing": "tests for your models",
     "models": "one file a paper",

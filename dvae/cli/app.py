@@ -36,6 +36,7 @@ COMMANDS = {
     "forecast": ("futures:forecast", "Forecast the test windows, or those of one clip, many times each."),
     "complete": ("futures:complete", "Complete motion along paths of some joints, from a clip or from a file."),
     "animate": ("futures:animate", "Play forecasts beside what happened, or a clip, as moving skeletons."),
+    "report": ("report:report", "Put what is known of runs on one page, with moving futures."),
     "data": ("data:data", "Look into motion files."),
 }
 """Name to "module:function", imported when it is meant, and what `dvae --help` says of it."""

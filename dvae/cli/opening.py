@@ -26,12 +26,12 @@ def load_run(path: Path, data: str | None) -> runs.Loaded:
     return loaded
 
 
-def data_of(path: str | None, *alike: runs.Loaded) -> Any:
+def data_of(path: str | None, *shared: runs.Loaded) -> Any:
     """The data of runs of one schema or, where a path leads to others, these under the protocol of the runs."""
     if path is None:
-        return alike[0].data
-    found = alike[0].on(path)
-    for run in alike:
+        return shared[0].data
+    found = shared[0].on(path)
+    for run in shared:
         if not own(run, found):
             note(f"{path} is not the data that {run.path} was fitted on")
     return found
@@ -39,6 +39,12 @@ def data_of(path: str | None, *alike: runs.Loaded) -> Any:
 
 def on_the_same_data(paths: Sequence[Path], path: str | None) -> tuple[list[runs.Loaded], Any]:
     """Runs, and the data whose test windows they share: those that all were fitted on, or other data."""
+    loaded = alike(paths, path)
+    return loaded, data_of(path, *loaded)
+
+
+def alike(paths: Sequence[Path], path: str | None) -> list[runs.Loaded]:
+    """Runs that share their test windows: those of the data that all were fitted on, or of other data."""
     if not paths:
         raise UsageError("give at least one run directory")
     twice, count = Counter(map(str, paths)).most_common(1)[0]
@@ -53,7 +59,7 @@ def on_the_same_data(paths: Sequence[Path], path: str | None) -> tuple[list[runs
                 f"{other.path} has other test windows ({there}) than {first.path} ({here}); give runs of the same data "
                 "and protocol"
             )
-    return loaded, data_of(path, *loaded)
+    return loaded
 
 
 def own(run: runs.Loaded, opened: Any) -> bool:

@@ -141,7 +141,13 @@ def test_demo(tmp_path):
     demo.main(tmp_path / "demo", share=0.002, samples=2, clips=10)
     rows = Evaluation.load(tmp_path / "demo" / "evaluation.json").rows
     assert rows.keys() == {"zero velocity", "nearest neighbours", *demo.STEPS}
-    assert {file.name for file in (tmp_path / "demo").iterdir()} == {"evaluation.json", "futures.png"}
+    data = {"labels.csv", "people.npz", "skeleton.json"}
+    names = {"evaluation.json", "futures.png", "report.html", "runs", *data}
+    assert {file.name for file in (tmp_path / "demo").iterdir()} == names
+    page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
+    for row in rows:
+        assert row in page
+    assert "has changed since it was scored" not in page
 
 
 def test_overview(tmp_path):

@@ -276,6 +276,28 @@ class Motions(ArrayWindows):
         return x.unflatten(-1, (-1, 3))
 
 
+def test_a_calibration_is_read_back_with_all_that_it_says():
+    result = from_ranks(np.random.default_rng(0).binomial(9, 0.6, (40, 3)), 9)
+    read = Calibration.from_json(result.to_json())
+    assert read.to_json() == result.to_json()
+    assert str(read) == str(result)
+    document = json.loads(result.to_json())
+    first = document["quantities"]["z_1[0]"]["rank_counts"]
+    for damage in (
+        {"simulations": 41},
+        {"draws": 8},
+        {"quantities": {}},
+        {"quantities": {"z": {"rank_counts": [-1, *first[1:-1], first[-1] + first[0] + 1]}}},
+        {"quantities": {"z": {"rank_counts": [10**15] + [0] * 9}}, "simulations": 10**15},  # memory is not asked for it
+        {"quantities": {"z": {"rank_counts": [10**400] + [0] * 9}}, "simulations": 10**400},
+    ):
+        with pytest.raises(ValueError, match="not a calibration"):
+            Calibration.from_json(json.dumps({**document, **damage}))
+    for text in ("", "[]", "{}", "null"):
+        with pytest.raises(ValueError, match="not a calibration"):
+            Calibration.from_json(text)
+
+
 def test_statistics_of_any_sequences_have_their_known_values():
     t = torch.arange(64, dtype=torch.float64)
     wave = torch.stack([2 + 3 * (2 * math.pi * t / 32).sin(), 0 * t], 1)

@@ -1,0 +1,108 @@
+"""The command that puts what is known of runs on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from markupsafe import Markup
+
+from .. import files
+from ..inference.checkpoints import CheckpointError
+from ..inference.result import progress_bar, reason
+from ..motion.player import SCRIPT, player
+from ..motion.plot import staged
+from ..report import Section, document, lacking, sections
+from ..runs import directory as runs
+from . import opening
+from .console import ERROR, at_least, check_files
+from .futures import draw_futures
+from .judging import Control
+from .judging import evaluate as evaluate_runs
+
+OF_DIRECTORIES = (
+    sections.overview,
+    sections.equations,
+    sections.graphs,
+    sections.curves,
+    sections.evaluated,
+    sections.calibration,
+)
+"""What needs no data."""
+
+
+def report(
+    run: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path,
+    evaluate: bool = False,
+    windows: int = 6,
+    samples: int = 10,
+    bound_windows: int = 64,
+    particles: int = 64,
+    seed: int = 0,
+    data: str | None = None,
+) -> None:
+    """One page of what is known of runs: equations, graphs, curves, scores, bounds, latents, and moving futures.
+
+    The page is one file that any browser shows, without a network. Several runs stand side by side. What a run lacks,
+    such as scores or a calibration, is said there with the command that makes it.
+
+    Args:
+        run: run directories, fitted on the same data under the same protocol.
+        out: the html file to write.
+        evaluate: score the runs first, as `dvae evaluate` does; without it, scores are those that it has left.
+        windows: test windows whose futures are shown, evenly spread; 0 leaves them out.
+        samples: futures of each.
+        bound_windows: test windows, evenly spread, of which bounds, KL and latents are shown.
+        particles: of the importance-weighted bound.
+        seed: of the draws.
+        data: where the data lie now, if the path in the runs no longer leads there; or other data of the same joints.
+    """
+    at_least(0, windows=windows)
+    at_least(1, samples=samples, bound_windows=bound_windows, particles=particles)
+    check_files(out, None, ".html", ".htm")
+    if evaluate:
+        evaluate_runs(run, Control(), data=data, seed=seed)
+    loaded = opening.alike(run, data)
+    named = dict(zip(opening.names(loaded), loaded, strict=True))
+    opening.note_unfinished(loaded)
+
+    with progress_bar(True) as bar:
+        shown = [make(named) for make in bar.track(OF_DIRECTORIES, description="run directories")]
+    try:
+        test = opening.data_of(data, *loaded).windows("test")
+    except CheckpointError as error:
+        text = f"Bounds, latents and futures need the data. {reason(error)}; say where they are with --data."
+        shown.append(Section("Latents and futures", before=lacking(text)))
+    else:
+        few = sections.Few(test, bound_windows)
+        shown += [sections.weighed(named, few, particles, seed), sections.posteriors(named, few, seed)]
+        shown += [_futures(named, test, windows, samples, seed)] if windows else []
+    text = document("Report: " + ", ".join(named), shown, [SCRIPT])
+    with files.written(out) as file:
+        file.write(text.encode(errors="replace"))
+    ERROR.print(f"wrote {out}: {', '.join(named)}, {len(text) / 1e6:.1f} MB")
+
+
+def _futures(named: Mapping[str, Any], windows: Any, count: int, samples: int, seed: int) -> Section:
+    """A few windows with what happened and what each run forecasts, as moving skeletons."""
+    few = sections.Few(windows, count)
+
+    def cell(run: runs.Loaded) -> Markup:
+        found = draw_futures(run, windows, few.chosen, samples, seed)
+        names = [str(k + 1) for k in range(samples)]
+        scenes = {
+            f"{split}/{clip} from frame {start}": staged(
+                found.skeleton, found.observed[n], found.forecasts[:, n], found.truth[n], names=names
+            )
+            for n, (split, clip, start) in enumerate(found.keys)
+        }
+        return player(scenes)
+
+    about = (
+        f"Black: observed. Green: what happened. In colour: {samples} futures, drawn from the model. "
+        "To turn the people, drag them, or press the arrow keys."
+    )
+    return Section("Futures", sections.cells(named, cell, "futures"), about)

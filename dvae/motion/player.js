@@ -1,0 +1,138 @@
+// Skeletons on a canvas: play, scrub, turn. What moves is in data-motion of each .player; see player.py for its form.
+'use strict';
+
+const SMALLEST = 64, NAME = 15, THICK = .02, WAYS = {ArrowLeft: -1, ArrowRight: 1};
+
+const unpacked = async text => {
+  const bytes = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('deflate'));
+  const planes = new Uint8Array(await new Response(stream).arrayBuffer()), count = planes.length / 2;
+  const whole = new Int16Array(count);
+  for (let i = 0; i < count; i++) whole[i] = planes[i] | planes[count + i] << 8;
+  return whole;
+};
+
+// Coordinates were stored as steps from the frame before; a person's first future frame follows the last observed one.
+const opened = async scene => {
+  const values = await unpacked(scene.packed), size = 3 * scene.joints, first = size * scene.observed;
+  for (let i = size; i < first; i++) values[i] += values[i - size];
+  const people = [];
+  let start = first;
+  for (const person of scene.people) {
+    for (let i = 0; i < size * person.frames; i++)
+      values[start + i] += values[i < size ? first - size + i : start + i - size];
+    people.push({...person, start});
+    start += size * person.frames;
+  }
+  const at = (person, frame) => frame < scene.observed ? frame * size
+    : person.start + Math.min(frame - scene.observed, person.frames - 1) * size;
+  return {...scene, people, values, at};
+};
+
+const play = async box => {
+  const scenes = JSON.parse(box.dataset.motion), canvas = box.querySelector('canvas'), pen = canvas.getContext('2d');
+  const [button, select, slider, time] = ['button', 'select', 'input', 'output'].map(name => box.querySelector(name));
+  let scene, frame, started = null, turn = 0, tilt = .2, wide = canvas.clientWidth;
+
+  const draw = () => {
+    const {people, bones, values, at, unit, middle, reach, low, high, observed} = scene;
+    const [right, up] = [2 * reach, (high - low) * Math.cos(tilt) + 2 * reach * Math.abs(Math.sin(tilt))];
+    const most = Math.max(240, .7 * innerHeight);
+    let columns = 1, scale = 0;
+    for (let tried = 1; tried <= people.length; tried++) {  // as large as can be, in one window of the browser
+      const fits = Math.min(wide / tried / right, (most / Math.ceil(people.length / tried) - NAME) / up);
+      if (fits > scale) [columns, scale] = [tried, fits];
+    }
+    if (right * scale < SMALLEST) {  // or as small as may be, and higher than it
+      columns = Math.max(1, Math.min(people.length, Math.floor(wide / SMALLEST)));
+      scale = Math.min(wide / columns / right, most / up);
+    }
+    const rows = Math.ceil(people.length / columns), [w, h] = [wide / columns, up * scale + NAME];
+    const sharp = devicePixelRatio || 1, [across, down] = [wide * sharp, rows * h * sharp].map(Math.round);
+    if (canvas.width !== across || canvas.height !== down) {
+      Object.assign(canvas, {width: across, height: down});
+      canvas.style.height = `${rows * h}px`;
+    }
+    pen.setTransform(sharp, 0, 0, sharp, 0, 0);
+    pen.clearRect(0, 0, wide, rows * h);
+    Object.assign(pen, {lineCap: 'round', lineJoin: 'round', font: '11px system-ui, sans-serif', textAlign: 'center'});
+
+    const [c, s, ct, st] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
+    const before = Math.floor(frame), after = Math.ceil(frame), share = frame - before, half = (low + high) / 2;
+    people.forEach((person, k) => {
+      const [x0, y0] = [(k % columns + .5) * w, Math.floor(k / columns) * h + NAME + up * scale / 2];
+      const seen = (x, y, z) => [x0 + scale * (c * x - s * y), y0 - scale * ((z - half) * ct + (s * x + c * y) * st)];
+      const line = (...points) => points.forEach((point, i) => i ? pen.lineTo(...seen(...point)) : pen.moveTo(...seen(...point)));
+      pen.strokeStyle = '#dfe2e6';
+      pen.lineWidth = 1;
+      pen.beginPath();
+      line(...[[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]].map(([x, y]) => [.6 * reach * x, .6 * reach * y, low]));
+      pen.stroke();
+      pen.fillStyle = '#57606a';
+      pen.fillText(person.name, x0, Math.floor(k / columns) * h + NAME - 4);
+      if (after >= observed + person.frames) return;  // a truth that ends early
+      const [a, b] = [at(person, before), at(person, after)];
+      const joint = j => {
+        const [x, y, z] = [0, 1, 2].map(i => unit * ((1 - share) * values[a + 3 * j + i] + share * values[b + 3 * j + i]));
+        return [x - middle[0], y - middle[1], z];
+      };
+      pen.strokeStyle = before < observed ? scene.past : person.colour;
+      pen.lineWidth = Math.max(1.2, THICK * scale);
+      pen.beginPath();
+      bones.forEach(([parent, child]) => line(joint(parent), joint(child)));
+      pen.stroke();
+    });
+    slider.value = frame;
+    const seconds = (frame - observed + 1) * scene.milliseconds / 1000;
+    time.textContent = `${seconds < 0 ? '−' : '+'}${Math.abs(seconds).toFixed(2)} s`;
+  };
+
+  const stop = () => { started = null; button.textContent = 'Play'; };
+  const move = now => {
+    if (started === null) return;
+    frame = Math.min(scene.frames - 1, Math.max(0, (now - started) / scene.milliseconds));
+    if (frame === scene.frames - 1) stop();
+    draw();
+    requestAnimationFrame(move);
+  };
+  const show = async () => {
+    stop();
+    scene = await opened(scenes[select.value]);
+    slider.max = scene.frames - 1;
+    frame = scene.frames - 1;
+    draw();
+    box.dataset.frames = scene.frames;
+  };
+
+  button.addEventListener('click', () => {
+    if (started !== null) return stop();
+    if (frame >= scene.frames - 1) frame = 0;
+    started = performance.now() - frame * scene.milliseconds;
+    button.textContent = 'Pause';
+    requestAnimationFrame(move);
+  });
+  slider.addEventListener('input', () => { stop(); frame = +slider.value; draw(); });
+  select.addEventListener('change', show);
+  const turned = (across, down) => {
+    turn += across;
+    tilt = Math.min(1.5, Math.max(-.2, tilt + down));
+    draw();
+  };
+  canvas.addEventListener('pointerdown', event => canvas.setPointerCapture(event.pointerId));
+  canvas.addEventListener('pointermove', event => {
+    if (event.buttons) turned(event.movementX / 100, event.movementY / 200);
+  });
+  canvas.addEventListener('keydown', event => {
+    if (event.key in WAYS) turned(WAYS[event.key] * Math.PI / 12, 0);
+  });
+  await show();
+  new ResizeObserver(() => {
+    if (canvas.clientWidth === wide) return;
+    wide = canvas.clientWidth;
+    draw();
+  }).observe(canvas);
+};
+
+document.querySelectorAll('.player').forEach(box => play(box).catch(error => {
+  box.querySelector('output').textContent = `cannot be played here: ${error.message}`;
+}));

@@ -1,0 +1,181 @@
+"""One HTML page in one file: what stands in it is text, tables and pictures, and a script that is known beforehand.
+
+Whatever is put into the page is escaped, unless it is `Markup`, which only this package and players of applications
+make. Should something slip through, the browser is told to load nothing from anywhere, and to run no script but those
+whose hashes the page names.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import rich.table
+from markupsafe import Markup
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+
+DPI = 160
+"""Of pictures; their text is as large as that of the page."""
+
+COLOURS = 64
+"""Of a picture."""
+
+_SHRINK = 0.6  # how far a picture goes along with a narrow window, before it is to be scrolled
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page.
+
+    Args:
+        title: above it.
+        cells: run to what is shown of it; what several share is shown once.
+        about: how it is to be read, in a sentence or two.
+        before: what is shown of all runs together.
+    """
+
+    title: str
+    cells: Mapping[str, str] = field(default_factory=dict)
+    about: str = ""
+    before: str = ""
+
+
+def document(title: str, sections: Sequence[Section], scripts: Sequence[str] = ()) -> str:
+    """The page.
+
+    Args:
+        title: of it.
+        sections: from top to bottom.
+        scripts: that it needs, which come from no run.
+    """
+    hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    allowed = " ".join(f"'sha256-{each}'" for each in hashes) or "'none'"
+    links = Markup(" ").join(
+        Markup('<a href="#part{}">{}</a>').format(n, section.title) for n, section in enumerate(sections)
+    )
+    return _PAGE.format(
+        title=title,
+        policy=f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}",
+        style=Markup(STYLE),
+        links=links,
+        sections=Markup().join(_section(n, section) for n, section in enumerate(sections)),
+        scripts=Markup().join(Markup("<script>{}</script>").format(Markup(script)) for script in scripts),
+    )
+
+
+_PAGE = Markup(
+    """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<link rel="icon" href="data:,">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body>
+<header><h1>{title}</h1><nav>{links}</nav></header>
+<main>{sections}</main>
+{scripts}
+</body>
+</html>
+"""
+)
+
+
+def _section(number: int, section: Section) -> Markup:
+    about = paragraph(section.about) if section.about else ""
+    owners: dict[str, list[str]] = {}
+    for name, cell in section.cells.items():
+        owners.setdefault(cell, []).append(name)
+    headed = len(section.cells) > 1
+    cells = Markup().join(
+        Markup("<article>{}{}</article>").format(Markup("<h3>{}</h3>").format(", ".join(names)) if headed else "", cell)
+        for cell, names in owners.items()
+    )
+    beside = Markup('<div class="runs">{}</div>').format(cells) if cells else ""
+    inner = Markup("<h2>{}</h2>{}{}{}").format(section.title, about, section.before, beside)
+    return Markup('<section id="part{}">{}</section>').format(number, inner)
+
+
+def paragraph(text: str) -> Markup:
+    """A paragraph."""
+    return Markup("<p>{}</p>").format(text)
+
+
+def lacking(text: str) -> Markup:
+    """What a run lacks, in a sentence."""
+    return Markup('<p class="lacking">{}</p>').format(text)
+
+
+def command(*words: str) -> Markup:
+    """A command to type."""
+    return Markup("<code>{}</code>").format(" ".join(words))
+
+
+def tabulated(shown: RenderableType) -> Markup:
+    """A rich table, or a group of them, with title and caption."""
+    if isinstance(shown, Group):
+        return Markup().join(map(tabulated, shown.renderables))
+    assert isinstance(shown, rich.table.Table)
+    rows = zip(*(column.cells for column in shown.columns), strict=True)
+    head = Markup().join(Markup("<th>{}</th>").format(_plain(column.header)) for column in shown.columns)
+    body = Markup().join(Markup("<tr>{}</tr>").format(_row(row, shown.columns)) for row in rows)
+    title = Markup("<figcaption>{}</figcaption>").format(_plain(shown.title)) if shown.title else ""
+    caption = Markup('<p class="note">{}</p>').format(_plain(shown.caption)) if shown.caption else ""
+    return Markup('<figure>{}<div class="wide"><table><tr>{}</tr>{}</table></div>{}</figure>').format(
+        title, head, body, caption
+    )
+
+
+def _row(cells: Sequence[RenderableType], columns: Sequence[rich.table.Column]) -> Markup:
+    kinds = ["number" if column.justify == "right" else "text" for column in columns]
+    return Markup().join(
+        Markup('<td class="{}">{}</td>').format(
+            kind, Markup("<b>{}</b>").format(_plain(cell)) if getattr(cell, "style", "") == "bold" else _plain(cell)
+        )
+        for kind, cell in zip(kinds, cells, strict=True)
+    )
+
+
+def _plain(cell: RenderableType) -> str:
+    return cell.plain if isinstance(cell, Text) else str(cell)
+
+
+def picture(figure: Figure, about: str) -> Markup:
+    """A figure as a small PNG.
+
+    Args:
+        figure: of matplotlib.
+        about: what it shows, for who does not see it.
+    """
+    from PIL import Image
+
+    drawn, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=DPI)
+    with Image.open(drawn) as image:
+        image.convert("RGB").quantize(COLOURS).save(small, format="png", optimize=True)
+    width, height = (96 * figure.get_size_inches()).round().astype(int).tolist()
+    return Markup(
+        '<div class="wide"><img src="data:image/png;base64,{}" width="{}" height="{}" style="min-width:{}px" alt="{}">'
+        "</div>"
+    ).format(
+        base64.b64encode(small.getvalue()).decode(), width, height, min(width, max(round(_SHRINK * width), 280)), about
+    )
+
+
+def beside(*parts: Markup) -> Markup:
+    """Pictures beside each other, as many as there is room for."""
+    return Markup('<div class="pictures">{}</div>').format(Markup().join(parts))

@@ -1,0 +1,451 @@
+"""The parts of a report that hold for any sequences, from what lies in run directories and from held-out windows.
+
+What a run lacks, and what is in a state that it cannot be shown, is said in a sentence with the command that makes it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from operator import itemgetter
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from markupsafe import Markup
+from rich.text import Text
+from torch import Tensor
+
+from .. import files
+from ..data import Batch, HeldOutWindows, each
+from ..graph import audit
+from ..inference.calibration import Calibration
+from ..inference.checkpoints import CheckpointError, Run
+from ..inference.compare import compare
+from ..inference.comparison import KHAT, Comparison
+from ..inference.evaluation import ARROWS, Evaluation
+from ..inference.fit import Fit
+from ..inference.held import on_device_of, plain, reproducibly
+from ..inference.result import Table, as_they_are, canvas, progress_bar, reason
+from ..inference.trackers import JSONLines
+from ..options import flat
+from ..program.batch import repeat
+from ..program.protocols import Program
+from ..runs.directory import Loaded
+from .page import Section, beside, command, lacking, paragraph, picture, tabulated
+
+Runs = Mapping[str, Loaded]
+"""By what they are called."""
+
+LARGEST = 2**24
+"""Bytes of a record that is shown."""
+
+PANEL = 3.0, 2.2
+"""Inches of a small picture: one is as wide as a telephone, two as half a page."""
+
+MOST = 24
+"""Pictures of one kind."""
+
+STEPS = 4
+"""Time steps of a graph."""
+
+GRAPH = 0.75
+"""Of its usual size, so that two have room beside each other."""
+
+DRAWS = 8
+"""Of the guide, for each window."""
+
+COORDINATES = 3
+"""Of a latent, that are drawn."""
+
+
+@dataclass(frozen=True)
+class Few:
+    """Some of held-out windows, evenly spread, which are windows again.
+
+    Args:
+        windows: all of them.
+        most: how many at most.
+    """
+
+    windows: HeldOutWindows
+    most: int
+
+    @property
+    def chosen(self) -> list[int]:
+        """Which ones."""
+        count = len(self.windows.keys)
+        return np.unique(np.linspace(0, count - 1, min(self.most, count)).round().astype(int)).tolist()  # type: ignore[no-any-return]
+
+    @property
+    def protocol(self) -> Any:
+        """Of the windows."""
+        return self.windows.protocol
+
+    @property
+    def keys(self) -> list[tuple[str, str, int]]:
+        """(split, clip, first frame) of each."""
+        return [self.windows.keys[n] for n in self.chosen]
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the windows that they are taken from."""
+        return self.windows.fingerprint
+
+    @property
+    def description(self) -> Mapping[str, Any]:
+        """Of the windows."""
+        return self.windows.description
+
+    def all(self) -> Batch:
+        """They, one in each row."""
+        return each(self.windows.all(), itemgetter(self.chosen))
+
+
+# ------------------------------------------------------------------------------------------ what a run directory says
+
+
+def overview(runs: Runs) -> Section:
+    """What was run, how far, and how good it is: a column for each run."""
+    columns = {name: {**_facts(run), **_scores(run)} for name, run in runs.items()}
+    shown = Table()
+    for name in ("", *columns):
+        shown.add_column(name)
+    for fact in dict.fromkeys(fact for facts in columns.values() for fact in facts):
+        shown.add_row(fact, *(facts.get(fact, "–") for facts in columns.values()))
+    return Section("Runs" if len(runs) > 1 else "Run", before=tabulated(shown))
+
+
+def equations(runs: Runs) -> Section:
+    """The two factorizations, where they come from, and the options."""
+
+    def cell(run: Loaded) -> Markup:
+        pair = (run.model.generative, run.model.inference)
+        lines = [
+            Markup('<p class="equation">{}</p>').format(Markup(part._repr_html_())) for part in pair if part.factors
+        ]
+        options = Table()
+        for column in ("option", "value"):
+            options.add_column(column)
+        for name, value in list(flat(run.method.config()))[:200]:
+            options.add_row(name, str(value)[:200])
+        rest = Markup("<details><summary>options</summary>{}</details>").format(tabulated(options))
+        return Markup().join([*lines, paragraph(run.method.source), rest])
+
+    return Section("Equations", cells(runs, cell))
+
+
+def graphs(runs: Runs) -> Section:
+    """Both graphs unrolled, and what the guide misses."""
+
+    def cell(run: Loaded) -> Markup:
+        model = run.model
+        generative = _drawn(model.generative.draw(STEPS, observed=model.observed), "model")
+        if not model.inference.factors:
+            return generative + paragraph("Nothing is latent: there is no guide, and the bound is the log evidence.")
+        found = audit(model.generative, model.inference, observed=model.observed)
+        return (
+            beside(generative, _drawn(found.draw(STEPS), "guide")) + paragraph(found.verdict) + tabulated(found.table())
+        )
+
+    about = (
+        "Latents are open, data shaded. Dashed red: what the exact posterior also reads; dotted: what is not needed."
+    )
+    return Section("Graph and audit", cells(runs, cell), about)
+
+
+def curves(runs: Runs) -> Section:
+    """Every term of the loss over the steps of the training."""
+
+    def cell(run: Loaded) -> Markup:
+        fit = _fit(run)
+        if not fit.history:
+            return lacking("There is no log.jsonl in the run, which its training wrote: copy the run directory whole.")
+        names = {name for row in fit.history for name in row}
+        order = ("bound", "loss", "log_likelihood/", "kl/", "energy/")
+        kept = [name for start in order for name in sorted(names) if name.startswith(start)]
+        more = paragraph(f"And {len(kept) - MOST} more terms.") if len(kept) > MOST else ""
+        return beside(*(_curve(fit, name) for name in kept[:MOST])) + more
+
+    about = "Grey: training batches. Blue: validation. Dotted: the step whose weights were kept."
+    return Section("Learning curves", cells(runs, cell), about)
+
+
+def evaluated(runs: Runs) -> Section:
+    """The evaluation on test windows, beside the reference rows."""
+
+    def cell(run: Loaded) -> Markup:
+        if (found := _evaluation(run)) is None:
+            return _missing(run, "evaluation.json", "scores", "evaluate")
+        again = Markup("The run has changed since it was scored; score it anew with {}.").format(
+            _command(run, "evaluate")
+        )
+        return tabulated(found.table()) + (lacking(again) if _row(run, found) is None else "")
+
+    return Section(
+        "Scores", cells(runs, cell), "Of forecasts, and of bounds, on test windows; arrows say what is better."
+    )
+
+
+def calibration(runs: Runs) -> Section:
+    """Ranks of simulated latents among draws from the guide, and predictive checks."""
+
+    def cell(run: Loaded) -> Markup:
+        if (text := _record(run, "criticism.json")) is None:
+            return _missing(run, "criticism.json", "calibration and no predictive checks", "criticise")
+        document, parts = json.loads(text), []
+        if "calibration" in document:
+            found = Calibration.from_json(json.dumps(document["calibration"]))
+            parts += [picture(found.plot(), found.verdict), tabulated(found.table())]
+        else:
+            parts += [paragraph("The guide was not calibrated, as the model starts from given data.")]
+        if "predictive" in document:
+            parts += [tabulated(_checks(document["predictive"]))]
+        return Markup().join(parts)
+
+    about = "Is the guide the model's posterior on the model's own data, and do replicated windows look like real ones?"
+    return Section("Calibration and predictive checks", cells(runs, cell), about)
+
+
+# ---------------------------------------------------------------------------------------- what windows are needed for
+
+
+def weighed(runs: Runs, windows: HeldOutWindows, particles: int = 64, seed: int = 0) -> Section:
+    """Bounds with their errors, the KL of every latent over time, and how far importance weights can be trusted."""
+    likely = {name: run.model for name, run in runs.items() if run.model.likelihood}
+    settings: dict[str, Any] = {"particles": particles, "contrasts": 0, "samples": 0, "seed": seed}
+    about = f"Of {len(windows.keys)} test windows, evenly spread, with {particles} particles each."
+    title = "Bounds, KL over time, k-hat"
+    try:
+        found = compare(likely, windows, **settings) if likely else None
+    except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:
+        return Section(title, before=lacking(f"They cannot be measured: {reason(error)[:500]}"))
+
+    def cell(name: str) -> Markup:
+        if found is None or name not in found.rows:
+            return lacking(
+                "It has no likelihood: its data are functions of its latents, so there is no bound and no KL."
+            )
+        return _evidence(found, name)
+
+    return Section(title, {name: cell(name) for name in runs}, about, tabulated(found.table()) if found else "")
+
+
+def posteriors(runs: Runs, windows: HeldOutWindows, seed: int = 0) -> Section:
+    """Latents under the guide, and in free runs of the model."""
+    about = (
+        "Grey: the prior, in free runs of the model. Line: the posterior, drawn from the guide for "
+        f"{len(windows.keys)} test windows. Both are over all windows and steps. Of each latent, the coordinates whose "
+        "posterior mean varies most over windows and steps."
+    )
+    return Section("Posterior against prior", cells(runs, partial(_latents, windows=windows, seed=seed)), about)
+
+
+def _evidence(found: Comparison, name: str) -> Markup:
+    """KL over time and k-hat of one model."""
+    row, parts = found.rows[name], []
+    for latent, steps in list(row.kl_steps.items())[:MOST]:
+        figure, axes = _panel(f"KL of {latent}", "step", "nats a step")
+        axes.plot(range(1, steps.shape[-1] + 1), steps.mean(0), linewidth=1.3)
+        axes.set_ylim(bottom=min(0.0, float(steps.min())))
+        parts.append(picture(figure, f"KL of {latent} over time"))
+    khat = row.bounds["k-hat"].ravel()
+    khat = khat[~np.isnan(khat)]
+    if len(khat):
+        figure, axes = _panel("Pareto k-hat", f"k-hat (unreliable above {KHAT})", "share of windows")
+        right = max(1.0, min(3.0, float(khat.max())))
+        axes.ecdf(np.minimum(khat, right + 1))  # it cannot draw infinity
+        axes.axvline(KHAT, color="grey", linewidth=0.8, linestyle="--")
+        axes.set(xlim=(min(0.0, float(khat.min())), right), ylim=(0, 1.02))
+        parts.append(picture(figure, "share of windows below a k-hat"))
+    return beside(*parts)
+
+
+@torch.no_grad()
+def _latents(run: Loaded, windows: HeldOutWindows, seed: int) -> Markup:
+    model = run.model
+    if not model.latents:
+        return paragraph("Nothing is latent.")
+    with reproducibly(model, seed):
+        batch = windows.all()
+        data = on_device_of(model, model.read(batch))
+        size, length = (data["x"] if "x" in data else batch["x"]).shape[:2]
+        inferred = model.guide(repeat(data, DRAWS))
+        context = {name: value for name, value in data.items() if name in model.context}
+        free = model.sample(size, length, context or None)
+    parts = []
+    for latent in model.latents:
+        posterior = inferred[latent].unflatten(0, (DRAWS, size)).double().cpu()
+        told = posterior.mean(0).flatten(0, -2).var(0, correction=0)
+        for coordinate in told.argsort(descending=True, stable=True)[:COORDINATES].tolist():
+            values = (free[latent].double().cpu()[..., coordinate], posterior[..., coordinate])
+            parts.append(_densities(f"{latent}[{coordinate}]", *values))
+    return beside(*parts)
+
+
+def _densities(name: str, prior: Tensor, posterior: Tensor) -> Markup:
+    figure, axes = _panel(name, "", "density")
+    values = [part.flatten().numpy() for part in (prior, posterior)]
+    low, high = np.quantile(np.concatenate([np.quantile(part, (0.002, 0.998)) for part in values]), (0, 1))
+    edges = np.linspace(low, high if high > low else low + 1, 51)
+    for part, style in zip(values, ({"fill": True, "color": "0.82"}, {"color": "C0", "linewidth": 1.3}), strict=True):
+        heights = np.histogram(part.clip(low, high), edges, density=True)[0]
+        axes.stairs(heights, edges, **style)
+    axes.set_yticks([])
+    return picture(figure, f"densities of {name} under prior and posterior")
+
+
+# ------------------------------------------------------------------------------------------------------------ pieces
+
+
+def cells(runs: Runs, make: Callable[[Loaded], Markup], doing: str = "") -> dict[str, Markup]:
+    """What is shown of each run; what fails is said in its place.
+
+    Args:
+        runs: by name.
+        make: what is shown of one.
+        doing: what a bar says meanwhile, where it takes long.
+    """
+    found = {}
+    with progress_bar(bool(doing)) as bar:
+        for name, run in bar.track(runs.items(), description=doing):
+            try:
+                found[name] = make(run)
+            except Exception as error:  # what somebody else has laid into a run may fail in any way
+                found[name] = lacking(f"This cannot be shown: {reason(error)[:500] or type(error).__name__}")
+    return found
+
+
+def _missing(run: Loaded, file: str, what: str, name: str) -> Markup:
+    return lacking(
+        Markup("The run has no {}, so there are no {}. They are made by {}.").format(file, what, _command(run, name))
+    )
+
+
+def _command(run: Loaded, name: str) -> Markup:
+    return command("dvae", name, shlex.quote(str(run.path)))
+
+
+def _record(run: Loaded, name: str) -> str | None:
+    """What a record of a run says; None where there is none."""
+    try:
+        return files.read(run.path / name, LARGEST).decode()
+    except FileNotFoundError:
+        return None
+
+
+def _evaluation(run: Loaded) -> Evaluation | None:
+    text = _record(run, "evaluation.json")
+    return None if text is None else Evaluation.from_json(text)
+
+
+def _row(run: Loaded, evaluation: Evaluation) -> str | None:
+    """What a run as it stands is called in an evaluation."""
+    config = plain(Run(run.path).config)
+    return next((name for name, row in evaluation.rows.items() if row.config == config), None)
+
+
+def _fit(run: Loaded) -> Fit:
+    """What the training left."""
+    state, history = Run(run.path).state, JSONLines(run.path / "log.jsonl").read()
+    per = run.model.per if isinstance(run.model, Program) else Fit.per
+    return Fit(history, state["step"], state["best_step"], state["best_bound"], state["status"], run.path, per)
+
+
+def _facts(run: Loaded) -> dict[str, str]:
+    state, training, sizes = Run(run.path).state, run.config.training, run.model.sizes
+    parameters = sum(parameter.numel() for parameter in run.model.parameters())
+    try:
+        best = _fit(run).best
+    except CheckpointError:  # the curves say what is wrong with the log
+        best = ""
+    return {
+        "method": run.method.name,
+        "run": str(run.path),
+        "data": str(run.config.data.path),
+        "latents": ", ".join(f"{name} {sizes[name]}" for name in run.model.latents) or "none",
+        "parameters": f"{parameters:,}",
+        "training": f"{state['status']} at step {state['step']} of {training.steps}, seed {training.seed}",
+        "validation": best or "–",
+    }
+
+
+def _scores(run: Loaded) -> dict[str, str]:
+    """What the evaluation says of a run itself."""
+    try:
+        found = _evaluation(run)
+        name = None if found is None else _row(run, found)
+        if found is None or name is None:
+            return {}
+        values = {}
+        for name_of, score in found[name].items():
+            metric = found.metrics[name_of]
+            unit = f" ({metric.unit})" if metric.unit else ""
+            values[name_of + ARROWS[metric.better] + unit] = str(score)
+    except Exception:  # the section of scores says what is wrong with it
+        return {}
+    return {"forecasts scored, K": str(found.rows[name].samples), **values}
+
+
+def _checks(document: Mapping[str, Any]) -> Table:
+    """Predictive checks as they were written."""
+    shown = Table(title="predictive checks", caption="\n".join(f"{n}: {m}" for n, m in document["programs"].items()))
+    for column in ("", "", "5 %", "median", "95 %", "Wasserstein", "tail area", "outside"):
+        shown.add_column(column, justify="right" if column else "left")
+    for model, programs in document["checks"].items():
+        for program, checks in programs.items():
+            shown.add_row(Text(program, "bold"))
+            for name, check in checks.items():
+                unit = f" ({check['unit']})" if check["unit"] else ""
+                shown.add_row(f"{name}{unit}", "real", *(f"{check['real'][n]:.3g}" for n in (0, 2, 4)))
+                replicated = (f"{check['replicated'][n]:.3g}" for n in (0, 2, 4))
+                outcome = (f"{check['wasserstein']:.3g}", f"{check['tail_area']:.2f}", f"{check['outside']:.0%}")
+                shown.add_row("", model, *replicated, *outcome)
+    return shown
+
+
+def _drawn(axes: Any, title: str) -> Markup:
+    """A graph, which pyplot then forgets."""
+    axes.set_title(title)
+    axes.figure.set_size_inches(GRAPH * axes.figure.get_size_inches())
+    try:
+        return picture(axes.figure, f"graph of the {title}")
+    finally:
+        plt.close(axes.figure)
+
+
+def _panel(title: str, x: str, y: str) -> tuple[Any, Any]:
+    figure = canvas(*PANEL)
+    axes = figure.subplots()
+    as_they_are([axes.set_title(title, fontsize=10), axes.set_xlabel(x, fontsize=8), axes.set_ylabel(y, fontsize=8)])
+    axes.tick_params(which="both", labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _curve(fit: Fit, name: str) -> Markup:
+    kind, _, of = name.partition("/")
+    said = {"log_likelihood": "log p", "kl": "KL", "energy": ""}.get(kind, kind)
+    unit = f"a {fit.per}" if kind in ("loss", "energy") else f"nats a {fit.per}"
+    figure, axes = _panel(f"{said} {of}".strip(), "step", unit)
+    values = []
+    for series, style in (
+        (name, {"color": "0.7"}),
+        (f"validation/{name}", {"color": "C0", "marker": ".", "markersize": 4}),
+    ):
+        steps, found = fit.series(series)
+        axes.plot(steps, found, linewidth=1.1, **style)
+        values += [value for value in found if math.isfinite(value)]
+    if values:  # the first steps may be so far off that nothing else could be told apart
+        low, high = np.quantile(values, (0.02, 0.98))
+        axes.set_ylim(low - 0.1 * (high - low or 1), high + 0.1 * (high - low or 1))
+        if kind == "energy" and min(values) > 0:
+            axes.set(yscale="log", ylim=(min(values) / 1.2, max(values) * 1.2))
+    if fit.best_step is not None:
+        axes.axvline(fit.best_step, color="0.3", linestyle=":", linewidth=1)
+    return picture(figure, f"{name} over the steps of the training")

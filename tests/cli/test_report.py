@@ -1,0 +1,297 @@
+"""The page of runs: it is whole in one file, says what is there and what is not, moves, and believes nothing."""
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from browser import browser
+from markupsafe import Markup
+
+import dvae
+from dvae import motion
+from dvae.cli import main
+from dvae.inference.evaluation import Evaluation
+from dvae.motion.dataset import MotionData
+from dvae.motion.player import SCRIPT, player
+from dvae.motion.plot import staged
+from dvae.report import Section, document, lacking, sections
+from dvae.report.sections import Few
+from dvae.runs import directory as runs
+
+SMALL = ["--windows", "2", "--samples", "3", "--bound-windows", "3", "--particles", "4"]
+EVIL = "<script>said=1</script><img src=x onerror=said=1>$\\frac$"
+FRAMES = 75  # of a window of simulated people
+
+
+def report(*arguments, code=0):
+    assert main(["report", *SMALL, *map(str, arguments)]) == code
+
+
+class Tags(HTMLParser):
+    """What a page is made of: tags with their attributes, texts, and what is between tags of scripts."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tags, self.scripts, self.text = [], [], ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_data(self, data):
+        if self.tags and self.tags[-1][0] == "script" and self.lasttag == "script" and data.strip():
+            self.scripts.append(data)
+        self.text += data
+
+
+def is_harmless(page):
+    """Only our script, nothing that is fetched, and no attribute that runs."""
+    found = Tags(page)
+    assert "".join(found.scripts).strip() == SCRIPT.strip()
+    assert sum(tag == "script" for tag, _ in found.tags) == 1
+    for tag, attributes in found.tags:
+        assert not [name for name in attributes if name.startswith("on")]
+        assert tag not in ("iframe", "object", "embed", "base", "form")
+        for name in ("src", "href"):
+            assert attributes.get(name, "#").startswith(("#", "data:")), attributes
+    return found
+
+
+@pytest.fixture(scope="module")
+def page(fitted, tmp_path_factory):
+    out = tmp_path_factory.mktemp("page") / "deep" / "report.html"
+    report(fitted, "--out", out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
+    with browser(tmp_path_factory.mktemp("profile")) as tab:
+        yield tab
+
+
+def test_every_section_is_there_and_what_is_missing_has_its_command(page, fitted):
+    text = is_harmless(page.read_text(encoding="utf-8")).text
+    for title in ("Run", "Equations", "Learning curves", "Scores", "Posterior against prior", "Futures"):
+        assert title in text
+    for name, file in (("evaluate", "evaluation.json"), ("criticise", "criticism.json")):
+        assert f"The run has no {file}" in text
+        assert f"dvae {name} {fitted}" in text
+    assert "finished at step 10 of 10, seed 0" in text
+    assert "exact" in text
+
+
+def test_the_same_seed_gives_the_same_page(page, fitted, tmp_path):
+    report(fitted, "--out", tmp_path / "report.html")
+    assert (tmp_path / "report.html").read_bytes() == page.read_bytes()
+
+
+@pytest.mark.parametrize("width", [1280, 360])
+def test_the_page_is_shown_without_an_error_or_a_network(page, tab, width):
+    tab.open(page, width)
+    tab.wait("document.querySelector('.player').dataset.frames")
+    assert tab.ask("document.documentElement.scrollWidth") <= width
+    assert tab.ask("[...document.images].every(image => image.complete && image.naturalWidth)")
+    assert tab.said == []
+    assert tab.asked == []
+
+
+def test_people_play_scrub_and_turn(page, tab):
+    picture = "document.querySelector('canvas').toDataURL()"
+    slider = "document.querySelector('.player input')"
+    tab.open(page, 1280)
+    tab.wait("document.querySelector('.player').dataset.frames")
+    assert int(tab.ask("document.querySelector('.player').dataset.frames")) == FRAMES
+    seen = [tab.ask(picture)]
+    for action in (
+        f"{slider}.value = 20; {slider}.dispatchEvent(new Event('input'))",
+        "document.querySelector('canvas').dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}))",
+        "document.querySelector('select').selectedIndex = 1; "
+        "document.querySelector('select').dispatchEvent(new Event('change'))",
+    ):
+        tab.ask(action)
+        tab.wait(f"{picture} !== {json.dumps(seen[-1])}")
+        seen.append(tab.ask(picture))
+    assert len(set(seen)) == len(seen)
+    middle = tab.ask(
+        "(b => [b.x + b.width / 2, b.y + b.height / 2])(document.querySelector('canvas')"
+        ".getBoundingClientRect(document.querySelector('canvas').scrollIntoView()))"
+    )
+    for kind, x in (("mousePressed", 0), ("mouseMoved", 60), ("mouseReleased", 60)):
+        place = {"x": middle[0] + x, "y": middle[1]}
+        tab.call("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **place)
+    tab.wait(f"{picture} !== {json.dumps(seen[-1])}")
+    tab.ask("document.querySelector('.player button').click()")
+    tab.wait(f"0 < {slider}.value && {slider}.value < {FRAMES - 1}")
+    tab.wait(f"{slider}.value == {FRAMES - 1}")  # the window's own 2.5 s
+    assert tab.ask("document.querySelector('.player button').textContent") == "Play"
+    assert tab.said == []
+
+
+def test_the_browser_unpacks_the_motion_itself(tmp_path, tab):
+    people = motion.simulate(clips=3, frames=12, seed=2)
+    positions = np.stack([clip.positions for clip in people])
+    scene = staged(people.skeleton, positions[0, :5], positions[1:, 5:], positions[0, 5:9], every=1)
+    path = tmp_path / "page.html"
+    path.write_text(document("motion", [Section("a", before=player({"b": scene}))], [SCRIPT]), encoding="utf-8")
+    tab.open(path, 800)
+    read = "opened(JSON.parse(document.querySelector('.player').dataset.motion)[0])"
+    values = tab.ask(
+        f"{read}.then(scene => scene.people.map((person, k) => [...Array(12).keys()].map(frame => "
+        "[...scene.values.slice(scene.at(person, frame), scene.at(person, frame) + 51)])))"
+    )
+    shown = np.array(values).reshape(3, 12, 17, 3) / 1000
+    np.testing.assert_allclose(shown[1:], scene.motion[1:], atol=0.00051)
+    np.testing.assert_allclose(shown[0, :9], scene.motion[0, :9], atol=0.00051)  # the truth ends there
+    assert tab.said == []
+
+
+@pytest.fixture(scope="module")
+def scored(fitted, tmp_path_factory):
+    """A run with all that can be beside it."""
+    run = shutil.copytree(fitted, tmp_path_factory.mktemp("scored") / "run")
+    assert main(["evaluate", str(run), "--samples", "2"]) == 0
+    assert main(["criticise", str(run), "--simulations", "20", "--draws", "9", "--ranked-steps", "1"]) == 0
+    return run
+
+
+def test_records_beside_a_run_are_shown(scored):
+    run = {"a": dvae.load(scored)}
+    evaluation = Evaluation.load(scored / "evaluation.json")
+    facts, scores, criticism = (
+        Tags(document("a", [make(run)])).text for make in (sections.overview, sections.evaluated, sections.calibration)
+    )
+    assert str(evaluation["vae"]["ADE"]) in facts
+    assert "lowest" in facts or "best bound" in facts
+    for row in evaluation.rows:
+        assert str(evaluation[row]["ADE"]) in scores
+    assert json.loads((scored / "criticism.json").read_text())["calibration"]["verdict"] in criticism
+    assert "bone stretch (%)" in criticism
+    assert "changed" not in scores
+
+
+def test_scores_of_another_state_of_the_run_are_told_apart(scored, tmp_path):
+    run = shutil.copytree(scored, tmp_path / "run")
+    config = json.loads((run / "config.json").read_text())
+    config["training"]["steps"] += 1  # as `dvae resume --steps` does
+    (run / "config.json").write_text(json.dumps(config))
+    loaded = {"a": dvae.load(run)}
+    assert "The run has changed since it was scored" in document("a", [sections.evaluated(loaded)])
+    assert "ADE" not in document("a", [sections.overview(loaded)])
+
+
+def test_runs_stand_side_by_side_with_a_table_first(people, fitted, tmp_path):
+    other = tmp_path / "other"
+    training = dvae.Training(steps=1, batch_size=4, progress=False)
+    runs.fit_run(dvae.method("storn", latent=3, warm_up=1), MotionData.open(people), other, training)
+    report(fitted, other, "--out", tmp_path / "a.html")
+    found = is_harmless((tmp_path / "a.html").read_text(encoding="utf-8"))
+    titles = [place.start() for place in re.finditer("Runs|Equations|Scores|Futures", found.text)]
+    assert titles == sorted(titles)
+    assert sum(attributes.get("class") == "player" for _, attributes in found.tags) == 2
+    assert "difference to the best" in found.text
+
+
+def test_of_a_model_without_a_likelihood_it_is_said():
+    windows = dvae.ArrayWindows(np.zeros((2, 4, 1), np.float32), 2)
+    run = SimpleNamespace(model=SimpleNamespace(likelihood=False))
+    assert "It has no likelihood" in sections.weighed({"a": run}, windows).cells["a"]
+
+
+def test_what_runs_share_is_shown_once():
+    page = document(
+        "a", [Section("b", {"first": lacking("same"), "second": lacking("same"), "third": lacking("else")})]
+    )
+    text = Tags(page).text
+    assert text.count("same") == text.count("else") == 1
+    assert "first, second" in text
+
+
+def test_a_run_without_its_data_or_its_log_is_shown_as_far_as_it_goes(run, tmp_path):
+    config = json.loads((run / "config.json").read_text())
+    config["data"]["path"] = str(tmp_path / "gone.npz")
+    (run / "config.json").write_text(json.dumps(config))
+    (run / "log.jsonl").unlink()
+    (run / "evaluation.json").write_text("[1")
+    (run / "criticism.json").symlink_to(run / "config.json")
+    report(run, "--out", tmp_path / "a.html")
+    text = is_harmless((tmp_path / "a.html").read_text(encoding="utf-8")).text
+    for said in ("say where they are with --data", "no log.jsonl", "not an evaluation", "is a link"):
+        assert said in text
+
+
+def test_text_of_a_hostile_run_is_text(scored, tmp_path, tab):
+    run = shutil.copytree(scored, tmp_path / EVIL.replace("/", "⁄"))
+
+    text = (run / "evaluation.json").read_text()
+    for name in ("zero velocity", "nearest neighbours", "mm/frame", "ADE", "nats/frame"):
+        text = text.replace(json.dumps(name), json.dumps(f"{name}{EVIL}"))
+    (run / "evaluation.json").write_text(text)
+    criticism = json.loads((run / "criticism.json").read_text())
+    criticism["calibration"]["quantities"][EVIL] = criticism["calibration"]["quantities"].pop("log joint")
+    criticism["calibration"]["equations"] = {"inference": EVIL}
+    criticism["predictive"]["programs"][EVIL] = EVIL
+    criticism["predictive"]["checks"] = {EVIL: criticism["predictive"]["checks"]["vae"]}
+    (run / "criticism.json").write_text(json.dumps(criticism))
+    rows = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    (run / "log.jsonl").write_text("".join(json.dumps({**row, f"kl/{EVIL}": 1.0}) + "\n" for row in rows))
+    report(run, "--out", tmp_path / "a.html")
+    text = is_harmless((tmp_path / "a.html").read_text(encoding="utf-8")).text
+    assert text.count(EVIL) >= 8
+    tab.open(tmp_path / "a.html", 1280)
+    tab.wait("document.querySelector('.player').dataset.frames")
+    assert tab.ask("typeof said") == "undefined"
+    assert tab.said == []
+    assert tab.asked == []
+
+
+def test_should_a_script_slip_through_it_does_not_run(tmp_path, tab):
+    (tmp_path / "a.html").write_text(document("a", [Section("b", before=Markup(EVIL))], [SCRIPT]), encoding="utf-8")
+    tab.open(tmp_path / "a.html", 800)
+    assert tab.ask("typeof said") == "undefined"
+    assert len([each for each in tab.said if "Content Security Policy" in json.dumps(each)]) >= 2
+
+
+@pytest.mark.parametrize("before", [None, b"an older page"])
+def test_an_interrupted_report_leaves_no_half_page(fitted, tmp_path, monkeypatch, before):
+    class Torn(str):
+        def encode(self, *_, **__):
+            raise KeyboardInterrupt
+
+    out = tmp_path / "report.html"
+    if before is not None:
+        out.write_bytes(before)
+    monkeypatch.setattr("dvae.cli.report.OF_DIRECTORIES", ())
+    monkeypatch.setattr("dvae.cli.report.document", lambda *_: Torn())
+    report(fitted, "--out", out, "--windows", 0, code=130)
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"] * (before is not None)
+    assert before is None or out.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--out page.png", "end its name in .html"),
+        ("--out page.html --samples 0", "--samples is 0; it must be at least 1"),
+        ("--out page.html --windows -1", "--windows is -1; it must be at least 0"),
+    ],
+)
+def test_wrong_arguments_exit_with_2_before_any_work(capsys, tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", "nowhere", *arguments.split()]) == 2
+    assert message in re.sub(r"\s+", " ", capsys.readouterr().err.replace("│", " "))
+    assert not list(tmp_path.iterdir())
+
+
+def test_few_windows_are_windows():
+    windows = dvae.ArrayWindows(np.arange(40.0, dtype=np.float32).reshape(10, 4, 1), 2)
+    few = Few(windows, 4)
+    assert few.chosen == [0, 3, 6, 9]
+    assert few.keys == [windows.keys[n] for n in few.chosen]
+    np.testing.assert_array_equal(few.all()["x"], windows.all()["x"][few.chosen])
+    assert Few(windows, 99).keys == list(windows.keys)
+    assert isinstance(few, dvae.data.HeldOutWindows)
