@@ -4,12 +4,22 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from contextlib import contextmanager
 
 import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 OPTIONS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe")
+START = """
+import os, sys
+read, write = (os.dup(int(number)) for number in sys.argv[1:3])
+for number, place in ((read, 3), (write, 4)):
+    os.dup2(number, place)
+    os.set_inheritable(place, True)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
+"""The browser reads 3 and writes 4."""
 
 
 class Tab:
@@ -86,14 +96,10 @@ def browser(profile):
     theirs, commands = os.pipe()
     answers, ours = os.pipe()
 
-    def ends():  # the browser reads 3 and writes 4
-        read, write = os.dup(theirs), os.dup(ours)
-        os.dup2(read, 3)
-        os.dup2(write, 4)
-
-    command = [program, *OPTIONS, f"--user-data-dir={profile}"]
+    given = [sys.executable, "-c", START, str(theirs), str(ours)]
+    command = [*given, program, *OPTIONS, f"--user-data-dir={profile}"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen(command, preexec_fn=ends, pass_fds=(3, 4), **quiet) as process:
+    with subprocess.Popen(command, pass_fds=(theirs, ours), **quiet) as process:
         os.close(theirs)
         os.close(ours)
         try:

@@ -257,8 +257,9 @@ def _evidence(found: Comparison, name: str) -> Markup:
     khat = row.bounds["k-hat"].ravel()
     khat = khat[~np.isnan(khat)]
     if len(khat):
-        figure, axes = _panel("Pareto k-hat", f"k-hat (unreliable above {KHAT})", "share of windows")
         right = max(1.0, min(3.0, float(khat.max())))
+        beyond = f", {(khat > right).mean():.0%} beyond {right:g}" if (khat > right).any() else ""
+        figure, axes = _panel(f"Pareto k-hat{beyond}", f"k-hat (unreliable above {KHAT})", "share of windows")
         axes.ecdf(np.minimum(khat, right + 1))  # it cannot draw infinity
         axes.axvline(KHAT, color="grey", linewidth=0.8, linestyle="--")
         axes.set(xlim=(min(0.0, float(khat.min())), right), ylim=(0, 1.02))
