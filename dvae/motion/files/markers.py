@@ -58,9 +58,9 @@ def read_c3d(path: str | Path) -> Recording:
         raise ValueError(f"{path}: markers in {unit[:40]!r} at {fps:g} Hz, expected one of {', '.join(METRES)}")
     numbers = np.frombuffer(content, kind, frames * row, _BLOCK * (start - 1)).reshape(frames, row)
     values = numbers[:, : 4 * markers].reshape(frames, markers, 4).astype(np.float64)
-    places = values[..., :3] * (1 if scale < 0 else scale)
+    places: np.ndarray = values[..., :3] * (1 if scale < 0 else scale)
     hidden = (values[..., 3] < 0) | ~(np.abs(places) < 1e9).all(-1)
-    places = np.where(np.expand_dims(hidden, -1), np.nan, places)
+    places[hidden] = np.nan
     names = parameters.get("LABELS", [])[:markers]
     seen = np.isfinite(places).all(-1).any(0)
     kept = [n for n, name in enumerate(names) if name and name[0] != "*" and name not in names[:n] and seen[n]]
