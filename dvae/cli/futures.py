@@ -35,7 +35,7 @@ def forecast(
     """Forecast the test windows, or those of one clip, many times each.
 
     A name that ends in .bvh gets the first future of the window that moves most, after what was observed of it; one
-    without an ending is a folder, and gets a BVH file for every window and future: Blender opens these.
+    without an ending is a new folder, and gets a BVH file for every window and future: Blender opens these.
 
     The npz holds, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
     (windows, frames, joints, 3), `split`, `clip` and `start` of each window, and the skeleton. `dvae animate` plays
@@ -54,7 +54,7 @@ def forecast(
     """
     at_least(1, samples=samples, horizon=horizon)
     suffix = out.suffix.lower()
-    check_files(out if suffix else None, figure, ".npz", ".bvh")
+    check_files(out, figure, ".npz", ".bvh", "")
     loaded = load_run(run, data)
     windows = windows_of(loaded, data, clip)
     chosen: Sequence[int] = range(len(windows))

@@ -62,7 +62,7 @@ def read_c3d(path: str | Path) -> Recording:
     hidden = (values[..., 3] < 0) | ~(np.abs(places) < 1e9).all(-1)
     places[hidden] = np.nan
     names = parameters.get("LABELS", [])[:markers]
-    seen = np.isfinite(places).all(-1).any(0)
+    seen = np.asarray(np.isfinite(places).all(2)).max(0)
     kept = [n for n, name in enumerate(names) if name and name[0] != "*" and name not in names[:n] and seen[n]]
     if not kept:
         raise ValueError(f"{path}: it has no markers with names that are seen")

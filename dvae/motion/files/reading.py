@@ -118,7 +118,7 @@ def read_motion(
         return found if places or (joints is None and onto is None) else _chosen(found, joints, onto)
     known = read_labels((path if path.is_dir() else path.parent) / "labels.csv", labels)
     some = sampled(files, skip_bad)
-    reader = Reader(understand(some, metres, up), metres is not None, fps, skeleton, joints, onto)
+    reader = FileReader(understand(some, metres, up), metres is not None, fps, skeleton, joints, onto)
     collected = Collected(path.stem)
     clips, unread, size = [], [], 0
     for file in files:
@@ -210,7 +210,7 @@ def sampled(files: Sequence[File], skip_bad: bool = False) -> dict[str, Recordin
 
 
 @dataclass(frozen=True)
-class Reader:
+class FileReader:
     """From a file of one recording to a clip and its skeleton, alike for all files of a folder; see `read_motion`.
 
     Args:

@@ -12,7 +12,7 @@ from ..data import Clip, MotionSet
 from ..skeleton import Skeleton, brief
 from .bvh import write_bvh
 from .plain import save, save_clips, write_table
-from .reading import Collected, File, Reader, find_files, read_motion, sampled, upwards
+from .reading import Collected, File, FileReader, find_files, read_motion, sampled, upwards
 from .recording import Recording
 from .settled import understand
 from .smpl import write_amass
@@ -150,7 +150,7 @@ def convert(
         twice = next(key for key in keys if keys.count(key) > 1)
         raise ValueError(f"two files are clip {'/'.join(twice)}; put them into folders of different names")
     world = understand(sampled(files, skip_bad), metres, up)
-    reader = Reader(world, metres is not None, recorded, onto=onto, resampled=fps)
+    reader = FileReader(world, metres is not None, recorded, onto=onto, resampled=fps)
     collected, skipped = Collected(out.stem), []
     work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="2*n_jobs", batch_size=1)
     results = work(delayed(_converted)(reader, file, out, format, skip_bad) for file in files)
@@ -184,7 +184,7 @@ def _told(source: Path, several: bool) -> list[File]:
     return files
 
 
-def _converted(reader: Reader, file: File, out: Path, format: str, skip_bad: bool) -> tuple[Clip, Skeleton] | str:
+def _converted(reader: FileReader, file: File, out: Path, format: str, skip_bad: bool) -> tuple[Clip, Skeleton] | str:
     """One file, read and, where each clip has a file, written: what it holds; or why it does not."""
     try:
         clip, skeleton = reader(file)
