@@ -12,18 +12,18 @@ from dvae.motion.files.smpl import JOINTS
 
 
 @pytest.fixture(scope="module")
-def people():
+def three():
     return simulate(clips=3, frames=12, seed=2)
 
 
 @pytest.fixture(scope="module")
-def recordings(people, tmp_path_factory):
+def recordings(three, tmp_path_factory):
     folder = tmp_path_factory.mktemp("recordings")
-    write_motion(folder, people, "bvh")
+    write_motion(folder, three, "bvh")
     return folder
 
 
-def test_formats_and_names_fit_each_other_or_are_refused(people, tmp_path):
+def test_formats_and_names_fit_each_other_or_are_refused(three, tmp_path):
     for path, format, message in (
         ("a.bvh", None, "holds one clip a file, and there are 3"),
         ("a", None, "which format"),
@@ -32,16 +32,16 @@ def test_formats_and_names_fit_each_other_or_are_refused(people, tmp_path):
         ("a", "npz", "end its name in .npz"),
     ):
         with pytest.raises(ValueError, match=message):
-            write_motion(tmp_path / path, people, format)
+            write_motion(tmp_path / path, three, format)
     for split, name in (("..", "a"), ("/etc", "a"), ("a", "../../b"), ("a/../..", "b")):
-        away = MotionSet([replace(people.clips[0], split=split, name=name)], WALKER)
+        away = MotionSet([replace(three.clips[0], split=split, name=name)], WALKER)
         with pytest.raises(ValueError, match="leads out of the folder"):
             write_motion(tmp_path / "inner", away, "csv")
     assert not list(tmp_path.rglob("*.csv"))
 
 
-def test_what_has_z_up_is_written_with_y_up(people, tmp_path):
-    positions = people.clips[0].positions[..., [2, 0, 1]]  # cyclic, and so no mirror
+def test_what_has_z_up_is_written_with_y_up(three, tmp_path):
+    positions = three.clips[0].positions[..., [2, 0, 1]]  # cyclic, and so no mirror
     standing = MotionSet([Clip("all", "a", positions)], replace(HUMAN36M, fps=30.0))
     (path,) = write_motion(tmp_path / "a.bvh", standing)
     read = read_motion(path)
@@ -49,21 +49,21 @@ def test_what_has_z_up_is_written_with_y_up(people, tmp_path):
     np.testing.assert_allclose(read.clips[0].positions[:, 0, 1], positions[:, 0, 2], atol=1e-5)
 
 
-def test_amass_has_the_members_that_its_readers_ask_for(people, tmp_path):
-    (path,) = write_motion(tmp_path / "a.npz", MotionSet(people.clips[:1], WALKER), "amass")
+def test_amass_has_the_members_that_its_readers_ask_for(three, tmp_path):
+    (path,) = write_motion(tmp_path / "a.npz", MotionSet(three.clips[:1], WALKER), "amass")
     arrays = read_arrays(path)
     assert arrays["poses"].shape == (12, 156)
     assert arrays["trans"].shape == (12, 3)
     assert arrays["mocap_framerate"] == 30
     assert not arrays["betas"].any()
     assert not arrays["poses"][:, 3 * len(JOINTS) :].any()
-    heights = people.clips[0].positions[:, 0, 1]
+    heights = three.clips[0].positions[:, 0, 1]
     np.testing.assert_allclose(arrays["trans"][:, 2], heights, atol=1e-6)  # z up
 
 
-def test_a_forecast_is_a_clip_after_what_was_observed(people, tmp_path):
+def test_a_forecast_is_a_clip_after_what_was_observed(three, tmp_path):
     random = np.random.default_rng(0)
-    clip = people.clips[0].positions
+    clip = three.clips[0].positions
     future = np.stack([clip[4:], clip[4:] + random.normal(0, 1e-4, clip[4:].shape)])
     forecasts = Forecasts(WALKER, [("test", "a/b", 7)], future[:, None], clip[None, :4], clip[None, 4:])
     motion = forecasts.motion()
@@ -84,7 +84,7 @@ def test_a_folder_is_converted_as_it_would_be_read(jobs, recordings, tmp_path, c
     assert (read.skeleton.name, read.skeleton.up, read.skeleton.fps) == ("human36m", "z", 15)
 
 
-def test_every_format_is_converted_to_every_other(recordings, people, tmp_path):
+def test_every_format_is_converted_to_every_other(recordings, three, tmp_path):
     before = recordings
     for format in ("csv", "amass", "bvh"):
         told = ["--out", str(tmp_path / format), "--format", format, "--jobs", "1"]
