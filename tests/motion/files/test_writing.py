@@ -127,6 +127,8 @@ def test_what_cannot_be_converted_is_said_or_skipped(recordings, tmp_path, capsy
 def test_forecasts_of_a_run_are_bvh(run, tmp_path, capsys):
     assert main(["forecast", str(run), "--out", str(tmp_path / "one.bvh"), "--samples", "2"]) == 0
     assert "the first of 2 futures of 60 frames for each of 1 windows" in capsys.readouterr().err
-    assert read_motion(tmp_path / "one.bvh", onto=WALKER).clips[0].frames == 75
+    assert (
+        read_motion(tmp_path / "one.bvh", onto=WALKER, metres=0.01).clips[0].frames == 75
+    )  # hardly fitted: no person yet
     assert main(["forecast", str(run), "--out", str(tmp_path / "all"), "--samples", "2"]) == 0
     assert len(list((tmp_path / "all").rglob("*.bvh"))) % 2 == 0
