@@ -21,7 +21,7 @@ from PIL import Image
 
 ROOT = Path(__file__).parents[2]
 PLOTLY = "application/vnd.plotly.v1+json"
-SHARED = re.compile(r"(\b(?:steps|particles|warm_up)=|\bStage\(|\"warm_up\": )(\d{3,})")  # a sequence has fewer steps than 100
+SHARED = re.compile(r"(\b(?:steps|particles|warm_up)=|\bStage\(|\"warm_up\": )(\d{3,})")  # sequences have fewer steps
 TEXTS = ("text/plain", "text/html", "text/latex")
 
 
