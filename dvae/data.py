@@ -130,6 +130,46 @@ def each(batch: Mapping[str, Any], change: Callable[[Any], Tensor]) -> Batch:
     return {n: each(v, change) if isinstance(v, Mapping) else change(v) for n, v in batch.items()}
 
 
+def mask_of(batch: Batch, name: str = "x") -> Tensor | None:
+    """True where a variable was observed, as its values; None where all of it was."""
+    mask = batch.get("mask")
+    return mask.get(name) if isinstance(mask, Mapping) else mask
+
+
+def gapped(batch: Batch) -> Tensor:
+    """The x of a batch, NaN where it was not observed."""
+    x: Tensor = batch["x"]
+    mask = mask_of(batch)
+    return x if mask is None else torch.where(mask, x, torch.nan)
+
+
+def bridged(x: Tensor, mask: Tensor | None) -> Tensor:
+    """Sequences whose missing entries lie on the straight line between the observed ones around them, in time.
+
+    Before the first and after the last observed entry of a coordinate that one stays; of one that is never observed
+    there is 0.
+
+    Args:
+        x: (..., T, D), anything where entries are missing.
+        mask: (..., T, D), True where an entry was observed; None for all.
+
+    Example:
+        >>> x = torch.tensor([[0.0, 9.0, 9.0, 3.0, 9.0]]).mT
+        >>> bridged(x, x < 9).flatten().tolist()
+        [0.0, 1.0, 2.0, 3.0, 3.0]
+    """
+    if mask is None:
+        return x
+    length, (mask, x) = x.shape[-2], torch.broadcast_tensors(mask, x)
+    step = torch.arange(length, device=x.device)[:, None]
+    before = torch.where(mask, step, -1).cummax(-2).values
+    after = torch.where(mask, step, length).flip(-2).cummin(-2).values.flip(-2)
+    first, last = torch.where(before < 0, after, before), torch.where(after == length, before, after)
+    start, end = (x.gather(-2, place.clamp(0, length - 1)) for place in (first, last))
+    line = start + (end - start) * ((step - first) / (last - first).clamp(min=1)).to(x)
+    return torch.where(mask, x, torch.where(mask.any(-2, keepdim=True), line, 0.0))
+
+
 def leaves(batch: Batch) -> dict[str, Tensor]:
     """Every tensor by name; those of a mapping under "name/key"."""
     flat: dict[str, Tensor] = {}
@@ -183,9 +223,10 @@ class ArrayWindows:
         observed: frames the model sees; the other T - observed are predicted.
         multimodal_threshold: distance below which two last observed frames are alike, in the unit of x.
         clips: name of the clip each window was cut from; without it the windows count as independent.
+        mask: `(N, T, D)`, True where an entry was observed, where some are missing.
 
     Raises:
-        ValueError: x that is not `(N, T, D)`, or as many clip names as windows are not given.
+        ValueError: x that is not `(N, T, D)`, a mask of another shape, or as many clip names as windows are not given.
 
     Example:
         >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=5, clips=["a", "a", "a", "b", "b", "b"])
@@ -197,10 +238,13 @@ class ArrayWindows:
     observed: int
     multimodal_threshold: float = 0.5
     clips: Sequence[str] | None = None
+    mask: Tensor | np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.x.ndim != 3:
             raise ValueError(f"windows must be (N, T, D), but x has shape {tuple(self.x.shape)}")
+        if self.mask is not None and self.mask.shape != self.x.shape:
+            raise ValueError(f"the mask has shape {tuple(self.mask.shape)}, expected that of x, {tuple(self.x.shape)}")
         if self.clips is not None and len(self.clips) != len(self.x):
             raise ValueError(f"{len(self.x)} windows need as many clip names, not {len(self.clips)}")
 
@@ -224,8 +268,10 @@ class ArrayWindows:
     def fingerprint(self) -> str:
         """SHA-256 of the values, their shape and type."""
         values = np.ascontiguousarray(np.asarray(self.x))
-        return hashlib.sha256(f"{values.shape} {values.dtype}".encode() + values.tobytes()).hexdigest()
+        seen = b"" if self.mask is None else np.packbits(np.asarray(self.mask)).tobytes()
+        return hashlib.sha256(f"{values.shape} {values.dtype}".encode() + values.tobytes() + seen).hexdigest()
 
     def all(self) -> Batch:
-        """All windows, x `(N, T, D)`."""
-        return {"x": torch.as_tensor(self.x)}
+        """All windows, x `(N, T, D)`, and the mask if there is one."""
+        batch = {"x": torch.as_tensor(self.x)}
+        return batch if self.mask is None else {**batch, "mask": torch.as_tensor(self.mask)}

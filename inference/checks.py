@@ -283,6 +283,11 @@ def predictive_checks(
     for each in models.values():
         require_likelihood(each)
     held = hold(windows)
+    if held.mask is not None:
+        raise ValueError(
+            "statistics of replicates are compared with those of whole windows, but of these some entries are missing; "
+            "check windows without gaps"
+        )
     firsts = {"forecast": held.observed - min(_SEAM, held.observed), "posterior": 0}
     checks = {}
     with progress_bar(progress) as bar:

@@ -94,7 +94,7 @@ def compare(
 
     Raises:
         ValueError: no models, models of different equations or sizes in one row, numbers out of range, data without
-            sequences; windows that are ragged or masked, for forecasts.
+            sequences; windows that are ragged, for forecasts.
         TypeError: data of another kind, or what is no model.
         FloatingPointError: a bound that is not finite, naming model and sequence.
 

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..data import HeldOutWindows
+from ..data import HeldOutWindows, mask_of
 from ..program.model import DynamicalVAE
 from ..program.protocols import Forecasting
 from ..turns import alone
@@ -83,8 +83,8 @@ def evaluate(
 
     Raises:
         TypeError: what is no model that forecasts.
-        ValueError: windows that are ragged, masked or leave nothing to predict; a forecast of the wrong
-            shape; a model with the name of a reference row; fewer than one sample; two scores of one name.
+        ValueError: windows that are ragged or leave nothing to predict; a forecast of the wrong shape;
+            a model with the name of a reference row; fewer than one sample; two scores of one name.
         FloatingPointError: a forecast or bound that is not finite, naming method and window.
 
     Example:
@@ -136,7 +136,7 @@ def evaluate(
         log_score_particles=log_score_particles,
         basis={name: value for measure in measures for name, value in measure.basis.items()},
         notes=[
-            *dict.fromkeys(measure.note for measure in measures if measure.note),
+            *dict.fromkeys([*held.notes, *(measure.note for measure in measures if measure.note)]),
             *(
                 f"bounds of {name}: densities of {each.view.measured}"
                 for name, each in models.items()
@@ -245,14 +245,23 @@ def _references(
     rows: dict[str, tuple[int, Forecaster]] = {
         measure.truth: (1, lambda part: held.futures[part][None]) for measure in measures if measure.truth
     }
-    rows["zero velocity"] = 1, lambda part: zero_velocity(held.past(part)["x"], horizon)
+
+    def still(part: slice) -> Tensor:
+        past = held.past(part)
+        return zero_velocity(past["x"], horizon, mask_of(past))
+
+    rows["zero velocity"] = 1, still
     if training_windows is not None:
-        training = training_windows.all()["x"][:, : held.observed + horizon]
-        neighbours = min(samples, len(training))
-        rows["nearest neighbours"] = (
-            neighbours,
-            lambda part: nearest_neighbours(held.past(part)["x"], training, neighbours),
-        )
+        listed = training_windows.all()
+        training = listed["x"][:, : held.observed + horizon]
+        gaps = None if (mask := mask_of(listed)) is None else mask[:, : held.observed + horizon]
+        count = min(samples, len(training))
+
+        def remembered(part: slice) -> Tensor:
+            past = held.past(part)
+            return nearest_neighbours(past["x"], training, count, mask_of(past), gaps)
+
+        rows["nearest neighbours"] = count, remembered
     return rows
 
 

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, HeldOutWindows, each
+from ..data import Batch, HeldOutWindows, each, gapped, mask_of
+from ..program.batch import rows
 from ..program.conditional import evaluating
 
 
@@ -38,16 +39,22 @@ class Held:
 
     @property
     def futures(self) -> Tensor:
-        """The frames to predict `(N, H, D)`."""
-        return self.x[:, self.observed :]
+        """The frames to predict `(N, H, D)`, NaN where they were not observed."""
+        return gapped(self.batch)[:, self.observed :]
+
+    @property
+    def mask(self) -> Tensor | None:
+        """`(N, T, D)`, True where x was observed; None where all of it was."""
+        return mask_of(self.batch)
 
     def part(self, part: slice) -> dict[str, Any]:
         """Some windows, whole."""
-        return {name: value[part] for name, value in self.batch.items()}
+        return {name: rows(value, part) for name, value in self.batch.items()}
 
     def past(self, part: slice) -> dict[str, Any]:
-        """Some windows as forecasts see them: x `(B, O, D)`, and context."""
-        return {**self.part(part), "x": self.x[part, : self.observed]}
+        """Some windows as forecasts see them: x `(B, O, D)`, its mask if there is one, and context."""
+        seen = {} if self.mask is None else {"mask": self.mask[part, : self.observed]}
+        return {**self.part(part), "x": self.x[part, : self.observed], **seen}
 
     @property
     def clips(self) -> dict[str, int]:
@@ -63,25 +70,50 @@ class Held:
         """Of the data, for the record."""
         count, frames, coordinates = self.x.shape
         found = {"fingerprint": self.windows.fingerprint, "windows": count, "frames": frames}
-        return {**found, "coordinates": coordinates, **self.windows.description}
+        return {**found, "coordinates": coordinates, **self._shares, **self.windows.description}
+
+    @property
+    def notes(self) -> list[str]:
+        """A line on what is missing, if something is."""
+        return [
+            f"observed are {seen['past']:.1%} of the numbers before the present and {seen['future']:.1%} of those "
+            "after it; scores compare with these alone"
+            for seen in self._shares.values()
+        ]
+
+    @property
+    def _shares(self) -> dict[str, dict[str, float]]:
+        if self.mask is None:
+            return {}
+        past, future = self.mask[:, : self.observed], self.mask[:, self.observed :]
+        return {"seen": {"past": past.double().mean().item(), "future": future.double().mean().item()}}
 
 
 def hold(windows: HeldOutWindows) -> Held:
     """Windows prepared.
 
     Raises:
-        ValueError: windows that are ragged, masked, or leave nothing to observe or to predict.
+        ValueError: windows that are ragged, or leave nothing to observe or to predict.
     """
     batch = windows.all()
     observed = windows.protocol.observed
-    if partial := {"lengths", "mask"} & batch.keys():
-        raise ValueError(f"evaluation needs complete windows, but these have {', '.join(sorted(partial))}")
+    if "lengths" in batch:
+        raise ValueError("evaluation needs windows of one length, but these have lengths")
     if not 1 <= observed < batch["x"].shape[1]:
         raise ValueError(
             f"windows of {batch['x'].shape[1]} frames, {observed} of them observed, leave nothing to "
             "observe or nothing to predict"
         )
-    return Held(windows, batch, observed, list(windows.keys))
+    held = Held(windows, batch, observed, list(windows.keys))
+    if held.mask is not None:
+        for what, mask in (("past", held.mask[:, :observed]), ("future", held.mask[:, observed:])):
+            if (empty := ~mask.flatten(1).any(1)).any():
+                split, clip, start = held.keys[int(empty.nonzero()[0])]
+                raise ValueError(
+                    f"nothing was observed in the {what} of the window at frame {start} of clip {clip!r} ({split}); "
+                    "leave it out"
+                )
+    return held
 
 
 def clip_places(keys: Sequence[tuple[str, str, int]]) -> Tensor:

@@ -11,9 +11,11 @@ compares two sets of motions by features of them, and has shapes of its own.
 Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`,
 or `(..., M, T, D)` where M futures are admissible; the result has the leading shape `(...)`. Torch tensors
 and numpy arrays are accepted, a tensor comes back. A displacement is the Euclidean norm over *all* D
-coordinates of a frame, in the unit of the data (metres); it is not a mean over joints. The value for a data
-set is the plain mean over its windows. Every function raises ValueError for shapes that do not fit. Windows
-are scored one after another, so that memory does not grow with their number.
+coordinates of a frame, in the unit of the data (metres); it is not a mean over joints. What is NaN in a truth
+was not observed: it counts nowhere, nor does a frame of which nothing was observed (the final one is then the
+last of which something was). The value for a data set is the plain mean over its windows. Every function
+raises ValueError for shapes that do not fit. Windows are scored one after another, so that memory does not grow
+with their number.
 """
 
 from collections.abc import Callable
@@ -50,22 +52,22 @@ def average_displacement_error(samples: Array, truth: Array) -> Tensor:
     Returns:
         `(...)`, in the unit of the data.
     """
-    return _per_window(lambda x, y: _displacement(x, y).mean(-1).amin(), *_paired(samples, truth))
+    return _per_window(_observed(lambda x, y: _displacement(x, y).mean(-1).amin()), *_paired(samples, truth))
 
 
 def final_displacement_error(samples: Array, truth: Array) -> Tensor:
     """FDE: displacement at the last frame, of the sample that is best there. Shapes as in ADE."""
-    return _per_window(lambda x, y: _displacement(x[:, -1], y[-1]).amin(), *_paired(samples, truth))
+    return _per_window(_observed(lambda x, y: _displacement(x[:, -1], y[-1]).amin()), *_paired(samples, truth))
 
 
 def median_average_displacement_error(samples: Array, truth: Array) -> Tensor:
     """ADEm: median over the K samples of the mean displacement (even K: mean of the middle two)."""
-    return _per_window(lambda x, y: _median(_displacement(x, y).mean(-1)), *_paired(samples, truth))
+    return _per_window(_observed(lambda x, y: _median(_displacement(x, y).mean(-1))), *_paired(samples, truth))
 
 
 def median_final_displacement_error(samples: Array, truth: Array) -> Tensor:
     """FDEm: median over the K samples of the final displacement (even K: mean of the middle two)."""
-    return _per_window(lambda x, y: _median(_displacement(x[:, -1], y[-1])), *_paired(samples, truth))
+    return _per_window(_observed(lambda x, y: _median(_displacement(x[:, -1], y[-1]))), *_paired(samples, truth))
 
 
 def multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
@@ -83,7 +85,7 @@ def multimodal_average_displacement_error(samples: Array, truths: Array) -> Tens
 
 def multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
     """MMFDE: the FDE to each of M admissible futures, averaged over them. Shapes as in MMADE."""
-    return _per_window(lambda x, y: _cross(x[:, -1:], y[:, -1:]).amin(0).mean(), *_multimodal(samples, truths))
+    return _per_window(lambda x, y: _cross(x, y, LAST).amin(0).mean(), *_multimodal(samples, truths))
 
 
 def median_multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
@@ -93,7 +95,7 @@ def median_multimodal_average_displacement_error(samples: Array, truths: Array) 
 
 def median_multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
     """MMFDEm: the FDEm to each of M admissible futures, averaged over them. Shapes as in MMADE."""
-    return _per_window(lambda x, y: _median(_cross(x[:, -1:], y[:, -1:])).mean(), *_multimodal(samples, truths))
+    return _per_window(lambda x, y: _median(_cross(x, y, LAST)).mean(), *_multimodal(samples, truths))
 
 
 def average_pairwise_distance_error(samples: Array, truths: Array) -> Tensor:
@@ -107,7 +109,7 @@ def average_pairwise_distance_error(samples: Array, truths: Array) -> Tensor:
         truths: `(..., M, T, D)`, as for MMADE.
 
     Returns:
-        `(...)`, in the unit of the data; NaN for M = 1.
+        `(...)`, in the unit of the data; NaN for M = 1, and where no two truths have a number in common.
     """
 
     def score(x: Tensor, y: Tensor) -> Tensor:
@@ -159,7 +161,7 @@ def energy_score(samples: Array, truth: Array) -> Tensor:
     def score(x: Tensor, y: Tensor) -> Tensor:
         return _displacement(x.flatten(1), y.flatten()).mean() - _pairwise(x) / 2
 
-    return _per_window(score, *_paired(samples, truth))
+    return _per_window(_observed(score), *_paired(samples, truth))
 
 
 def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
@@ -179,6 +181,7 @@ def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
 
     def score(x: Tensor, y: Tensor) -> Tensor:
         errors, count = (x - y).flatten(1), len(x)
+        errors = errors[:, ~y.flatten().isnan()] if y.isnan().any() else errors
         # Sorted, number i is the larger one in i pairs and the smaller one in K - 1 - i.
         signs = 2 * torch.arange(count, dtype=x.dtype, device=x.device) - (count - 1)
         apart = (signs @ errors.sort(0).values).mean() / max(1, count * (count - 1) / 2)
@@ -210,14 +213,16 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
         raise ValueError(f"the order of a variogram must be positive, but is {order}")
 
     def score(x: Tensor, y: Tensor) -> Tensor:
-        frames, size = y.shape
-        total = y.new_zeros(())
+        size, total = y.shape[-1], y.new_zeros(())
+        seen = (~y.isnan()).sum(-1)  # by frame
+        complete = bool((seen == size).all())
         # Pairs (i, i + lag): a slice stays in the cache, where all D * D pairs at once would not.
         for lag in range(1, size):
             actual = (y[:, lag:] - y[:, :-lag]).abs().pow(order)
             forecast = (x[..., lag:] - x[..., :-lag]).abs().pow(order).mean(0)
-            total = total + (actual - forecast).square().sum()
-        return total / max(1, frames * size * (size - 1) // 2)
+            terms = (actual - forecast).square()
+            total = total + (terms if complete else terms.nan_to_num(0.0)).sum()
+        return total / max(1, int((seen * (seen - 1)).sum()) // 2)
 
     return _per_window(score, *_paired(samples, truth))
 
@@ -343,17 +348,41 @@ def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Te
     return mean, (squares - count[..., None] * mean[:, :, None] * mean[:, None]) / (count[..., None] - 1)
 
 
+LAST = slice(-1, None)
+
+
+def _observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
+    """A score of distances over what there is of a truth (T, D): frames that have something, 0 where they have not."""
+
+    def counted(samples: Tensor, truth: Tensor) -> Tensor:
+        missing = truth.isnan()
+        if missing.any():
+            told = ~missing.all(-1)
+            samples, truth = (torch.where(missing, 0.0, values)[..., told, :] for values in (samples, truth))
+        return score(samples, truth)
+
+    return counted
+
+
 def _displacement(samples: Tensor, truth: Tensor) -> Tensor:
     return torch.linalg.vector_norm(samples - truth, dim=-1)
 
 
 def _pairwise(samples: Tensor) -> Tensor:
     """Mean distance over pairs of (K, T, D), each a vector of T * D numbers."""
-    return torch.pdist(samples.flatten(1)).mean() if len(samples) > 1 else samples.new_zeros(())
+    rows = samples.flatten(1)
+    if rows.isnan().any():  # the mean square of what both have stands for all; NaN where no two share anything
+        apart = [(rows[k + 1 :] - row).square().nanmean(1) for k, row in enumerate(rows[:-1])]
+        return (rows.shape[1] * torch.cat(apart)).sqrt().nanmean()
+    return torch.pdist(rows).mean() if len(rows) > 1 else samples.new_zeros(())
 
 
-def _cross(samples: Tensor, truths: Tensor) -> Tensor:
+def _cross(samples: Tensor, truths: Tensor, frames: slice = slice(None)) -> Tensor:
     """Displacement averaged over frames between each of (K, T, D) and each of (M, T, D): (K, M)."""
+    if truths.isnan().any():
+        apart = _observed(lambda x, y: _displacement(x[:, frames], y[frames]).mean(-1))
+        return torch.stack([apart(samples, truth) for truth in truths], -1)
+    samples, truths = samples[:, frames], truths[:, frames]
     # cdist expands |x - y|^2 into products; about the centre of the truths the cancellation is harmless.
     centre = truths.mean(0)
     return torch.cdist((samples - centre).transpose(0, 1), (truths - centre).transpose(0, 1)).mean(0)

@@ -78,8 +78,9 @@ class Measure:
 
     Args:
         name: of the score.
-        function: of forecasts `(B, K, H, D)`, true futures `(B, H, D)`, the past (x `(B, O, D)` and context) and the
-            places `(B,)` of these windows among all, to the score `(B,)`, on the CPU.
+        function: of forecasts `(B, K, H, D)`, true futures `(B, H, D)`, NaN where they were not observed, the past (x
+            `(B, O, D)`, its mask if there is one, and context) and the places `(B,)` of these windows among all, to the
+            score `(B,)`, on the CPU.
         unit, better, partial: see `Metric`.
         pool: from what `function` gave of all windows, `(N, ...)`, and the clip of each, to a value for each clip, of
             which the score is the mean weighted by windows. A score of the whole set gives pseudo-values.

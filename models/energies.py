@@ -148,7 +148,7 @@ class EnergyModel(DynamicalVAE):
 
         Args:
             samples: (S, B, T, D), positions that are turned as the networks see motion.
-            truth: (B, T, D), likewise.
+            truth: (B, T, D), likewise; NaN where it was not observed.
             batch: with "pseudo" and "valid", where there are further futures.
             frames: those that count.
         """
@@ -158,20 +158,22 @@ class EnergyModel(DynamicalVAE):
         if self.method.multimodal:
             found["multimodal"] = truth.new_zeros(len(truth))
             if "pseudo" in batch:
-                others = self.turned(batch["pseudo"])[:, :, frames]
+                others = self._turned(batch["pseudo"], batch)[:, :, frames]
                 found["multimodal"] = energies.multimodal_best_of_many(samples[:, :, frames], others, batch["valid"])
         return found
 
-    def realism(self, samples: Tensor, reference: Tensor, frames: slice) -> dict[str, Tensor]:
+    def realism(self, samples: Tensor, truth: Tensor, frames: slice) -> dict[str, Tensor]:
         """The energies of the limbs' lengths, the angles and the pose prior, (B,) each; as in `best`.
 
         Args:
             samples: (S, B, T, D), whose limbs count in all frames.
-            reference: (B, D), a pose with the right lengths.
+            truth: (B, T, D), whose first frame, of those that have the most joints, has the right lengths.
             frames: whose poses count.
         """
         found: dict[str, Tensor] = {}
         if self.method.limb:
+            fullest = truth.isfinite().sum(-1).argmax(-1)
+            reference = truth.take_along_dim(fullest[:, None, None], 1).squeeze(1)
             found["limb"] = energies.limb_length(samples, reference, self.skeleton)
         judged = samples[:, :, frames]
         if self.limits is not None:
@@ -190,3 +192,14 @@ class EnergyModel(DynamicalVAE):
         """Positions (..., B, T, D), turned, from x or all its parts as the networks see them."""
         lengths = {LENGTHS: data[LENGTHS]} if self.bones else {}
         return self.view.inverse({**values, **lengths})
+
+    def _turned(self, others: Tensor, batch: Mapping[str, Tensor]) -> Tensor:
+        """Other futures (B, M, T, D) of the windows of a batch, turned as these were."""
+        if self.heading is None:
+            return others
+        return self.heading({WHOLE: others.transpose(0, 1)}, batch)[WHOLE].transpose(0, 1)
+
+    def seen(self, x: Tensor, batch: Mapping[str, Any]) -> Tensor:
+        """x (B, T, D) of a batch as it was read, NaN where it was not observed."""
+        mask = batch.get("mask", {}).get(self.view.history or WHOLE)
+        return x if mask is None else torch.where(mask, x, torch.nan)

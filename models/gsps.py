@@ -220,9 +220,7 @@ class GSPSModel(EnergyModel):
         """Those of whole windows."""
         if not draws:
             return {}
-        if "mask" in data:
-            raise ValueError("the energies are of whole windows; leave 'mask' out of the batch")
-        truth = self.positions({WHOLE: data[HISTORY]}, data)[WHOLE]
+        truth = self.positions({WHOLE: self.seen(data[HISTORY], data)}, data)[WHOLE]
         parts = {name: rollout.values[name].unflatten(0, (-1, len(truth))) for name in self.observed}
         values = {name: value.flatten(0, 1) for name, value in self.positions(parts, data).items()}
         return self.energies(values, truth, data)
@@ -232,15 +230,15 @@ class GSPSModel(EnergyModel):
 
         Args:
             values: name to rows, draw by draw, of a run with `draws`.
-            truth: (B, T, D).
-            batch: with "pseudo" and "valid", where there are further futures.
+            truth: (B, T, D), NaN where it was not observed.
+            batch: as it was read, with "pseudo" and "valid" where there are further futures.
         """
         method, past, size = self.method, self.frames, len(truth)
         samples = values[WHOLE].unflatten(0, (-1, size))  # (S, B, T, D)
         found = self.best(samples, truth, batch, slice(past, None))
         if method.history:
             found["history"] = energies.history_error(samples[:, :, :past], truth[:, :past])
-        found |= self.realism(samples, truth[:, 0], slice(past, None))
+        found |= self.realism(samples, truth, slice(past, None))
         draws = list(self.draws.values())
         names = self.observed
         weights, scales = (_each(given, method.parts) for given in (method.diversity, method.diversity_scale))
@@ -271,6 +269,18 @@ class GSPSModel(EnergyModel):
         return {
             name: value[:, :, :horizon] if name in (WHOLE, *self.observed) else value for name, value in out.items()
         }
+
+    @override
+    def impute(self, batch: AnyBatch, samples: int = 1, **options: Any) -> dict[str, Tensor]:
+        """Not of this model.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(
+            "gsps has no guide: it draws motions from what was observed before the present alone, and reads nothing "
+            "behind a gap; forecast from a past with gaps, or fill them by a method whose guide reads x_{1:T}"
+        )
 
     @torch.no_grad()
     @override

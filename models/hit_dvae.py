@@ -43,6 +43,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
+from ..data import bridged
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
 from ..inference.schedules import Ramp, Schedule
@@ -262,7 +263,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         if isinstance(model, EnergyModel):
             super().start(model, windows)
         if self.standardise:
-            model.units[WHOLE].fit(model.read(windows.sample(1024, torch.default_generator))[WHOLE])
+            poses = model.read(windows.sample(1024, torch.default_generator))
+            model.units[WHOLE].fit(bridged(poses[WHOLE], poses.get("mask", {}).get(WHOLE)))
             if self.emission == "fixed" and not self.bones:
                 nn.init.zeros_(model.generator[WHOLE].law.log_scale)
 
@@ -310,16 +312,15 @@ class HiTModel(EnergyModel):
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
         if not draws or WHOLE not in rollout.values:
             return {}
-        if rollout.lengths is not None or rollout.observed:
+        if rollout.lengths is not None:
             raise ValueError(
-                "the energies are of whole windows; leave 'lengths' and 'mask' out of the batch, or fit with "
-                "loss='evidence'"
+                "the energies are of whole windows; leave 'lengths' out of the batch, or fit with loss='evidence'"
             )
         size = rollout.batch // rollout.draws
         x, everything = rollout.values[WHOLE], slice(None)
         made = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size))
-        truth, motions = (self.positions({WHOLE: each}, data)[WHOLE] for each in (x[:size], made))
-        means = self.realism(motions, truth[:, 0], everything)
+        truth, motions = (self.positions({WHOLE: each}, data)[WHOLE] for each in (self.seen(x[:size], data), made))
+        means = self.realism(motions, truth, everything)
         method = self.method
         for part, weight, scale in zip(PARTS, method.diversity, method.diversity_scale, strict=True):
             if weight:

@@ -157,18 +157,69 @@ def test_missing_entries_through_a_view_are_those_of_windows_turned_by_hand(hidd
 
 def test_what_a_turn_cannot_carry_is_refused():
     model, (x, mask) = build(Heading(WALKER, 3)), missing()
-    hip = WALKER.names.index("LHip") - 1
-    half, hipless = mask.clone(), mask.clone()
+    half = mask.clone()
     half[1, 4, 6:9] = torch.tensor([True, True, False])
-    hipless[2, 2, 3 * hip : 3 * hip + 3] = False
     with pytest.raises(ValueError, match=r"window 1 lacks one horizontal coordinate of .* and has the other"):
         model.guide({"x": x, "mask": half})
-    with pytest.raises(ValueError, match="window 2 lacks LHip in the pose by which this model turns it"):
-        model.guide({"x": x, "mask": hipless})
     with pytest.raises(ValueError, match=r"the mask of x is torch\.float64"):
         model.guide({"x": x, "mask": mask.double()})
     with pytest.raises(ValueError, match="have 51 coordinates, or 48 without the root"):
         model.guide(x[..., :30])
+
+
+def without(mask, window, frames, *names):
+    """The mask without joints of one window in some frames."""
+    mask = mask.clone()
+    for name in names:
+        joint = 3 * (WALKER.names.index(name) - 1)
+        mask[window, frames, joint : joint + 3] = False
+    return mask
+
+
+LEFT, RIGHT = ("LHip", "LShoulder"), ("RHip", "RShoulder")
+
+
+@pytest.mark.parametrize(
+    ("frames", "names", "tells"),
+    [
+        ([2], LEFT, 1),  # no left side: the pose before
+        ([1, 2], RIGHT, 0),
+        ([0, 1, 2], LEFT, 3),  # nothing up to the pose: the first after it
+        ([2], ["LHip"], 1),  # a whole pose goes before one with a shoulder alone
+        ([0, 1, 2], ["LHip", "RHip"], 2),  # the sides that are there
+    ],
+)
+def test_the_nearest_pose_with_hips_and_shoulders_tells_the_heading(frames, names, tells):
+    x = people(B, T, D)
+    mask = without(torch.ones_like(x, dtype=torch.bool), 1, frames, *names)
+    hidden = torch.where(mask, x, torch.nan)
+    seen = Heading(WALKER, 3)({"x": hidden, "mask": {"x": mask}})
+    joints = WALKER.with_root(x.unflatten(-1, (-1, 3)))
+    expected = WALKER.heading(joints[:, 2])
+    pose = WALKER.with_root(hidden.unflatten(-1, (-1, 3)))[1, tells]
+    lateral = torch.stack([pose[WALKER.names.index(n)] for n in LEFT]).nanmean(0)
+    lateral -= torch.stack([pose[WALKER.names.index(n)] for n in RIGHT]).nanmean(0)
+    expected[1] = torch.atan2(lateral[0], lateral[2]) - torch.pi / 2
+    apart = seen["heading"] - expected
+    torch.testing.assert_close(torch.sin(apart), torch.zeros_like(apart), atol=1e-9, rtol=0)
+    assert (torch.cos(apart) > 0).all()
+    torch.testing.assert_close(Heading(WALKER, 3).inverse(seen)["x"][mask], x[mask])
+
+
+def test_a_window_that_tells_no_heading_stays_as_it_is():
+    x = people(B, T, D)
+    mask = without(torch.ones_like(x, dtype=torch.bool), 1, slice(None), *LEFT)
+    seen = Heading(WALKER, 3)({"x": x, "mask": {"x": mask}})
+    assert seen["heading"][1] == 0
+    assert torch.equal(seen["x"][1][mask[1]], x[1][mask[1]])
+
+
+def test_what_follows_in_padding_tells_no_heading():
+    x = people(B, T, D)
+    mask = without(torch.ones_like(x, dtype=torch.bool), 1, [0, 1, 2], *LEFT)
+    lengths = torch.full((B,), T)
+    lengths[1] = 3
+    assert Heading(WALKER, 3)({"x": x, "mask": {"x": mask}, "lengths": lengths})["heading"][1] == 0
 
 
 def test_samples_beside_a_batch_are_turned_back():

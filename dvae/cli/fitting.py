@@ -82,6 +82,7 @@ def fit(
     data: str = SIMULATED,
     protocol: ProtocolName | None = None,
     skip_bad: bool = False,
+    missing: bool = False,
     tensorboard: bool = False,
 ) -> None:
     """Fit a method, or equations of your own, to motion data.
@@ -95,6 +96,7 @@ def fit(
         data: a motion file, or "simulated".
         protocol: how windows are cut, by default as suits the skeleton.
         skip_bad: leave out clips that cannot be used instead of refusing the file.
+        missing: keep clips that lack joints, which are NaN where they were not observed.
         tensorboard: write TensorBoard files to the run directory too.
     """
     if out.is_file():
@@ -104,7 +106,7 @@ def fit(
     with arguments():
         method.check()  # wrong equations and options are found before the data are read
         how = Training(**vars(training))
-    opened = MotionData.open(data, protocol, skip_bad)
+    opened = MotionData.open(data, protocol, skip_bad, missing)
     with _reported():
         _report(runs.fit_run(method, opened, out, how, trackers=[TensorBoard(out)] if tensorboard else []))
 
@@ -145,6 +147,7 @@ def sweep(
     data: str = SIMULATED,
     protocol: ProtocolName | None = None,
     skip_bad: bool = False,
+    missing: bool = False,
     jobs: int = 2,
     scheduler: str | None = None,
 ) -> None:
@@ -162,6 +165,7 @@ def sweep(
         data: a motion file, or "simulated".
         protocol: how windows are cut, by default as suits the skeleton.
         skip_bad: leave out clips that cannot be used instead of refusing the file.
+        missing: keep clips that lack joints, which are NaN where they were not observed.
         jobs: runs at a time.
         scheduler: address of a dask scheduler, such as tcp://host:8786, whose workers fit the runs in place of --jobs.
     """
@@ -177,7 +181,7 @@ def sweep(
         for each in chosen:
             each.check()
         how = Training(**vars(training))
-    opened = MotionData.open(data, protocol, skip_bad)
+    opened = MotionData.open(data, protocol, skip_bad, missing)
     with nullcontext() if scheduler is None else _cluster(scheduler):
         results = sweep_methods(chosen, opened, out, seeds, how, jobs)
     if failed := [result for result in results if result.status == "failed"]:

@@ -1,4 +1,4 @@
-"""Commands that make motion and show it: forecast, complete, animate."""
+"""Commands that make motion and show it: forecast, complete, impute, animate."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import torch
 import tyro
 
 from .. import motion
+from ..data import gapped
 from ..models.trajectories import TrajectoryModel
 from ..motion.dataset import SIMULATED
 from ..options import nearest
@@ -30,6 +31,7 @@ def forecast(
     fix: tuple[str, ...] = (),
     seed: int = 0,
     data: str | None = None,
+    missing: bool = False,
     figure: Path | None = None,
 ) -> None:
     """Forecast the test windows, or those of one clip, many times each.
@@ -38,8 +40,8 @@ def forecast(
     without an ending is a new folder, and gets a BVH file for every window and future: Blender opens these.
 
     The npz holds, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
-    (windows, frames, joints, 3), `split`, `clip` and `start` of each window, and the skeleton. `dvae animate` plays
-    it, `dvae.motion.Forecasts.load` reads it.
+    (windows, frames, joints, 3), NaN where a joint was missing, `split`, `clip` and `start` of each window, and the
+    skeleton. `dvae animate` plays it, `dvae.motion.Forecasts.load` reads it.
 
     Args:
         run: the run directory.
@@ -50,16 +52,17 @@ def forecast(
         fix: parts of the body, such as lower, or static latents, of which all forecasts of a window share one draw.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
+        missing: keep clips of other data that lack joints, which are NaN where they were not observed.
         figure: save a figure of the first window's futures.
     """
     at_least(1, samples=samples, horizon=horizon)
     suffix = out.suffix.lower()
     check_files(out, figure, ".npz", ".bvh", "")
     loaded = load_run(run, data)
-    windows = windows_of(loaded, data, clip)
+    windows = windows_of(loaded, data, clip, missing)
     chosen: Sequence[int] = range(len(windows))
     if suffix == ".bvh":
-        chosen = [_liveliest(windows.positions(windows.all()["x"]).numpy(), None)]
+        chosen = [_liveliest(windows.positions(gapped(windows.all())).numpy(), None)]
     futures = draw_futures(loaded, windows, chosen, samples, seed, horizon, fix)
     if suffix == ".npz":
         futures.save(out)
@@ -116,7 +119,7 @@ def complete(
     if exact and not (joints or paths):
         raise UsageError("--exact has motions follow paths; say which, by --joints or --paths")
     windows = windows_of(loaded, data, clip)
-    positions = windows.positions(windows.all()["x"]).numpy()
+    positions = windows.positions(gapped(windows.all())).numpy()
     chosen = _liveliest(positions, window)
     pose, truth = positions[chosen, 0], positions[chosen, 1:]
     given = _told(joint_names(joints), truth, paths, windows.skeleton)
@@ -130,6 +133,50 @@ def complete(
     OUT.print(str(done))
     ERROR.print(f"wrote {out}: window {chosen}, {_title(motions)}")
     _save_futures(motions, figure, given)
+
+
+def impute(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    clip: str | None = None,
+    samples: int = 10,
+    seed: int = 0,
+    data: str | None = None,
+    missing: bool = False,
+) -> None:
+    """Fill in the joints that test windows lack, or those of a whole clip, several times each.
+
+    The npz holds, in metres, `filled` (samples, windows, frames, joints, 3), positions as windows have them, with
+    joints as they were observed, or else filled in; `observed` (windows, frames, joints), which were; `spread`, how far
+    the samples' places of a joint are from their mean; `split`, `clip` and `start` of each window, and the skeleton.
+
+    Args:
+        run: the run directory.
+        out: the npz file to write.
+        clip: name of a clip, or split/name where the name is not unique; of any split, filled as one window.
+        samples: fillings of each window.
+        seed: of the draws.
+        data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
+        missing: keep clips of other data that lack joints, which are NaN where they were not observed.
+    """
+    at_least(1, samples=samples)
+    check_files(out, None, ".npz")
+    loaded = load_run(run, data)
+    windows = windows_of(loaded, data, clip, missing, whole=clip is not None)
+    listed, parts = windows.all(), []
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        for some in torch.arange(len(windows)).split(64):
+            made = loaded.model.impute({name: value[some] for name, value in listed.items()}, samples)["x"]
+            parts.append(windows.positions(made).numpy())
+    seen = windows.skeleton.with_root(listed["mask"].unflatten(-1, (-1, 3)), True)[..., 0].numpy()
+    found = motion.Imputed(windows.skeleton, windows.keys, np.concatenate(parts, 1), seen)
+    found.save(out)
+    spread = 1000 * found.spread[~seen].mean() if not seen.all() else 0.0
+    ERROR.print(
+        f"wrote {out}: {samples} fillings of each of {len(windows)} windows, which lacked {1 - seen.mean():.1%} of "
+        f"their joints; they spread by {spread:.0f} mm"
+    )
 
 
 def _told(joints: Sequence[str], truth: Any, paths: Path | None, skeleton: motion.Skeleton) -> dict[str, Any]:
@@ -180,7 +227,7 @@ def animate(
     if Path(source).is_dir():
         loaded = load_run(Path(source), data)
         windows = windows_of(loaded, data, clip)
-        chosen = _liveliest(windows.positions(windows.all()["x"]).numpy(), window)
+        chosen = _liveliest(windows.positions(gapped(windows.all())).numpy(), window)
         futures = draw_futures(loaded, windows, [chosen], samples or 5, seed, fix=fix)
     elif fix:
         raise UsageError(f"--fix is about the futures that a run draws; {source} is no run directory")
@@ -245,14 +292,17 @@ def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
     return found[0]
 
 
-def windows_of(loaded: runs.Loaded, data: str | None, clip: str | None) -> motion.Windows:
-    """The test windows of a run's data or of others, or all windows of one clip, of any split."""
-    opened = data_of(data, loaded)
+def windows_of(
+    loaded: runs.Loaded, data: str | None, clip: str | None, missing: bool = False, whole: bool = False
+) -> motion.Windows:
+    """The test windows of a run's data or of others, or all windows of one clip, of any split; or one, of it all."""
+    opened = data_of(data, loaded, missing=missing)
     if clip is None:
         return opened.windows("test")  # type: ignore[no-any-return]
-    chosen = motion.MotionSet([_clip(opened.motion, clip)], opened.motion.skeleton, opened.path)
+    found, own = _clip(opened.motion, clip), opened.motion
+    chosen = motion.MotionSet([found], own.skeleton, opened.path, missing=own.missing)
     anywhere = replace(opened.protocol, split_by="split", test=tuple(chosen.splits), train=())
-    return motion.windows(chosen, anywhere, "test")
+    return motion.windows(chosen, anywhere, "test", found.frames if whole else None)
 
 
 def draw_futures(
@@ -273,16 +323,18 @@ def draw_futures(
             + (f"{', '.join(sorted(free))} to fix" if free else "nothing to fix, no parts and no static latents")
         )
     observed, horizon = loaded.schema.protocol.observed, horizon or loaded.schema.protocol.predicted
-    x, keys = windows.all()["x"][list(chosen)], windows.keys
+    listed, keys = windows.all(), windows.keys
+    x = gapped(listed)[list(chosen)]
     past, future = x[:, :observed], x[:, observed:][:, :horizon]
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         whole = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # parts are fixed as a whole
         parts = []
         for part in past.split(64):
-            once = model.forecast({"x": part}, whole, 1) if fix else {}
+            given = {"x": part, **({"mask": part.isfinite()} if windows.missing else {})}
+            once = model.forecast(given, whole, 1) if fix else {}
             held = {"fix": {name: once[name][0] for name in fix}} if fix else {}
-            made = model.forecast({"x": part}, whole, samples, **held)["x"][:, :, :horizon]
+            made = model.forecast(given, whole, samples, **held)["x"][:, :, :horizon]
             parts.append(windows.positions(made).numpy())
             del made  # with many samples the largest thing here
     positions = [np.concatenate(parts, axis=1), *(windows.positions(frames).numpy() for frames in (past, future))]
@@ -299,7 +351,8 @@ def _alike(futures: motion.Forecasts) -> list[int]:
 def _liveliest(positions: np.ndarray, window: int | None) -> int:
     """The window that was asked for, or the one of (N, T, J, 3) whose joints move fastest."""
     if window is None:
-        return int(np.linalg.norm(np.diff(positions, axis=1), axis=-1).mean((1, 2)).argmax())
+        speeds = np.ma.masked_invalid(np.linalg.norm(np.diff(positions, axis=1), axis=-1))
+        return int(speeds.mean((1, 2)).filled(0.0).argmax())
     if window >= len(positions):
         raise UsageError(f"--window {window}: they go from 0 to {len(positions) - 1}")
     return window

@@ -64,6 +64,7 @@ def evaluate(
     run: Annotated[tuple[Path, ...], tyro.conf.Positional],
     control: Control,
     data: str | None = None,
+    missing: bool = False,
     samples: int = 50,
     bound_particles: int = 0,
     log_score_particles: int = 0,
@@ -83,6 +84,7 @@ def evaluate(
         run: run directories, fitted on the same data under the same protocol.
         control: what methods that take trajectories are told.
         data: where the data lie now, if the path in the runs no longer leads there; or other data of the same joints.
+        missing: keep clips of other data that lack joints, which are NaN where they were not observed.
         samples: forecasts of each window, K.
         bound_particles: particles of the importance-weighted bound; 0 leaves it out.
         log_score_particles: particles of the log density of the future under the forecasts; 0 leaves it out.
@@ -96,7 +98,7 @@ def evaluate(
     at_least(1, samples=samples, batch_size=batch_size)
     at_least(0, bound_particles=bound_particles, log_score_particles=log_score_particles)
     check_files(out, figure, ".json")
-    loaded, opened = opening.on_the_same_data(run, data)
+    loaded, opened = opening.on_the_same_data(run, data, missing)
     opening.note_unfinished(loaded)
     called, windows = dict(zip(opening.names(loaded), loaded, strict=True)), opened.windows("test")
     given = control.windows(windows, loaded)

@@ -26,21 +26,23 @@ def load_run(path: Path, data: str | None) -> runs.Loaded:
     return loaded
 
 
-def data_of(path: str | None, *shared: runs.Loaded) -> Any:
+def data_of(path: str | None, *shared: runs.Loaded, missing: bool = False) -> Any:
     """The data of runs of one schema or, where a path leads to others, these under the protocol of the runs."""
     if path is None:
+        if missing and not shared[0].data.motion.missing:
+            raise UsageError("--missing is about other data (--data); those of the run have no joint missing")
         return shared[0].data
-    found = shared[0].on(path)
+    found = shared[0].on(path, **({"missing": True} if missing else {}))
     for run in shared:
         if not own(run, found):
             note(f"{path} is not the data that {run.path} was fitted on")
     return found
 
 
-def on_the_same_data(paths: Sequence[Path], path: str | None) -> tuple[list[runs.Loaded], Any]:
+def on_the_same_data(paths: Sequence[Path], path: str | None, missing: bool = False) -> tuple[list[runs.Loaded], Any]:
     """Runs, and the data whose test windows they share: those that all were fitted on, or other data."""
     loaded = alike(paths, path)
-    return loaded, data_of(path, *loaded)
+    return loaded, data_of(path, *loaded, missing=missing)
 
 
 def alike(paths: Sequence[Path], path: str | None) -> list[runs.Loaded]:

@@ -12,7 +12,8 @@ from .data import Clip, MotionSet
 from .dataset import MotionData
 from .exchange import Exchanged
 from .files import read_motion, read_paths, save, write_motion
-from .forecasts import Forecasts, is_forecasts
+from .forecasts import Forecasts, Imputed, is_forecasts
+from .occlusion import occlude
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
 from .scoring import displacements, scores
 from .simulator import simulate
@@ -32,6 +33,7 @@ __all__ = [
     "Exchanged",
     "Forecasts",
     "Heading",
+    "Imputed",
     "MotionData",
     "MotionSet",
     "Poses",
@@ -45,6 +47,7 @@ __all__ = [
     "draw_traversal",
     "estimate_angle_limits",
     "is_forecasts",
+    "occlude",
     "read_motion",
     "read_paths",
     "rotate_about_up",

@@ -77,7 +77,7 @@ def draw_traversal(
     poses = windows.positions(found.frames[order, :, sequence])[:, :, frame].double().cpu()
     poses = poses - poses[..., skeleton.root : skeleton.root + 1, :]
     middle = int(found.offsets.abs().argmin())
-    azimuth = math.pi / 5 - facing(skeleton, poses[0, middle])
+    azimuth = math.pi / 5 - facing(skeleton, poses[0, middle : middle + 1])
     figure = canvas(0.5 + 0.95 * len(found.offsets), 0.6 + 1.9 * len(order))
     panels = figure.subplots(len(order), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
     for panel, chosen, row in zip(panels, order.tolist(), poses, strict=True):

@@ -37,7 +37,7 @@ class Clip:
     Args:
         split: what the archive files it under: "train" and "test", or a subject.
         name: its name, unique within the split.
-        positions: (F, J, 3) in metres, global.
+        positions: (F, J, 3) in metres, global; NaN where a joint was not observed (see `MotionSet`).
         labels: what is known about it, as text.
         truth: what a simulator knows about it, as arrays; real clips have none.
         rotations: (F, J, 4), of every joint against its parent, as quaternions w x y z; of files that have them, and
@@ -80,7 +80,7 @@ class Clip:
         before = np.minimum(at.astype(int), max(self.frames - 2, 0))
         after = np.minimum(before + 1, self.frames - 1)
         part = (at - before)[:, None, None]
-        positions = (1 - part) * self.positions[before] + part * self.positions[after]
+        positions = (1 - part) * self.positions[before] + np.where(part > 0, part * self.positions[after], 0)
         turns = None if self.rotations is None else _between(self.rotations[before], self.rotations[after], part)
         return replace(self, positions=positions.astype(self.positions.dtype), rotations=turns, truth={})
 
@@ -94,8 +94,14 @@ def _between(first: np.ndarray, second: np.ndarray, part: np.ndarray) -> np.ndar
     return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True), first.dtype)
 
 
-def defect(clip: Clip, skeleton: Skeleton) -> str | None:
-    """Why a clip cannot be used with a skeleton, in a sentence that names the clip; None when it can."""
+def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
+    """Why a clip cannot be used with a skeleton, in a sentence that names the clip; None when it can.
+
+    Args:
+        clip: the clip.
+        skeleton: that it is to have.
+        missing: joints may be NaN in some frames.
+    """
     where, positions = f"clip {clip.split}/{clip.name}", clip.positions
     if positions.dtype.kind not in "fiu":
         return f"{where} holds {positions.dtype}, expected numbers"
@@ -107,19 +113,24 @@ def defect(clip: Clip, skeleton: Skeleton) -> str | None:
         return f"{where} has no frames"
     with np.errstate(over="ignore"):
         positions = positions.astype(np.float32, copy=False)
-    bad = ~np.isfinite(positions).all(axis=2)
+    bad = (np.isinf(positions) if missing else ~np.isfinite(positions)).any(axis=2)
     if bad.any():
         frame, joint = np.argwhere(bad)[0]
+        what = "infinite" if missing else "NaN or infinite"
+        kept = not missing and not defect(clip, skeleton, missing=True)
+        hint = "; missing=True (--missing) keeps the clip, with these joints missing" if kept else ""
         return (
-            f"{where} has NaN or infinite positions, or none that float32 can hold: {bad.sum()} joint positions in "
-            f"{bad.any(axis=1).sum()} of {clip.frames} frames, first {skeleton.names[joint]} at frame {frame}"
+            f"{where} has {what} positions, or none that float32 can hold: {bad.sum()} joint positions in "
+            f"{bad.any(axis=1).sum()} of {clip.frames} frames, first {skeleton.names[joint]} at frame {frame}{hint}"
         )
+    if np.isnan(positions).any(axis=2).all():
+        return f"{where} has no joint that is observed in any of its {clip.frames} frames"
     if clip.rotations is not None:
         if clip.rotations.shape != (*positions.shape[:2], 4) or clip.rotations.dtype.kind != "f":
             return f"{where} has rotations {clip.rotations.shape}, expected quaternions {(*positions.shape[:2], 4)}"
         if not (np.abs(np.square(clip.rotations).sum(-1) - 1) < 1e-3).all():
             return f"{where} has rotations that are no quaternions of unit length"
-    extent = float(np.median((positions.max(axis=1) - positions.min(axis=1).astype(np.float64)).max(axis=1)))
+    extent = float(np.median(extents(positions).max(axis=1)))
     if not SMALLEST <= extent <= TALLEST:
         unit = "millimetres" if extent >= 300 else "centimetres" if extent >= 30 else "another unit"
         return (
@@ -127,6 +138,20 @@ def defect(clip: Clip, skeleton: Skeleton) -> str | None:
             f"expected {SMALLEST} to {TALLEST} m): it looks like {unit}; convert the positions to metres"
         )
     return None
+
+
+def extents(positions: np.ndarray) -> np.ndarray:
+    """Of the body along each axis, (frames, 3), in those frames of (F, J, 3) that have the most joints."""
+    poses = fullest(positions).astype(np.float64)
+    found: np.ndarray = np.nanmax(poses, axis=1) - np.nanmin(poses, axis=1)
+    return found
+
+
+def fullest(positions: np.ndarray) -> np.ndarray:
+    """Those frames of (F, J, 3) that have the most joints."""
+    there = (~np.isnan(positions).any(axis=2)).sum(axis=1)
+    found: np.ndarray = positions[there == there.max()]
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,10 +167,12 @@ class MotionSet:
         copy: False takes over arrays that are float32 already, which nobody else may hold.
         skip_bad: leave out clips that cannot be used, and list them in `skipped`, as (split, name, reason).
         said: how the files' units and axes were understood, for people to check.
+        missing: joints may be NaN where they were not observed, a joint as a whole: what lacks a coordinate lacks all.
+            Windows then tell by a mask what was observed.
 
     Raises:
-        ValueError: a clip has NaN, wrong joints, a wrong shape or implausible units, two clips share a key,
-            or there is no clip.
+        ValueError: a clip has NaN that is not allowed, wrong joints, a wrong shape or implausible units, two clips
+            share a key, or there is no clip.
     """
 
     clips: Sequence[Clip]
@@ -155,11 +182,12 @@ class MotionSet:
     copy: InitVar[bool] = True
     skip_bad: InitVar[bool] = False
     said: str = field(default="", kw_only=True)
+    missing: bool = field(default=False, kw_only=True)
 
     def __post_init__(self, copy: bool, skip_bad: bool) -> None:
         single, skipped, what = [], [], self.name or "motion set"
         for clip in self.clips:  # once: an iterator need not hold clips that were taken over
-            if reason := defect(clip, self.skeleton):
+            if reason := defect(clip, self.skeleton, self.missing):
                 if not skip_bad:
                     raise ValueError(f"{what}: {reason}")
                 skipped.append((*clip.key, reason))
@@ -167,6 +195,8 @@ class MotionSet:
                 continue
             positions = np.require(clip.positions, np.float32, ["C", "A", "W"])
             positions = positions.copy() if copy and np.may_share_memory(positions, clip.positions) else positions
+            if self.missing and (hidden := np.isnan(positions).any(axis=2)).any():
+                positions[hidden] = np.nan
             turns = None if clip.rotations is None else clip.rotations.astype(np.float32)
             single.append(Clip(clip.split, clip.name, positions, clip.labels, clip.truth, turns))
             del clip, positions
@@ -210,6 +240,11 @@ class MotionSet:
     def _turned(self) -> MotionSet:
         if self.skeleton.rest and all(clip.rotations is not None for clip in self):
             return self
+        if lacking := [clip for clip in self if clip.rotations is None and np.isnan(clip.positions).any()]:
+            raise ValueError(
+                f"clip {'/'.join(lacking[0].key)} lacks joints, without which their turns are not known; leave it out, "
+                "or fill its gaps first"
+            )
         skeleton = self.skeleton
         if not skeleton.rest:
             every = -(-sum(clip.frames for clip in self) // MOST_FRAMES)
@@ -223,7 +258,7 @@ class MotionSet:
                     clip = replace(clip, rotations=continuous(from_matrix(turns, "quaternion")).numpy())
                 yield clip
 
-        return MotionSet(turned(), skeleton, self.name, said=self.said)  # type: ignore[arg-type]
+        return MotionSet(turned(), skeleton, self.name, said=self.said, missing=self.missing)  # type: ignore[arg-type]
 
     def resampled(self, fps: float) -> MotionSet:
         """The same motion at another number of frames per second; see `Clip.resampled`.
@@ -234,7 +269,7 @@ class MotionSet:
         if not 0 < fps < 1e6:
             raise ValueError(f"{fps} frames per second, expected more than 0")
         ratio, skeleton = self.skeleton.fps / fps, replace(self.skeleton, fps=float(fps))
-        return MotionSet([clip.resampled(ratio) for clip in self], skeleton, self.name, said=self.said)
+        return replace(self, clips=[clip.resampled(ratio) for clip in self], skeleton=skeleton)
 
     def divided(self, test: float = 0.2, shortest: int = 1) -> MotionSet:
         """The same motion in splits "train" and "test", for recordings that nobody has divided.
@@ -268,7 +303,7 @@ class MotionSet:
         if len(found) == len(self) > 1:
             held = min(max(round(test * len(self)), 1), len(self) - 1)
             found = [*found[:-held], *(replace(clip, split="test") for clip in found[-held:])]
-        return MotionSet(found, self.skeleton, self.name, said=self.said)
+        return replace(self, clips=found)
 
     def fingerprint(self) -> str:
         """SHA-256 of the content: skeleton, and every clip's key, shape and bytes, in order."""
@@ -308,10 +343,12 @@ class MotionSet:
             splits.add_row(*(f"{value:,}" if isinstance(value, int) else str(value) for value in row.values()))
 
         bones = [self.skeleton.bone_lengths(clip.positions.astype(np.float64)) for clip in self.clips]
-        variation = [lengths.std(axis=0) / np.maximum(lengths.mean(axis=0), 1e-9) for lengths in bones]
+        bones = [np.ma.masked_invalid(lengths) for lengths in bones]
+        variation = [(b.std(axis=0) / np.maximum(b.mean(axis=0), 1e-9)).filled(0.0) for b in bones]
         worst = int(np.argmax([v.max() for v in variation]))
         bone = self.skeleton.names[self.skeleton.edges[int(np.argmax(variation[worst]))][1]]
-        extent = np.median([np.median(np.ptp(clip.positions, axis=1)[:, self.skeleton.vertical]) for clip in self])
+        extent = np.median([np.median(extents(clip.positions)[:, self.skeleton.vertical]) for clip in self])
+        lacking = [np.isnan(clip.positions).any(axis=2).mean() for clip in self]
 
         facts = Table.grid(padding=(0, 2))
         fact = facts.add_row
@@ -322,6 +359,9 @@ class MotionSet:
             fact("read as", self.said)
         if sum(clip.rotations is not None for clip in self):
             fact("rotations", "of every joint")
+        if any(lacking):
+            share = np.average(lacking, weights=[clip.frames for clip in self])
+            fact("missing joints", f"{share:.2%} of all frames' joints, in {np.count_nonzero(lacking)} clips")
         fact(
             "bone lengths",
             f"vary by at most {variation[worst].max():.2%} within a clip (sd / mean; {bone} in "

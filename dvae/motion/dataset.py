@@ -54,11 +54,13 @@ class Recordings:
         path: the file as it was given, or "simulated".
         fingerprint: SHA-256 of the clips.
         skip_bad: whether unusable clips were left out.
+        missing: whether joints may be missing.
     """
 
     path: str
     fingerprint: str
     skip_bad: bool = False
+    missing: bool = False
 
     def __post_init__(self) -> None:
         check(self)
@@ -86,7 +88,11 @@ class MotionData:
 
     @classmethod
     def open(
-        cls, path: str | os.PathLike[str] = SIMULATED, protocol: str | Protocol | None = None, skip_bad: bool = False
+        cls,
+        path: str | os.PathLike[str] = SIMULATED,
+        protocol: str | Protocol | None = None,
+        skip_bad: bool = False,
+        missing: bool = False,
     ) -> Self:
         """Reads a motion file, or simulates.
 
@@ -96,13 +102,14 @@ class MotionData:
                 observed and two predicted, see `default_protocol`. Clips that are in neither split "train" nor "test"
                 are divided, see `MotionSet.divided`.
             skip_bad: leave out unusable clips instead of refusing the file.
+            missing: keep clips that lack joints (NaN) in some frames.
 
         Raises:
             FileNotFoundError: there is no such file.
             ValueError: a file that cannot be read, or an unknown protocol.
         """
         name = os.fspath(path)
-        clips = simulate() if name == SIMULATED else read_motion(name, skip_bad=skip_bad)
+        clips = simulate() if name == SIMULATED else read_motion(name, skip_bad=skip_bad, missing=missing)
         if isinstance(protocol, str):
             protocol = named_protocol(protocol)
         protocol = protocol or default_protocol(clips)
@@ -130,7 +137,7 @@ class MotionData:
 
     def recorded(self) -> Recordings:
         """Where the clips are; `reopened` reads it."""
-        return Recordings(self.path, self.fingerprint, self.skip_bad)
+        return Recordings(self.path, self.fingerprint, self.skip_bad, self.motion.missing)
 
     @classmethod
     def reopened(
@@ -147,4 +154,4 @@ class MotionData:
             FileNotFoundError, ValueError: see `open`.
         """
         protocol = Protocol(**tuples(schema)) if isinstance(schema, Mapping) else schema.protocol
-        return cls.open(path or source.path, protocol, source.skip_bad)
+        return cls.open(path or source.path, protocol, source.skip_bad, source.missing)

@@ -6,7 +6,8 @@ code.
 
 Shapes everywhere: samples (S, B, T, D), S samples for each of B sequences, T frames of D coordinates in metres; the
 result is (B,), and its mean over the batch is the paper's term. Which frames count is up to the caller, who passes
-these frames alone. Gradients flow to the samples. Every function raises ValueError for shapes that do not fit.
+these frames alone. What is NaN in a truth, a history or a reference was not observed, and does not count. Gradients
+flow to the samples. Every function raises ValueError for shapes that do not fit.
 """
 
 from collections.abc import Callable
@@ -36,8 +37,8 @@ def best_of_many(samples: Tensor, truth: Tensor) -> Tensor:
     """
     _check(samples, truth=(truth, samples.shape[1:]))
     with torch.no_grad():
-        best = torch.stack([(sample - truth).square().sum((1, 2)) for sample in samples]).argmin(0)
-    return (_chosen(samples, best, torch.arange(len(best), device=best.device)) - truth).square().sum((1, 2))
+        best = torch.stack([_errors(sample, truth).sum((1, 2)) for sample in samples]).argmin(0)
+    return _errors(_chosen(samples, best, torch.arange(len(best), device=best.device)), truth).sum((1, 2))
 
 
 def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> Tensor:
@@ -69,6 +70,11 @@ def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> T
         best = distances[sequence, future].argmin(1)
     errors = (_chosen(samples, best, sequence) - truths).square().sum((1, 2))
     return errors.new_zeros(sequences).index_add(0, sequence, errors) * (sequences / max(len(sequence), 1))
+
+
+def _errors(samples: Tensor, truth: Tensor) -> Tensor:
+    """Squared errors, 0 where the truth is NaN."""
+    return torch.where(truth.isnan(), 0.0, samples - truth).square()
 
 
 def _chosen(samples: Tensor, sample: Tensor, sequence: Tensor) -> Tensor:
@@ -115,7 +121,7 @@ def history_error(samples: Tensor, history: Tensor) -> Tensor:
         (B,), square metres.
     """
     _check(samples, history=(history, samples.shape[1:]))
-    return (samples - history).square().sum(3).mean((0, 2))
+    return _errors(samples, history).sum(3).mean((0, 2))
 
 
 def limb_length(samples: Tensor, reference: Tensor, skeleton: Skeleton) -> Tensor:
@@ -125,7 +131,7 @@ def limb_length(samples: Tensor, reference: Tensor, skeleton: Skeleton) -> Tenso
 
     Args:
         samples: (S, B, T, D).
-        reference: (B, D), a pose of each sequence; a constant.
+        reference: (B, D), a pose of each sequence; a constant. Limbs that it lacks have any length.
         skeleton: the joints; D = 3 J, or 3 (J - 1) without the root.
 
     Returns:
@@ -137,9 +143,11 @@ def limb_length(samples: Tensor, reference: Tensor, skeleton: Skeleton) -> Tenso
         return skeleton.limbs(poses).square().sum(-1).clamp_min(1e-30).sqrt()  # the gradient at 0 is 0, not NaN
 
     def energy(poses: Tensor, expected: Tensor) -> Tensor:
-        return (lengths(poses) - expected[:, None]).square().sum(3).mean((0, 2))
+        return _errors(lengths(poses), expected[:, None]).sum(3).mean((0, 2))
 
-    error: Tensor = _InBlocks.apply(energy, samples, lengths(reference.detach()))
+    pose = reference.detach()
+    lacking = skeleton.bone_lengths(skeleton.with_root(pose.unflatten(-1, (-1, 3)))).isnan()
+    error: Tensor = _InBlocks.apply(energy, samples, torch.where(lacking, torch.nan, lengths(pose.nan_to_num(0.0))))
     return error
 
 

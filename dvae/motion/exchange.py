@@ -41,9 +41,11 @@ class Exchanged:
                 f"windows.given(['LWrist']); these have {windows.protocol.observed} observed frames and are given "
                 f"{', '.join(windows.given_joints or ()) or 'no joints'}"
             )
+        if windows.missing:
+            raise ValueError("poses are exchanged whole; these windows may lack joints, fill the gaps first")
         if not threshold > 0:
             raise ValueError(f"the threshold is {threshold}; it must be a positive distance in metres")
-        self.windows, self.threshold, self.seed = windows, threshold, seed
+        self.windows, self.threshold, self.seed, self.missing = windows, threshold, seed, False
         self.protocol, self.skeleton, self.joints = windows.protocol, windows.skeleton, windows.joints
         self.given_joints, self.positions = windows.given_joints, windows.positions
         self._kept, self._partners = self._pairs()

@@ -32,12 +32,12 @@ class Forecasts:
         skeleton: the tree.
         keys: (split, clip, first frame) of the N windows.
         forecasts: (S, N, H, J, 3), S futures of each window.
-        observed: (N, O, J, 3).
-        truth: (N, F, J, 3), what came after the observed frames; F is at most H.
+        observed: (N, O, J, 3), NaN where a joint was missing.
+        truth: (N, F, J, 3), what came after the observed frames, likewise; F is at most H.
 
     Raises:
         ValueError: the shapes do not fit each other or the skeleton, or there is nothing.
-        FloatingPointError: a position is NaN or infinite, naming window and clip.
+        FloatingPointError: a future is NaN or infinite, or another position infinite, naming window and clip.
     """
 
     skeleton: Skeleton
@@ -57,9 +57,10 @@ class Forecasts:
                 f"truth ({windows}, up to H, {joint[0]}, 3), got {shapes[0]}, {shapes[1]} and {shapes[2]}"
             )
         for what, array in (("futures", self.forecasts), ("observed frames", self.observed), ("truth", self.truth)):
-            finite = np.isfinite(array).all((*range(array.ndim - 4), -3, -2, -1))
-            if not finite.all():
-                split, clip, start = self.keys[int(finite.argmin())]
+            bad = np.isinf(array) if array.ndim == 4 else ~np.isfinite(array)
+            wrong = bad.any((*range(array.ndim - 4), -3, -2, -1))
+            if wrong.any():
+                split, clip, start = self.keys[int(wrong.argmax())]
                 raise FloatingPointError(f"the {what} of clip {clip!r} ({split}), frame {start}, are NaN or infinite")
 
     def window(self, n: int, samples: int | None = None) -> Forecasts:
@@ -80,6 +81,7 @@ class Forecasts:
             ],
             self.skeleton,
             "forecasts",
+            missing=bool(np.isnan(self.observed).any()),
         )
 
     def save(self, path: str | Path) -> None:
@@ -90,11 +92,7 @@ class Forecasts:
         `fps`.
         """
         arrays = {"forecasts": self.forecasts, "observed": self.observed, "truth": self.truth}
-        arrays |= zip(("split", "clip", "start"), map(np.array, zip(*self.keys, strict=True)), strict=True)
-        for field, key in FIELDS.items():
-            arrays[key] = np.array(getattr(self.skeleton, field), int if field in ("left", "right") else None)
-        with files.written(path) as file:
-            write_arrays(file, arrays.items())
+        _write(path, arrays, self.keys, self.skeleton)
 
     @classmethod
     def load(cls, path: str | Path) -> Forecasts:
@@ -111,10 +109,52 @@ class Forecasts:
                 raise ValueError("split and clip are text and start is a whole number; these are not")
             keys = list(zip(*(arrays[name].tolist() for name in ("split", "clip", "start")), strict=True))
             motions = [arrays[name] for name in ("forecasts", "observed", "truth")]
-            if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in motions):
-                raise ValueError("forecasts, observed and truth are numbers, none NaN or infinite; these are not")
+            finite = np.isfinite(motions[0]).all() and not any(np.isinf(array).any() for array in motions[1:])
+            if not finite or any(array.dtype.kind != "f" for array in motions):
+                raise ValueError(
+                    "forecasts, observed and truth are numbers, none infinite, and forecasts none NaN; these are not"
+                )
             return cls(skeleton, keys, *motions)
         except KeyError as error:
             raise ValueError(f"{path} lacks {error}: `dvae forecast` writes files with all that is needed") from error
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Imputed:
+    """Motion whose missing joints were filled in several times, in metres.
+
+    Args:
+        skeleton: the tree.
+        keys: (split, clip, first frame) of the N windows.
+        filled: (S, N, T, J, 3), as observed, or filled in.
+        observed: (N, T, J), True where a joint was observed.
+    """
+
+    skeleton: Skeleton
+    keys: Sequence[tuple[str, str, int]]
+    filled: np.ndarray
+    observed: np.ndarray
+
+    @property
+    def spread(self) -> np.ndarray:
+        """(N, T, J), root mean square distance of a joint's places from their mean over the samples; 0 if observed."""
+        variance: np.ndarray = self.filled.var(0).sum(-1)
+        return np.where(self.observed, 0.0, variance**0.5)
+
+    def save(self, path: str | Path) -> None:
+        """Write an npz: `filled`, `observed`, `spread`, and what `Forecasts.save` says of windows and skeleton."""
+        arrays = {"filled": self.filled, "observed": self.observed, "spread": self.spread}
+        _write(path, arrays, self.keys, self.skeleton)
+
+
+def _write(
+    path: str | Path, arrays: dict[str, np.ndarray], keys: Sequence[tuple[str, str, int]], skeleton: Skeleton
+) -> None:
+    """Writes arrays beside what says which windows they are of."""
+    arrays |= zip(("split", "clip", "start"), map(np.array, zip(*keys, strict=True)), strict=True)
+    for field, key in FIELDS.items():
+        arrays[key] = np.array(getattr(skeleton, field), int if field in ("left", "right") else None)
+    with files.written(path) as file:
+        write_arrays(file, arrays.items())

@@ -1,7 +1,7 @@
 // Skeletons on a canvas: play, scrub, turn. What moves is in data-motion of each .player; see player.py for its form.
 'use strict';
 
-const SMALLEST = 64, NAME = 15, THICK = .02, WAYS = {ArrowLeft: -1, ArrowRight: 1};
+const MISSING = -32768, SMALLEST = 64, NAME = 15, THICK = .02, WAYS = {ArrowLeft: -1, ArrowRight: 1};
 
 const unpacked = async text => {
   const bytes = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));
@@ -73,13 +73,14 @@ const play = async box => {
       if (after >= observed + person.frames) return;  // a truth that ends early
       const [a, b] = [at(person, before), at(person, after)];
       const joint = j => {
+        if (values[a + 3 * j] === MISSING || values[b + 3 * j] === MISSING) return null;
         const [x, y, z] = [0, 1, 2].map(i => unit * ((1 - share) * values[a + 3 * j + i] + share * values[b + 3 * j + i]));
         return [x - middle[0], y - middle[1], z];
       };
       pen.strokeStyle = before < observed ? scene.past : person.colour;
       pen.lineWidth = Math.max(1.2, THICK * scale);
       pen.beginPath();
-      bones.forEach(([parent, child]) => line(joint(parent), joint(child)));
+      for (const ends of bones.map(bone => bone.map(joint))) if (ends.every(Boolean)) line(...ends);
       pen.stroke();
     });
     slider.value = frame;

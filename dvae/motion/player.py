@@ -1,8 +1,9 @@
 """Moving skeletons within a page of HTML, small and without a library: to play, to scrub, to turn.
 
 A scene is stored as whole numbers of a millimetre: the observed frames, which all people share, then each one's future,
-as steps from frame to frame. Of these numbers of 16 bits first all low bytes and then all high ones are deflated and
-written in base64: 50 futures of a window take about 100 kB, a fifteenth of what plotly's frames take.
+as steps from frame to frame; a joint that lacks is at `MISSING`. Of these numbers of 16 bits first all low bytes and
+then all high ones are deflated and written in base64: 50 futures of a window take about 100 kB, a fifteenth of what
+plotly's frames take.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ SCRIPT = Path(__file__).with_name("player.js").read_text(encoding="utf-8")
 """What moves all players of a page."""
 
 MILLIMETRE = 1e-3
+
+MISSING = -32768
+"""In place of coordinates that nobody knows."""
 
 _PLAYER = Markup(
     '<div class="player" data-motion="{motion}">'
@@ -47,8 +51,9 @@ def _scene(stage: Scene) -> dict[str, Any]:
     observed = sum(frame <= stage.now for frame in stage.shown)
     low, high = stage.low, stage.high
     unit = max(MILLIMETRE, np.abs([low, high]).max() / 32767)
-    past, future = np.split(np.round(motion / unit), [observed], axis=1)
-    futures = [ahead[np.isfinite(ahead).all((1, 2))] for ahead in future]
+    past, future = np.split(np.nan_to_num(np.round(motion / unit), nan=MISSING), [observed], axis=1)
+    ends = [np.flatnonzero((ahead != MISSING).any((1, 2))).max(initial=-1) + 1 for ahead in future]
+    futures = [ahead[:end] for ahead, end in zip(future, ends, strict=True)]
     pieces = [np.diff(past[0], axis=0, prepend=0)]
     pieces += [np.diff(ahead, axis=0, prepend=past[0, -1:]) for ahead in futures]
     middle = (low + high) / 2

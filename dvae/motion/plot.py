@@ -117,7 +117,7 @@ def futures(
 
     Args:
         skeleton: the tree.
-        observed: (O, J, 3) in metres, numpy or torch.
+        observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing, as in the truth.
         samples: (K, H, J, 3) in metres.
         truth: (F, J, 3) in metres, where it is known; F is at most H.
         frames: how many future frames are drawn, the last always among them.
@@ -133,7 +133,7 @@ def futures(
     """
     past, future, real = _checked(skeleton, observed, samples, truth)
     crosses = _given(paths or {}, skeleton, future.shape[1])
-    azimuth = view - facing(skeleton, torch.from_numpy(past[-1]))
+    azimuth = view - facing(skeleton, torch.from_numpy(past))
     now, horizon = len(past) - 1, future.shape[1]
     ahead = np.unique(np.linspace(0, horizon, frames + 1)[1:].round().clip(1)).astype(int)
     shown = [*sorted({0, now}), *(now + ahead)]
@@ -246,7 +246,8 @@ def staged(
         raise ValueError(f"fixed names joints {sorted(strangers)}; they go from 0 to {skeleton.joints - 1}")
     if every < 1:
         raise ValueError(f"every is {every}; show each frame with 1, each second one with 2")
-    if not all(np.isfinite(positions).all() for positions in (past, future, *([] if real is None else [real]))):
+    known = [past] if real is None else [past, real]
+    if not np.isfinite(future).all() or any(np.isinf(positions).any() for positions in known):
         raise ValueError("observed, samples or truth have NaN or infinite positions, which cannot be drawn")
     people = list(zip(names, map(to_hex, _colours(len(future))), future, strict=True))
     if real is not None:
@@ -281,7 +282,7 @@ def animate(
 
     Args:
         skeleton: the tree.
-        observed: (O, J, 3) in metres, numpy or torch.
+        observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing, as in the truth.
         samples: (K, H, J, 3) in metres; without them the observed motion is played alone, from time zero.
         truth: (F, J, 3) in metres, where it is known; F is at most H.
         names: what to call the K samples; by default they are numbered.
@@ -401,7 +402,7 @@ def _seen(skeleton: Skeleton, past: np.ndarray, futures: Sequence[np.ndarray], h
     motion = np.full((len(futures), len(past) + horizon, skeleton.joints, 3), np.nan)
     for k, ahead in enumerate(futures):  # a truth that ends early leaves NaN, which plotly does not draw
         motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
-    turn = torch.tensor(view - facing(skeleton, torch.from_numpy(past[-1])), dtype=torch.float64)
+    turn = torch.tensor(view - facing(skeleton, torch.from_numpy(past)), dtype=torch.float64)
     motion = rotate_about_up(torch.from_numpy(motion), turn, skeleton.up).numpy()
     return motion if skeleton.up == "z" else motion[..., [0, 2, 1]] * [1, -1, 1]  # plotly turns a scene about z
 
@@ -461,8 +462,8 @@ def _colours(samples: int) -> np.ndarray:
 
 
 def facing(skeleton: Skeleton, positions: Tensor) -> float:
-    """Where the person of a pose (J, 3) faces; zero where the skeleton does not tell left from right."""
-    return float(skeleton.heading(positions)) if skeleton.left and skeleton.right else 0.0
+    """Where the person of motion (F, J, 3) faces in the end; zero where the skeleton does not tell left from right."""
+    return float(skeleton.heading_near(positions, len(positions) - 1)) if skeleton.left and skeleton.right else 0.0
 
 
 def _polylines(skeleton: Skeleton, joints: Collection[int]) -> list[int]:

@@ -48,7 +48,8 @@ class Protocol:
         fps: frames per second the numbers of frames refer to.
         train_stride, test_stride: frames between the starts of listed training and test windows.
         root: "drop": every frame relative to its own pelvis, which is then left out, D = 3 (J - 1).
-            "relative": relative to the pelvis of the window's first frame, D = 3 J; global motion is kept.
+            "relative": relative to the pelvis of the window's first frame (that has it), D = 3 J; global motion is
+            kept.
         multimodal_threshold: metres; test windows whose last observed poses are closer are each other's
             futures.
         split_by: "split", or the label, by which clips are assigned.
@@ -98,7 +99,6 @@ class Protocol:
 
 _HUMAN36M: dict[str, Any] = {"train": ("S1", "S5", "S6", "S7", "S8"), "test": ("S9", "S11"), "sampling": "subject"}
 _STYLES: dict[str, Any] = {"split_by": "file_group", "train": ("A", "B"), "test": ("C",)}
-_TUNING: dict[str, Any] = {"split_by": "file_group", "train": ("A",), "test": ("B",)}
 _TRAJECTORIES: dict[str, Any] = {"root": "relative", "rotate": True}
 
 PROTOCOLS = {
@@ -272,6 +272,7 @@ class Windows:
     Attributes:
         protocol, skeleton, split: what they were made from.
         length: frames in a window, T.
+        missing: whether joints may be missing.
         clips: the clips that are long enough.
         skipped: (split, clip, frames) of those that are not.
     """
@@ -280,6 +281,7 @@ class Windows:
         if length < 1 or (protocol.heading and length < protocol.observed):
             raise ValueError(f"windows of {length} frames: expected at least {protocol.observed} (the observed frames)")
         self.protocol, self.skeleton, self.split, self.length = protocol, motion.skeleton, split, length
+        self.missing = motion.missing
         self.clips = [clip for clip in clips if clip.frames >= length]
         self.skipped = [(*clip.key, clip.frames) for clip in clips if clip.frames < length]
         if not self.clips:
@@ -300,6 +302,15 @@ class Windows:
         self._classes: dict[str, Tensor] = {}  # by variable, the class of every clip
         self._given: Tensor | float | None = None  # see `given`
         self._starts = frames - length + 1
+        if self.missing:
+            seen = self._frames.isfinite().all(-1)
+            told = seen[:, self.skeleton.root] & (seen.sum(-1) > 1)
+            self._told = torch.cat([torch.zeros(1, dtype=torch.long), told.cumsum(0)])  # frames before each that tell
+            if not len(self):
+                raise ValueError(
+                    f"{split} split of {motion.name!r} has no window that has the root beside another joint in some "
+                    "observed and in some predicted frame"
+                )
         self._weights = self._draw_weights().cumsum(0)
 
     def _draw_weights(self) -> Tensor:
@@ -347,7 +358,7 @@ class Windows:
     def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw windows with replacement, as the protocol's `sampling` says: {"x": (B, T, D)} float32.
 
-        The same generator state gives the same windows.
+        Of a set that may lack joints there is a "mask" too, see `all`. The same generator state gives the same windows.
         """
         which, where, turn = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
         clips = torch.searchsorted(self._weights, which * self._weights[-1], right=True)
@@ -363,7 +374,12 @@ class Windows:
         return batch
 
     def all(self, stride: int | None = None) -> dict[str, Tensor]:
-        """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32."""
+        """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32.
+
+        Of a set that may lack joints there is a "mask" too, (N, T, D), False where nothing was observed; x is 0 there.
+        Poses are relative to a root, so that where this is missing they are (with root="relative", where it is missing
+        throughout). Listed are windows of which something was observed, both before the present and after.
+        """
         clips, starts = self._list(stride or self.stride)
         x = torch.empty(len(clips), self.length, self.size)
         for block in torch.arange(len(clips)).split(512):  # so that memory holds the windows little more than once
@@ -374,8 +390,9 @@ class Windows:
         return batch
 
     def poses(self) -> Tensor:
-        """Every frame of the clips, once, as a window that starts there has it: (N, D) float32."""
-        return self._represented(self._frames[:, None], 0)[:, 0]
+        """Every frame of the clips, once, as a window that starts there has it: (N, D) float32; whole poses alone."""
+        poses = self._represented(self._frames[:, None], 0)[:, 0]
+        return poses[poses.isfinite().all(-1)] if self.missing else poses
 
     def labels(self, name: str) -> list[str]:
         """The label of every listed window's clip; empty text where a clip lacks it.
@@ -476,7 +493,10 @@ class Windows:
 
     def _batch(self, x: Tensor, clips: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         """Windows with what is to go with them."""
+        seen, x = x.isfinite(), x.nan_to_num(0.0)
         batch = {"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}}
+        if self.missing:
+            batch["mask"] = seen
         if self._given is not None:
             mask = self._given
             if not isinstance(mask, Tensor):
@@ -506,7 +526,13 @@ class Windows:
             raise ValueError(f"stride is {stride}, expected 1 or more")
         counts = (self._starts + stride - 1) // stride
         clips = torch.repeat_interleave(counts)
-        return clips, stride * (torch.arange(len(clips)) - (counts.cumsum(0) - counts)[clips])
+        starts = stride * (torch.arange(len(clips)) - (counts.cumsum(0) - counts)[clips])
+        if not self.missing:
+            return clips, starts
+        first = self._first[clips] + starts
+        before, now, after = (self._told[first + n] for n in (0, min(self.protocol.observed, self.length), self.length))
+        kept = (before < now) & ((now < after) | (self.length <= self.protocol.observed))
+        return clips[kept], starts[kept]
 
     def _cut(self, clips: Tensor, starts: Tensor) -> Tensor:
         """(B,), (B,) -> (B, T, D): one gather, then the protocol's representation."""
@@ -517,11 +543,12 @@ class Windows:
         """Frames (B, T, D) of joints (B, T, J, 3), of whose frame `now` the heading is zero, if it is fixed."""
         root = self.skeleton.root
         if self.protocol.heading:
-            heading = self.skeleton.heading(joints[:, now])[:, None, None]
+            heading = self.skeleton.heading_near(joints, now)[:, None, None]
         if self.protocol.root == "drop":
             joints = self.skeleton.without_root(joints - joints[:, :, root : root + 1])
         else:
-            joints = joints - joints[:, :1, root : root + 1]
+            origin = joints[:, :, root].isfinite().all(-1).byte().argmax(1)  # the first frame, unless it lacks it
+            joints = joints - joints[:, :, root : root + 1].take_along_dim(origin[:, None, None, None], 1)
         if self.protocol.heading:
             joints = rotate_about_up(joints, -heading, self.skeleton.up)
         return joints.flatten(-2)

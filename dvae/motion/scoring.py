@@ -12,7 +12,8 @@ their last pose with another one. *CMD* (`metrics.cumulative_motion_distance`) i
 frame, for each class of motion and averaged by the classes' shares of the windows, as in the public code. A class is
 the label "content" of a clip; where clips have none, all windows are one class. The pace of a class is that of the true
 futures of the windows at hand, in the public code a constant for each of its data sets. CMD is a number of the whole
-set, with a jackknife over clips, and real motion, which has no steady pace, is not at 0.
+set, with a jackknife over clips, and real motion, which has no steady pace, is not at 0. The pace
+is one of whole bodies: of windows that may lack joints there is no CMD, and a note says so.
 
 Bodies have limb stretch, limb jitter and limb-angle errors (SkeletonDiffusion: Curreli et al. 2025, arXiv:2501.06035,
 equation 13). With l_t the length of a limb in frame t of a future, and m that in the true one, its mean over frames,
@@ -40,7 +41,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, HeldOutWindows
+from ..data import Batch, HeldOutWindows, bridged, gapped, mask_of
 from ..inference import metrics
 from ..inference.held import clip_places, on_device_of, reproducibly
 from ..inference.references import multimodal_note, multimodal_truths
@@ -83,7 +84,8 @@ def scores(
     if windows.given_joints:
         found.append(_path_error(windows))
     found += [_bone_length_error(windows), *_limbs(windows)]
-    found += [_cumulative_motion(windows)] if windows.protocol.predicted > 1 else []
+    if windows.protocol.predicted > 1 and not windows.missing:
+        found.append(_cumulative_motion(windows))
     if pose_prior is not None:
         found.append(_pose_nll(pose_prior, windows.protocol.observed))
     judged = [_judged(name, classifier, windows) for name, classifier in sorted((classifiers or {}).items())]
@@ -132,7 +134,7 @@ def displacements(windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = la
 def _multimodal(windows: HeldOutWindows, body: Callable[[Tensor], Tensor]) -> list[Measure]:
     """Errors averaged over the futures of all windows in almost the same pose."""
     truths = multimodal_truths(windows)
-    futures = body(windows.all()["x"][:, windows.protocol.observed :])
+    futures = body(gapped(windows.all())[:, windows.protocol.observed :])
     lonely = sum(len(found) == 1 for found in truths)
     said = {"threshold": windows.protocol.multimodal_threshold, "itself": True, "alone": lonely}
     shared: Any = {"unit": "m", "note": multimodal_note(**said, windows=len(truths)), "basis": {"multimodal": said}}
@@ -167,9 +169,9 @@ def _path_error(windows: Windows | Exchanged) -> Measure:
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         paths = past["y"][:, None, windows.protocol.observed :]
+        paths = torch.where(truth[:, None].isnan(), torch.nan, paths)
         distances = (forecasts - paths).unflatten(-1, (-1, 3)).norm(dim=-1)
-        found: Tensor = distances[..., places].mean((1, 2, 3))
-        return found
+        return _mean(distances[..., places], (1, 2, 3))
 
     return Measure("path error", function, "m")
 
@@ -178,12 +180,18 @@ def _bone_length_error(windows: Windows | Exchanged) -> Measure:
     """Mean of |length / observed length - 1| over samples, frames and bones."""
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        both = forecasts, past["x"]
+        both = forecasts, gapped(past)
         lengths, reference = (windows.skeleton.bone_lengths(windows.positions(poses)) for poses in both)
-        found: Tensor = (lengths / reference.mean(1)[:, None, None] - 1).abs().mean((1, 2, 3))
-        return found
+        return _mean((lengths / _mean(reference, 1)[:, None, None] - 1).abs(), (1, 2, 3))
 
-    return Measure("bone-length error", function, "relative")
+    note = "CMD is of whole bodies and left out, as joints lack" if windows.missing else ""
+    return Measure("bone-length error", function, "relative", partial=windows.missing, note=note)
+
+
+def _mean(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
+    """Means over some dimensions of what is not NaN."""
+    found: Tensor = values.nanmean(dims) if values.isnan().any() else values.mean(dims)
+    return found
 
 
 def _limbs(windows: Windows | Exchanged) -> list[Measure]:
@@ -198,7 +206,7 @@ def _limbs(windows: Windows | Exchanged) -> list[Measure]:
         """The mean over limbs and futures of a score (B, K, limbs) of relative errors (B, K, T, limbs) of lengths."""
 
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-            return score(lengths(forecasts) / lengths(truth).mean(1)[:, None, None] - 1).mean((1, 2))
+            return _mean(score(lengths(forecasts) / _mean(lengths(truth), 1)[:, None, None] - 1), (1, 2))
 
         return function
 
@@ -209,7 +217,7 @@ def _limbs(windows: Windows | Exchanged) -> list[Measure]:
     if windows.protocol.predicted > 1:
         scores["limb jitter"] = lambda errors: errors.diff(dim=2).abs().mean(2)
         scores["limb jitter RMS"] = lambda errors: errors.diff(dim=2).square().mean(2).sqrt()
-    found = [Measure(name, of_errors(score), "relative") for name, score in scores.items()]
+    found = [Measure(name, of_errors(score), "relative", partial=windows.missing) for name, score in scores.items()]
 
     ends = [child for _, child in skeleton.edges]
     pairs = [(ends.index(parent), ends.index(child)) for parent, child in skeleton.edges if parent in ends]
@@ -221,9 +229,10 @@ def _limbs(windows: Windows | Exchanged) -> list[Measure]:
         return torch.atan2(torch.linalg.cross(u, v).norm(dim=-1), (u * v).sum(-1)).rad2deg()
 
     def angle_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        return (angles(forecasts) - angles(truth)[:, None]).abs().mean((2, 3)).amin(1)
+        return _mean((angles(forecasts) - angles(truth)[:, None]).abs(), (2, 3)).amin(1)
 
-    return [*found, *([Measure("limb-angle error", angle_error, "degrees")] if pairs else [])]
+    angular = Measure("limb-angle error", angle_error, "degrees", partial=windows.missing)
+    return [*found, *([angular] if pairs else [])]
 
 
 def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
@@ -263,7 +272,7 @@ def _pose_nll(prior: Any, observed: int) -> Measure:
 
     @torch.no_grad()
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        seen = past["x"][:, None].expand(-1, forecasts.shape[1], -1, -1)
+        seen = bridged(past["x"], mask_of(past))[:, None].expand(-1, forecasts.shape[1], -1, -1)
         motion = prior.facing(torch.cat([seen, forecasts], 2))[:, :, observed:]
         return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)
 
@@ -272,6 +281,11 @@ def _pose_nll(prior: Any, observed: int) -> Measure:
 
 def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[Measure | None, Measure]:
     """ACC, where a class of some window is known, and FID."""
+    if windows.missing:
+        raise ValueError(
+            f"ACC and FID {name} are of features of whole futures, but these windows lack joints; leave the classifier "
+            "out, or fill the gaps first (`dvae impute`)"
+        )
     labels = _labels(name, classifier, windows)
     classes = torch.tensor([classifier.classes.index(label) if label in classifier.classes else -1 for label in labels])
     unknown = int((classes < 0).sum())

@@ -323,19 +323,48 @@ class Skeleton:
         left side towards +x: facing +z where y is up, -y where z is up.
 
         Args:
-            positions: (..., J, 3).
+            positions: (..., J, 3); sides that are NaN are left out.
 
         Returns:
-            (...,); `rotate_about_up(positions, -heading, up)` turns everybody to heading zero.
+            (...,), NaN where a side is NaN altogether; `rotate_about_up(positions, -heading, up)` turns everybody to
+            heading zero.
 
         Raises:
             ValueError: the skeleton does not say what is left and right.
         """
-        left, right = self.sides
-        across = positions[..., left, :].sum(-2) - positions[..., right, :].sum(-2)
-        first, second = (self.vertical + 1) % 3, (self.vertical + 2) % 3
-        towards_x = 0.0 if first == 0 else pi / 2
-        return torch.atan2(across[..., second], across[..., first]) - towards_x
+        plane = [(self.vertical + 1) % 3, (self.vertical + 2) % 3]
+        left, right = (self._side(positions[..., side, :][..., plane]) for side in self.sides)
+        across = left - right
+        towards_x = 0.0 if plane[0] == 0 else pi / 2
+        return torch.atan2(across[..., 1], across[..., 0]) - towards_x
+
+    def heading_near(self, positions: Tensor, frame: int) -> Tensor:
+        """The `heading` at a frame of motion some of whose joints are missing; 0 where no frame tells any.
+
+        It is taken from the frame that has most of the `sides`, at least one left and one right; of several, from the
+        last one up to the frame that is asked for. Only where none of these tells a heading, from the first later one.
+
+        Args:
+            positions: (..., T, J, 3), NaN where a joint was not observed.
+            frame: which of the T.
+
+        Returns:
+            (...,).
+        """
+        time = torch.arange(positions.shape[-3], device=positions.device)
+        level = positions[..., self.vertical - 1].isfinite()
+        left, right = (level[..., side].sum(-1) for side in self.sides)
+        order = torch.where(time <= frame, time + len(time) * (left + right), -time)
+        chosen = torch.where((left > 0) & (right > 0), order, -len(time)).argmax(-1)
+        pose = positions.take_along_dim(chosen[..., None, None, None], -3).squeeze(-3)
+        return self.heading(pose).nan_to_num(0.0)
+
+    @staticmethod
+    def _side(places: Tensor) -> Tensor:
+        """The sum (..., 2) of places (..., n, 2), where those that are NaN count as the mean of the others."""
+        there = places.isfinite().all(-1, keepdim=True)
+        found: Tensor = torch.where(there, places, 0.0).sum(-2) * (there.shape[-2] / there.sum(-2))
+        return found
 
     @classmethod
     def from_json(cls, path: str | Path) -> Skeleton:

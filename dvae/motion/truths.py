@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..data import bridged
 from .protocols import Windows
 from .views import Heading
 
@@ -75,7 +76,8 @@ class PseudoTruths:
                 self._limbs[node, nodes.index(parents[joint])] = -1
         self._chains = torch.linalg.inv(self._limbs).round()
 
-        x = windows.all(stride)["x"][:, self._observed - 1 :]
+        listed = windows.all(stride)
+        x = bridged(listed["x"], listed.get("mask"))[:, self._observed - 1 :]
         self._average = self._lengths(x[:, 0].unflatten(-1, (-1, 3))).mean(0)
         self._last = torch.empty(len(x), len(nodes) * 3)
         self._futures = torch.empty(len(nodes), len(x), 3, x.shape[1] - 1)  # so that products and sums run over rows
@@ -190,9 +192,11 @@ class WithPseudoTruths:
         """Draw windows as `Windows.sample` does, turned to heading zero where `truths.heading` says so.
 
         Returns:
-            "x" (B, T, D), "pseudo" (B, M, T, D) and "valid" (B, M), as of `PseudoTruths.of`.
+            "x" (B, T, D), "pseudo" (B, M, T, D) and "valid" (B, M), as of `PseudoTruths.of`; "mask" where joints may be
+            missing, whose gaps are bridged before futures are exchanged.
         """
-        x = self.windows.sample(batch_size, generator)["x"]
+        batch = self.windows.sample(batch_size, generator)
+        x = bridged(batch["x"], batch.get("mask"))
         x = self.truths.turn(x) if self.truths.heading else x
         pseudo, valid = self.truths.of(x, generator)
-        return {"x": x, "pseudo": pseudo, "valid": valid}
+        return {**batch, "x": x, "pseudo": pseudo, "valid": valid}

@@ -33,8 +33,9 @@ class Heading(View):
     itself nothing scores, so that bounds are those of turned windows: they compare with those of models that turn
     windows by the same pose, and with no others.
 
-    Missing entries stay missing. The joints that tell the heading must be observed in that pose, and of every joint
-    both horizontal coordinates or neither, as a turn mixes them.
+    Missing entries stay missing, of every joint both horizontal coordinates or neither, as a turn mixes them. Where
+    hips and shoulders lack in that pose, the nearest one that has some of them tells the heading, an earlier one if
+    there is any; a window none of whose poses does stays as it is (`Skeleton.heading_near`).
 
     Args:
         skeleton: with left and right.
@@ -67,7 +68,7 @@ class Heading(View):
                         f"this model turns every window by its frame {needed}, but a sequence has {shortest}; leave it "
                         "out, or fit with heading=False"
                     )
-            found = self.of(seen[source])
+            found = self._observed(seen)
         return self._turn(seen, -found) | {HEADING: found}
 
     @override
@@ -77,8 +78,9 @@ class Heading(View):
         return data if heading is None else self._turn(data, heading)
 
     def of(self, x: Tensor) -> Tensor:
-        """Headings (...) of windows (..., T, D), or of poses (..., D)."""
-        return self.skeleton.heading(self._joints(x, 0.0))
+        """Headings (...) of windows (..., T, D), or of poses (..., D); NaN where a joint was not observed."""
+        frames = x[..., None, :] if self.pose else x
+        return self.skeleton.heading_near(self._joints(frames), min(self.frames, frames.shape[-2]) - 1)
 
     def face(self, x: Tensor) -> Tensor:
         """Windows (..., T, D) turned each by its own heading."""
@@ -91,19 +93,28 @@ class Heading(View):
     def _rotated(self, x: Tensor, angle: Tensor, dims: int) -> Tensor:
         return rotate_about_up(x.unflatten(-1, (-1, 3)), angle[(..., *[None] * dims)], self.skeleton.up).flatten(-2)
 
-    def _joints(self, x: Tensor, root: float) -> Tensor:
-        """The pose (..., J, 3) of windows or poses, with the root where that was dropped."""
-        pose = x if self.pose else x[..., min(self.frames, x.shape[-2]) - 1, :]
+    def _observed(self, data: Batch) -> Tensor:
+        """Headings (B,) of what was observed of the data."""
+        source = self.pose or WHOLE
+        x, seen = data[source], data.get("mask", {}).get(source)
+        if seen is None:
+            return self.of(x)
+        if not self.pose and "lengths" in data:
+            seen = seen & valid_steps(data["lengths"], x.shape[-2])[..., None]
+        return self.of(torch.where(seen, x, torch.nan))
+
+    def _joints(self, poses: Tensor) -> Tensor:
+        """Joints (..., J, 3) of poses (..., D), with the root where that was dropped."""
         sizes = 3 * self.skeleton.joints, 3 * self.skeleton.joints - 3
-        if pose.shape[-1] not in sizes:
+        if poses.shape[-1] not in sizes:
             raise ValueError(
-                f"{self.pose or WHOLE} has shape {tuple(x.shape)}; poses of the skeleton {self.skeleton.name!r} have "
-                f"{sizes[0]} coordinates, or {sizes[1]} without the root"
+                f"{self.pose or WHOLE} has shape {tuple(poses.shape)}; poses of the skeleton {self.skeleton.name!r} "
+                f"have {sizes[0]} coordinates, or {sizes[1]} without the root"
             )
-        return self.skeleton.with_root(pose.unflatten(-1, (-1, 3)), root)
+        return self.skeleton.with_root(poses.unflatten(-1, (-1, 3)))
 
     def _check_mask(self, name: str, mask: Tensor) -> None:
-        """Refuses missing entries that leave the heading open, or half of what a turn mixes."""
+        """Refuses missing entries that leave half of what a turn mixes."""
         skeleton, joints = self.skeleton, mask.unflatten(-1, (-1, 3))
         across = [axis for axis in range(3) if axis != skeleton.vertical]
         mixed = joints[..., across[0]] != joints[..., across[1]]
@@ -114,16 +125,6 @@ class Heading(View):
                 f"window {window} lacks one horizontal coordinate of {held[joint]} and has the other, but this model "
                 "turns windows, which mixes them; hide both in 'mask', or fit with heading=False"
             )
-        if name == (self.pose or WHOLE):
-            left, right = skeleton.sides
-            telling = [*left, *right]
-            lacking = ~self._joints(mask, True)[..., telling, :][..., across].all(-1)
-            if lacking.any():
-                window, joint = lacking.nonzero()[0].tolist()
-                raise ValueError(
-                    f"window {window} lacks {skeleton.names[telling[joint]]} in the pose by which this model turns it: "
-                    "hips and shoulders tell a heading; leave the window out, or fit with heading=False"
-                )
 
 
 @dataclass(frozen=True)

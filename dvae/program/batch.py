@@ -90,11 +90,12 @@ class Reader:
                         "Normal()"
                     )
             seen |= {name: torch.where(mask, seen[name], means.get(name, 0.0)) for name, mask in known.items()}
-            seen["mask"] = {name: mask for name, mask in known.items() if name in self.observed}
+            kept = {*self.observed, self.view.history}
+            seen["mask"] = {name: mask for name, mask in known.items() if name in kept}
         return seen
 
     def _check_mask(self, name: str, mask: Tensor, values: Mapping[str, Any]) -> None:
-        if name not in (*self.observed, WHOLE) or name not in values:
+        if name not in (*self.observed, self.view.history, WHOLE) or name not in values:
             given = {n: v for n, v in values.items() if isinstance(v, Tensor)}
             raise ValueError(f"there is a mask of {name}, but the batch holds no data of that name: {shapes(given)}")
         if mask.shape != values[name].shape or mask.dtype != torch.bool:

@@ -1,6 +1,6 @@
 """What a fitted model makes of data: sequences that go on, and means given latents of the guide.
 
-These are the bodies of `DynamicalVAE.forecast` and `DynamicalVAE.reconstruct`, which say what they take and return.
+These are the bodies of `DynamicalVAE.forecast`, `reconstruct` and `impute`, which say what they take and return.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from ..views import WHOLE
 from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like
 
@@ -99,3 +100,19 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
 
     with model._evaluating():
         return in_chunks(means, whole.batch, samples, chunk)
+
+
+def impute(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
+    """The data, with means given latents from the guide where they are missing."""
+    given: Any = batch if isinstance(batch, Mapping) else {}
+    masks = given.get("mask", {})
+    masks = masks if isinstance(masks, Mapping) else {WHOLE if model.view.parts else model.observed[0]: masks}
+    if not masks:
+        raise ValueError("nothing is missing in this batch; give a 'mask' that is False where entries are to be filled")
+    made, found = model.reconstruct(batch, samples, chunk=chunk), {}
+    for name, mask in masks.items():
+        value = made[name]
+        lacking = mask.shape[1] - value.shape[2]  # frames that the model starts from, and does not make
+        value = torch.cat([value[:, :, :1].expand(-1, -1, lacking, -1), value], 2)
+        found[name] = torch.where(torch.as_tensor(mask), torch.as_tensor(given[name]).to(value), value)
+    return found

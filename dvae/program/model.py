@@ -31,7 +31,7 @@ from ..units import Units
 from ..views import LOG_DET, View, volume
 from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
-from .forecast import forecast, reconstruct
+from .forecast import forecast, impute, reconstruct
 from .rollout import Rollout, SelfFeeding
 
 _COUNT = itertools.count()
@@ -369,6 +369,28 @@ class DynamicalVAE(nn.Module):
             Name to (S, B, T, D) for every data variable, and the whole where these are parts.
         """
         return reconstruct(self, batch, samples, chunk)
+
+    @alone
+    @torch.no_grad()
+    def impute(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
+        """The data with their missing entries filled in, S times: as observed, or means given latents from the guide.
+
+        The guide reads all that was observed, before and after a gap. How far samples differ says how sure the model is
+        of an entry, but for the noise of the emission. Frames that a model starts from and does not make, as the first
+        pose of those along paths, take the places of the first frame that it makes.
+
+        Args:
+            batch: with a "mask", see `model`.
+            samples: S, draws of the latents for each sequence.
+            chunk: sequences times samples to hold at once, beside the result.
+
+        Returns:
+            Name to (S, B, T, D) for the variables that have a mask.
+
+        Raises:
+            ValueError: a batch without a mask.
+        """
+        return impute(self, batch, samples, chunk)
 
     @alone
     @torch.no_grad()

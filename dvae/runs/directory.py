@@ -97,13 +97,17 @@ class Loaded:
         """Whether another run was fitted on the same data, under the same schema."""
         return (self.config.data.fingerprint, self.schema) == (other.config.data.fingerprint, other.schema)
 
-    def on(self, path: str | os.PathLike[str]) -> Any:
+    def on(self, path: str | os.PathLike[str], **read: Any) -> Any:
         """Other data of the same kind, under the run's schema.
+
+        Args:
+            path: where they are.
+            **read: fields of the run's source that are others for them, such as missing=True.
 
         Raises:
             ValueError: data with another schema, such as other joints.
         """
-        other = DATA[self.config.kind].reopened(self.config.data, self.schema, path)
+        other = DATA[self.config.kind].reopened(replace(self.config.data, **read), self.schema, path)
         here, there = (dict(flat(schema.config())) for schema in (self.schema, other.schema))
         if differing := [name for name in here | there if here.get(name) != there.get(name)]:
             values = (f"{name} is {brief(there.get(name))}, not {brief(here.get(name))}" for name in differing)

@@ -443,7 +443,7 @@ def test_ragged_windows_are_refused():
     ragged = SimpleNamespace(
         protocol=windows.protocol, keys=windows.keys, all=lambda: {**windows.all(), "lengths": torch.ones(12)}
     )
-    with pytest.raises(ValueError, match="complete windows, but these have lengths"):
+    with pytest.raises(ValueError, match="windows of one length, but these have lengths"):
         run({}, ragged)
 
 

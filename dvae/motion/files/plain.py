@@ -51,6 +51,7 @@ def read_archive(
     metres: float | None = None,
     up: str | None = None,
     fps: float | None = None,
+    missing: bool = False,
 ) -> MotionSet:
     """Read an npz of positions; see `read_motion`.
 
@@ -79,7 +80,7 @@ def read_archive(
             yield Clip(split, name, positions, labelled, rotations=turns if skeleton.rest else None)
             del positions, turns
 
-    return MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad)  # type: ignore[arg-type]
+    return MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad, missing=missing)  # type: ignore[arg-type]
 
 
 def save(path: str | Path, motion: MotionSet) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data import Clip, MotionSet, defect
+from ..data import Clip, MotionSet, defect, extents, fullest
 from ..matching import Kept
 from ..skeleton import Skeleton, brief, is_name
 from .amc import read_amc, read_expmap
@@ -65,6 +65,7 @@ def read_motion(
     metres: float | None = None,
     up: str | None = None,
     fps: float | None = None,
+    missing: bool = False,
 ) -> MotionSet:
     """Read a motion file, or a folder of files of one kind and one skeleton.
 
@@ -101,6 +102,7 @@ def read_motion(
         metres: of the file's unit, instead of what is found.
         up: the file's axis that is up, "y" or "z", instead of what is found.
         fps: frames per second, instead of those that the file states; to change them, see `MotionSet.resampled`.
+        missing: keep clips that lack joints, which are NaN in frames where they were not observed.
 
     Returns:
         The clips in file order, in metres.
@@ -114,11 +116,11 @@ def read_motion(
     files = find_files(path)
     if not files:
         places = [joint for joint in joints or () if isinstance(joint, int)] if onto is None else []
-        found = read_archive(path, skeleton, labels, skip_bad, places or None, metres, up, fps)
+        found = read_archive(path, skeleton, labels, skip_bad, places or None, metres, up, fps, missing)
         return found if places or (joints is None and onto is None) else _chosen(found, joints, onto)
     known = read_labels((path if path.is_dir() else path.parent) / "labels.csv", labels)
     some = sampled(files, skip_bad)
-    reader = FileReader(understand(some, metres, up), metres is not None, fps, skeleton, joints, onto)
+    reader = FileReader(understand(some, metres, up), metres is not None, fps, skeleton, joints, onto, missing=missing)
     collected = Collected(path.stem)
     clips, unread, size = [], [], 0
     for file in files:
@@ -142,9 +144,8 @@ def read_motion(
         raise ValueError(f"{path}: no file of it can be read; the first: {unread[0][2]}")
     if not collected.skeleton.rest:
         clips = [replace(clip, rotations=None) for clip in clips]
-    made = MotionSet(
-        clips, collected.skeleton, path.stem, copy=False, skip_bad=skip_bad, said=collected.said(reader.world)
-    )
+    said = collected.said(reader.world)
+    made = MotionSet(clips, collected.skeleton, path.stem, copy=False, skip_bad=skip_bad, said=said, missing=missing)
     object.__setattr__(made, "skipped", (*made.skipped, *unread))
     return made
 
@@ -217,6 +218,7 @@ class FileReader:
         world: how their units and axes are understood.
         given: whether its unit goes before what a file says of its own.
         resampled: frames per second of what is returned; by default the file's.
+        missing: whether joints may be missing.
     """
 
     world: World
@@ -226,6 +228,7 @@ class FileReader:
     joints: Sequence[int | str] | Mapping[str, str] | None = None
     onto: Skeleton | None = None
     resampled: float | None = None
+    missing: bool = False
 
     def __call__(self, file: File, recording: Recording | None = None) -> tuple[Clip, Skeleton]:
         """The clip, and the skeleton of it alone.
@@ -262,7 +265,7 @@ class FileReader:
         clip, own = clip_of(settled, empty, fps, known, self.joints, self.onto)
         if self.resampled and self.resampled != fps:
             clip, own = clip.resampled(fps / self.resampled), replace(own, fps=float(self.resampled))
-        if reason := defect(clip, own):
+        if reason := defect(clip, own, self.missing):
             raise ValueError(reason)
         return clip, own
 
@@ -332,14 +335,14 @@ class Collected:
     def __init__(self, name: str):
         self._name, self._first = name, Path()
         self._skeleton: Skeleton | None = None
-        self._size, self._alike, self._extents = 0.0, True, [0.0]
+        self._bones, self._alike, self._extents = np.zeros(0), True, [0.0]
 
     def add(self, path: Path, clip: Clip, skeleton: Skeleton) -> str | None:
         """Takes a clip in, or says why it does not belong to those before."""
-        size = float(skeleton.bone_lengths(clip.positions[0].astype(np.float64)).sum())
-        own = float(np.median(np.ptp(clip.positions, axis=1).max(1)))
+        bones = skeleton.bone_lengths(fullest(clip.positions)[0].astype(np.float64))
+        own = float(np.median(extents(clip.positions).max(1)))
         if self._skeleton is None:
-            self._first, self._skeleton, self._size, self._extents = path, skeleton, size, [own]
+            self._first, self._skeleton, self._bones, self._extents = path, skeleton, bones, [own]
             return None
         first = self._skeleton
         if set(first.names) != set(skeleton.names):
@@ -354,9 +357,11 @@ class Collected:
                 f"{path}: {skeleton.fps:g} frames per second, {self._first} has {first.fps:g}; give fps= if their "
                 "headers are wrong, or have `dvae data convert --fps` resample them"
             )
-        if not 1 / LIKE < size / max(self._size, 1e-9) < LIKE:
+        there = np.isfinite(bones + self._bones)  # of both
+        size = bones[there].sum() / max(self._bones[there].sum(), 1e-9)
+        if there.any() and not 1 / LIKE < size < LIKE:
             return (
-                f"{path}: its body is {size / max(self._size, 1e-9):.2g} times that of {self._first}; if it is in "
+                f"{path}: its body is {size:.2g} times that of {self._first}; if it is in "
                 "another unit, read it apart, by metres="
             )
         other, rest = np.array(first.rest), np.array(skeleton.rest)
@@ -393,4 +398,4 @@ def _chosen(
         clips.append(made)
     if not collected.skeleton.rest:
         clips = [replace(clip, rotations=None) for clip in clips]
-    return MotionSet(clips, collected.skeleton, motion.name, copy=False, said=motion.said)
+    return MotionSet(clips, collected.skeleton, motion.name, copy=False, said=motion.said, missing=motion.missing)

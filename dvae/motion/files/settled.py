@@ -11,6 +11,7 @@ from math import log
 import numpy as np
 import torch
 
+from ..data import extents
 from ..rotations import continuous, from_matrix, to_matrix
 from .recording import Recording
 
@@ -59,16 +60,17 @@ def upright(recording: Recording) -> tuple[str, bool]:
     tops = [place for place, name in enumerate(recording.names) if _TOP.search(name)]
     bottoms = [place for place, name in enumerate(recording.names) if _BOTTOM.search(name)]
     if tops and bottoms:
-        along = (recording.positions[:, tops].mean(1) - recording.positions[:, bottoms].mean(1)).mean(0)
+        ends = [np.ma.masked_invalid(recording.positions[:, places]).mean(1) for places in (tops, bottoms)]
+        along = (ends[0] - ends[1]).mean(0).filled(0.0)
     else:
-        along = np.median(np.ptp(recording.positions, axis=1), axis=0)
+        along = np.median(extents(recording.positions), axis=0)
     axis = int(np.abs(along).argmax())
     return "xyz"[axis], bool(along[axis] > 0)
 
 
 def extent(recording: Recording) -> float:
     """The body's largest extent along an axis, in the recording's unit: the median over frames."""
-    return float(np.median(np.ptp(recording.positions, axis=1).max(1)))
+    return float(np.median(extents(recording.positions).max(1)))
 
 
 def unit(recording: Recording) -> tuple[str, float]:

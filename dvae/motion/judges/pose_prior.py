@@ -30,7 +30,7 @@ import pyro
 import torch
 from torch import Tensor, nn
 
-from ...data import Batch
+from ...data import Batch, bridged
 from ...inference.checkpoints import Run, load_weights
 from ...inference.recipe import Recipe, Trainable
 from ...inference.result import progress_bar
@@ -109,8 +109,9 @@ class VariedPoses:
         return self.windows.fingerprint
 
     def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """Draws windows as `Windows.sample` does, turned and with noise: {"x": (B, T, D)}."""
-        x = self.windows.sample(batch_size, generator)["x"]
+        """Draws windows as `Windows.sample` does, turned and with noise: {"x": (B, T, D)}, gaps bridged."""
+        drawn = self.windows.sample(batch_size, generator)
+        x = bridged(drawn["x"], drawn.get("mask"))
         if self.turned:
             angle = 2 * pi * torch.rand(len(x), 1, 1, generator=generator)
             x = rotate_about_up(x.unflatten(-1, (-1, 3)), angle, self.windows.skeleton.up).flatten(-2)

@@ -1,0 +1,392 @@
+"""Motion that lacks joints: read, cut, turned, fitted by every method, forecast, scored and filled in."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import dvae
+from dvae import motion
+from dvae.cli import main
+from dvae.data import bridged, gapped
+from dvae.inference import metrics
+from dvae.inference.references import distances, nearest_neighbours, zero_velocity
+from dvae.models.registry import METHODS
+from dvae.models.trajectories import TrajectoryMethod
+from dvae.motion import energies
+from dvae.motion.data import Clip, MotionSet
+
+PEOPLE = motion.simulate(clips=10, frames=90, seed=1)
+GAPS = motion.occlude(PEOPLE, seed=1)
+WALKER = PEOPLE.skeleton
+SMALL = {
+    "hit-dvae": {"samples": 2, "width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "pose_prior": 0.0},
+    "gsps": {"width": 8, "blocks": 1, "draws": (2, 2), "coefficients": 4, "pose_prior": 0.0},
+    "trajevae": {"width": 8, "feedforward": 8, "components": 4},
+    "cvae-rnn": {"latent": 4, "summary": 4, "width": 8, "hidden": (8,)},
+}
+
+
+def without(clips, **joints):
+    """Clips whose joints are NaN in some frames."""
+    found = []
+    for clip in clips:
+        positions = clip.positions.copy()
+        for name, frames in joints.items():
+            positions[frames, WALKER.names.index(name)] = np.nan
+        found.append(Clip(clip.split, clip.name, positions, clip.labels))
+    return MotionSet(found, WALKER, "some", missing=True)
+
+
+# ------------------------------------------------------------------------------------------------------ sets and files
+
+
+def test_missing_joints_are_refused_unless_they_are_allowed():
+    clips = list(GAPS)
+    with pytest.raises(ValueError, match=r"has NaN or infinite positions.*missing=True \(--missing\) keeps the clip"):
+        MotionSet(clips, WALKER)
+    assert MotionSet(clips, WALKER, missing=True).fingerprint() == GAPS.fingerprint()
+
+
+def test_what_lacks_a_coordinate_lacks_the_joint():
+    positions = PEOPLE.clips[0].positions.copy()
+    positions[4, 3, 1] = np.nan
+    (clip,) = MotionSet([Clip("a", "b", positions)], WALKER, missing=True)
+    assert np.isnan(clip.positions[4, 3]).all()
+    assert np.isnan(clip.positions).sum() == 3
+    assert np.isnan(positions).sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [(np.inf, "has infinite positions"), (np.nan, "has no joint that is observed in any of its 90 frames")],
+)
+def test_what_is_no_gap_is_refused(value, message):
+    clip = Clip("a", "b", np.full_like(PEOPLE.clips[0].positions, value))
+    with pytest.raises(ValueError, match=message):
+        MotionSet([clip], WALKER, missing=True)
+
+
+def test_gaps_are_written_and_read_back(tmp_path):
+    motion.save(tmp_path / "gaps.npz", GAPS)
+    with pytest.raises(ValueError, match="missing=True"):
+        motion.read_motion(tmp_path / "gaps.npz")
+    assert motion.read_motion(tmp_path / "gaps.npz", missing=True).fingerprint() == GAPS.fingerprint()
+
+
+def test_rotations_need_whole_bodies():
+    with pytest.raises(ValueError, match="lacks joints, without which their turns are not known"):
+        GAPS.with_rotations()
+
+
+@pytest.mark.parametrize(("share", "length"), [(0.2, 15.0), (0.5, 4.0)])
+def test_bursts_have_their_share_and_length(share, length):
+    """Of F independent chains, within five standard errors: a burst has a variance of length (length - 1)."""
+    still = np.broadcast_to(PEOPLE.clips[0].positions[:1], (20_000, WALKER.joints, 3))
+    (clip,) = motion.occlude(MotionSet([Clip("a", "b", still)], WALKER), share, length, seed=3)
+    hidden = np.isnan(clip.positions).any(2)
+    assert not hidden[:, WALKER.root].any()
+    hidden = np.delete(hidden, WALKER.root, 1)
+    begins = np.diff(hidden.astype(int), axis=0) == 1
+    count = begins.sum()
+    assert abs(hidden.sum() / count - length) < 5 * length / count**0.5
+    cycle = length / share
+    assert abs(hidden.mean() - share) < 5 * (1 - share) * length / cycle * (2 / count) ** 0.5
+
+
+@pytest.mark.parametrize(("share", "length"), [(1.0, 4.0), (-0.1, 4.0), (0.2, 0.5), (0.9, 2.0)])
+def test_bursts_that_cannot_be_are_refused(share, length):
+    with pytest.raises(ValueError, match="expected a share from 0 to below 1 and bursts of"):
+        motion.occlude(PEOPLE, share, length)
+
+
+# -------------------------------------------------------------------------------------------------------------- windows
+
+
+@pytest.mark.parametrize("name", ["simulated", "simulated-trajectories", "turned"])
+def test_windows_say_what_was_observed_and_hide_the_rest(name):
+    """Where it was, they are the windows of the whole motion; of each joint all three coordinates or none."""
+    protocol = motion.PROTOCOLS[name.replace("turned", "simulated")]
+    protocol = motion.Protocol(**{**vars(protocol), "heading": name == "turned", "rotate": False})
+    whole, some = (motion.windows(each, protocol, "train").all() for each in (PEOPLE, GAPS))
+    mask = some["mask"]
+    assert 0.7 < mask.float().mean() < 0.95
+    assert torch.equal(mask.unflatten(-1, (-1, 3)).any(-1), mask.unflatten(-1, (-1, 3)).all(-1))
+    assert (some["x"][~mask] == 0).all()
+    if name != "turned":
+        assert torch.equal(some["x"][mask], whole["x"][mask])
+    drawn = motion.windows(GAPS, protocol, "train").sample(5, torch.Generator().manual_seed(0))
+    assert drawn["x"].isfinite().all()
+    assert drawn["mask"].shape == drawn["x"].shape
+
+
+def test_complete_windows_have_no_mask():
+    assert set(motion.windows(PEOPLE, motion.PROTOCOLS["simulated"], "train").all()) == {"x"}
+
+
+def test_a_frame_without_its_root_is_hidden():
+    some = without(PEOPLE, Pelvis=slice(20, 30))
+    windows = motion.windows(some, motion.PROTOCOLS["simulated"], "train")
+    mask, starts = windows.all()["mask"], [start for _, _, start in windows.keys]
+    for seen, start in zip(mask, starts, strict=True):
+        frames = [20 <= start + t < 30 for t in range(75)]
+        assert seen.any(-1).logical_not().tolist() == frames
+
+
+def test_paths_start_where_the_root_is_first_seen():
+    some = without(PEOPLE, Pelvis=slice(0, 1), LWrist=slice(1, 2))
+    windows = motion.windows(some, motion.Protocol("p", 2, 60, 30, 90, 90, root="relative"), "train")
+    x = windows.positions(windows.all()["x"])
+    assert torch.equal(x[:, 1, WALKER.root], torch.zeros(len(x), 3))
+    world = torch.stack([torch.from_numpy(clip.positions) for clip in windows.clips])
+    torch.testing.assert_close(x[:, 2], world[:, 2] - world[:, 1, [WALKER.root]])
+
+
+def test_listed_windows_have_something_before_and_after_the_present():
+    some = without(PEOPLE, Pelvis=slice(0, 18))
+    windows = motion.windows(some, motion.PROTOCOLS["simulated"], "train")
+    assert {start for _, _, start in windows.keys} == {5, 10, 15}  # 15 frames from 5 on end at 19
+    assert len(windows.all()["x"]) == len(windows.keys) == len(windows)
+    with pytest.raises(ValueError, match="no window that has the root beside another joint"):
+        motion.windows(without(PEOPLE, Pelvis=slice(None)), motion.PROTOCOLS["simulated"], "train")
+
+
+# ----------------------------------------------------------------------------------------- references, scores, energies
+
+
+def test_gaps_are_bridged_by_straight_lines():
+    x = torch.randn(3, 12, 4).cumsum(1)
+    mask = torch.rand(3, 12, 4) < 0.6
+    mask[0, :, 0] = False
+    found = bridged(torch.where(mask, x, torch.nan), mask)
+    for n in range(3):
+        for d in range(4):
+            seen = np.flatnonzero(mask[n, :, d])
+            line = np.interp(range(12), seen, x[n, seen, d]) if len(seen) else np.zeros(12)
+            np.testing.assert_allclose(found[n, :, d], line, atol=1e-5)
+
+
+def test_zero_velocity_stays_where_joints_were_last():
+    x, mask = torch.randn(2, 5, 3), torch.ones(2, 5, 3, dtype=torch.bool)
+    mask[0, 3:, 1] = mask[1, :, 2] = False
+    found = zero_velocity(torch.where(mask, x, torch.nan), 4, mask)
+    assert torch.equal(found[0, :, 0], found[0, :, 3])
+    assert torch.equal(found[0, 0, 0], torch.stack([x[0, 4, 0], x[0, 2, 1], x[0, 4, 2]]))
+    assert found[0, 1, 0, 2] == 0
+
+
+def test_distances_are_over_what_both_have():
+    first, second = torch.randn(5, 6) + 100, torch.randn(4, 6) + 100
+    seen, also = torch.rand(5, 6) < 0.6, torch.rand(4, 6) < 0.6
+    seen[0], also[0] = torch.tensor([1, 1, 1, 0, 0, 0]), torch.tensor([0, 0, 0, 1, 1, 1])
+    found = distances(torch.where(seen, first, torch.nan), second, seen.bool(), also.bool())
+    assert found[0, 0] == torch.inf
+    for n in range(5):
+        for m in range(4):
+            both = seen[n].bool() & also[m].bool()
+            if both.any():
+                expected = ((first[n] - second[m])[both].square().mean() * 6).sqrt()
+                torch.testing.assert_close(found[n, m], expected, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(distances(first, second, torch.ones(5, 6).bool()), torch.cdist(first, second))
+
+
+def test_neighbours_are_found_by_what_was_observed():
+    training = torch.randn(30, 9, 3)
+    mask, gaps = torch.rand(7, 5, 3) < 0.7, torch.rand(30, 9, 3) < 0.9
+    mask[:, 4, 0] = gaps[:, 4, 0] = True
+    observed = torch.where(mask, training[:7, :5], torch.nan)
+    (found,) = nearest_neighbours(observed, torch.where(gaps, training, torch.nan), 1, mask, gaps)
+    shown = bridged(training, gaps)
+    assert found.isfinite().all()
+    assert all(any(torch.equal(future, other) for other in shown[:, 5:]) for future in found)
+    everything = torch.ones_like(mask), torch.ones_like(gaps)
+    same = nearest_neighbours(training[:7, :5], training, 3, *everything)
+    assert torch.equal(same, nearest_neighbours(training[:7, :5], training, 3))
+
+
+SCORES = [
+    metrics.average_displacement_error,
+    metrics.final_displacement_error,
+    metrics.median_average_displacement_error,
+    metrics.median_final_displacement_error,
+    metrics.energy_score,
+    metrics.continuous_ranked_probability_score,
+    metrics.variogram_score,
+]
+SEVERAL = [
+    metrics.multimodal_average_displacement_error,
+    metrics.multimodal_final_displacement_error,
+    metrics.median_multimodal_average_displacement_error,
+    metrics.median_multimodal_final_displacement_error,
+]
+
+
+@pytest.mark.parametrize("score", [*SCORES, *SEVERAL])
+def test_scores_are_of_what_was_observed(score):
+    """A coordinate that was never observed, or a frame of which nothing was, might as well not be there."""
+    several = (3,) if score in SEVERAL else ()
+    samples, truth = torch.randn(2, 4, 6, 5).double(), torch.randn(2, *several, 6, 5).double()
+    gaps = truth.clone()
+    gaps[..., 2, :], gaps[..., 3] = torch.nan, torch.nan
+    kept, coordinates = [0, 1, 3, 4, 5], [0, 1, 2, 4]
+    torch.testing.assert_close(
+        score(samples, gaps), score(samples[..., kept, :][..., coordinates], truth[..., kept, :][..., coordinates])
+    )
+    gaps = truth.clone()
+    gaps[..., 5, :] = torch.nan
+    torch.testing.assert_close(score(samples, gaps), score(samples[..., :5, :], truth[..., :5, :]))
+    gaps[..., 1, 2] = torch.nan
+    found = score(samples, gaps)
+    samples[..., 1, 2] += 100
+    different = score(samples, gaps)
+    if score is metrics.energy_score:  # which has the samples' own spread too
+        samples[..., 1, 2] = 0.0
+        different = score(samples, gaps)
+    torch.testing.assert_close(found, different)
+
+
+def test_energies_are_of_what_was_observed():
+    samples, truth = torch.randn(3, 2, 6, 48).double(), torch.randn(2, 6, 48).double()
+    seen = torch.rand(2, 6, 48) < 0.8
+    gaps = torch.where(seen, truth, torch.nan)
+    errors = torch.where(seen, samples - truth, 0.0).square()
+    torch.testing.assert_close(energies.best_of_many(samples, gaps), errors.sum((2, 3)).amin(0))
+    torch.testing.assert_close(energies.history_error(samples, gaps), errors.sum(3).mean((0, 2)))
+    joint = 3 * (WALKER.names.index("LElbow") - 1)
+    pose = truth[:, 0].clone()
+    pose[:, joint : joint + 3] = torch.nan
+    kept = [n for n, edge in enumerate(WALKER.edges) if WALKER.names.index("LElbow") not in edge]
+    lengths, own = (WALKER.limbs(each).norm(dim=-1) for each in (samples, truth[:, 0]))
+    expected = (lengths - own[:, None]).square()[..., kept].sum(3).mean((0, 2))
+    torch.testing.assert_close(energies.limb_length(samples, pose, WALKER), expected)
+
+
+# -------------------------------------------------------------------------------------------------------- every method
+
+
+def small(name):
+    kind = dvae.methods()[name]
+    protocol = motion.PROTOCOLS["simulated-trajectories" if issubclass(kind, TrajectoryMethod) else "simulated"]
+    protocol = replace(protocol, predicted=12, observed=min(protocol.observed, 6), train_stride=15)
+    data = motion.MotionData("simulated", GAPS, protocol)
+    options = SMALL.get(name, {"latent": 4, "warm_up": 1} | ({"width": 8} if name == "equations" else {}))
+    return data, dvae.method(name, **options).suited(data.windows("train"))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_goes_the_whole_way_with_gaps(name):
+    """Fitted, validated, scored; and whatever stands where nothing was observed changes nothing."""
+    data, method = small(name)
+    train, validation, test = map(data.windows, ("train", "validation", "test"))
+    torch.manual_seed(0)
+    model, recipe = method.build(data.schema), method.train(train, validation, 1)
+    recipe.fit(model, steps=1, batch_size=3, validate_every=1, progress=False)
+    assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+    scores = dvae.evaluate(model, test, scores=motion.displacements, samples=2, training_windows=train, progress=False)
+    assert all(np.isfinite(score.mean) for score in scores["model"].values())
+    assert scores.data["seen"]["future"] == test.all()["mask"][:, data.protocol.observed :].double().mean()
+
+    drawn, objective = recipe.batches.sample(3, torch.Generator().manual_seed(1)), recipe.objective
+    present, drawing = data.protocol.observed, {"draws": objective.draws} if objective.draws else {}
+    results = []
+    for hidden in (0.0, 7.0, torch.nan):
+        batch = {**drawn, "x": torch.where(drawn["mask"], drawn["x"], hidden)}
+        past = {"x": batch["x"][:, :present], "mask": batch["mask"][:, :present]}
+        model.zero_grad()
+        torch.manual_seed(2)
+        loss = objective(dvae.SequenceELBO().terms(model.eval(), batch, **drawing), 0)
+        loss.backward()
+        slopes = [p.grad.clone() for p in model.parameters() if p.grad is not None]
+        results.append([loss.detach(), *slopes, model.forecast(past, 5, 2)["x"]])
+        if name != "gsps":
+            whole = {n: value for n, value in batch.items() if n not in ("pseudo", "valid")}
+            results[-1].append(filled := model.impute(whole, 2)["x"])
+            assert torch.equal(filled[:, drawn["mask"]], batch["x"][drawn["mask"]].expand(2, -1))
+    assert all(value.isfinite().all() for value in results[0])
+    assert any(slope.any() for slope in results[0][1:-2])
+    for other in results[1:]:
+        assert all(torch.equal(here, there) for here, there in zip(results[0], other, strict=True))
+
+
+def test_gsps_fills_no_gaps():
+    data, method = small("gsps")
+    with pytest.raises(
+        ValueError, match="gsps has no guide: it draws motions from what was observed before the present"
+    ):
+        method.build(data.schema).impute(data.windows("test").all())
+
+
+def test_what_is_whole_has_no_gap_to_fill():
+    model = dvae.method("vae", latent=2).build({"x": 4})
+    with pytest.raises(ValueError, match="nothing is missing in this batch; give a 'mask'"):
+        model.impute(torch.randn(2, 3, 4))
+
+
+def test_a_best_of_many_is_that_of_observed_places():
+    """A mask that hides nothing changes no energy; one that does, the errors of the truth alone."""
+    data, method = small("hit-dvae")
+    model, source = method.build(data.schema).eval(), method.scored(data.windows("train"))
+    batch = dict(source.sample(3, torch.Generator().manual_seed(0)))
+    seen, found = batch.pop("mask"), []
+    for mask in ({}, {"mask": torch.ones_like(seen)}, {"mask": seen}):
+        torch.manual_seed(0)
+        found.append(dvae.SequenceELBO().terms(model, batch | mask, draws={"w": 2}).energies)
+    assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
+    assert (found[2]["reconstruction"] != found[1]["reconstruction"]).all()
+
+
+# ----------------------------------------------------------------------------------------------------- the command line
+
+
+QUICK = ["--steps", "1", "--batch-size", "2", "--warm-up", "1"]
+
+
+def test_commands_take_gaps_from_fit_to_filling(tmp_path, capsys):
+    motion.save(tmp_path / "gaps.npz", GAPS)
+    run, data = tmp_path / "run", ["--data", str(tmp_path / "gaps.npz")]
+    fit = ["fit", "vae", *data, "--out", str(run), "--protocol", "simulated", *QUICK]
+    assert main(fit) == 1
+    assert "--missing" in capsys.readouterr().err
+    assert main([*fit, "--missing"]) == 0
+    assert json.loads((run / "config.json").read_text())["data"]["missing"] is True
+    assert main(["evaluate", str(run), "--samples", "2"]) == 0
+    assert "observed are" in capsys.readouterr().out
+    assert main(["forecast", str(run), "--out", str(tmp_path / "f.npz"), "--samples", "2"]) == 0
+    futures = motion.Forecasts.load(tmp_path / "f.npz")
+    assert np.isnan(futures.truth).any()
+    assert np.isfinite(futures.forecasts).all()
+    assert main(["animate", str(tmp_path / "f.npz"), "--out", str(tmp_path / "f.html")]) == 0
+
+    clip = GAPS.clips[-1]
+    assert main(["impute", str(run), "--out", str(tmp_path / "i.npz"), "--clip", clip.name, "--samples", "3"]) == 0
+    with np.load(tmp_path / "i.npz") as file:
+        found = {name: file[name] for name in file}
+    there = ~np.isnan(clip.positions).any(-1)
+    assert np.array_equal(found["observed"][0], there)
+    assert found["filled"].shape == (3, 1, clip.frames, WALKER.joints, 3)
+    relative = clip.positions - clip.positions[:, [WALKER.root]]
+    np.testing.assert_array_equal(found["filled"][1, 0][there], relative[there])
+    assert (found["spread"][0][there] == 0).all()
+    spread = found["filled"].var(0).sum(-1) ** 0.5
+    np.testing.assert_allclose(found["spread"][~found["observed"]], spread[~found["observed"]], rtol=1e-5)
+
+
+def test_a_run_on_whole_motion_forecasts_other_motion_with_gaps(tmp_path, capsys):
+    motion.save(tmp_path / "whole.npz", PEOPLE)
+    (tmp_path / "other").mkdir()
+    motion.save(tmp_path / "other" / "gaps.npz", GAPS)
+    run, other = str(tmp_path / "run"), str(tmp_path / "other" / "gaps.npz")
+    fit = ["--protocol", "simulated", *QUICK, "--out", run]
+    assert main(["fit", "vae", "--data", str(tmp_path / "whole.npz"), *fit]) == 0
+    forecast = ["forecast", run, "--out", str(tmp_path / "f.npz"), "--samples", "1"]
+    assert main([*forecast, "--data", other]) == 1
+    assert main([*forecast, "--data", other, "--missing"]) == 0
+    assert main([*forecast, "--missing"]) == 2
+    assert "--missing is about other data" in capsys.readouterr().err
+
+
+def test_past_that_is_shown_has_its_gaps():
+    batch = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test").all()
+    assert torch.equal(gapped(batch).isnan(), ~batch["mask"])
