@@ -5,8 +5,22 @@ import shutil
 
 import networkx as nx
 import pytest
+import torch
 
-from benchmarks.tables import audits, bones, bounds, demo, family, gsps, hit_dvae, house, overview, pages, trajevae
+from benchmarks.tables import (
+    audits,
+    bones,
+    bounds,
+    demo,
+    family,
+    gsps,
+    hit_dvae,
+    house,
+    occlusion,
+    overview,
+    pages,
+    trajevae,
+)
 from dvae import Evaluation, motion
 from dvae.cli import main as command
 
@@ -135,6 +149,22 @@ def test_trajevae(folder, page):
     assert {cell for row in changes[1:7] for cell in row[2:]} == {"0.000"}
     assert {row[1] for row in means[1:]} == {"0"}
     assert {row[1] for row in exchanged[1:]} == {"1"}
+
+
+def test_occlusion(folder, page, monkeypatch):
+    monkeypatch.setattr(occlusion, "STEPS", {"srnn": 2})
+    monkeypatch.setattr(occlusion, "METHODS", {"srnn": {"latent": 2, "width": 4}})
+    occlusion.main(folder / "people.npz", page, "simulated", length=8.0, stride=75, seeds=2, samples=2)
+    errors, differences = tables(page)
+    assert [row[0] for row in errors[1:]] == ["straight line", f"{occlusion.NEIGHBOURS} neighbours", "srnn"]
+    assert all(float(cell.split()[0]) > 0 for row in errors[1:] for cell in row[1:3])
+    error, line, more = (float(row[1].split()[0]) for row in (errors[3], errors[1], differences[2]))
+    assert abs(error - line - more) < 0.11  # of three rounded numbers
+
+
+def test_gaps_are_as_long_as_they_are():
+    mask = torch.tensor([1, 0, 0, 1, 1, 0, 0, 0, 1, 0]).bool()
+    assert occlusion.bursts(mask[None, :, None])[0, :, 0].tolist() == [0, 2, 2, 0, 0, 3, 3, 3, 0, 1]
 
 
 def test_demo(tmp_path):

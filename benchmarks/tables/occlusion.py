@@ -1,0 +1,167 @@
+"""Writes the table of docs/results/occlusion.md: how well gaps in motion are filled, by methods and by simpler means.
+
+Joints of the recordings are hidden in bursts (`dvae.motion.occlude`), in training and in test. Methods are fitted to
+what is left, and fill the gaps of whole test windows with means given latents of their guide.
+"""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+import dvae
+from dvae import motion
+from dvae.data import bridged
+from dvae.inference.held import clip_places
+from dvae.inference.references import distances
+from dvae.inference.uncertainty import clustered_variance, linearised
+
+from .pages import DOCS, table, write
+
+METHODS: dict[str, dict[str, Any]] = {
+    "srnn": {"residual": 0.9},
+    "hit-dvae": {"loss": "evidence", "heading": True, "self_feeding": 0.0},
+}
+"""With options that suit teacher-forced filling; the rest are the presets."""
+STEPS = {"srnn": 1500, "hit-dvae": 250}
+NEIGHBOURS = 10
+LENGTHS = ((1, 10), (11, 30), (31, None))
+"""Frames of a burst, as far as it lies in the window."""
+
+
+def bursts(mask: Tensor) -> Tensor:
+    """How long the gap is in which an entry lies, (N, T, D); 0 where it was observed."""
+    step = torch.arange(1, mask.shape[1] + 1)[:, None]
+    before = torch.where(mask, step, 0).cummax(1).values
+    after = torch.where(mask, step, mask.shape[1] + 1).flip(1).cummin(1).values.flip(1)
+    return torch.where(mask, 0, after - before - 1)
+
+
+def neighbours(windows: motion.Windows, training: motion.Windows, batch: Mapping[str, Tensor]) -> Tensor:
+    """The mean of the nearest training windows, by what both have over all frames, all turned to one heading."""
+    view = motion.Heading(windows.skeleton, windows.protocol.observed)
+
+    def turned(each: Mapping[str, Tensor]) -> dict[str, Any]:
+        return view({**each, "mask": {"x": each["mask"]}})
+
+    given, known = turned(batch), turned(training.all())
+    gaps = [each["mask"]["x"].flatten(1) for each in (given, known)]
+    nearest = distances(given["x"].flatten(1), known["x"].flatten(1), *gaps).topk(NEIGHBOURS, largest=False).indices
+    filled = bridged(known["x"], known["mask"]["x"])
+    means = torch.stack([filled[some].mean(0) for some in nearest])
+    return view.inverse({"x": means, "heading": given["heading"]})["x"]
+
+
+def imputed(model: Any, batch: Mapping[str, Tensor], samples: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Mean over draws, and spread of a joint, (N, T, D) and (N, T, J)."""
+    means, spreads = [], []
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        for rows in torch.arange(len(batch["x"])).split(64):
+            drawn = model.impute({name: value[rows] for name, value in batch.items()}, samples)["x"]
+            means.append(drawn.mean(0))
+            spreads.append(drawn.var(0).unflatten(-1, (-1, 3)).sum(-1).sqrt())
+    return torch.cat(means), torch.cat(spreads)
+
+
+def sums(values: Tensor, gaps: Tensor, places: np.ndarray) -> np.ndarray:
+    """Sums (4, C) by clip of values (N, T, J) in all gaps, and in those of each range of lengths."""
+    ranges = [(gaps >= low) & (gaps <= (high or gaps.shape[1])) for low, high in ((1, None), *LENGTHS)]
+    by_window = [torch.where(counted, values.double(), 0.0).sum((1, 2)).numpy() for counted in ranges]
+    return np.stack([np.bincount(places, weights=each) for each in by_window])
+
+
+def cells(means: np.ndarray, weights: np.ndarray) -> list[str]:
+    """Means over what is hidden (4, C), and their standard errors, clustered by clip."""
+    found = []
+    for own, weight in zip(means, weights, strict=True):
+        mean, deviations = linearised(own, np.maximum(weight, 1e-9))
+        found.append(f"{mean:.1f} ± {clustered_variance(deviations) ** 0.5:.1f}" if weight.any() else "–")
+    return found
+
+
+def fitted(name: str, data: motion.MotionData, steps: int, seed: int) -> Any:
+    """A method, fitted to what is not hidden."""
+    train = data.windows("train")
+    torch.manual_seed(seed)
+    method = dvae.method(name, **METHODS[name], warm_up=steps // 3).suited(train)
+    model = method.build(data.schema)
+    recipe = method.train(train, None, steps)
+    recipe.fit(model, batch_size=32, learning_rate=2e-3, decay=0.5, seed=seed, progress=False)
+    return model.eval()
+
+
+def main(
+    data: Path,
+    page: Path = DOCS / "results" / "occlusion.md",
+    protocol: str = "bandai2-tuning",
+    share: float = 0.2,
+    length: float = 15.0,
+    stride: int = 30,
+    seeds: int = 2,
+    samples: int = 5,
+    steps: float = 1.0,
+) -> None:
+    """Write the table.
+
+    Args:
+        data: motion file.
+        page: where.
+        protocol: by which windows are cut and split.
+        share: of the joints that is hidden.
+        length: frames of a burst.
+        stride: frames between test windows.
+        seeds: fits of each method.
+        samples: draws of the latents that are averaged.
+        steps: share of the steps of training.
+    """
+    whole = motion.read_motion(data)
+    opened = motion.MotionData(str(data), motion.occlude(whole, share, length), motion.PROTOCOLS[protocol])
+    test, training = opened.windows("test"), opened.windows("train+validation")
+    batch, truth = test.all(stride), motion.windows(whole, opened.protocol, "test").all(stride)["x"]
+    places = clip_places(test.index(stride)).numpy()
+    gaps = bursts(batch["mask"]).unflatten(-1, (-1, 3))[..., 0]
+
+    weights = sums(torch.ones_like(gaps), gaps, places)
+
+    def means(values: Tensor) -> np.ndarray:
+        return 1000 * sums(values, gaps, places) / np.maximum(weights, 1)
+
+    def errors(x: Tensor) -> np.ndarray:
+        return means((x - truth).unflatten(-1, (-1, 3)).norm(dim=-1))
+
+    made = {
+        "straight line": [errors(bridged(batch["x"], batch["mask"]))],
+        f"{NEIGHBOURS} neighbours": [errors(neighbours(test, training, batch))],
+    }
+    spreads: dict[str, list[np.ndarray]] = {}
+    for name in METHODS:
+        for seed in range(seeds):
+            start = time.process_time()
+            model = fitted(name, opened, max(round(steps * STEPS[name]), 1), seed)
+            print(f"{name}, seed {seed}: fitted in {time.process_time() - start:.0f} s of processor time", flush=True)
+            mean, spread = imputed(model, batch, samples, seed)
+            made.setdefault(name, []).append(errors(mean))
+            spreads.setdefault(name, []).append(means(spread))
+
+    def over(found: list[np.ndarray]) -> list[str]:
+        return [f"{np.average(each[0], weights=weights[0]):.1f}" for each in found]
+
+    ranges = ["all", *(f"{low} to {high}" if high else f"{low} or more" for low, high in LENGTHS)]
+    rows, differences = [], []
+    for name, found in made.items():
+        average, spread = np.mean(found, 0), over([np.mean(spreads[name], 0)]) if name in spreads else ["–"]
+        rows.append([name, *cells(average, weights), *spread, ", ".join(over(found)) if name in spreads else "–"])
+        differences.append([name, *cells(average - made["straight line"][0], weights)])
+    said = f"{len(truth)} windows of {len(set(places))} clips, {int(weights[0].sum()):,} hidden places of joints.\n"
+    others = table(["minus straight line", *ranges], differences[1:])
+    write(page, said, table(["", *ranges, "spread", "seeds"], rows), others)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
