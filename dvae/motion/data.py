@@ -80,7 +80,8 @@ class Clip:
         before = np.minimum(at.astype(int), max(self.frames - 2, 0))
         after = np.minimum(before + 1, self.frames - 1)
         part = (at - before)[:, None, None]
-        positions = (1 - part) * self.positions[before] + np.where(part > 0, part * self.positions[after], 0)
+        first, second = np.where(part < 1, self.positions[before], 0), np.where(part > 0, self.positions[after], 0)
+        positions = (1 - part) * first + part * second  # what has no share may be missing
         turns = None if self.rotations is None else _between(self.rotations[before], self.rotations[after], part)
         return replace(self, positions=positions.astype(self.positions.dtype), rotations=turns, truth={})
 

@@ -219,12 +219,13 @@ def _limbs(windows: Windows | Exchanged) -> list[Measure]:
         scores["limb jitter RMS"] = lambda errors: errors.diff(dim=2).square().mean(2).sqrt()
     found = [Measure(name, of_errors(score), "relative", partial=windows.missing) for name, score in scores.items()]
 
-    ends = [child for _, child in skeleton.edges]
+    starts, ends = (list(joints) for joints in zip(*skeleton.edges, strict=True))
     pairs = [(ends.index(parent), ends.index(child)) for parent, child in skeleton.edges if parent in ends]
     first, second = ([pair[side] for pair in pairs] for side in (0, 1))
 
     def angles(x: Tensor) -> Tensor:
-        limbs = skeleton.limbs(x)
+        joints = windows.positions(x)
+        limbs = joints[..., ends, :] - joints[..., starts, :]  # `skeleton.limbs`, but for what is NaN
         u, v = limbs[..., first, :], limbs[..., second, :]
         return torch.atan2(torch.linalg.cross(u, v).norm(dim=-1), (u * v).sum(-1)).rad2deg()
 

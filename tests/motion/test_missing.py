@@ -1,6 +1,8 @@
 """Motion that lacks joints: read, cut, turned, fitted by every method, forecast, scored and filled in."""
 
+import base64
 import json
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +19,9 @@ from dvae.models.registry import METHODS
 from dvae.models.trajectories import TrajectoryMethod
 from dvae.motion import energies
 from dvae.motion.data import Clip, MotionSet
+from dvae.motion.film import save_film
+from dvae.motion.player import MISSING, _scene
+from dvae.motion.plot import staged
 
 PEOPLE = motion.simulate(clips=10, frames=90, seed=1)
 GAPS = motion.occlude(PEOPLE, seed=1)
@@ -74,6 +79,52 @@ def test_gaps_are_written_and_read_back(tmp_path):
     with pytest.raises(ValueError, match="missing=True"):
         motion.read_motion(tmp_path / "gaps.npz")
     assert motion.read_motion(tmp_path / "gaps.npz", missing=True).fingerprint() == GAPS.fingerprint()
+
+
+@pytest.mark.parametrize("format", ["csv", "npz"])
+def test_gaps_are_read_from_a_folder_and_an_archive(tmp_path, format):
+    path = tmp_path / ("clips" if format == "csv" else "clips.npz")
+    motion.write_motion(path, GAPS, format)
+    with pytest.raises(ValueError, match=r"NaN.*missing=True"):
+        motion.read_motion(path, skeleton=WALKER)
+    for onto in (None, WALKER):
+        found = motion.read_motion(path, skeleton=WALKER, missing=True, onto=onto)
+        assert found.missing
+        for clip in GAPS:
+            there = next(other for other in found if other.key == clip.key).positions
+            assert np.array_equal(np.isnan(there), np.isnan(clip.positions))
+            np.testing.assert_allclose(there, clip.positions, atol=1e-5)
+
+
+def test_gaps_stay_where_motion_is_resampled_or_divided():
+    whole, half = GAPS.divided(0.3), GAPS.resampled(WALKER.fps / 2)
+    assert whole.missing
+    assert half.missing
+    assert sum(np.isnan(clip.positions).sum() for clip in whole) == sum(np.isnan(clip.positions).sum() for clip in GAPS)
+    doubled = GAPS.resampled(2 * WALKER.fps)  # its even frames are those that were there
+    for clip, slow, fast in zip(GAPS, half, doubled, strict=True):
+        np.testing.assert_array_equal(slow.positions, clip.positions[::2])
+        np.testing.assert_array_equal(fast.positions[::2], clip.positions)
+
+
+def test_turns_are_refused_where_joints_lack():
+    turned = replace(motion.PROTOCOLS["simulated"], representation="6d")
+    with pytest.raises(ValueError, match="lacks joints, without which their turns are not known"):
+        motion.windows(GAPS, turned, "train")
+    found = replace(PEOPLE.with_rotations(), missing=True)
+    batch = motion.windows(found, turned, "test").all()
+    with pytest.raises(ValueError, match="leaves the turns of others open"):
+        motion.windows(found, turned, "test").schema.view({**batch, "mask": {"x": batch["mask"]}})
+    futures = motion.Forecasts(WALKER, [("a", "b", 0)], *_future_with_gaps())
+    assert futures.motion().missing
+    with pytest.raises(ValueError, match="fill its gaps first"):
+        motion.write_motion("futures.bvh", futures.motion(), "bvh")
+
+
+def _future_with_gaps():
+    """Forecasts, what was observed of them, and the truth."""
+    clip, gaps = PEOPLE.clips[0].positions, without(PEOPLE, LElbow=slice(3, 30), RKnee=slice(25, 40)).clips[0].positions
+    return clip[None, None, 10:40], gaps[None, :10], gaps[None, 10:40]
 
 
 def test_rotations_need_whole_bodies():
@@ -247,6 +298,35 @@ def test_scores_are_of_what_was_observed(score):
     torch.testing.assert_close(found, different)
 
 
+def test_a_diversity_with_gaps_is_that_of_what_pairs_share():
+    """Futures that lie equally far apart in all numbers have the same diversity, whatever is missing."""
+    samples, truths = torch.randn(4, 6, 5).double(), torch.arange(3.0).double()[:, None, None].expand(3, 6, 5)
+    gaps = torch.where(torch.rand(3, 6, 5) < 0.7, truths, torch.nan)
+    found = metrics.average_pairwise_distance_error(samples, gaps)
+    torch.testing.assert_close(found, metrics.average_pairwise_distance_error(samples, truths))
+    gaps[0], gaps[1:, 0] = torch.nan, truths[1:, 0]
+    gaps[1, 1:], gaps[2] = torch.nan, torch.nan
+    assert metrics.average_pairwise_distance_error(samples, gaps).isnan()  # no two share anything
+
+
+def test_scores_of_bodies_are_of_what_was_observed():
+    """Whoever foresees the truth errs in nothing, whatever of it was seen."""
+    whole, gaps = (motion.windows(each, motion.PROTOCOLS["simulated"], "test") for each in (PEOPLE, GAPS))
+    assert whole.keys == gaps.keys
+    past = gaps.protocol.observed
+    listed = gaps.all()
+    observed = {name: value[:, :past] for name, value in listed.items()}
+    args = whole.all()["x"][:, None, past:], gapped(listed)[:, past:], observed, torch.arange(len(gaps))
+    measures = {measure.name: measure for measure in motion.scores(gaps)}
+    assert "CMD" in {measure.name for measure in motion.scores(whole)} - measures.keys()
+    assert any("CMD" in measure.note for measure in measures.values())
+    errors = [name for name in measures if name.startswith("limb") or name in ("ADE", "FDE", "bone-length error")]
+    assert len(errors) == 8
+    for name in errors:
+        assert measures[name].function(*args).abs().max() < (0.1 if "angle" in name else 1e-4), name
+    assert measures["limb stretch"].function(1.1 * args[0], *args[1:]).sub(0.1).abs().max() < 1e-4
+
+
 def test_energies_are_of_what_was_observed():
     samples, truth = torch.randn(3, 2, 6, 48).double(), torch.randn(2, 6, 48).double()
     seen = torch.rand(2, 6, 48) < 0.8
@@ -337,6 +417,37 @@ def test_a_best_of_many_is_that_of_observed_places():
     assert (found[2]["reconstruction"] != found[1]["reconstruction"]).all()
 
 
+@pytest.mark.parametrize("name", ["gsps", "hit-dvae"])
+def test_exact_bones_need_both_ends(name):
+    data, method = small(name)
+    method = replace(method, bones=True)
+    torch.manual_seed(0)
+    model = method.build(data.schema)
+    with pytest.raises(ValueError, match=r"directions of bones, of which both ends have to be there.*bones=False"):
+        dvae.SequenceELBO().terms(model, data.windows("train").sample(3, torch.Generator().manual_seed(1)))
+
+
+# ------------------------------------------------------------------------------------------------------- what is shown
+
+
+def test_players_and_films_have_gaps(tmp_path):
+    """A joint that is missing is nowhere; all others are where they are in whole motion, in both."""
+    samples, observed, truth = (each[:, 0] if each.ndim == 5 else each[0] for each in _future_with_gaps())
+    stage = staged(WALKER, observed, samples, truth, every=1)
+    gaps = np.isnan(np.concatenate([observed, truth])).any(-1)
+    assert np.array_equal(np.isnan(stage.motion[0]).any(-1), gaps)
+    scene = _scene(stage)
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(scene["packed"])), np.uint8).reshape(2, -1).astype(np.int32)
+    steps = (planes[0] | planes[1] << 8).reshape(-1, WALKER.joints, 3)
+    assert [person["frames"] for person in scene["people"]] == [30, 30]
+    person = np.cumsum(steps[:40], 0).astype(np.int16)
+    assert np.array_equal((person == MISSING).any(-1), gaps)
+    np.testing.assert_allclose(scene["unit"] * person[~gaps], stage.motion[0][~gaps], atol=0.51 * scene["unit"])
+    save_film(tmp_path / "gaps.gif", WALKER, observed, samples, truth, every=10)
+    with pytest.raises(ValueError, match="NaN"):
+        staged(WALKER, observed, truth[None])
+
+
 # ----------------------------------------------------------------------------------------------------- the command line
 
 
@@ -358,6 +469,10 @@ def test_commands_take_gaps_from_fit_to_filling(tmp_path, capsys):
     assert np.isnan(futures.truth).any()
     assert np.isfinite(futures.forecasts).all()
     assert main(["animate", str(tmp_path / "f.npz"), "--out", str(tmp_path / "f.html")]) == 0
+
+    page = ["report", str(run), "--out", str(tmp_path / "r.html"), "--windows", "1", "--samples", "2"]
+    assert main([*page, "--bound-windows", "2", "--particles", "2"]) == 0
+    assert "cannot be shown" not in (tmp_path / "r.html").read_text()
 
     clip = GAPS.clips[-1]
     assert main(["impute", str(run), "--out", str(tmp_path / "i.npz"), "--clip", clip.name, "--samples", "3"]) == 0
