@@ -143,16 +143,16 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
 
 def extents(positions: np.ndarray) -> np.ndarray:
     """Of the body along each axis, (frames, 3), in those frames of (F, J, 3) that have the most joints."""
-    poses = fullest(positions).astype(np.float64)
-    found: np.ndarray = np.nanmax(poses, axis=1) - np.nanmin(poses, axis=1)
+    poses = fullest(positions)
+    found: np.ndarray = np.nanmax(poses, axis=1) - np.nanmin(poses, axis=1).astype(np.float64)
     return found
 
 
 def fullest(positions: np.ndarray) -> np.ndarray:
     """Those frames of (F, J, 3) that have the most joints."""
     there = (~np.isnan(positions).any(axis=2)).sum(axis=1)
-    found: np.ndarray = positions[there == there.max()]
-    return found
+    full: np.ndarray = there == there.max()
+    return positions if full.all() else positions[full]  # a copy only where it is another
 
 
 @dataclass(frozen=True, eq=False)

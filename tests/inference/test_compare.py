@@ -521,7 +521,7 @@ def test_ragged_windows_are_refused_before_any_bound_is_computed():
         description={},
         all=lambda: {**windows.all(), "lengths": torch.full((4,), T)},
     )
-    with pytest.raises(ValueError, match="complete windows, but these have lengths"):
+    with pytest.raises(ValueError, match="windows of one length, but these have lengths"):
         run({"a": recurrent()}, ragged, samples=2)
 
 

@@ -499,7 +499,6 @@ def test_nothing_is_suggested_where_nothing_is_near(capsys):
     ("arguments", "end"),
     [
         ("forecast RUN --out f.txt", ".npz"),
-        ("forecast RUN --out futures", ".npz"),
         ("complete RUN --out f.json", ".npz"),
         ("evaluate RUN --out scores.csv", ".json"),
         ("criticise RUN --out f.npz", ".json"),
