@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import fields, make_dataclass
+from dataclasses import dataclass, fields, make_dataclass, replace
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 import tyro
 from joblib import parallel_config
@@ -75,14 +75,36 @@ else:
     SweepOptions = _options("SweepOptions", Training, DEFAULT, "self_feeding", "progress", "seed", "devices")
 
 
+@dataclass(frozen=True)
+class DataOptions:
+    """Motion data to fit to.
+
+    Args:
+        data: a motion file or a folder of them, or "simulated".
+        protocol: how windows are cut, by default as suits the skeleton.
+        representation: what the model sees: positions; or turns of joints in this form, and bones then keep their
+            lengths.
+        skip_bad: leave out clips that cannot be used instead of refusing the file.
+        missing: keep clips that lack joints, which are NaN where they were not observed.
+    """
+
+    data: str = SIMULATED
+    protocol: ProtocolName | None = None
+    representation: Literal["positions", "6d", "quaternion", "vector"] = "positions"
+    skip_bad: bool = False
+    missing: bool = False
+
+    def open(self) -> MotionData:
+        """The clips under their protocol."""
+        found = MotionData.open(self.data, self.protocol, self.skip_bad, self.missing)
+        return replace(found, protocol=replace(found.protocol, representation=self.representation))
+
+
 def fit(
     method: MethodChoice,
     out: Path,
     training: TrainingOptions,
-    data: str = SIMULATED,
-    protocol: ProtocolName | None = None,
-    skip_bad: bool = False,
-    missing: bool = False,
+    source: DataOptions,
     tensorboard: bool = False,
 ) -> None:
     """Fit a method, or equations of your own, to motion data.
@@ -93,10 +115,7 @@ def fit(
         method: what to fit.
         out: the run directory.
         training: options of the run.
-        data: a motion file, or "simulated".
-        protocol: how windows are cut, by default as suits the skeleton.
-        skip_bad: leave out clips that cannot be used instead of refusing the file.
-        missing: keep clips that lack joints, which are NaN where they were not observed.
+        source: the motion data.
         tensorboard: write TensorBoard files to the run directory too.
     """
     if out.is_file():
@@ -106,7 +125,7 @@ def fit(
     with arguments():
         method.check()  # wrong equations and options are found before the data are read
         how = Training(**vars(training))
-    opened = MotionData.open(data, protocol, skip_bad, missing)
+    opened = source.open()
     with _reported():
         _report(runs.fit_run(method, opened, out, how, trackers=[TensorBoard(out)] if tensorboard else []))
 
@@ -142,12 +161,9 @@ def sweep(
     out: Path,
     model: MethodOptions,
     training: SweepOptions,
+    source: DataOptions,
     seeds: tuple[int, ...] = (0, 1, 2),
     latent: tuple[int, ...] = (),
-    data: str = SIMULATED,
-    protocol: ProtocolName | None = None,
-    skip_bad: bool = False,
-    missing: bool = False,
     jobs: int = 2,
     scheduler: str | None = None,
 ) -> None:
@@ -160,12 +176,9 @@ def sweep(
         out: directory of the run directories, such as srnn-seed0, or srnn-z8-seed0 where sizes differ.
         model: options of all methods, in place of their defaults.
         training: options of the runs.
+        source: the motion data.
         seeds: of initial weights, batches and draws; a run for each.
         latent: sizes of z; a run for each.
-        data: a motion file, or "simulated".
-        protocol: how windows are cut, by default as suits the skeleton.
-        skip_bad: leave out clips that cannot be used instead of refusing the file.
-        missing: keep clips that lack joints, which are NaN where they were not observed.
         jobs: runs at a time.
         scheduler: address of a dask scheduler, such as tcp://host:8786, whose workers fit the runs in place of --jobs.
     """
@@ -181,7 +194,7 @@ def sweep(
         for each in chosen:
             each.check()
         how = Training(**vars(training))
-    opened = MotionData.open(data, protocol, skip_bad, missing)
+    opened = source.open()
     with nullcontext() if scheduler is None else _cluster(scheduler):
         results = sweep_methods(chosen, opened, out, seeds, how, jobs)
     if failed := [result for result in results if result.status == "failed"]:

@@ -568,3 +568,15 @@ def test_ctrl_c_leaves_a_run_that_resumes(people, tmp_path):
     assert stopped["status"] == "interrupted"
     assert main(["resume", str(run), "--steps", str(stopped["step"] + 5)]) == 0
     assert json.loads((run / "state.json").read_text())["step"] == stopped["step"] + 5
+
+
+def test_a_model_of_turns_forecasts_bones_of_one_length(people, tmp_path, capsys):
+    fit = ["fit", "vae", "--data", str(people), "--representation", "6d", "--steps", "5", *SMALL]
+    assert main([*fit, "--out", str(tmp_path / "run")]) == 0
+    out = str(tmp_path / "f.npz")
+    assert main(["forecast", str(tmp_path / "run"), "--samples", "2", "--horizon", "4", "--out", out]) == 0
+    futures = motion.Forecasts.load(out)
+    lengths = futures.skeleton.bone_lengths(futures.forecasts)
+    np.testing.assert_allclose(lengths, lengths[:1, :, :1].repeat(2, 0).repeat(4, 2), atol=1e-5)
+    other = ["fit", "gsps", "--data", str(people), "--representation", "6d", "--out", str(tmp_path / "other")]
+    assert "gsps reads positions of joints" in failure(capsys, *other, "--steps", "2")
