@@ -115,7 +115,7 @@ def _meant(given: Sequence[str]) -> Iterator[str]:
     name, *rest = given
     hints = get_type_hints(called)
     if name in ("fit", "sweep"):
-        for kind in (hints["training"], *methods().values()):
+        for kind in (hints["training"], hints["source"], *methods().values()):
             hints = get_type_hints(kind) | hints
     choices = {option: _choices(hint) for option, hint in hints.items()}
     names = {"fit": [*methods(), *judges()], "sweep": choices.get("method"), "data": choices.get("action")}.get(name)
