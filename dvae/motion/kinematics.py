@@ -10,10 +10,10 @@ little as possible against its parent.
 from collections.abc import Sequence
 from itertools import pairwise
 
-import roma
 import torch
 from torch import Tensor
 
+from .rotations import procrustes
 from .skeleton import Skeleton, rotate_about_up
 
 TIE = 1e-6
@@ -70,7 +70,7 @@ def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
         if below:
             rest = torch.nn.functional.normalize(offsets[below], dim=-1)
             seen = torch.nn.functional.normalize(positions[..., below, :] - positions[..., joint, None, :], dim=-1)
-            found = roma.special_procrustes(seen.transpose(-1, -2) @ rest + TIE * above)
+            found = procrustes(seen.transpose(-1, -2) @ rest + TIE * above)
             world[joint] = _swing(found @ rest[0], seen[..., 0, :]) @ found if len(below) == 1 else found
         local[joint] = above.transpose(-1, -2) @ world[joint]
     return torch.stack([local[joint] for joint in range(skeleton.joints)], -3)
@@ -111,7 +111,7 @@ def rest(skeleton: Skeleton, positions: Tensor, rounds: int = 10) -> Tensor:
         if len(below) > 1:
             seen = positions[:, below] - positions[:, joint, None]
             for _ in range(rounds):
-                turn = roma.special_procrustes(seen.transpose(-1, -2) @ found[below])
+                turn = procrustes(seen.transpose(-1, -2) @ found[below])
                 found[below] = (seen @ turn).mean(0)
     lengths = positions.new_zeros(skeleton.joints)
     lengths[joints] = skeleton.bone_lengths(positions).mean(0)

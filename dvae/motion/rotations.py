@@ -1,7 +1,8 @@
 """Rotations in the forms that files and models use, to and from matrices.
 
 Everything is right-handed, acts on columns, is batched over leading dimensions and differentiable; the conversions are
-roma's (Brégier 2021, arXiv 2103.16317), whose gradients are finite at no turn and at half a turn too.
+roma's (Brégier 2021, arXiv 2103.16317), whose gradients are finite at no turn and at half a turn too. It takes as long
+to import as torch does, so that it is imported where something is turned.
 
 | form | numbers | |
 |---|---|---|
@@ -14,7 +15,6 @@ roma's (Brégier 2021, arXiv 2103.16317), whose gradients are finite at no turn 
 
 import re
 
-import roma
 import torch
 from torch import Tensor
 
@@ -48,6 +48,8 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
         raise ValueError(f"a rotation as {form} has {size(form)} numbers, got {tuple(values.shape)}")
     if form == "matrix":
         return values.unflatten(-1, (3, 3))
+    import roma
+
     if form == "quaternion":
         return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(values, dim=-1)))
     if form == "vector":
@@ -70,12 +72,14 @@ def from_matrix(rotations: Tensor, form: str) -> Tensor:
         raise ValueError(f"not every rotation is one as {form}; expected three axes, no two alike in a row")
     if form == "matrix":
         return rotations.flatten(-2)
+    if form == "6d":
+        return rotations[..., :2].transpose(-1, -2).flatten(-2)
+    import roma
+
     if form == "quaternion":
         return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(rotations))
     if form == "vector":
         return roma.rotmat_to_rotvec(rotations)
-    if form == "6d":
-        return rotations[..., :2].transpose(-1, -2).flatten(-2)
     return roma.rotmat_to_euler(form[-3:].upper(), rotations)
 
 
@@ -92,3 +96,11 @@ def continuous(quaternions: Tensor, dim: int = -3) -> Tensor:
         opposite[:1] = False  # the first has none before it
         signs = 1 - 2 * (opposite.cumsum(0) % 2).movedim(0, dim).to(quaternions.dtype)
     return quaternions * signs
+
+
+def procrustes(products: Tensor) -> Tensor:
+    """The rotations (..., 3, 3) nearest to matrices: of targets times sources, those that turn these onto those."""
+    import roma
+
+    found: Tensor = roma.special_procrustes(products)
+    return found
