@@ -2,7 +2,8 @@
 
 A batch is a dict of tensors with one sequence in each row. Local variables are (B, T, D), static ones (B, D); "lengths"
 (B,) counts the valid frames of right-padded sequences, and "mask" (B, T, D) is True where an entry of the observed
-variable was observed (or maps several such names to masks).
+variable was observed (or maps several such names to masks). "beside" maps names to what some views read, as the turns
+of joints beside their positions; any other model passes over it.
 
 | who | asks for |
 |---|---|
@@ -25,6 +26,8 @@ from torch import Tensor
 from typing_extensions import Protocol, runtime_checkable  # typing's own, in Python 3.11, evaluates properties
 
 Batch = Mapping[str, Any]
+BESIDE = "beside"
+"""Name in batches of what some views read beside the data, and no other model."""
 
 
 @runtime_checkable

@@ -41,6 +41,11 @@ class Schema:
         """What models see of the data."""
         return View()
 
+    @property
+    def windows(self) -> Schema:
+        """The schema of the same data where models see them as they are; runs that share it can be judged together."""
+        return self
+
     @classmethod
     def of(cls, data: Any, who: str = "this method") -> Self:
         """The schema of data.

@@ -13,6 +13,7 @@ from ..models.registry import judges
 from ..options import flat
 from ..runs import directory as runs
 from ..runs.sweep import ENDED
+from ..views import View
 from .console import UsageError, note
 
 
@@ -27,12 +28,16 @@ def load_run(path: Path, data: str | None) -> runs.Loaded:
 
 
 def data_of(path: str | None, *shared: runs.Loaded, missing: bool = False) -> Any:
-    """The data of runs of one schema or, where a path leads to others, these under the protocol of the runs."""
+    """The data of runs of one schema or, where a path leads to others, these under the protocol of the runs.
+
+    With them comes what any of the runs sees of them.
+    """
+    most = next((run for run in shared if type(run.schema.view) is not View), shared[0])
     if path is None:
-        if missing and not shared[0].data.motion.missing:
+        if missing and not most.data.motion.missing:
             raise UsageError("--missing is about other data (--data); those of the run have no joint missing")
-        return shared[0].data
-    found = shared[0].on(path, **({"missing": True} if missing else {}))
+        return most.data
+    found = most.on(path, **({"missing": True} if missing else {}))
     for run in shared:
         if not own(run, found):
             note(f"{path} is not the data that {run.path} was fitted on")
@@ -55,7 +60,7 @@ def alike(paths: Sequence[Path], path: str | None) -> list[runs.Loaded]:
     loaded = [load_run(each, path) for each in paths]
     first = loaded[0]
     for other in loaded[1:]:
-        if not (other.alike(first) if path is None else other.schema == first.schema):
+        if not (other.alike(first) if path is None else other.schema.windows == first.schema.windows):
             there, here = (f"{run.config.data.path}, {run.schema.protocol.name}" for run in (other, first))
             raise ValueError(
                 f"{other.path} has other test windows ({there}) than {first.path} ({here}); give runs of the same data "

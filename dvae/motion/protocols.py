@@ -21,7 +21,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import asdict, astuple, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field, replace
 from math import pi
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from ..data import BESIDE
 from ..options import Amount, Frames, Range, check, nearest, tuples
 from ..schema import Schema, SchemaError
 from ..views import View
@@ -190,6 +191,12 @@ class Poses(Schema):
     @override
     def view(self) -> View:
         return self._view(self.protocol, self.skeleton)
+
+    @property
+    @override
+    def windows(self) -> Poses:
+        protocol, skeleton = replace(self.protocol, representation="positions"), replace(self.skeleton, rest=())
+        return self.under(protocol, skeleton, self.length)
 
     @property
     def frames(self) -> int:
@@ -355,7 +362,7 @@ class Windows:
         """Numbers per frame, D = 3 J, or 3 (J - 1) without the root."""
         return 3 * len(self.joints)
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
+    def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Any]:
         """Draw windows with replacement, as the protocol's `sampling` says: {"x": (B, T, D)} float32.
 
         Of a set that may lack joints there is a "mask" too, see `all`. The same generator state gives the same windows.
@@ -370,10 +377,10 @@ class Windows:
             x = rotate_about_up(joints, angle, self.skeleton.up).flatten(-2)
         batch = self._batch(x, clips, generator)
         if self._turns is not None:
-            batch[TURNS] = self._turned(clips, starts, angle if self.protocol.rotate else None)
+            batch[BESIDE] = {TURNS: self._turned(clips, starts, angle if self.protocol.rotate else None)}
         return batch
 
-    def all(self, stride: int | None = None) -> dict[str, Tensor]:
+    def all(self, stride: int | None = None) -> dict[str, Any]:
         """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32.
 
         Of a set that may lack joints there is a "mask" too, (N, T, D), False where nothing was observed; x is 0 there.
@@ -386,7 +393,7 @@ class Windows:
             x[block] = self._cut(clips[block], starts[block])
         batch = self._batch(x, clips, torch.Generator().manual_seed(0))
         if self._turns is not None:
-            batch[TURNS] = self._turned(clips, starts)
+            batch[BESIDE] = {TURNS: self._turned(clips, starts)}
         return batch
 
     def poses(self) -> Tensor:
@@ -491,7 +498,7 @@ class Windows:
         windows.protocol = protocol
         return windows
 
-    def _batch(self, x: Tensor, clips: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+    def _batch(self, x: Tensor, clips: Tensor, generator: torch.Generator) -> dict[str, Any]:
         """Windows with what is to go with them."""
         seen, x = x.isfinite(), x.nan_to_num(0.0)
         batch = {"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}}

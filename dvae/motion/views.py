@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ..data import Batch
+from ..data import BESIDE, Batch
 from ..networks.base import valid_steps
 from ..views import WHOLE, View
 from . import kinematics
@@ -22,7 +22,7 @@ HEADING = "heading"
 LENGTHS = "bone_lengths"
 """Name in batches of the lengths (B, J - 1) of windows' bones, in metres, in the order of `Skeleton.edges`."""
 TURNS = "turns"
-"""Name in batches of the turns (B, T, 4 J) of all joints, quaternions w x y z one after the other."""
+"""Name beside windows of the turns (B, T, 4 J) of all joints, quaternions w x y z one after the other."""
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,7 @@ class Rotations(View):
     skeleton: Skeleton
     form: str = "6d"
     root: bool = False
-    names = (TURNS, LENGTHS)
+    names = (LENGTHS,)
 
     def __post_init__(self) -> None:
         size(self.form)
@@ -285,7 +285,6 @@ class Rotations(View):
     @override
     def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
         seen = dict(data)
-        turns = seen.pop(TURNS, None)
         if WHOLE not in data or LENGTHS in data:
             return seen
         x, skeleton = data[WHOLE], self.skeleton
@@ -300,6 +299,7 @@ class Rotations(View):
                 "positions, which may be masked"
             )
         positions = skeleton.with_root(x.unflatten(-1, (-1, 3)))
+        turns = data.get(BESIDE, {}).get(TURNS)
         if turns is None:
             found = kinematics.inverse(skeleton, positions, skeleton.offsets.to(x))[..., self.turning, :, :]
         else:

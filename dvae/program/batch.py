@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..data import Batch
+from ..data import BESIDE, Batch
 from ..networks.base import valid_steps
 from ..notation import Factorization
 from ..views import LOG_DET, WHOLE, View
@@ -66,7 +66,9 @@ class Reader:
             if len(self.observed) > 1 and not self.view.parts:
                 raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
             batch = {whole: batch}
-        if unknown := [name for name in batch if name not in (*names, *self.extras, "lengths", "mask", LOG_DET)]:
+        if unknown := [
+            name for name in batch if name not in (*names, *self.extras, "lengths", "mask", LOG_DET, BESIDE)
+        ]:
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
             )
@@ -77,6 +79,7 @@ class Reader:
             for name, seen in masks.items():
                 self._check_mask(name, seen, values)
         seen = self.view(values)
+        seen.pop(BESIDE, None)
         if self.density and whole in values and LOG_DET not in values and not self.view.keeps_volume:
             seen[LOG_DET] = self.view.counted(values)
         seen = {name: value for name, value in seen.items() if name in values or name not in self.made}

@@ -94,8 +94,9 @@ class Loaded:
         return opened(self.path, self.config.kind, self.config.data, self.schema, self.where)
 
     def alike(self, other: Loaded) -> bool:
-        """Whether another run was fitted on the same data, under the same schema."""
-        return (self.config.data.fingerprint, self.schema) == (other.config.data.fingerprint, other.schema)
+        """Whether another run was fitted on the same windows of the same data, whatever the models see of them."""
+        data, others = self.config.data.fingerprint, other.config.data.fingerprint
+        return bool(data == others and self.schema.windows == other.schema.windows)
 
     def on(self, path: str | os.PathLike[str], **read: Any) -> Any:
         """Other data of the same kind, under the run's schema.

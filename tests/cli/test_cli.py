@@ -580,3 +580,39 @@ def test_a_model_of_turns_forecasts_bones_of_one_length(people, tmp_path, capsys
     np.testing.assert_allclose(lengths, lengths[:1, :, :1].repeat(2, 0).repeat(4, 2), atol=1e-5)
     other = ["fit", "gsps", "--data", str(people), "--representation", "6d", "--out", str(tmp_path / "other")]
     assert "gsps reads positions of joints" in failure(capsys, *other, "--steps", "2")
+
+
+def test_motion_is_the_same_in_every_format_and_to_models_of_everything(people, tmp_path, capsys):
+    """Runs on BVH files and on an npz of the same motion, of models of positions and of turns, in one table."""
+    folder, npz, runs = tmp_path / "bvh", tmp_path / "all.npz", {}
+    motion.write_motion(folder, motion.read_motion(people), "bvh")
+    motion.save(npz, motion.read_motion(folder))
+    for data in (folder, npz):
+        for form in ("positions", "6d"):
+            runs[data, form] = str(tmp_path / f"{data.stem}-{form}")
+            fit = ["fit", "srnn", "--data", str(data), "--representation", form, "--steps", "5", *SMALL]
+            assert main([*fit, "--out", runs[data, form]]) == 0
+
+    def table(*arguments):
+        out = tmp_path / "evaluation.json"
+        assert main(["evaluate", *arguments, "--samples", "3", "--out", str(out)]) == 0
+        return dvae.inference.evaluation.Evaluation.load(out)
+
+    forms = table(runs[npz, "positions"], runs[npz, "6d"])
+    assert any("bounds of all-6d: densities of turns" in note for note in forms.notes)
+    for form in ("positions", "6d"):
+        alone = table(runs[npz, form])
+        assert alone["srnn"] == forms[f"all-{form}"]
+        for other in (table(runs[folder, form]), table(runs[npz, form], "--data", str(folder))):
+            assert "srnn" in other.rows
+            for row in other.rows:  # neighbours are those in a run's own data alone
+                assert {name: score.mean for name, score in other[row].items()} == pytest.approx(
+                    {name: score.mean for name, score in alone[row].items()}, rel=1e-4, abs=1e-6
+                )
+    capsys.readouterr()
+    assert "bounds compare where they are densities of the same" in failure(
+        capsys, "compare", runs[npz, "positions"], runs[npz, "6d"]
+    )
+    page = tmp_path / "page.html"
+    assert main(["report", runs[npz, "positions"], runs[npz, "6d"], "--windows", "1", "--out", str(page)]) == 0
+    assert page.read_text(encoding="utf-8").count("<canvas") == 2
