@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
+from ...inference.result import progress_bar
 from ..data import Clip, MotionSet
 from ..skeleton import Skeleton, brief
 from .bvh import write_bvh
@@ -156,14 +157,15 @@ def convert(
     results = work(delayed(_converted)(reader, file, out, format, skip_bad) for file in files)
 
     def clips() -> Iterator[Clip]:
-        for file, result in zip(files, results, strict=True):
-            reason = result if isinstance(result, str) else collected.add(file.path, *result)
-            if reason and not skip_bad:
-                raise ValueError(reason)
-            if reason:
-                skipped.append(reason)
-            else:
-                yield result[0]
+        with progress_bar(True) as bar:
+            for file, result in bar.track(zip(files, results, strict=True), len(files), description="clips"):
+                reason = result if isinstance(result, str) else collected.add(file.path, *result)
+                if reason and not skip_bad:
+                    raise ValueError(reason)
+                if reason:
+                    skipped.append(reason)
+                else:
+                    yield result[0]
 
     if format == "npz":
         save_clips(out, clips(), lambda: collected.skeleton)
