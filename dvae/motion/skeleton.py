@@ -38,15 +38,10 @@ def read_text(path: Path) -> str:
     """What a text file holds.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        OSError: there is no such file.
         ValueError: it is larger than any of this kind, or no UTF-8.
     """
-    if not path.is_file():  # nor a pipe, which would never end
-        raise FileNotFoundError(f"{path}: no such file")
-    with path.open("rb") as file:
-        content = file.read(MOST_TEXT + 1)
-    if len(content) > MOST_TEXT:
-        raise ValueError(f"{path}: it has more than {MOST_TEXT:,} bytes, which no skeleton, labels or paths take")
+    content = files.read(path, MOST_TEXT, links=True)
     try:
         return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig").read()
     except UnicodeDecodeError as error:

@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 import pytest
+import roma  # noqa: F401, it makes folders as it is imported, which what is watched must not
 from hypothesis import strategies as st
 
 from dvae.motion import MotionSet, read_motion, simulate, write_motion

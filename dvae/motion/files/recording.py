@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
+from ... import files
 from ..kinematics import forward
 from ..rotations import continuous, from_matrix
 from ..skeleton import MOST_JOINTS, Skeleton
@@ -73,16 +74,10 @@ def read_lines(path: Path) -> list[str]:
     """The lines of a text file, in any of the encodings that motion files come in.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        OSError: there is no such file.
         ValueError: it is larger than any of this kind.
     """
-    if not path.is_file():  # nor a pipe, which would never end
-        raise FileNotFoundError(f"{path}: no such file")
-    with path.open("rb") as file:
-        content = file.read(MOST_TEXT + 1)
-    if len(content) > MOST_TEXT:
-        raise ValueError(f"{path}: it has more than {MOST_TEXT:,} bytes; cut the recording")
-    return content.decode("utf-8-sig", errors="replace").splitlines()
+    return files.read(path, MOST_TEXT, links=True).decode("utf-8-sig", errors="replace").splitlines()
 
 
 def numbers(text: str, where: str) -> np.ndarray:
