@@ -1,11 +1,11 @@
 """Recordings that somebody else made, of every format: read right, or refused in a sentence, whatever is in them."""
 
 import shutil
-import struct
 
 import numpy as np
 import pytest
 import roma  # noqa: F401, it makes folders as it is imported, which what is watched must not
+from c3d import write_c3d
 from hypothesis import strategies as st
 
 from dvae.motion import MotionSet, read_motion, simulate, write_motion
@@ -48,29 +48,8 @@ def amass(folder):
 
 
 def c3d(folder):
-    """Written by the letter of the format: a header, a group of parameters, three markers in four frames."""
-    labels, frames = [b"HEAD", b"HIP ", b"FOOT"], 4
-
-    def parameter(name, kind, sizes, content):
-        body = struct.pack("<bB", kind, len(sizes)) + bytes(sizes) + content + b"\0"
-        return struct.pack("<bb", len(name), 1) + name + struct.pack("<h", len(body) + 2) + body
-
-    group = struct.pack("<bb", 5, -1) + b"POINT" + struct.pack("<h", 3) + b"\0"
-    parameters = [
-        parameter(b"USED", 2, [], struct.pack("<h", 3)),
-        parameter(b"FRAMES", 2, [], struct.pack("<h", frames)),
-        parameter(b"SCALE", 4, [], struct.pack("<f", -1.0)),
-        parameter(b"RATE", 4, [], struct.pack("<f", 100.0)),
-        parameter(b"DATA_START", 2, [], struct.pack("<h", 3)),
-        parameter(b"UNITS", -1, [2, 1], b"mm"),
-        parameter(b"LABELS", -1, [4, 3], b"".join(labels)),
-        parameter(b"DESCRIPTIONS", -1, [1, 3], b"   "),
-    ]
-    block = b"\x01\x50\x01\x54" + group + b"".join(parameters) + b"\0\0"
-    head = struct.pack("<BB5HfHHf", 2, 0x50, 3, 0, 1, frames, 0, -1.0, 3, 0, 100.0)
-    places = [(0, 0, 1700, 0), (10, 0, 900, 0), (0, 20, 10, 0)]
-    data = b"".join(struct.pack("<4f", x + frame, y, z, 0) for frame in range(frames) for x, y, z, _ in places)
-    (folder / "a.c3d").write_bytes(head.ljust(512, b"\0") + block.ljust(512, b"\0") + data.ljust(512, b"\0"))
+    places = [[(0, 0, 1700, 0), (10, 0, 900, 0), (0, 20, 10, 0)]] * 4
+    write_c3d(folder / "a.c3d", ["HEAD", "HIP", "FOOT"], np.add(places, [[[n, 0, 0, 0]] for n in range(4)]))
 
 
 SAMPLES = {"bvh": (bvh, "a.bvh"), "amc": (amc, "a.amc"), "asf": (amc, "a.asf"), "expmap": (expmap, "a.txt")}

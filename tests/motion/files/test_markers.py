@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from c3d import write_c3d
 
 from dvae.motion import read_motion
 from dvae.motion.files.markers import read_c3d, tree
@@ -25,6 +26,21 @@ def test_markers_are_what_ezc3d_writes(tmp_path):
     expected = places[:, [names.index(name) for name in read.names]]
     np.testing.assert_allclose(read.positions, expected, atol=1e-3)  # single precision
     assert read_motion(tmp_path / "a.c3d").skeleton.up == "z"
+
+
+def test_markers_that_were_not_seen_are_gaps(tmp_path):
+    random, names = np.random.default_rng(0), ["HEAD", "HIP", "LFT", "RFT"]
+    rest = np.array([[0, 0, 1700.0], [0, 0, 900], [100, 0, 10], [-100, 0, 10]])
+    places = rest + random.normal(0, 5, (7, 4, 3))
+    unseen = np.zeros((7, 4), bool)
+    unseen[2:5, 0], unseen[6, 3] = True, True
+    write_c3d(tmp_path / "a.c3d", names, np.concatenate([places, -unseen[..., None].astype(float)], 2))
+    with pytest.raises(ValueError, match=r"has NaN.*missing=True \(--missing\) keeps the clip"):
+        read_motion(tmp_path / "a.c3d")
+    found = read_motion(tmp_path / "a.c3d", missing=True)
+    order = [names.index(name) for name in found.skeleton.names]
+    expected = np.where(unseen[..., None], np.nan, places / 1000)[:, order]
+    np.testing.assert_allclose(found.clips[0].positions, expected, atol=1e-6)
 
 
 def test_markers_hang_from_those_that_move_with_them():
