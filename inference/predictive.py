@@ -13,6 +13,9 @@ guide that has seen the future too, and weighted:
 
 The mean of K weights is unbiased for F, so that its logarithm is on average at most log F: it errs to the side of a
 worse score, by the less the more particles there are, and not at all where both guides are posteriors.
+
+Where entries are missing, the density is that of the observed ones: x_{O+1:T} and x_{1:O} are what was observed of
+them. A model that reads its own past reads its means in gaps, as in the bounds.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from ..data import each
 from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
@@ -48,8 +52,8 @@ def predictive_bound(
         The bound in nats a sequence, and the shape of the weights' tail, (B,) each.
 
     Raises:
-        ValueError: a model without likelihood or with forecasts of its own, a ragged batch, missing entries, or nothing
-            observed or to predict.
+        ValueError: a model without likelihood or with forecasts of its own, a ragged batch, or nothing observed or to
+            predict.
     """
     require_likelihood(model)
     if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
@@ -58,8 +62,8 @@ def predictive_bound(
         )
     data = model.read(batch)
     size, length = data[model.observed[0]].shape[:2]
-    if partial := {"lengths", "mask"} & data.keys():
-        raise ValueError(f"a log score needs complete sequences, but these have {', '.join(sorted(partial))}")
+    if "lengths" in data:
+        raise ValueError("a log score needs sequences of one length, but these have lengths")
     if particles < 1 or not 0 < observed < length:
         raise ValueError(
             f"expected at least 1 particle, and observed frames from 1 to {length - 1}; got {particles} and {observed}"
@@ -70,7 +74,7 @@ def predictive_bound(
             "the view changes the volume of whole sequences, and what of that is due to the future is not known; leave "
             "the log score out, or give the view a log_det by entry, (B, T, D)"
         )
-    past = {n: v[:, :observed] if v.dim() == 3 else v for n, v in data.items()}
+    past = each(data, lambda value: value[:, :observed] if value.dim() == 3 else value)
 
     def log_weights(count: int) -> Tensor:
         whole = repeat(data, count)

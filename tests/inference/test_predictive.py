@@ -99,13 +99,32 @@ def test_with_exact_guides_one_particle_gives_the_exact_predictive_density():
     torch.testing.assert_close(predictive_bound(model, x, SEEN, 1).bound, exact, rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize(("pair", "last"), [(DKF, False), (DRIVEN, True)])
+def test_a_log_score_with_gaps_is_of_what_was_observed(pair, last):
+    """A marginal of the density of forecasts: exact where no x reads a gap, and the guide reads it as 0."""
+    model = wide(pair)
+    x, mask = draws(model, 1), torch.ones(1, T, 2).bool()
+    mask[0, -1, 0] = False
+    if not last:
+        mask[0, 1, 0] = mask[0, 2, 1] = mask[0, 3, 1] = False
+    mean, covariance = law(model, torch.where(mask, x, 0.0))
+    kept = mask[0, SEEN:].flatten()
+    marginal = torch.distributions.MultivariateNormal(mean[:, kept], covariance[kept][:, kept])
+    exact = marginal.log_prob(x[:, SEEN:].flatten(1)[:, kept])
+    batch = {"x": torch.where(mask, x, torch.nan).expand(2000, -1, -1), "mask": mask.expand(2000, -1, -1)}
+    ratios = (predictive_bound(model, batch, SEEN, 8).bound - exact).exp()
+    error = ratios.std() / math.sqrt(2000)
+    assert abs(ratios.mean() - 1) < 4 * error
+    assert error < 0.05
+
+
 def test_what_has_no_log_score():
     model = twin(*DKF, T)
     x = draws(model, 4)
     for observed, particles in ((0, 1), (T, 1), (2, 0)):
         with pytest.raises(ValueError, match="expected at least 1 particle, and observed frames from 1 to 4"):
             predictive_bound(model, x, observed, particles)
-    with pytest.raises(ValueError, match="complete sequences, but these have lengths"):
+    with pytest.raises(ValueError, match="sequences of one length, but these have lengths"):
         predictive_bound(model, {"x": x, "lengths": torch.full((4,), T)}, 2)
 
     class Own(DynamicalVAE):
