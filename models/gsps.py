@@ -33,6 +33,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from ..data import bridged, mask_of
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
 from ..inference.training import Stage
@@ -250,6 +251,25 @@ class GSPSModel(EnergyModel):
             found[f"diversity_{names[i]}"] = likeness.unflatten(0, (-1, size)).mean(0)
         return found
 
+    @override
+    def read(self, batch: AnyBatch | None) -> dict[str, Any]:
+        """The batch, whose observed frames have no gaps.
+
+        Ours: across a gap a joint goes straight from where it was to where it is next among the observed frames. One
+        that these never show is at its parent's place.
+        """
+        data = super().read(batch)
+        mask = data.get("mask", {}).get(HISTORY)
+        if mask is None or mask.all():
+            return data
+        past, seen = data[HISTORY][:, : self.frames], mask[:, : self.frames]
+        bridge, shown = (self.skeleton.with_root(x.unflatten(-1, (-1, 3))) for x in (bridged(past, seen), seen.any(1)))
+        for joint in self.skeleton.order[1:]:
+            above = bridge[..., self.skeleton.parents[joint], :]
+            bridge[..., joint, :] = torch.where(shown[:, None, joint], bridge[..., joint, :], above)
+        bridge = self.skeleton.without_root(bridge).flatten(-2)
+        return data | {HISTORY: torch.cat([bridge, data[HISTORY][:, self.frames :]], 1)}
+
     @torch.no_grad()
     @override
     def forecast(self, batch: AnyBatch, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
@@ -270,17 +290,29 @@ class GSPSModel(EnergyModel):
             name: value[:, :, :horizon] if name in (WHOLE, *self.observed) else value for name, value in out.items()
         }
 
+    @torch.no_grad()
     @override
     def impute(self, batch: AnyBatch, samples: int = 1, **options: Any) -> dict[str, Tensor]:
-        """Not of this model.
+        """Whole windows with their gaps filled in, S times, by the motion that is nearest to all that was observed.
+
+        There is no guide that reads what is behind a gap. Each filling is from as many draws as in training, of which
+        the best is what the model learns to have near the truth.
 
         Raises:
-            ValueError: always.
+            ValueError: a batch without a mask, or windows of another length than the networks make.
         """
-        raise ValueError(
-            "gsps has no guide: it draws motions from what was observed before the present alone, and reads nothing "
-            "behind a gap; forecast from a past with gaps, or fill them by a method whose guide reads x_{1:T}"
-        )
+        if not isinstance(batch, Mapping) or (mask := mask_of(batch)) is None:
+            return super().impute(batch, samples, **options)  # which says so
+        if (length := batch[WHOLE].shape[1]) != self.length:
+            raise ValueError(f"gsps fills gaps in windows of {self.length} frames, not {length}; cut the motion so")
+        filled, count = [], prod(self.draws.values())
+        for _ in range(samples):
+            made = self.reconstruct(batch, count, **options)[WHOLE]
+            given, seen = torch.as_tensor(batch[WHOLE]).to(made), torch.as_tensor(mask).to(made.device)
+            nearest = (made - given).square().masked_fill(~seen, 0.0).sum((2, 3)).argmin(0)
+            best = made.take_along_dim(nearest[None, :, None, None], 0)[0]
+            filled.append(torch.where(seen, given, best))
+        return {WHOLE: torch.stack(filled)}
 
     @torch.no_grad()
     @override

@@ -380,22 +380,58 @@ def test_every_method_goes_the_whole_way_with_gaps(name):
         loss.backward()
         slopes = [p.grad.clone() for p in model.parameters() if p.grad is not None]
         results.append([loss.detach(), *slopes, model.forecast(past, 5, 2)["x"]])
-        if name != "gsps":
-            whole = {n: value for n, value in batch.items() if n not in ("pseudo", "valid")}
-            results[-1].append(filled := model.impute(whole, 2)["x"])
-            assert torch.equal(filled[:, drawn["mask"]], batch["x"][drawn["mask"]].expand(2, -1))
+        whole = {n: value for n, value in batch.items() if n not in ("pseudo", "valid")}
+        results[-1].append(filled := model.impute(whole, 2)["x"])
+        assert torch.equal(filled[:, drawn["mask"]], batch["x"][drawn["mask"]].expand(2, -1))
     assert all(value.isfinite().all() for value in results[0])
     assert any(slope.any() for slope in results[0][1:-2])
     for other in results[1:]:
         assert all(torch.equal(here, there) for here, there in zip(results[0], other, strict=True))
 
 
-def test_gsps_fills_no_gaps():
+def still_gsps():
+    """A model of GSPS, and windows in which all joints rest."""
     data, method = small("gsps")
-    with pytest.raises(
-        ValueError, match="gsps has no guide: it draws motions from what was observed before the present"
-    ):
-        method.build(data.schema).impute(data.windows("test").all())
+    torch.manual_seed(0)
+    model, x = method.build(data.schema).eval(), data.windows("test").all()["x"][:4]
+    return model, x[:, :1].expand_as(x).clone()
+
+
+def test_gsps_reads_past_a_gap_in_time():
+    """Where a joint rests, its gap is none; one that was never seen is where its parent is; and nothing is 0."""
+    model, x = still_gsps()
+    mask = torch.rand(*x.shape[:2], WALKER.joints - 1) < 0.5
+    mask[:, 2] = True
+    elbow, wrist = (WALKER.names.index(name) - 1 for name in ("LElbow", "LWrist"))
+
+    def forecast(x, mask):
+        torch.manual_seed(1)
+        past = slice(None, model.frames)
+        return model.forecast({"x": x[:, past], "mask": mask[:, past].repeat_interleave(3, -1)}, 5, 2)["x"]
+
+    whole = torch.ones_like(mask)
+    torch.testing.assert_close(forecast(x, mask), forecast(x, whole))
+    mask[..., wrist] = False
+    bent = x.clone()
+    bent[..., 3 * wrist : 3 * wrist + 3] = x[..., 3 * elbow : 3 * elbow + 3]
+    torch.testing.assert_close(forecast(x, mask), forecast(bent, whole))
+    assert not torch.allclose(forecast(x, mask), forecast(x, whole))
+
+
+def test_gsps_fills_gaps_by_what_comes_near_to_all_that_was_seen():
+    """Of many motions of the model, the one of which all but a joint was seen is found again."""
+    model, x = still_gsps()
+    batch = {"x": x, "mask": torch.ones_like(x).bool()}
+    torch.manual_seed(2)
+    made = model.reconstruct(batch, 4)["x"]
+    batch["mask"][:, model.frames :, 9:12] = False
+    for motion_of in made[:, :, model.frames :]:
+        batch["x"] = torch.cat([x[:, : model.frames], motion_of], 1)
+        torch.manual_seed(2)
+        filled = model.impute(batch, 1)["x"][0]
+        torch.testing.assert_close(filled[:, model.frames :], motion_of)
+    with pytest.raises(ValueError, match="gsps fills gaps in windows of 18 frames, not 12"):
+        model.impute({name: value[:, :12] for name, value in batch.items()})
 
 
 def test_what_is_whole_has_no_gap_to_fill():
