@@ -146,6 +146,12 @@ def gapped(batch: Batch) -> Tensor:
     return x if mask is None else torch.where(mask, x, torch.nan)
 
 
+def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
+    """Means over some dimensions of what is not NaN."""
+    found: Tensor = values.nanmean(dims) if values.isnan().any() else values.mean(dims)
+    return found
+
+
 def bridged(x: Tensor, mask: Tensor | None) -> Tensor:
     """Sequences whose missing entries lie on the straight line between the observed ones around them, in time.
 

@@ -17,7 +17,7 @@ import torch
 from rich.text import Text
 from torch import Tensor
 
-from ..data import HeldOutWindows
+from ..data import HeldOutWindows, gapped, mask_of, mean_of_known
 from ..program.batch import repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
@@ -34,7 +34,7 @@ class Statistic:
     """A number that says something of a sequence.
 
     Args:
-        function: x (..., T, D) -> (...).
+        function: x (..., T, D) -> (...). Of windows with missing entries x is NaN there, in replicates too.
         unit: of the number.
     """
 
@@ -42,31 +42,39 @@ class Statistic:
     unit: str = ""
 
 
+def variance(x: Tensor) -> Tensor:
+    """(..., D), over time, of what is not NaN of x (..., T, D)."""
+    if not x.isnan().any():
+        return x.var(-2, correction=0)
+    return mean_of_known((x - mean_of_known(x, -2).unsqueeze(-2)).square(), -2)
+
+
 def _scale(x: Tensor) -> Tensor:
-    return x.var(-2, correction=0).mean(-1).sqrt()
+    return mean_of_known(variance(x), -1).sqrt()
 
 
 def _roughness(x: Tensor) -> Tensor:
-    return x.diff(dim=-2).square().mean((-2, -1)).sqrt()
+    return mean_of_known(x.diff(dim=-2).square(), (-2, -1)).sqrt()
 
 
 def _correlation_length(x: Tensor) -> Tensor:
     length = x.shape[-2]
-    centred = x - x.mean(-2, keepdim=True)
-    lags = [(centred[..., lag:, :] * centred[..., : length - lag, :]).sum((-2, -1)) for lag in range(length)]
+    centred = x - mean_of_known(x, -2).unsqueeze(-2)
+    products = (centred[..., lag:, :] * centred[..., : length - lag, :] for lag in range(length))
+    lags = [(1 - lag / length) * mean_of_known(product, (-2, -1)) for lag, product in enumerate(products)]
     below = torch.stack(lags, -1) < lags[0][..., None] / math.e
     return torch.where(below.any(-1), below.double().argmax(-1), length).double()
 
 
 STATISTICS = {
-    "mean": Statistic(lambda x: x.mean((-2, -1))),
+    "mean": Statistic(lambda x: mean_of_known(x, (-2, -1))),
     "scale": Statistic(_scale),
     "roughness": Statistic(_roughness),
     "correlation length": Statistic(_correlation_length, "frames"),
 }
 """For any sequences: mean of all numbers; their standard deviation over time about it, coordinate by coordinate, and
 that of their steps from frame to frame (root mean squares over coordinates); and the lag at which the autocorrelation,
-pooled over coordinates, falls below 1/e, T where it never does."""
+pooled over coordinates, falls below 1/e, T where it never does. Means are of what was observed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +258,8 @@ def predictive_checks(
 
     Two replications, both free-running. "forecast": the frames after the observed ones; the last two observed frames
     are joined to them, so that a jump at the seam counts. "posterior", the posterior predictive distribution proper:
-    latents are inferred from the whole window, and all its frames are generated anew from them.
+    latents are inferred from the whole window, and all its frames are generated anew from them. Where entries of a
+    window are missing, its replicates lack them too.
 
     Args:
         model: a model, or `{name: model}`.
@@ -264,7 +273,7 @@ def predictive_checks(
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: incomplete windows, too few samples, a statistic of the wrong shape or not finite on real windows.
+        ValueError: ragged windows, too few samples, a statistic of the wrong shape or not finite on real windows.
         FloatingPointError: a statistic that is not finite on replicated windows.
 
     Example:
@@ -283,24 +292,22 @@ def predictive_checks(
     for each in models.values():
         require_likelihood(each)
     held = hold(windows)
-    if held.mask is not None:
-        raise ValueError(
-            "statistics of replicates are compared with those of whole windows, but of these some entries are missing; "
-            "check windows without gaps"
-        )
+    truth = gapped(held.batch)
     firsts = {"forecast": held.observed - min(_SEAM, held.observed), "posterior": 0}
     checks = {}
     with progress_bar(progress) as bar:
         for program, first in firsts.items():
-            real = _measure(statistics, held.x[:, first:], "real windows")
+            real = _measure(statistics, truth[:, first:], "real windows")
             for label, each in models.items():
                 parts: list[dict[str, Tensor]] = []
                 with reproducibly(each, seed):
                     starts = range(0, len(held.x), batch_size)
                     for start in bar.track(starts, description=f"{label}, {program}"):
-                        part = on_device_of(each, held.part(slice(start, start + batch_size)))
-                        x = _REPLICATES[program](each, part, held.observed, samples, draw_emission)
-                        parts.append(_measure(statistics, x.to(held.x), f"replicates of {label} ({program})"))
+                        some = slice(start, start + batch_size)
+                        part = on_device_of(each, held.part(some))
+                        x = _REPLICATES[program](each, part, held.observed, samples, draw_emission).to(held.x)
+                        x = x.masked_fill(truth[some, first:].isnan(), torch.nan)
+                        parts.append(_measure(statistics, x, f"replicates of {label} ({program})"))
                 for name, statistic in statistics.items():
                     replicated = torch.cat([part[name] for part in parts], 1).numpy()
                     checks[label, program, name] = Check(real[name].numpy(), replicated, statistic.unit)
@@ -316,8 +323,9 @@ def predictive_checks(
 
 def _forecast(model: DynamicalVAE, batch: dict[str, Tensor], observed: int, samples: int, drawn: bool) -> Tensor:
     """The last observed frames and the future, (S, B, seam + H, D)."""
-    x = batch["x"]
-    seen, horizon = {**batch, "x": x[:, :observed]}, x.shape[1] - observed
+    x, mask = batch["x"], mask_of(batch)
+    horizon, known = x.shape[1] - observed, {} if mask is None else {"mask": mask[:, :observed]}
+    seen = {**batch, "x": x[:, :observed], **known}
     future = model.forecast(seen, horizon, samples, draw_emission=drawn)["x"]
     return torch.cat([seen["x"][None, :, -_SEAM:].expand(samples, -1, -1, -1), future], 2)
 

@@ -24,6 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..data import mean_of_known
+
 Array = Tensor | np.ndarray
 
 
@@ -300,7 +302,8 @@ def motion_pseudo_values(motion: Tensor, real: Tensor, classes: Tensor, places: 
     It is computed for each class of motion, and averaged with the classes' shares of the windows.
 
     Args:
-        motion: `(N, T - 1)`, what joints move by in the forecasts of each window.
+        motion: `(N, T - 1)`, what joints move by in the forecasts of each window; NaN where that cannot be compared. A
+            step of which no window tells counts as one at the true pace.
         real: `(N,)`, and in its true future, over all frames.
         classes: `(N,)`, whole numbers.
         places: `(N,)`, the clip of every window, from 0 to C - 1.
@@ -308,7 +311,8 @@ def motion_pseudo_values(motion: Tensor, real: Tensor, classes: Tensor, places: 
 
     def distance(kept: Tensor) -> Tensor:
         groups = [kept & (classes == number) for number in classes[kept].unique()]
-        found = [rows.sum() * cumulative_motion_distance(motion[rows].mean(0), real[rows].mean()) for rows in groups]
+        paces = [(rows.sum(), mean_of_known(motion[rows], 0), mean_of_known(real[rows], 0)) for rows in groups]
+        found = [n * cumulative_motion_distance(steps.where(~steps.isnan(), pace), pace) for n, steps, pace in paces]
         return torch.stack(found).sum() / kept.sum()
 
     clips = range(int(places.max()) + 1)

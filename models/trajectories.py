@@ -323,6 +323,11 @@ class TrajectoryModel(DynamicalVAE):
                 f"the initial pose has shape {tuple(pose.shape)}, expected ({self.skeleton.joints}, 3): "
                 f"{', '.join(self.skeleton.names)}"
             )
+        if lacking := [name for name, place in zip(self.skeleton.names, pose, strict=True) if place.isnan().any()]:
+            raise ValueError(
+                f"the initial pose lacks {', '.join(lacking)}, but motion starts at a whole one; take another window, "
+                "or fill the gaps first (`dvae impute RUN --filled FILE`)"
+            )
         if complaint := defect(Clip("initial", "pose", pose[None].numpy()), self.skeleton):
             raise ValueError(complaint.replace("clip initial/pose", "the initial pose"))
         given = trajectories or {}

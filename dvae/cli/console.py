@@ -6,7 +6,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from .. import files
 from ..inference.result import Plain
@@ -17,6 +19,12 @@ if TYPE_CHECKING:
 # Both keep to the width of the terminal; a file or a pipe gets lines as long as they need to be.
 OUT = Plain(width=None if sys.stdout.isatty() else 200)
 ERROR = Plain(stderr=True, soft_wrap=True, highlight=False)
+
+Missing = Annotated[
+    bool,
+    tyro.conf.arg(help="keep clips that lack joints, which are NaN where they were not observed (default: refuse)"),
+]
+"""The option of every command that reads motion."""
 
 
 class UsageError(ValueError):

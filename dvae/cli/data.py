@@ -10,7 +10,7 @@ import tyro
 from .. import motion
 from ..motion.dataset import SIMULATED
 from ..motion.files import writing
-from .console import ERROR, OUT, UsageError
+from .console import ERROR, OUT, Missing, UsageError
 
 ONTO = {skeleton.name: skeleton for skeleton in (motion.WALKER, motion.HUMAN36M, motion.HUMANEVA)}
 """Skeletons by name; others come from a skeleton.json."""
@@ -29,6 +29,7 @@ def data(
     recorded: float | None = None,
     url: str | None = None,
     skip_bad: bool = False,
+    missing: Missing = False,
 ) -> None:
     """Look into motion files, convert them, or get some.
 
@@ -54,7 +55,7 @@ def data(
         if out or format or fps or onto or url:
             raise UsageError("--out, --format, --fps, --onto and --url are of convert and get; info writes nothing")
         for file in files:
-            OUT.print(_read(file, metres, up, recorded, skip_bad).info())
+            OUT.print(_read(file, metres, up, recorded, skip_bad, missing).info())
         return
     if out is None:
         raise UsageError(f"data {action} writes files; say where, by --out")
@@ -72,16 +73,18 @@ def data(
         people = motion.simulate() if fps is None else motion.simulate().resampled(fps)
         said = f"{len(writing.write_motion(out, people, format))} files"
     else:
-        told = {"metres": metres, "up": up, "recorded": recorded, "skip_bad": skip_bad}
+        told = {"metres": metres, "up": up, "recorded": recorded, "skip_bad": skip_bad, "missing": missing}
         paths = [Path(file) for file in files]
         said = writing.convert(paths, out, format, fps, _skeleton(onto), jobs, **told)  # type: ignore[arg-type]
     ERROR.print(f"wrote {out}: {said}", markup=False)
 
 
-def _read(file: str, metres: float | None, up: str | None, recorded: float | None, skip_bad: bool) -> motion.MotionSet:
+def _read(
+    file: str, metres: float | None, up: str | None, recorded: float | None, skip_bad: bool, missing: bool
+) -> motion.MotionSet:
     if file == SIMULATED:
         return motion.simulate()
-    return motion.read_motion(file, skip_bad=skip_bad, metres=metres, up=up, fps=recorded)
+    return motion.read_motion(file, skip_bad=skip_bad, metres=metres, up=up, fps=recorded, missing=missing)
 
 
 def _skeleton(name: str | None) -> motion.Skeleton | None:

@@ -27,7 +27,7 @@ from ..models.trajectories import TrajectoryMethod
 from ..motion.dataset import SIMULATED, MotionData
 from ..runs import directory as runs
 from ..runs.sweep import sweep as sweep_methods
-from .console import OUT, UsageError, arguments, at_least
+from .console import OUT, Missing, UsageError, arguments, at_least
 
 DEFAULT = Training(decay=0.5)
 """How the command line trains, where it is not told."""
@@ -85,14 +85,13 @@ class DataOptions:
         representation: what the model sees: positions; or turns of joints in this form, and bones then keep their
             lengths.
         skip_bad: leave out clips that cannot be used instead of refusing the file.
-        missing: keep clips that lack joints, which are NaN where they were not observed.
     """
 
     data: str = SIMULATED
     protocol: ProtocolName | None = None
     representation: Literal["positions", "6d", "quaternion", "vector"] = "positions"
     skip_bad: bool = False
-    missing: bool = False
+    missing: Missing = False
 
     def open(self) -> MotionData:
         """The clips under their protocol."""

@@ -16,9 +16,10 @@ from .. import motion
 from ..data import gapped
 from ..models.trajectories import TrajectoryModel
 from ..motion.dataset import SIMULATED
+from ..motion.files.writing import format_of
 from ..options import nearest
 from ..runs import directory as runs
-from .console import ERROR, OUT, UsageError, at_least, check_files, save_figure
+from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, save_figure
 from .opening import data_of, load_run
 
 
@@ -31,7 +32,7 @@ def forecast(
     fix: tuple[str, ...] = (),
     seed: int = 0,
     data: str | None = None,
-    missing: bool = False,
+    missing: Missing = False,
     figure: Path | None = None,
 ) -> None:
     """Forecast the test windows, or those of one clip, many times each.
@@ -52,7 +53,6 @@ def forecast(
         fix: parts of the body, such as lower, or static latents, of which all forecasts of a window share one draw.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
-        missing: keep clips of other data that lack joints, which are NaN where they were not observed.
         figure: save a figure of the first window's futures.
     """
     at_least(1, samples=samples, horizon=horizon)
@@ -86,6 +86,7 @@ def complete(
     temperature: float = 1.0,
     seed: int = 0,
     data: str | None = None,
+    missing: Missing = False,
     figure: Path | None = None,
 ) -> None:
     """Complete motion along paths of some joints, from a clip or from a file.
@@ -118,7 +119,7 @@ def complete(
         raise UsageError(f"{run} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
     if exact and not (joints or paths):
         raise UsageError("--exact has motions follow paths; say which, by --joints or --paths")
-    windows = windows_of(loaded, data, clip)
+    windows = windows_of(loaded, data, clip, missing)
     positions = windows.positions(gapped(windows.all())).numpy()
     chosen = _liveliest(positions, window)
     pose, truth = positions[chosen, 0], positions[chosen, 1:]
@@ -137,32 +138,42 @@ def complete(
 
 def impute(
     run: Annotated[Path, tyro.conf.Positional],
-    out: Path,
+    out: Path | None = None,
+    filled: Path | None = None,
     clip: str | None = None,
     samples: int = 10,
     seed: int = 0,
     data: str | None = None,
-    missing: bool = False,
+    missing: Missing = False,
 ) -> None:
     """Fill in the joints that test windows lack, or those of a whole clip, several times each.
 
-    The npz holds, in metres, `filled` (samples, windows, frames, joints, 3), positions as windows have them, with
-    joints as they were observed, or else filled in; `observed` (windows, frames, joints), which were; `spread`, how far
-    the samples' places of a joint are from their mean; `split`, `clip` and `start` of each window, and the skeleton.
+    The npz of --out holds, in metres, `filled` (samples, windows, frames, joints, 3), positions as windows have them,
+    with joints as they were observed, or else filled in; `observed` (windows, frames, joints), which were; `spread`,
+    how far the samples' places of a joint are from their mean; `split`, `clip` and `start` of each window, and the
+    skeleton. --filled is the motion itself, where it was in the world, with the gaps in these windows filled once: for
+    `dvae evaluate --data`, or other programs.
 
     Args:
         run: the run directory.
         out: the npz file to write.
+        filled: motion to write, an npz of all clips, BVH or csv of one; a name without an ending is a folder of BVH.
         clip: name of a clip, or split/name where the name is not unique; of any split, filled as one window.
         samples: fillings of each window.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
-        missing: keep clips of other data that lack joints, which are NaN where they were not observed.
     """
     at_least(1, samples=samples)
     check_files(out, None, ".npz")
+    if out is None and filled is None:
+        raise UsageError("impute writes files; say which, by --out or --filled")
+    kind = None if filled is None else format_of(filled, None if filled.suffix else "bvh")
     loaded = load_run(run, data)
     windows = windows_of(loaded, data, clip, missing, whole=clip is not None)
+    if filled is not None and filled.suffix and kind != "npz" and len(windows.clips) > 1:
+        raise UsageError(
+            f"--filled {filled} holds one clip, of {len(windows.clips)}; say which by --clip, or end it in .npz"
+        )
     listed, parts = windows.all(), []
     with torch.random.fork_rng():
         torch.manual_seed(seed)
@@ -171,12 +182,21 @@ def impute(
             parts.append(windows.positions(made).numpy())
     seen = windows.skeleton.with_root(listed["mask"].unflatten(-1, (-1, 3)), True)[..., 0].numpy()
     found = motion.Imputed(windows.skeleton, windows.keys, np.concatenate(parts, 1), seen)
-    found.save(out)
-    spread = 1000 * found.spread[~seen].mean() if not seen.all() else 0.0
-    ERROR.print(
-        f"wrote {out}: {samples} fillings of each of {len(windows)} windows, which lacked {1 - seen.mean():.1%} of "
-        f"their joints; they spread by {spread:.0f} mm"
-    )
+    if out is not None:
+        found.save(out)
+        spread = 1000 * found.spread[~seen].mean() if not seen.all() else 0.0
+        ERROR.print(
+            f"wrote {out}: {samples} fillings of each of {len(windows)} windows, which lacked {1 - seen.mean():.1%} of "
+            f"their joints; they spread by {spread:.0f} mm"
+        )
+    if filled is not None:
+        whole = windows.filled(torch.from_numpy(found.filled[0]))
+        motion.write_motion(filled, whole, kind)
+        left = sum(int(np.isnan(each.positions).any(-1).sum()) for each in whole)
+        ERROR.print(
+            f"wrote {filled}: {len(whole)} clips"
+            + (f"; {left} joints are missing in frames of no window" if left else "")
+        )
 
 
 def _told(joints: Sequence[str], truth: Any, paths: Path | None, skeleton: motion.Skeleton) -> dict[str, Any]:
@@ -198,6 +218,7 @@ def animate(
     fix: tuple[str, ...] = (),
     seed: int = 0,
     data: str | None = None,
+    missing: Missing = False,
     every: int | None = None,
     figure: Path | None = None,
 ) -> None:
@@ -226,7 +247,7 @@ def animate(
         raise UsageError("an mp4 needs imageio-ffmpeg: pip install 'pyro-dvae[video]'; or end the name in .gif")
     if Path(source).is_dir():
         loaded = load_run(Path(source), data)
-        windows = windows_of(loaded, data, clip)
+        windows = windows_of(loaded, data, clip, missing)
         chosen = _liveliest(windows.positions(gapped(windows.all())).numpy(), window)
         futures = draw_futures(loaded, windows, [chosen], samples or 5, seed, fix=fix)
     elif fix:
@@ -238,7 +259,7 @@ def animate(
     elif window is not None or samples is not None or figure is not None:
         raise UsageError(f"--window, --samples and --figure are about futures; {source} has none")
     else:
-        _play_clip(source, clip, every, out)
+        _play_clip(source, clip, missing, every, out)
         return
     now = futures.observed[0], futures.forecasts[:, 0], futures.truth[0]
     _play(out, futures.skeleton, *now, fixed=_alike(futures), every=every, title=_title(futures))
@@ -258,8 +279,8 @@ def _stored(source: str, clip: str | None, window: int | None, samples: int | No
     return chosen, stored.window(known[chosen], samples or 5)
 
 
-def _play_clip(source: str, name: str | None, every: int | None, out: Path) -> None:
-    clips = motion.simulate() if source == SIMULATED else motion.read_motion(source)
+def _play_clip(source: str, name: str | None, missing: bool, every: int | None, out: Path) -> None:
+    clips = motion.simulate() if source == SIMULATED else motion.read_motion(source, missing=missing)
     clip = clips.clips[0] if name is None else _clip(clips, name)
     _play(out, clips.skeleton, clip.positions, every=every, title="/".join(clip.key))
     ERROR.print(f"wrote {out}: {'/'.join(clip.key)}, {clip.frames} frames")

@@ -22,7 +22,7 @@ from ..models.trajectories import TrajectoryModel
 from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
 from . import opening
-from .console import ERROR, OUT, UsageError, at_least, check_files, save_figure
+from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, save_figure
 from .futures import joint_names
 
 
@@ -64,7 +64,7 @@ def evaluate(
     run: Annotated[tuple[Path, ...], tyro.conf.Positional],
     control: Control,
     data: str | None = None,
-    missing: bool = False,
+    missing: Missing = False,
     samples: int = 50,
     bound_particles: int = 0,
     log_score_particles: int = 0,
@@ -84,7 +84,6 @@ def evaluate(
         run: run directories, fitted on the same data under the same protocol.
         control: what methods that take trajectories are told.
         data: where the data lie now, if the path in the runs no longer leads there; or other data of the same joints.
-        missing: keep clips of other data that lack joints, which are NaN where they were not observed.
         samples: forecasts of each window, K.
         bound_particles: particles of the importance-weighted bound; 0 leaves it out.
         log_score_particles: particles of the log density of the future under the forecasts; 0 leaves it out.
@@ -135,6 +134,7 @@ def _keep(result: Any, paths: Sequence[Path], figure: Path | None) -> None:
 def criticise(
     run: Annotated[Path, tyro.conf.Positional],
     data: str | None = None,
+    missing: Missing = False,
     simulations: int = 200,
     draws: int = 99,
     ranked_steps: int = 4,
@@ -169,7 +169,7 @@ def criticise(
     check_files(out, figure, ".json")
     loaded = opening.load_run(run, data)
     opening.note_unfinished([loaded])
-    opened, model = opening.data_of(data, loaded), loaded.model
+    opened, model = opening.data_of(data, loaded, missing=missing), loaded.model
     windows = opened.windows("test")
     steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
     document: dict[str, Any] = {}
@@ -205,6 +205,7 @@ def _add(document: dict[str, Any], part: str, result: Any, path: Path, figure: P
 def compare(
     run: Annotated[tuple[Path, ...], tyro.conf.Positional],
     data: str | None = None,
+    missing: Missing = False,
     particles: int = 64,
     estimates: int = 1,
     contrasts: int = 128,
@@ -239,7 +240,7 @@ def compare(
     at_least(1, particles=particles, estimates=estimates, samples=samples, batch_size=batch_size, stride=stride)
     at_least(0, contrasts=contrasts)
     check_files(out, figure, ".json")
-    loaded, opened = opening.on_the_same_data(run, data)
+    loaded, opened = opening.on_the_same_data(run, data, missing)
     if stopped := opening.unfinished(loaded):
         raise ValueError("\n".join(stopped))
     protocol = opened.protocol if stride is None else replace(opened.protocol, test_stride=stride)

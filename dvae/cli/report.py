@@ -17,7 +17,7 @@ from ..motion.plot import staged
 from ..report import Section, document, lacking, sections
 from ..runs import directory as runs
 from . import opening
-from .console import ERROR, at_least, check_files
+from .console import ERROR, Missing, at_least, check_files
 from .futures import draw_futures
 from .judging import Control
 from .judging import evaluate as evaluate_runs
@@ -43,6 +43,7 @@ def report(
     particles: int = 64,
     seed: int = 0,
     data: str | None = None,
+    missing: Missing = False,
 ) -> None:
     """One page of what is known of runs: equations, graphs, curves, scores, bounds, latents, and moving futures.
 
@@ -64,7 +65,7 @@ def report(
     at_least(1, samples=samples, bound_windows=bound_windows, particles=particles)
     check_files(out, None, ".html", ".htm")
     if evaluate:
-        evaluate_runs(run, Control(), data=data, seed=seed)
+        evaluate_runs(run, Control(), data=data, missing=missing, seed=seed)
     loaded = opening.alike(run, data)
     named = dict(zip(opening.names(loaded), loaded, strict=True))
     opening.note_unfinished(loaded)
@@ -72,7 +73,7 @@ def report(
     with progress_bar(True) as bar:
         shown = [make(named) for make in bar.track(OF_DIRECTORIES, description="run directories")]
     try:
-        test = opening.data_of(data, *loaded).windows("test")
+        test = opening.data_of(data, *loaded, missing=missing).windows("test")
     except CheckpointError as error:
         text = f"Bounds, latents and futures need the data. {reason(error)}; say where they are with --data."
         shown.append(Section("Latents and futures", before=lacking(text)))

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from torch import Tensor
 
-from ..inference.checks import Statistic
+from ..data import mean_of_known
+from ..inference.checks import Statistic, variance
 from ..inference.result import canvas
 from ..inference.traversal import Traversal
 from .exchange import Exchanged
@@ -31,6 +32,9 @@ def statistics(windows: Windows | Exchanged) -> dict[str, Statistic]:
       stands it is the height above the ground; it needs no ground, so that it means the same with and without the
       pelvis's own motion. Feet are the ends of the chains whose names say foot, toe, ankle or heel; a skeleton without
       such names has no foot height.
+
+    Where joints are missing, means are over the differences, bones and feet that are known, and the lowest joint is
+    that of those that are.
     """
     skeleton = windows.skeleton
     up, fps = skeleton.vertical, skeleton.fps
@@ -39,20 +43,22 @@ def statistics(windows: Windows | Exchanged) -> dict[str, Statistic]:
 
     def bone_stretch(positions: Tensor) -> Tensor:
         lengths = skeleton.bone_lengths(positions)
-        stretch: Tensor = (lengths.std(-2, correction=0) / lengths.mean(-2)).mean(-1)
-        return 100 * stretch
+        return 100 * mean_of_known(variance(lengths).sqrt() / mean_of_known(lengths, -2), -1)
 
     def foot_height(positions: Tensor) -> Tensor:
         heights = positions[..., up]
-        return (heights[..., feet] - heights.amin(-1, keepdim=True)).mean((-2, -1))
+        lowest = heights.nan_to_num(math.inf).amin(-1, keepdim=True)
+        return mean_of_known(heights[..., feet] - lowest, (-2, -1))
 
     def of(unit: str, function: Callable[[Tensor], Tensor]) -> Statistic:
         return Statistic(lambda x: function(windows.positions(x)), unit)
 
     return {
-        "speed": of("m/s", lambda found: fps * found.diff(dim=-3).norm(dim=-1).mean((-2, -1))),
-        "acceleration": of("m/s²", lambda found: fps**2 * found.diff(n=2, dim=-3).norm(dim=-1).mean((-2, -1))),
-        "bone length": of("m", lambda found: skeleton.bone_lengths(found).mean((-2, -1))),
+        "speed": of("m/s", lambda found: fps * mean_of_known(found.diff(dim=-3).norm(dim=-1), (-2, -1))),
+        "acceleration": of(
+            "m/s²", lambda found: fps**2 * mean_of_known(found.diff(n=2, dim=-3).norm(dim=-1), (-2, -1))
+        ),
+        "bone length": of("m", lambda found: mean_of_known(skeleton.bone_lengths(found), (-2, -1))),
         "bone stretch": of("%", bone_stretch),
         **({"foot height": of("m", foot_height)} if feet else {}),
     }

@@ -244,7 +244,7 @@ class MotionSet:
         if lacking := [clip for clip in self if clip.rotations is None and np.isnan(clip.positions).any()]:
             raise ValueError(
                 f"clip {'/'.join(lacking[0].key)} lacks joints, without which their turns are not known; leave it out, "
-                "or fill its gaps first"
+                "or fill its gaps first (`dvae impute RUN --filled FILE`)"
             )
         skeleton = self.skeleton
         if not skeleton.rest:

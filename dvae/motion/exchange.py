@@ -42,7 +42,10 @@ class Exchanged:
                 f"{', '.join(windows.given_joints or ()) or 'no joints'}"
             )
         if windows.missing:
-            raise ValueError("poses are exchanged whole; these windows may lack joints, fill the gaps first")
+            raise ValueError(
+                "poses are exchanged whole, but these windows may lack joints; fill the gaps first (`dvae impute RUN "
+                "--filled FILE`)"
+            )
         if not threshold > 0:
             raise ValueError(f"the threshold is {threshold}; it must be a positive distance in metres")
         self.windows, self.threshold, self.seed, self.missing = windows, threshold, seed, False

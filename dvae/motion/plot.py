@@ -233,7 +233,8 @@ def staged(
     view: float = pi / 5,
 ) -> Scene:
     """People for an animation; see `animate` for its arguments and what it refuses."""
-    if samples is None:
+    alone = samples is None
+    if alone:
         motion = np.asarray(observed)
         observed, samples, names = motion[:1], motion[None, 1:], names or [""]
     past, future, real = _checked(skeleton, observed, samples, truth)
@@ -246,8 +247,8 @@ def staged(
         raise ValueError(f"fixed names joints {sorted(strangers)}; they go from 0 to {skeleton.joints - 1}")
     if every < 1:
         raise ValueError(f"every is {every}; show each frame with 1, each second one with 2")
-    known = [past] if real is None else [past, real]
-    if not np.isfinite(future).all() or any(np.isinf(positions).any() for positions in known):
+    known = [each for each in (past, real, future if alone else None) if each is not None]
+    if not (alone or np.isfinite(future).all()) or any(np.isinf(positions).any() for positions in known):
         raise ValueError("observed, samples or truth have NaN or infinite positions, which cannot be drawn")
     people = list(zip(names, map(to_hex, _colours(len(future))), future, strict=True))
     if real is not None:

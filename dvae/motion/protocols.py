@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ..data import BESIDE
+from ..data import BESIDE, bridged
 from ..options import Amount, Frames, Range, check, nearest, tuples
 from ..schema import Schema, SchemaError
 from ..views import View
@@ -446,6 +446,34 @@ class Windows:
                 f"root {self.protocol.root}"
             )
         return self.skeleton.with_root(x.unflatten(-1, (-1, 3)))
+
+    def filled(self, positions: Tensor) -> MotionSet:
+        """The clips as they were read, and where they lack joints, with those of the listed windows.
+
+        Windows are put back where they were cut, turned and moved as the clip is: the root where it was, or on the
+        straight line across its own gap. What several windows fill is the first one's; gaps that none covers stay.
+
+        Args:
+            positions: (N, T, J, 3) of the windows, whole ones, see `positions`.
+        """
+        clips, starts = self._list(self.stride)
+        frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
+        joints, root = self._frames[frames], self.skeleton.root
+        if self.protocol.heading:
+            heading = self.skeleton.heading_near(joints, self.protocol.observed - 1)[:, None, None]
+            positions = rotate_about_up(positions, heading, self.skeleton.up)
+        places = joints[:, :, root : root + 1]
+        seen = places.isfinite()
+        if self.protocol.root == "drop":
+            places = bridged(places.flatten(2), seen.flatten(2))[:, :, None]
+        else:
+            places = places.take_along_dim(seen.all(-1).byte().argmax(1, keepdim=True)[..., None], 1)
+        found = self._frames.clone()
+        for where, made in zip(frames, positions + places, strict=True):
+            found[where] = torch.where(found[where].isfinite(), found[where], made.to(found))
+        whole = found.split([clip.frames for clip in self.clips])
+        made_whole = [replace(clip, positions=each.numpy()) for clip, each in zip(self.clips, whole, strict=True)]
+        return MotionSet(made_whole, self.skeleton, missing=bool(found.isnan().any()))
 
     def given(self, joints: Sequence[str] | float) -> Windows:
         """These windows, whose batches hold trajectories too: {"y": (B, T, D)}, x at given joints and 0 at others.

@@ -12,8 +12,8 @@ their last pose with another one. *CMD* (`metrics.cumulative_motion_distance`) i
 frame, for each class of motion and averaged by the classes' shares of the windows, as in the public code. A class is
 the label "content" of a clip; where clips have none, all windows are one class. The pace of a class is that of the true
 futures of the windows at hand, in the public code a constant for each of its data sets. CMD is a number of the whole
-set, with a jackknife over clips, and real motion, which has no steady pace, is not at 0. The pace
-is one of whole bodies: of windows that may lack joints there is no CMD, and a note says so.
+set, with a jackknife over clips, and real motion, which has no steady pace, is not at 0. Where joints are missing, a
+joint counts in the steps at both ends of which it was observed, of futures as of the truth.
 
 Bodies have limb stretch, limb jitter and limb-angle errors (SkeletonDiffusion: Curreli et al. 2025, arXiv:2501.06035,
 equation 13). With l_t the length of a limb in frame t of a future, and m that in the true one, its mean over frames,
@@ -41,7 +41,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, HeldOutWindows, bridged, gapped, mask_of
+from ..data import Batch, HeldOutWindows, bridged, gapped, mask_of, mean_of_known
 from ..inference import metrics
 from ..inference.held import clip_places, on_device_of, reproducibly
 from ..inference.references import multimodal_note, multimodal_truths
@@ -84,7 +84,7 @@ def scores(
     if windows.given_joints:
         found.append(_path_error(windows))
     found += [_bone_length_error(windows), *_limbs(windows)]
-    if windows.protocol.predicted > 1 and not windows.missing:
+    if windows.protocol.predicted > 1:
         found.append(_cumulative_motion(windows))
     if pose_prior is not None:
         found.append(_pose_nll(pose_prior, windows.protocol.observed))
@@ -171,7 +171,7 @@ def _path_error(windows: Windows | Exchanged) -> Measure:
         paths = past["y"][:, None, windows.protocol.observed :]
         paths = torch.where(truth[:, None].isnan(), torch.nan, paths)
         distances = (forecasts - paths).unflatten(-1, (-1, 3)).norm(dim=-1)
-        return _mean(distances[..., places], (1, 2, 3))
+        return mean_of_known(distances[..., places], (1, 2, 3))
 
     return Measure("path error", function, "m")
 
@@ -182,16 +182,9 @@ def _bone_length_error(windows: Windows | Exchanged) -> Measure:
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         both = forecasts, gapped(past)
         lengths, reference = (windows.skeleton.bone_lengths(windows.positions(poses)) for poses in both)
-        return _mean((lengths / _mean(reference, 1)[:, None, None] - 1).abs(), (1, 2, 3))
+        return mean_of_known((lengths / mean_of_known(reference, 1)[:, None, None] - 1).abs(), (1, 2, 3))
 
-    note = "CMD is of whole bodies and left out, as joints lack" if windows.missing else ""
-    return Measure("bone-length error", function, "relative", partial=windows.missing, note=note)
-
-
-def _mean(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
-    """Means over some dimensions of what is not NaN."""
-    found: Tensor = values.nanmean(dims) if values.isnan().any() else values.mean(dims)
-    return found
+    return Measure("bone-length error", function, "relative", partial=windows.missing)
 
 
 def _limbs(windows: Windows | Exchanged) -> list[Measure]:
@@ -206,7 +199,9 @@ def _limbs(windows: Windows | Exchanged) -> list[Measure]:
         """The mean over limbs and futures of a score (B, K, limbs) of relative errors (B, K, T, limbs) of lengths."""
 
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-            return _mean(score(lengths(forecasts) / _mean(lengths(truth), 1)[:, None, None] - 1), (1, 2))
+            return mean_of_known(
+                score(lengths(forecasts) / mean_of_known(lengths(truth), 1)[:, None, None] - 1), (1, 2)
+            )
 
         return function
 
@@ -230,7 +225,7 @@ def _limbs(windows: Windows | Exchanged) -> list[Measure]:
         return torch.atan2(torch.linalg.cross(u, v).norm(dim=-1), (u * v).sum(-1)).rad2deg()
 
     def angle_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        return _mean((angles(forecasts) - angles(truth)[:, None]).abs(), (2, 3)).amin(1)
+        return mean_of_known((angles(forecasts) - angles(truth)[:, None]).abs(), (2, 3)).amin(1)
 
     angular = Measure("limb-angle error", angle_error, "degrees", partial=windows.missing)
     return [*found, *([angular] if pairs else [])]
@@ -249,15 +244,18 @@ def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
 
     def moved(x: Tensor) -> Tensor:
         """What joints move by, (..., T - 1), of frames (..., T, D)."""
-        steps: Tensor = body(x).unflatten(-1, (-1, 3)).diff(dim=-3).norm(dim=-1)
-        return steps.mean(-1).double()
+        return mean_of_known(body(x).unflatten(-1, (-1, 3)).diff(dim=-3).norm(dim=-1), -1).double()
 
-    real = moved(windows.all()["x"][:, windows.protocol.observed :]).mean(-1)
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        return mean_of_known(moved(forecasts.masked_fill(truth[:, None].isnan(), torch.nan)), 1)
+
+    real = mean_of_known(moved(gapped(windows.all())[:, windows.protocol.observed :]), -1)
     what = f"of the windows of each {label}, {len(names)} in all" if label else "of all windows as one class"
     return Measure(
         "CMD",
-        lambda forecasts, *_: moved(forecasts).mean(1),
+        function,
         "m",
+        partial=windows.missing,
         pool=lambda motion, clips: metrics.motion_pseudo_values(motion, real, classes, clips),
         note=f"CMD: {what}, against the pace of their true futures",
         basis={"CMD": {"label": label, "classes": names}},
@@ -285,7 +283,7 @@ def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[M
     if windows.missing:
         raise ValueError(
             f"ACC and FID {name} are of features of whole futures, but these windows lack joints; leave the classifier "
-            "out, or fill the gaps first (`dvae impute`)"
+            "out, or fill the gaps first (`dvae impute RUN --filled FILE`)"
         )
     labels = _labels(name, classifier, windows)
     classes = torch.tensor([classifier.classes.index(label) if label in classifier.classes else -1 for label in labels])

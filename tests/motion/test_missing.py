@@ -3,7 +3,8 @@
 import base64
 import json
 import zlib
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -12,8 +13,12 @@ import torch
 import dvae
 from dvae import motion
 from dvae.cli import main
+from dvae.cli.app import COMMANDS, command
+from dvae.cli.console import Missing
 from dvae.data import bridged, gapped
 from dvae.inference import metrics
+from dvae.inference.checks import STATISTICS, Statistic
+from dvae.inference.held import clip_places
 from dvae.inference.references import distances, nearest_neighbours, zero_velocity
 from dvae.models.registry import METHODS
 from dvae.models.trajectories import TrajectoryMethod
@@ -117,7 +122,7 @@ def test_turns_are_refused_where_joints_lack():
         motion.windows(found, turned, "test").schema.view({**batch, "mask": {"x": batch["mask"]}})
     futures = motion.Forecasts(WALKER, [("a", "b", 0)], *_future_with_gaps())
     assert futures.motion().missing
-    with pytest.raises(ValueError, match="fill its gaps first"):
+    with pytest.raises(ValueError, match=r"lacks joints, and bvh has no gaps; fill them first"):
         motion.write_motion("futures.bvh", futures.motion(), "bvh")
 
 
@@ -318,13 +323,134 @@ def test_scores_of_bodies_are_of_what_was_observed():
     observed = {name: value[:, :past] for name, value in listed.items()}
     args = whole.all()["x"][:, None, past:], gapped(listed)[:, past:], observed, torch.arange(len(gaps))
     measures = {measure.name: measure for measure in motion.scores(gaps)}
-    assert "CMD" in {measure.name for measure in motion.scores(whole)} - measures.keys()
-    assert any("CMD" in measure.note for measure in measures.values())
+    assert measures.keys() == {measure.name for measure in motion.scores(whole)}
     errors = [name for name in measures if name.startswith("limb") or name in ("ADE", "FDE", "bone-length error")]
     assert len(errors) == 8
     for name in errors:
         assert measures[name].function(*args).abs().max() < (0.1 if "angle" in name else 1e-4), name
     assert measures["limb stretch"].function(1.1 * args[0], *args[1:]).sub(0.1).abs().max() < 1e-4
+
+
+def test_cumulative_motion_is_of_joints_that_were_observed():
+    """A joint that nobody saw might as well not be there, and where futures are in gaps is nobody's business."""
+    elbow = WALKER.names.index("LElbow") - 1
+    some = motion.windows(without(PEOPLE, LElbow=slice(None)), motion.PROTOCOLS["simulated"], "test")
+    for windows in (some, motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")):
+        truth = gapped(windows.all())[:, windows.protocol.observed :]
+        (measure,) = (each for each in motion.scores(windows) if each.name == "CMD")
+        clips, index = clip_places(windows.keys), torch.arange(len(truth))
+
+        def score(forecasts, measure=measure, truth=truth, clips=clips, index=index):
+            return np.average(
+                measure.pool(measure.function(forecasts, truth, {}, index), clips), weights=clips.bincount()
+            )
+
+        forecasts = torch.randn(len(truth), 3, *truth.shape[1:])
+        found = score(forecasts)
+        assert score(torch.where(truth[:, None].isnan(), 9.0, forecasts)) == found
+        if windows is some:
+            joints = [n for n in range(WALKER.joints - 1) if n != elbow]
+            ours, real = (
+                x.unflatten(-1, (-1, 3))[..., joints, :].diff(dim=-3).norm(dim=-1).mean(-1).double()
+                for x in (forecasts, truth)
+            )
+            pooled = metrics.motion_pseudo_values(ours.mean(1), real.mean(-1), torch.zeros_like(clips), clips)
+            assert found == pytest.approx(np.average(pooled, weights=clips.bincount()), rel=1e-5)
+
+
+def test_statistics_are_of_what_was_observed():
+    """A coordinate that was never observed, or the last frames, might as well not be there."""
+    x = torch.randn(3, 20, 4).cumsum(1).double()
+    gaps = x.clone()
+    gaps[..., 2] = torch.nan
+    for statistic in STATISTICS.values():
+        torch.testing.assert_close(statistic.function(gaps), statistic.function(x[..., [0, 1, 3]]))
+    gaps[:, 15:] = torch.nan
+    for name in ("mean", "scale", "roughness"):
+        function = STATISTICS[name].function
+        torch.testing.assert_close(function(gaps), function(x[:, :15, [0, 1, 3]]))
+    windows = motion.windows(PEOPLE, motion.PROTOCOLS["simulated"], "test")
+    x = windows.all()["x"]
+    gaps, toe = x.clone(), WALKER.names.index("Head") - 1  # an end, so that one bone goes with it
+    gaps[:, 60:], gaps[..., 3 * toe : 3 * toe + 3] = torch.nan, torch.nan
+    found = {name: statistic.function(gaps) for name, statistic in motion.statistics(windows).items()}
+    whole = {name: statistic.function(x[:, :60]) for name, statistic in motion.statistics(windows).items()}
+    lengths = WALKER.bone_lengths(windows.positions(x[:, :60]))
+    kept = [n for n, (_, child) in enumerate(WALKER.edges) if child != toe + 1]
+    torch.testing.assert_close(found["bone length"], lengths[..., kept].mean((1, 2)))
+    torch.testing.assert_close(found["foot height"], whole["foot height"])
+    assert all(value.isfinite().all() for value in found.values())
+
+
+def test_replicates_have_the_gaps_of_their_windows():
+    """Statistics see the same gaps in a window and in all that is compared with it."""
+    data, method = small("vae")
+    torch.manual_seed(0)
+    model, test, given = method.build(data.schema), data.windows("test"), []
+
+    def speed(x):
+        given.append(x.isnan())
+        return x.diff(dim=-2).square().nanmean((-2, -1))
+
+    checks = dvae.predictive_checks(model, test, {"speed": Statistic(speed)}, samples=19, progress=False)
+    mask, seam = test.all()["mask"], data.protocol.observed - 2
+    for real, made, first in ((0, 1, seam), (2, 3, 0)):
+        assert torch.equal(given[real], ~mask[:, first:])
+        assert torch.equal(given[made], ~mask[:, first:].expand(19, -1, -1, -1))
+    whole = dvae.predictive_checks(model, test, motion.statistics(test), samples=19, progress=False)
+    assert all(np.isfinite(check.wasserstein) for check in (*checks.checks.values(), *whole.checks.values()))
+
+
+def test_what_needs_whole_bodies_says_what_to_do():
+    windows = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")
+    with pytest.raises(ValueError, match=r"features of whole futures, but these windows lack joints.*dvae impute"):
+        motion.scores(windows, classifiers={"content": None})
+    told = motion.windows(GAPS, motion.PROTOCOLS["simulated-trajectories"], "test").given(["LWrist"])
+    with pytest.raises(ValueError, match=r"exchanged whole, but these windows may lack joints.*dvae impute"):
+        motion.Exchanged(told)
+    data, method = small("trajevae")
+    pose = GAPS.clips[0].positions[np.isnan(GAPS.clips[0].positions).any((1, 2))][0]
+    with pytest.raises(ValueError, match=r"the initial pose lacks .*fill the gaps first") as refused:
+        method.build(data.schema).complete(pose, frames=5)
+    assert "--missing" not in str(refused.value)
+
+
+@pytest.mark.parametrize("format", ["bvh", "amass"])
+def test_formats_of_rotations_have_no_gaps(tmp_path, format):
+    for clips in (GAPS, replace(PEOPLE.with_rotations(), clips=GAPS.clips, missing=True)):
+        with pytest.raises(
+            ValueError, match=f"lacks joints, and {format} has no gaps; fill them first.*or write npz or csv"
+        ):
+            motion.write_motion(tmp_path / "folder", clips, format)
+
+
+@pytest.mark.parametrize("heading", [True, False])
+@pytest.mark.parametrize("root", ["drop", "relative"])
+def test_windows_are_put_back_where_they_were(root, heading):
+    """Whole poses, turned and moved as windows are, fill the clips; but for the root's own gap, where poses lack it."""
+    gaps = without(GAPS, Pelvis=slice(30, 36))
+    protocol = replace(motion.PROTOCOLS["simulated"], root=root, heading=heading, test_stride=20)
+    windows = motion.windows(gaps, protocol, "test")
+    read, true = (
+        torch.stack([torch.from_numpy(clips[key[:2]].positions[key[2] :][: windows.length]) for key in windows.keys])
+        for clips in (gaps, PEOPLE)
+    )
+    made = true - (true[:, :, [WALKER.root]] if root == "drop" else true[:, :1, [WALKER.root]])
+    if heading:
+        angle = WALKER.heading_near(read, protocol.observed - 1)[:, None, None]
+        made = motion.rotate_about_up(made, -angle, WALKER.up)
+    found = windows.filled(made)
+    assert found.missing == any(np.isnan(clip.positions).any() for clip in found)
+    covered = max(key[2] for key in windows.keys) + windows.length
+    for clip in found:
+        true, read = PEOPLE[clip.key].positions, gaps[clip.key].positions
+        assert np.array_equal(clip.positions[~np.isnan(read)], read[~np.isnan(read)])
+        assert np.array_equal(np.isnan(clip.positions[covered:]), np.isnan(read[covered:]))
+        bridge = np.linspace(true[29, WALKER.root], true[36, WALKER.root], 8)[1:-1]
+        moved = (bridge - true[30:36, WALKER.root])[:, None] if root == "drop" else 0.0
+        expected = np.where(np.isnan(read), true, read)[:covered]
+        expected[30:36] += np.where(np.isnan(read[30:36]), moved, 0.0)
+        np.testing.assert_allclose(clip.positions[:covered], expected, atol=1e-5)
 
 
 def test_energies_are_of_what_was_observed():
@@ -541,3 +667,88 @@ def test_a_run_on_whole_motion_forecasts_other_motion_with_gaps(tmp_path, capsys
 def test_past_that_is_shown_has_its_gaps():
     batch = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test").all()
     assert torch.equal(gapped(batch).isnan(), ~batch["mask"])
+
+
+def test_every_command_that_reads_motion_takes_gaps_the_same_way():
+    for name in COMMANDS:
+        hints = get_type_hints(command([name]), include_extras=True)
+        if "source" in hints and is_dataclass(hints["source"]):
+            hints |= get_type_hints(hints["source"], include_extras=True)
+        reads = {"data", "files"} & hints.keys() and name != "resume"  # which reads what the run has
+        assert (hints.get("missing") == Missing) == bool(reads), name
+
+
+def test_files_with_gaps_are_looked_at_played_and_converted(tmp_path, capsys):
+    source, page = str(tmp_path / "gaps.npz"), str(tmp_path / "clip.html")
+    motion.save(source, GAPS)
+    for arguments in (
+        ["data", "info", source],
+        ["animate", source, "--out", page],
+        ["data", "convert", source, "--out", str(tmp_path / "a" / "b.npz")],
+    ):
+        assert main(arguments) == 1
+        assert "--missing" in capsys.readouterr().err
+    assert main(["data", "info", source, "--missing"]) == 0
+    assert "missing joints" in capsys.readouterr().out
+    for out in (page, str(tmp_path / "clip.gif")):
+        assert main(["animate", source, "--out", out, "--missing", "--every", "10"]) == 0
+    for number, (place, options) in enumerate(
+        [("1.npz", []), ("csv", ["--format", "csv"]), ("2/whole.npz", []), ("half.npz", ["--fps", "15"])]
+    ):
+        out, given = tmp_path / place, str(tmp_path / "csv") if number == 2 else source
+        out.parent.mkdir(exist_ok=True)
+        convert = ["data", "convert", given, "--out", str(out), "--missing", "--jobs", "1", *options]
+        assert main(convert) == 0
+        assert "nan" not in capsys.readouterr().err
+        found = motion.read_motion(out, missing=True)
+        for clip in found:
+            expected = GAPS[clip.key].positions[:: 2 if options[-1:] == ["15"] else 1]
+            np.testing.assert_allclose(clip.positions, expected, atol=1e-6)
+    assert main(["data", "convert", source, "--out", str(tmp_path / "x"), "--format", "bvh", "--missing"]) == 1
+    assert "lacks joints, and bvh has no gaps" in capsys.readouterr().err
+
+
+def test_a_run_is_judged_and_shown_on_other_motion_with_gaps(tmp_path, capsys):
+    (tmp_path / "other").mkdir()
+    motion.save(tmp_path / "other" / "gaps.npz", GAPS)
+    run, other = str(tmp_path / "run"), ["--data", str(tmp_path / "other" / "gaps.npz"), "--missing"]
+    assert main(["fit", "vae", "--data", "simulated", *QUICK, "--out", run]) == 0
+    few = ["--samples", "2"]
+    assert main(["evaluate", run, *other, *few, "--log-score-particles", "2", "--out", str(tmp_path / "e.json")]) == 0
+    assert np.isfinite(json.loads((tmp_path / "e.json").read_text())["rows"]["vae"]["scores"]["log score"]["mean"])
+    criticise = ["--simulations", "2", "--draws", "2", "--samples", "19", "--out", str(tmp_path / "c.json")]
+    assert main(["criticise", run, *other, *criticise]) == 0
+    assert main(["compare", run, *other, *few, "--particles", "2", "--contrasts", "2"]) == 0
+    page = ["--out", str(tmp_path / "r.html"), "--windows", "1", *few, "--bound-windows", "2", "--particles", "2"]
+    assert main(["report", run, *other, *page, "--evaluate"]) == 0
+    assert main(["animate", run, *other, "--out", str(tmp_path / "a.html")]) == 0
+
+
+def test_gaps_are_filled_in_the_motion_itself(tmp_path, capsys):
+    motion.save(tmp_path / "gaps.npz", GAPS)
+    run, data = str(tmp_path / "run"), ["--data", str(tmp_path / "gaps.npz"), "--missing"]
+    assert main(["fit", "vae", *data, "--out", run, "--protocol", "simulated", *QUICK]) == 0
+    clip = GAPS.clips[-1]
+    impute = ["impute", run, "--samples", "1", "--filled"]
+    (tmp_path / "made").mkdir()
+    assert main([*impute, str(tmp_path / "made" / "all.npz"), "--out", str(tmp_path / "i.npz")]) == 0
+    assert (tmp_path / "i.npz").is_file()
+    whole = motion.read_motion(tmp_path / "made" / "all.npz", missing=True)
+    assert {each.key for each in whole} == {each.key for each in GAPS if each.split == "test"}
+    for each in whole:
+        read = GAPS[each.key].positions
+        assert np.array_equal(each.positions[~np.isnan(read)], read[~np.isnan(read)])
+        assert np.isfinite(each.positions[:75]).all()
+    one = [*impute[:-1], "--clip", clip.name, "--filled"]
+    for name in ("one.csv", "one.bvh"):
+        assert main([*one, str(tmp_path / "made" / name)]) == 0
+    read = motion.read_motion(tmp_path / "made" / "one.csv").clips[0].positions  # whole: nothing is NaN
+    there = ~np.isnan(clip.positions)
+    np.testing.assert_allclose(read[there], clip.positions[there], atol=1e-6)
+    bvh = motion.read_motion(tmp_path / "made" / "one.bvh")
+    assert (bvh.clips[0].frames, bvh.skeleton.fps) == (clip.frames, WALKER.fps)
+    capsys.readouterr()
+    assert main([*impute, str(tmp_path / "made" / "all.bvh")]) == 2
+    assert "holds one clip, of" in capsys.readouterr().err
+    assert main(["impute", run]) == 2
+    assert "say which, by --out or --filled" in capsys.readouterr().err

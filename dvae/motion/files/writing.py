@@ -7,6 +7,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from ...inference.result import progress_bar
 from ..data import Clip, MotionSet
@@ -56,7 +59,8 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
         The files that were written.
 
     Raises:
-        ValueError: the format is not known, several clips go to a file of one, or their names lead out of the folder.
+        ValueError: the format is not known, several clips go to a file of one, or their names lead out of the folder;
+            or joints are missing, which a format of rotations cannot say.
         OSError: a file cannot be written.
     """
     path, format = Path(path), format_of(path, format)
@@ -69,6 +73,11 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
             "and the format"
         )
     if format in ("bvh", "amass"):
+        if lacking := [clip for clip in motion if np.isnan(clip.positions).any()]:
+            raise ValueError(
+                f"clip {brief('/'.join(lacking[0].key))} lacks joints, and {format} has no gaps; fill them first "
+                "(`dvae impute RUN --filled FILE`), or write npz or csv, where they are NaN"
+            )
         motion = motion.with_rotations()
     return [write_clip(_place(path, clip, format), clip, motion.skeleton, format) for clip in motion]
 
@@ -113,6 +122,7 @@ def convert(
     up: str | None = None,
     recorded: float | None = None,
     skip_bad: bool = False,
+    missing: bool = False,
 ) -> str:
     """Write the motion of files or folders anew, clip by clip, on several cores.
 
@@ -126,6 +136,7 @@ def convert(
         metres, up: see `read_motion`.
         recorded: frames per second of the files, where they are wrong about it.
         skip_bad: leave out what cannot be used.
+        missing: keep clips that lack joints (NaN) in some frames.
 
     Returns:
         What was written, in a sentence or several.
@@ -140,7 +151,8 @@ def convert(
     if not files:  # an archive
         if len(sources) > 1:
             raise ValueError(f"{sources[0]} is an archive of many clips, which is converted by itself")
-        motion = read_motion(sources[0], skip_bad=skip_bad, onto=onto, metres=metres, up=up, fps=recorded)
+        told: Any = {"metres": metres, "up": up, "fps": recorded, "missing": missing}
+        motion = read_motion(sources[0], skip_bad=skip_bad, onto=onto, **told)
         motion = motion if fps is None else motion.resampled(fps)
         written = write_motion(out, motion, format)
         return f"{len(motion)} clips in {len(written)} files; {len(motion.skipped)} skipped"
@@ -151,7 +163,7 @@ def convert(
         twice = next(key for key in keys if keys.count(key) > 1)
         raise ValueError(f"two files are clip {'/'.join(twice)}; put them into folders of different names")
     world = understand(sampled(files, skip_bad), metres, up)
-    reader = FileReader(world, metres is not None, recorded, onto=onto, resampled=fps)
+    reader = FileReader(world, metres is not None, recorded, onto=onto, resampled=fps, missing=missing)
     collected, skipped = Collected(out.stem), []
     work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="2*n_jobs", batch_size=1)
     results = work(delayed(_converted)(reader, file, out, format, skip_bad) for file in files)
@@ -192,9 +204,10 @@ def _converted(reader: FileReader, file: File, out: Path, format: str, skip_bad:
         clip, skeleton = reader(file)
         if format == "npz":
             return clip, skeleton
-        motion = MotionSet([clip], skeleton, file.name, copy=False)
+        motion = MotionSet([clip], skeleton, file.name, copy=False, missing=reader.missing)
         write_motion(_place(out, clip, format), motion, format)
-        return clip.between(0, 1), skeleton
+        fullest = int(np.isnan(clip.positions).any(2).sum(1).argmin())
+        return clip.between(fullest, fullest + 1), skeleton
     except ValueError as error:
         if not skip_bad:
             raise
