@@ -295,8 +295,9 @@ class GSPSModel(EnergyModel):
     def impute(self, batch: AnyBatch, samples: int = 1, **options: Any) -> dict[str, Tensor]:
         """Whole windows with their gaps filled in, S times, by the motion that is nearest to all that was observed.
 
-        There is no guide that reads what is behind a gap. Each filling is from as many draws as in training, of which
-        the best is what the model learns to have near the truth.
+        Ours, as there is no guide that reads what is behind a gap. Each filling is from as many draws as in training,
+        of which the best is what the model learns to have near the truth. Across a gap it is moved so that it meets
+        what was observed at both ends: by its errors there, on a straight line in time.
 
         Raises:
             ValueError: a batch without a mask, or windows of another length than the networks make.
@@ -304,14 +305,17 @@ class GSPSModel(EnergyModel):
         if not isinstance(batch, Mapping) or (mask := mask_of(batch)) is None:
             return super().impute(batch, samples, **options)  # which says so
         if (length := batch[WHOLE].shape[1]) != self.length:
-            raise ValueError(f"gsps fills gaps in windows of {self.length} frames, not {length}; cut the motion so")
+            raise ValueError(
+                f"gsps fills gaps in windows of {self.length} frames, not {length}; cut the motion so, as "
+                "`dvae impute` does without --clip"
+            )
         filled, count = [], prod(self.draws.values())
         for _ in range(samples):
             made = self.reconstruct(batch, count, **options)[WHOLE]
             given, seen = torch.as_tensor(batch[WHOLE]).to(made), torch.as_tensor(mask).to(made.device)
             nearest = (made - given).square().masked_fill(~seen, 0.0).sum((2, 3)).argmin(0)
             best = made.take_along_dim(nearest[None, :, None, None], 0)[0]
-            filled.append(torch.where(seen, given, best))
+            filled.append(torch.where(seen, given, best + bridged(given - best, seen)))
         return {WHOLE: torch.stack(filled)}
 
     @torch.no_grad()

@@ -22,7 +22,7 @@ ERROR = Plain(stderr=True, soft_wrap=True, highlight=False)
 
 Missing = Annotated[
     bool,
-    tyro.conf.arg(help="keep clips that lack joints, which are NaN where they were not observed (default: refuse)"),
+    tyro.conf.arg(help="keep clips that lack joints, which are NaN where they were not observed"),
 ]
 """The option of every command that reads motion."""
 
