@@ -82,7 +82,7 @@ class Check:
     """One statistic of real and of replicated windows.
 
     Attributes:
-        real: (N,).
+        real: (N,), of the windows of which the statistic says something.
         replicated: (S, N).
         unit: of both.
     """
@@ -259,7 +259,7 @@ def predictive_checks(
     Two replications, both free-running. "forecast": the frames after the observed ones; the last two observed frames
     are joined to them, so that a jump at the seam counts. "posterior", the posterior predictive distribution proper:
     latents are inferred from the whole window, and all its frames are generated anew from them. Where entries of a
-    window are missing, its replicates lack them too.
+    window are missing, its replicates lack them too; a window that leaves too few for a statistic does not count in it.
 
     Args:
         model: a model, or `{name: model}`.
@@ -298,6 +298,7 @@ def predictive_checks(
     with progress_bar(progress) as bar:
         for program, first in firsts.items():
             real = _measure(statistics, truth[:, first:], "real windows")
+            told = {name: values.isfinite() for name, values in real.items()}
             for label, each in models.items():
                 parts: list[dict[str, Tensor]] = []
                 with reproducibly(each, seed):
@@ -307,10 +308,14 @@ def predictive_checks(
                         part = on_device_of(each, held.part(some))
                         x = _REPLICATES[program](each, part, held.observed, samples, draw_emission).to(held.x)
                         x = x.masked_fill(truth[some, first:].isnan(), torch.nan)
-                        parts.append(_measure(statistics, x, f"replicates of {label} ({program})"))
+                        known = {name: seen[some] for name, seen in told.items()}
+                        parts.append(_measure(statistics, x, f"replicates of {label} ({program})", known))
                 for name, statistic in statistics.items():
-                    replicated = torch.cat([part[name] for part in parts], 1).numpy()
-                    checks[label, program, name] = Check(real[name].numpy(), replicated, statistic.unit)
+                    values, replicated = real[name], torch.cat([part[name] for part in parts], 1)
+                    kept = told[name]
+                    checks[label, program, name] = Check(
+                        values[kept].numpy(), replicated[:, kept].numpy(), statistic.unit
+                    )
     return PredictiveChecks(
         checks={(m, p, s): checks[m, p, s] for m in models for p in firsts for s in statistics},
         data=held.description(),
@@ -339,7 +344,10 @@ def _posterior(model: DynamicalVAE, batch: dict[str, Tensor], observed: int, sam
 _REPLICATES = {"forecast": _forecast, "posterior": _posterior}
 
 
-def _measure(statistics: Mapping[str, Statistic], x: Tensor, whose: str) -> dict[str, Tensor]:
+def _measure(
+    statistics: Mapping[str, Statistic], x: Tensor, whose: str, told: Mapping[str, Tensor] | None = None
+) -> dict[str, Tensor]:
+    """Statistics (..., N) by name; NaN of a window that has too many gaps, or of which `told` (N,) says so."""
     found = {}
     for name, statistic in statistics.items():
         found[name] = statistic.function(x).double().cpu()
@@ -348,8 +356,9 @@ def _measure(statistics: Mapping[str, Statistic], x: Tensor, whose: str) -> dict
                 f"the statistic {name} maps {tuple(x.shape)} to {tuple(found[name].shape)}; expected "
                 f"{tuple(x.shape[:-2])}, one number for each sequence (..., T, D)"
             )
-        if not found[name].isfinite().all():
-            error = ValueError if whose == "real windows" else FloatingPointError
+        nothing = found[name].isnan() & x.isnan().any(-1).any(-1) if told is None else ~told[name]
+        if not (found[name].isfinite() | nothing).all() or (told is None and nothing.all()):
+            error = ValueError if told is None else FloatingPointError
             raise error(f"the statistic {name} is not finite on {whose} of {x.shape[-2]} frames")
     return found
 

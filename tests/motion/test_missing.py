@@ -397,6 +397,10 @@ def test_replicates_have_the_gaps_of_their_windows():
     for real, made, first in ((0, 1, seam), (2, 3, 0)):
         assert torch.equal(given[real], ~mask[:, first:])
         assert torch.equal(given[made], ~mask[:, first:].expand(19, -1, -1, -1))
+    some = {"sum": Statistic(lambda x: torch.where(x.isnan().sum((-2, -1)) > 150, torch.nan, x.nansum((-2, -1))))}
+    told = [int((x.isnan().sum((1, 2)) <= 150).sum()) for x in (gapped(test.all())[:, seam:], gapped(test.all()))]
+    few = dvae.predictive_checks(model, test, some, samples=19, progress=False)
+    assert [check.replicated.shape for check in few.checks.values()] == [(19, count) for count in told]
     whole = dvae.predictive_checks(model, test, motion.statistics(test), samples=19, progress=False)
     assert all(np.isfinite(check.wasserstein) for check in (*checks.checks.values(), *whole.checks.values()))
 
