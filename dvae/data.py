@@ -152,6 +152,12 @@ def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
     return found
 
 
+def past_of(batch: Batch, observed: int) -> dict[str, Any]:
+    """A batch as forecasts see it: of x, its mask and what lies beside it, the first frames alone; all context."""
+    known = {name: batch[name] for name in ("x", "mask", BESIDE) if name in batch}
+    return {**batch, **each(known, lambda value: value[:, :observed])}
+
+
 def bridged(x: Tensor, mask: Tensor | None) -> Tensor:
     """Sequences whose missing entries lie on the straight line between the observed ones around them, in time.
 

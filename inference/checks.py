@@ -17,7 +17,7 @@ import torch
 from rich.text import Text
 from torch import Tensor
 
-from ..data import HeldOutWindows, gapped, mask_of, mean_of_known
+from ..data import HeldOutWindows, gapped, mean_of_known, past_of
 from ..program.batch import repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
@@ -328,9 +328,8 @@ def predictive_checks(
 
 def _forecast(model: DynamicalVAE, batch: dict[str, Tensor], observed: int, samples: int, drawn: bool) -> Tensor:
     """The last observed frames and the future, (S, B, seam + H, D)."""
-    x, mask = batch["x"], mask_of(batch)
-    horizon, known = x.shape[1] - observed, {} if mask is None else {"mask": mask[:, :observed]}
-    seen = {**batch, "x": x[:, :observed], **known}
+    x = batch["x"]
+    seen, horizon = past_of(batch, observed), x.shape[1] - observed
     future = model.forecast(seen, horizon, samples, draw_emission=drawn)["x"]
     return torch.cat([seen["x"][None, :, -_SEAM:].expand(samples, -1, -1, -1), future], 2)
 

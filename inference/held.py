@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, HeldOutWindows, each, gapped, mask_of
+from ..data import Batch, HeldOutWindows, each, gapped, mask_of, past_of
 from ..program.batch import rows
 from ..program.conditional import evaluating
 
@@ -52,9 +52,8 @@ class Held:
         return {name: rows(value, part) for name, value in self.batch.items()}
 
     def past(self, part: slice) -> dict[str, Any]:
-        """Some windows as forecasts see them: x `(B, O, D)`, its mask if there is one, and context."""
-        seen = {} if self.mask is None else {"mask": self.mask[part, : self.observed]}
-        return {**self.part(part), "x": self.x[part, : self.observed], **seen}
+        """Some windows as forecasts see them: x `(B, O, D)`, see `past_of`."""
+        return past_of(self.part(part), self.observed)
 
     @property
     def clips(self) -> dict[str, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
+from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +14,7 @@ import torch
 import tyro
 
 from .. import motion
-from ..data import gapped
+from ..data import Sequences, each, gapped, past_of
 from ..models.trajectories import TrajectoryModel
 from ..motion.dataset import SIMULATED
 from ..motion.files.writing import format_of
@@ -344,21 +345,20 @@ def draw_futures(
             + (f"{', '.join(sorted(free))} to fix" if free else "nothing to fix, no parts and no static latents")
         )
     observed, horizon = loaded.schema.protocol.observed, horizon or loaded.schema.protocol.predicted
-    listed, keys = windows.all(), windows.keys
-    x = gapped(listed)[list(chosen)]
-    past, future = x[:, :observed], x[:, observed:][:, :horizon]
+    keys = windows.keys
+    some = each(windows.all(), itemgetter(list(chosen)))
+    past, future = past_of(some, observed), gapped(some)[:, observed:][:, :horizon]
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         whole = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # parts are fixed as a whole
         parts = []
-        for part in past.split(64):
-            given = {"x": part, **({"mask": part.isfinite()} if windows.missing else {})}
+        for given in Sequences(past).split(64):
             once = model.forecast(given, whole, 1) if fix else {}
             held = {"fix": {name: once[name][0] for name in fix}} if fix else {}
             made = model.forecast(given, whole, samples, **held)["x"][:, :, :horizon]
             parts.append(windows.positions(made).numpy())
             del made  # with many samples the largest thing here
-    positions = [np.concatenate(parts, axis=1), *(windows.positions(frames).numpy() for frames in (past, future))]
+    positions = [np.concatenate(parts, axis=1), *(windows.positions(x).numpy() for x in (gapped(past), future))]
     return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], *positions)
 
 
