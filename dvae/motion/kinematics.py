@@ -13,8 +13,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from .rotations import procrustes
-from .skeleton import Skeleton, rotate_about_up
+from .rotations import across, procrustes
+from .skeleton import Skeleton, inverse_lengths, rotate_about_up
 
 TIE = 1e-6
 """Weight of the parent's turn beside unit vectors, where these leave the turn about themselves open."""
@@ -69,22 +69,30 @@ def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
         world[joint] = above
         if below:
             rest = torch.nn.functional.normalize(offsets[below], dim=-1)
-            seen = torch.nn.functional.normalize(positions[..., below, :] - positions[..., joint, None, :], dim=-1)
-            found = procrustes(seen.transpose(-1, -2) @ rest + TIE * above)
-            world[joint] = _swing(found @ rest[0], seen[..., 0, :]) @ found if len(below) == 1 else found
+            seen = positions[..., below, :] - positions[..., joint, None, :]
+            seen = seen * inverse_lengths(seen)[..., None]
+            if len(below) == 1:
+                world[joint] = _swing(above @ rest[0], seen[..., 0, :]) @ above
+            else:
+                world[joint] = procrustes(seen.transpose(-1, -2) @ rest + TIE * above)
         local[joint] = above.transpose(-1, -2) @ world[joint]
     return torch.stack([local[joint] for joint in range(skeleton.joints)], -3)
 
 
 def _swing(start: Tensor, end: Tensor) -> Tensor:
-    """The smallest rotation (..., 3, 3) from one unit vector to another that is not its opposite."""
-    axis = torch.linalg.cross(start, end)
-    zero = torch.zeros_like(axis[..., 0])
-    x, y, z = axis.unbind(-1)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    cosine = (start * end).sum(-1)[..., None, None]
-    found: Tensor = torch.eye(3, dtype=start.dtype, device=start.device) + skew + skew @ skew / (1 + cosine)
-    return found
+    """The smallest rotation (..., 3, 3) from one unit vector to another: half a turn about it, then about their middle.
+
+    Of the many onto a vector's opposite, one; none, where the end is zero.
+    """
+    middle = start + end
+    opposite = middle.norm(dim=-1, keepdim=True) < torch.finfo(middle.dtype).eps ** 0.5  # below, rounding rules
+    middle = torch.nn.functional.normalize(torch.where(opposite, across(start), middle), dim=-1)
+    return _half_turn(middle) @ _half_turn(start)
+
+
+def _half_turn(axis: Tensor) -> Tensor:
+    """(..., 3, 3) about a unit vector."""
+    return 2 * axis[..., :, None] * axis[..., None, :] - torch.eye(3, dtype=axis.dtype, device=axis.device)
 
 
 def rest(skeleton: Skeleton, positions: Tensor, rounds: int = 10) -> Tensor:

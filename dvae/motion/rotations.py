@@ -1,15 +1,19 @@
 """Rotations in the forms that files and models use, to and from matrices.
 
 Everything is right-handed, acts on columns, is batched over leading dimensions and differentiable; the conversions are
-roma's (Brégier 2021, arXiv 2103.16317), whose gradients are finite at no turn and at half a turn too. It takes as long
-to import as torch does, so that it is imported where something is turned.
+roma's (Brégier 2021, arXiv 2103.16317). It takes as long to import as torch does, so that it is imported where something
+is turned.
+
+Derivatives to a rotation are right everywhere, those from one but where a form jumps: a quaternion to its opposite where
+another of its numbers becomes the largest, a vector at half a turn to the other end of its axis, and Euler angles where
+one is half a turn, or the second one brings the axes of the others together.
 
 | form | numbers | |
 |---|---|---|
 | `matrix` | 9 | row after row |
 | `quaternion` | 4 | w x y z; of the two for one rotation, see `continuous` |
 | `vector` | 3 | axis times angle in radians, the exponential map |
-| `6d` | 6 | the matrix's first column, then its second (Zhou et al. 2019, arXiv 1812.07035); any two vectors are read |
+| `6d` | 6 | the matrix's first column, then its second (Zhou et al. 2019, arXiv 1812.07035) |
 | `euler-zyx`, ... | 3 | radians, about axes that turn along, the first of them first; read with any number of axes |
 """
 
@@ -37,6 +41,9 @@ def size(form: str) -> int:
 def to_matrix(values: Tensor, form: str) -> Tensor:
     """Matrices (..., 3, 3) of rotations (..., `size(form)`); quaternions and 6d of any length are taken.
 
+    What says nothing leaves unturned: a quaternion shorter than rounding (`finfo.eps`), and of 6d a first vector so
+    short, which is read as x; a second one so short, or along the first, as one across that.
+
     Raises:
         ValueError: an unknown form, or another number of numbers.
 
@@ -50,12 +57,20 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
         return values.unflatten(-1, (3, 3))
     import roma
 
+    shortest = torch.finfo(values.dtype).eps
     if form == "quaternion":
+        none = values.norm(dim=-1, keepdim=True) < shortest
+        values = torch.where(none, values.new_tensor([1.0, 0, 0, 0]), values)
         return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(values, dim=-1)))
     if form == "vector":
         return roma.rotvec_to_rotmat(values)
     if form == "6d":
-        return roma.special_gramschmidt(values.unflatten(-1, (2, 3)).transpose(-1, -2))
+        first, second = values.unflatten(-1, (2, 3)).unbind(-2)
+        first = torch.where(first.norm(dim=-1, keepdim=True) < shortest, values.new_tensor([1.0, 0, 0]), first)
+        axis = torch.nn.functional.normalize(first, dim=-1)
+        apart = second - (axis * second).sum(-1, keepdim=True) * axis
+        along = apart.norm(dim=-1, keepdim=True) <= (shortest**0.5 * second.norm(dim=-1, keepdim=True)).clamp(shortest)
+        return roma.special_gramschmidt(torch.stack([first, torch.where(along, across(axis), second)], -1))
     return roma.euler_to_rotmat(form.removeprefix("euler-").upper(), values)
 
 
@@ -96,6 +111,12 @@ def continuous(quaternions: Tensor, dim: int = -3) -> Tensor:
         opposite[:1] = False  # the first has none before it
         signs = 1 - 2 * (opposite.cumsum(0) % 2).movedim(0, dim).to(quaternions.dtype)
     return quaternions * signs
+
+
+def across(vectors: Tensor) -> Tensor:
+    """For each of unit vectors (..., 3) another one at right angles to it, near the axis that it has least of."""
+    least = torch.nn.functional.one_hot(vectors.abs().argmin(-1), 3).to(vectors)
+    return torch.nn.functional.normalize(least - (least * vectors).sum(-1, keepdim=True) * vectors, dim=-1)
 
 
 def procrustes(products: Tensor) -> Tensor:

@@ -59,6 +59,18 @@ def test_gradients_are_right_at_no_turn_and_at_half_a_turn(form, angle):
     )
 
 
+@each_form
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, 2.5, torch.pi - 1e-3])
+def test_gradients_are_those_of_differences(form, angle):
+    if form.startswith("euler") and form[-1] == form[-3]:
+        angle = max(angle, 1.0)  # below, the first and the third axis come together
+    axes = torch.nn.functional.normalize(torch.tensor([[1.0, 2, 3], [-2, 1, 1]]).double(), dim=-1)
+    vectors = (angle * axes).requires_grad_()
+    values = rotations.from_matrix(rotations.to_matrix(vectors.detach(), "vector"), form).requires_grad_()
+    torch.autograd.gradcheck(lambda v: rotations.to_matrix(v, form), values)
+    torch.autograd.gradcheck(lambda v: rotations.from_matrix(rotations.to_matrix(v, "vector"), form), vectors)
+
+
 def test_a_rotation_vector_goes_through_matrices_with_finite_gradients():
     for angle in (0.0, torch.pi):
         vector = torch.tensor([angle, 0, 0], dtype=torch.float64, requires_grad=True)
@@ -73,6 +85,31 @@ def test_quaternions_and_6d_of_any_length_are_read():
     matrices = turns(0.7)
     for form in ("quaternion", "6d"):
         torch.testing.assert_close(rotations.to_matrix(3 * rotations.from_matrix(matrices, form), form), matrices)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("form", "values"),
+    [
+        ("quaternion", [0.0] * 4),
+        ("6d", [0.0] * 6),
+        ("6d", [0.0, 0, 0, 2, 0, 0]),
+        ("6d", [1.0, 2, 3, 0, 0, 0]),
+        ("6d", [1.0, 2, 3, -2, -4, -6]),
+        ("6d", [1e-30] * 6),
+    ],
+)
+def test_numbers_that_tell_no_rotation_are_read_as_one(form, values, dtype):
+    given = torch.tensor(values, dtype=dtype, requires_grad=True)
+    found = rotations.to_matrix(given, form)
+    torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=dtype))
+    torch.testing.assert_close(torch.linalg.det(found), torch.ones((), dtype=dtype))
+    if not any(values):
+        assert torch.equal(found, torch.eye(3, dtype=dtype))
+    if form == "6d" and any(values[:3]) and values[0] == 1:
+        torch.testing.assert_close(found[:, 0], torch.nn.functional.normalize(given[:3], dim=0))
+    (gradient,) = torch.autograd.grad((found * torch.randn(3, 3, dtype=dtype)).sum(), given)
+    assert gradient.abs().max() < 10
 
 
 def test_quaternions_are_made_continuous_without_a_change_of_rotation():
@@ -122,10 +159,9 @@ def test_forward_kinematics_is_a_product_along_every_chain():
 
 
 def test_forward_kinematics_has_a_gradient():
-    offsets, local, root = random_pose(1)
-    values = rotations.from_matrix(local, "6d").requires_grad_()
+    offsets, local, root = (value.requires_grad_() for value in random_pose(1))
     assert torch.autograd.gradcheck(
-        lambda v: kinematics.forward(WALKER.parents, rotations.to_matrix(v, "6d"), offsets, root)[0], values
+        lambda *given: kinematics.forward(WALKER.parents, *given), (local, offsets, root), fast_mode=True
     )
 
 
@@ -148,11 +184,47 @@ def test_a_bone_is_not_turned_about_itself():
     torch.testing.assert_close(found[:, foot], torch.eye(3).double().expand(7, 3, 3))
 
 
-def test_a_bone_that_points_backwards_is_turned_by_half_a_turn():
-    offsets = torch.zeros(WALKER.joints, 3, dtype=torch.float64)
-    offsets[:, 1] = 1.0
-    found = kinematics.inverse(WALKER, -offsets.cumsum(0)[None], offsets)
-    assert found.isfinite().all()
+CHAIN = Skeleton(("hip", "knee", "foot"), (-1, 0, 1))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("aside", [0.0, 1e-12, 1e-6, 1e-3])
+def test_a_bone_that_points_backwards_is_turned_by_half_a_turn(aside, dtype):
+    offsets = torch.tensor([[0.0, 0, 0], [0, 1, 0], [0.6, 0.8, 0]], dtype=dtype)
+    positions = -offsets.cumsum(0)[None]
+    positions[0, 1, 2] += aside
+    found = kinematics.inverse(CHAIN, positions.requires_grad_(), offsets)
+    again, _ = kinematics.forward(CHAIN.parents, found, offsets, positions[:, 0])
+    torch.testing.assert_close(again, positions, atol=2e-3 if dtype is torch.float32 else 1e-6, rtol=0)
+    torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=dtype).expand_as(found))
+    (gradient,) = torch.autograd.grad((found * torch.randn_like(found)).sum(), positions)
+    assert gradient.isfinite().all()
+
+
+def test_a_joint_whose_bone_has_no_length_is_not_turned():
+    offsets = torch.tensor([[0.0, 0, 0], [0, 1, 0], [0, 1, 0]], dtype=torch.float64)
+    positions = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [1, 0, 0]]], dtype=torch.float64, requires_grad=True)
+    found = kinematics.inverse(CHAIN, positions, offsets)
+    torch.testing.assert_close(found[0, 1], torch.eye(3, dtype=torch.float64))
+    (gradient,) = torch.autograd.grad((found * torch.randn_like(found)).sum(), positions)
+    assert gradient.abs().max() < 10
+
+
+def test_inverse_kinematics_has_a_gradient():
+    offsets, local, root = random_pose(1)
+    positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
+    positions = positions + 0.1 * torch.randn_like(positions)  # of no such body
+    assert torch.autograd.gradcheck(lambda x: kinematics.inverse(WALKER, x, offsets), positions.requires_grad_())
+
+
+def test_inverse_kinematics_rounds_as_its_numbers_do():
+    offsets, local, root = random_pose()
+    positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
+    positions = positions.float()
+    exact = kinematics.inverse(WALKER, positions.double(), offsets)
+    torch.testing.assert_close(
+        kinematics.inverse(WALKER, positions, offsets.float()).double(), exact, atol=1e-4, rtol=0
+    )
 
 
 def test_inverse_kinematics_of_real_people_is_within_a_centimetre(real):
