@@ -84,6 +84,7 @@ def _swing(start: Tensor, end: Tensor) -> Tensor:
 
     Of the many onto a vector's opposite, one; none, where the end is zero.
     """
+    start = torch.nn.functional.normalize(start, dim=-1)  # or rounding would grow from joint to joint
     middle = start + end
     opposite = middle.norm(dim=-1, keepdim=True) < torch.finfo(middle.dtype).eps ** 0.5  # below, rounding rules
     middle = torch.nn.functional.normalize(torch.where(opposite, across(start), middle), dim=-1)

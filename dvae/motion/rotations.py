@@ -1,18 +1,18 @@
 """Rotations in the forms that files and models use, to and from matrices.
 
 Everything is right-handed, acts on columns, is batched over leading dimensions and differentiable; the conversions are
-roma's (Brégier 2021, arXiv 2103.16317). It takes as long to import as torch does, so that it is imported where something
-is turned.
+roma's (Brégier 2021, arXiv 2103.16317). It takes as long to import as torch does, so that it is imported where
+something is turned.
 
-Derivatives to a rotation are right everywhere, those from one but where a form jumps: a quaternion to its opposite where
-another of its numbers becomes the largest, a vector at half a turn to the other end of its axis, and Euler angles where
-one is half a turn, or the second one brings the axes of the others together.
+Derivatives to a rotation are right everywhere, those from one but where a form jumps: a quaternion to its opposite,
+where another of its numbers becomes the largest; a vector at half a turn, to the other end of its axis; Euler angles
+where one is half a turn, or the second one brings the axes of the others together.
 
 | form | numbers | |
 |---|---|---|
 | `matrix` | 9 | row after row |
-| `quaternion` | 4 | w x y z; of the two for one rotation, see `continuous` |
-| `vector` | 3 | axis times angle in radians, the exponential map |
+| `quaternion` | 4 | w x y z; of the two for one rotation, see `in_time` |
+| `vector` | 3 | axis times angle in radians, the exponential map; of the many, see `in_time` |
 | `6d` | 6 | the matrix's first column, then its second (Zhou et al. 2019, arXiv 1812.07035) |
 | `euler-zyx`, ... | 3 | radians, about axes that turn along, the first of them first; read with any number of axes |
 """
@@ -111,6 +111,34 @@ def continuous(quaternions: Tensor, dim: int = -3) -> Tensor:
         opposite[:1] = False  # the first has none before it
         signs = 1 - 2 * (opposite.cumsum(0) % 2).movedim(0, dim).to(quaternions.dtype)
     return quaternions * signs
+
+
+def in_time(rotations: Tensor, form: str) -> Tensor:
+    """Rotations (..., T, J, 3, 3) in a form as `from_matrix` gives it, without its jumps from frame to frame.
+
+    Where a rotation has several quaternions or vectors, a frame has the one nearest to that of the frame before; the
+    first has the quaternion with w >= 0, or the vector of at most half a turn. So a frame depends on none after it.
+    """
+    values = from_matrix(rotations, form)
+    if form == "quaternion":
+        return continuous(torch.where(values[..., :1, :, :1] < 0, -values, values))
+    return _unwrapped(values) if form == "vector" else values
+
+
+def _unwrapped(vectors: Tensor) -> Tensor:
+    """Vectors (..., T, J, 3), each with so many whole turns about its axis that it is nearest to the one before.
+
+    One after the other, since where a vector lies says which turns are nearest for the next.
+    """
+    first, *others = vectors.unbind(-3)
+    found = [first]
+    for vector in others:
+        angle = vector.norm(dim=-1, keepdim=True)
+        unturned = angle < 100 * torch.finfo(angle.dtype).eps  # about any axis, as the rest is rounding
+        axis = torch.nn.functional.normalize(torch.where(unturned, found[-1], vector), dim=-1)
+        turns = ((found[-1] * axis).sum(-1, keepdim=True) - angle) / (2 * torch.pi)
+        found.append(vector + 2 * torch.pi * turns.round() * axis)
+    return torch.stack(found, -3)
 
 
 def across(vectors: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from ..data import BESIDE, Batch
 from ..networks.base import valid_steps
 from ..views import WHOLE, View
 from . import kinematics
-from .rotations import from_matrix, size, to_matrix
+from .rotations import in_time, size, to_matrix
 from .skeleton import Skeleton, inverse_lengths, rotate_about_up
 
 HEADING = "heading"
@@ -241,9 +241,9 @@ class Rotations(View):
     """Turns of joints in place of positions, and bones that keep their lengths.
 
     x is positions (B, T, D) in metres on either side of a model; what the model sees is first the root's place, where
-    x has it, then the turn of every joint from which others hang, in `form`. The turns are those that come with the
-    data; of data without, as of the past of a forecast, they are found (`kinematics.inverse`). Bones have the lengths
-    that they have in the data, on average, or in the rest pose, where there are none.
+    x has it, then the turn of every joint from which others hang, in `form`, without jumps (`rotations.in_time`). The
+    turns are those that lie beside the data; of data without they are found (`kinematics.inverse`), with twists of
+    their own. Bones have the lengths that they have in the data, on average, or in the rest pose, where there are none.
 
     Densities are of these numbers, not of positions, which have other volumes and one dimension for each bone more:
     bounds compare with those of models that see the same.
@@ -262,10 +262,11 @@ class Rotations(View):
     form: str = "6d"
     root: bool = False
     names = (LENGTHS,)
+    _offsets: Tensor = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         size(self.form)
-        assert len(self.skeleton.offsets)  # which says what to do where there are none
+        object.__setattr__(self, "_offsets", self.skeleton.offsets)  # which says what to do where there are none
 
     @property
     def measured(self) -> str:  # type: ignore[override]
@@ -301,12 +302,12 @@ class Rotations(View):
         positions = skeleton.with_root(x.unflatten(-1, (-1, 3)))
         turns = data.get(BESIDE, {}).get(TURNS)
         if turns is None:
-            found = kinematics.inverse(skeleton, positions, skeleton.offsets.to(x))[..., self.turning, :, :]
+            found = kinematics.inverse(skeleton, positions, self._offsets.to(x))[..., self.turning, :, :]
         else:
             turns = turns[:, : x.shape[1]].unflatten(-1, (-1, 4))  # of a past, no more than that
             found = to_matrix(turns[..., self.turning, :], "quaternion").to(x)
         place = [positions[..., skeleton.root, :]] if self.root else []
-        seen[WHOLE] = torch.cat([*place, from_matrix(found, self.form).flatten(-2)], -1)
+        seen[WHOLE] = torch.cat([*place, in_time(found, self.form).flatten(-2)], -1)
         seen[LENGTHS] = (beside or {}).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
         return seen
 
@@ -317,7 +318,7 @@ class Rotations(View):
         if WHOLE not in seen:
             return data
         x, skeleton = seen[WHOLE], self.skeleton
-        offsets = skeleton.offsets.to(x)
+        offsets = self._offsets.to(x)
         if bones is not None:
             children = [child for _, child in skeleton.edges]
             lengths = bones.new_zeros(*bones.shape[:-1], skeleton.joints)

@@ -9,7 +9,7 @@ import torch
 import dvae
 from dvae import motion
 from dvae.cli.futures import draw_futures
-from dvae.data import leaves
+from dvae.data import leaves, past_of
 from dvae.inference import metrics
 from dvae.inference.held import clip_places
 from dvae.motion import kinematics, rotations
@@ -101,6 +101,22 @@ def test_forecasts_keep_the_bones_of_the_past(people_of_two_sizes, method, form)
     lengths = data.skeleton.bone_lengths(data.positions(past)).mean(1)
     found = data.skeleton.bone_lengths(data.positions(futures))
     torch.testing.assert_close(found, lengths[None, :, None].expand_as(found), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("told", [True, False])
+def test_what_is_seen_has_no_jumps(people_of_two_sizes, form, told):
+    data = windows(twisted(people_of_two_sizes), representation=form)
+    model, batch = small(data), data.all()
+    batch = batch if told else {"x": batch["x"]}
+    seen = model.read(batch)["x"].unflatten(-1, (-1, rotations.size(form)))
+    assert seen.diff(dim=1).norm(dim=-1).max() < 1  # opposite quaternions are 2 apart, vectors a turn
+    if form == "quaternion":
+        assert seen[:, 0, :, 0].min() >= 0 > seen[..., 0].min() or not told
+    if form == "vector":
+        assert seen[:, 0].norm(dim=-1).max() <= torch.pi < seen.norm(dim=-1).max() or not told
+    past = model.read(past_of(batch, 5))["x"]
+    torch.testing.assert_close(past, seen[:, :5].flatten(2))
 
 
 def test_without_data_bones_are_those_of_the_rest_pose(people_of_two_sizes):

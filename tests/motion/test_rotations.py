@@ -125,6 +125,15 @@ def test_quaternions_are_made_continuous_without_a_change_of_rotation():
     assert rotations.continuous(whole[:1]).shape == (1, 2, 4)
 
 
+@pytest.mark.parametrize("turns", [1.0, 3.3])
+def test_vectors_go_on_beyond_half_a_turn(turns):
+    axis = torch.nn.functional.normalize(torch.randn(5, 3, dtype=torch.float64), dim=-1)
+    angle = torch.pi * torch.arange(0.25, 2 * turns, 0.125, dtype=torch.float64)  # whole turns among them
+    expected = angle[:, None, None] * axis
+    found = rotations.in_time(rotations.to_matrix(expected, "vector"), "vector")
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -215,6 +224,13 @@ def test_inverse_kinematics_has_a_gradient():
     positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
     positions = positions + 0.1 * torch.randn_like(positions)  # of no such body
     assert torch.autograd.gradcheck(lambda x: kinematics.inverse(WALKER, x, offsets), positions.requires_grad_())
+
+
+def test_rounding_does_not_grow_along_a_chain():
+    body = Skeleton(tuple(map(str, range(30))), tuple(range(-1, 29)))
+    offsets = torch.randn(30, 3)
+    found = kinematics.inverse(body, torch.randn(50, 30, 3), offsets)
+    torch.testing.assert_close(found @ found.mT, torch.eye(3).expand_as(found), atol=1e-5, rtol=0)
 
 
 def test_inverse_kinematics_rounds_as_its_numbers_do():
