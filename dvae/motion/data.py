@@ -10,7 +10,6 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field, replace
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -235,10 +234,6 @@ class MotionSet:
         Those that files have are kept. Elsewhere they are found by `kinematics.inverse`, for bones that have the mean
         lengths of all clips; positions stay as they are.
         """
-        return self._turned
-
-    @cached_property
-    def _turned(self) -> MotionSet:
         if self.skeleton.rest and all(clip.rotations is not None for clip in self):
             return self
         if lacking := [clip for clip in self if clip.rotations is None and np.isnan(clip.positions).any()]:
@@ -246,20 +241,24 @@ class MotionSet:
                 f"clip {'/'.join(lacking[0].key)} lacks joints, without which their turns are not known; leave it out, "
                 "or fill its gaps first (`dvae impute RUN --filled FILE`)"
             )
-        skeleton = self.skeleton
-        if not skeleton.rest:
-            every = -(-sum(clip.frames for clip in self) // MOST_FRAMES)
-            some = torch.cat([torch.from_numpy(clip.positions)[::every] for clip in self])
-            skeleton = replace(skeleton, rest=tuple(rest(skeleton, some.double()).flatten().tolist()))
+        found: MotionSet | None = self.__dict__.get("_turned")
+        if found is None:  # once, for all splits
+            skeleton = self.skeleton
+            if not skeleton.rest:
+                every = -(-sum(clip.frames for clip in self) // MOST_FRAMES)
+                some = torch.cat([torch.from_numpy(clip.positions)[::every] for clip in self])
+                skeleton = replace(skeleton, rest=tuple(rest(skeleton, some.double()).flatten().tolist()))
 
-        def turned() -> Iterator[Clip]:
-            for clip in self:
-                if not self.skeleton.rest or clip.rotations is None:
-                    turns = inverse(skeleton, torch.from_numpy(clip.positions).double(), skeleton.offsets)
-                    clip = replace(clip, rotations=continuous(from_matrix(turns, "quaternion")).numpy())
-                yield clip
+            def turned() -> Iterator[Clip]:
+                for clip in self:
+                    if not self.skeleton.rest or clip.rotations is None:
+                        turns = inverse(skeleton, torch.from_numpy(clip.positions).double(), skeleton.offsets)
+                        clip = replace(clip, rotations=continuous(from_matrix(turns, "quaternion")).numpy())
+                    yield clip
 
-        return MotionSet(turned(), skeleton, self.name, said=self.said, missing=self.missing)  # type: ignore[arg-type]
+            found = MotionSet(turned(), skeleton, self.name, said=self.said, missing=self.missing)  # type: ignore[arg-type]
+            object.__setattr__(self, "_turned", found)
+        return found
 
     def resampled(self, fps: float) -> MotionSet:
         """The same motion at another number of frames per second; see `Clip.resampled`.
@@ -309,6 +308,8 @@ class MotionSet:
     def fingerprint(self) -> str:
         """SHA-256 of the content: skeleton, and every clip's key, shape and bytes, in order."""
         digest = hashlib.sha256(repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up)).encode())
+        if any(clip.rotations is not None for clip in self.clips):
+            digest.update(repr(self.skeleton.rest).encode())
         for clip in self.clips:
             digest.update(repr((*clip.key, clip.positions.shape)).encode())
             for values in (clip.positions, clip.rotations):

@@ -236,7 +236,6 @@ def windows(motion: MotionSet, protocol: Protocol, split: str, length: int | Non
     if unknown:
         raise ValueError(f"no split {unknown[0]!r}: expected train, validation, test or train+validation")
     chosen = {clip.key for name in split.split("+") for clip in parts[name]}
-    motion = motion if protocol.representation == "positions" else motion.with_rotations()
     return Windows([clip for clip in motion if clip.key in chosen], motion, protocol, split, length or protocol.length)
 
 
@@ -287,8 +286,9 @@ class Windows:
     def __init__(self, clips: list[Clip], motion: MotionSet, protocol: Protocol, split: str, length: int) -> None:
         if length < 1 or (protocol.heading and length < protocol.observed):
             raise ValueError(f"windows of {length} frames: expected at least {protocol.observed} (the observed frames)")
-        self.protocol, self.skeleton, self.split, self.length = protocol, motion.skeleton, split, length
-        self.missing = motion.missing
+        turned = motion if protocol.representation == "positions" else motion.with_rotations()
+        self.protocol, self.skeleton, self.split, self.length = protocol, turned.skeleton, split, length
+        self.missing, self._rest = motion.missing, motion.skeleton.rest
         self.clips = [clip for clip in clips if clip.frames >= length]
         self.skipped = [(*clip.key, clip.frames) for clip in clips if clip.frames < length]
         if not self.clips:
@@ -303,7 +303,7 @@ class Windows:
         self._frames = torch.cat([torch.from_numpy(clip.positions) for clip in self.clips])
         self._turns = None
         if protocol.representation != "positions":
-            self._turns = torch.cat([torch.from_numpy(clip.rotations) for clip in self.clips])
+            self._turns = torch.cat([torch.from_numpy(turned[clip.key].rotations) for clip in self.clips])
         frames = torch.tensor([clip.frames for clip in self.clips])
         self._first = frames.cumsum(0) - frames
         self._classes: dict[str, Tensor] = {}  # by variable, the class of every clip
@@ -542,12 +542,19 @@ class Windows:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the protocol, the skeleton, the listed windows and the data they are cut from."""
+        """SHA-256 of the protocol, the skeleton, the listed windows and what is read of the data they are cut from."""
         protocol = astuple(self.protocol)  # with its last field where that is not what it always was
         protocol = protocol if self._turns is not None else protocol[:-1]
         digest = hashlib.sha256(repr((protocol, self.split, self.length)).encode())
         digest.update(repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up, self.keys)).encode())
         digest.update(self._frames.numpy().astype("<f4", copy=False).tobytes())
+        if (
+            self._turns is not None and self._rest
+        ):  # turns of files: those that are found each machine rounds in its way
+            digest.update(repr(self._rest).encode())
+            for clip in self.clips:
+                turns = b"" if clip.rotations is None else clip.rotations.astype("<f4", copy=False).tobytes()
+                digest.update(turns)
         for variable, classes in self._classes.items():
             digest.update(repr((variable, classes.tolist())).encode())
         if self._given is not None:

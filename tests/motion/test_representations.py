@@ -184,6 +184,17 @@ def test_what_is_drawn_is_what_is_scored(people_of_two_sizes, tmp_path):
     torch.testing.assert_close(torch.stack(means), torch.tensor(scored.clip_means["ADE"]).to(errors))
 
 
+def test_data_of_other_turns_have_another_fingerprint_where_they_are_read(people_of_two_sizes):
+    people = people_of_two_sizes.with_rotations()
+    longer = replace(people.skeleton, rest=tuple(1.1 * place for place in people.skeleton.rest))
+    sets = [people_of_two_sizes, people, twisted(people), motion.MotionSet(people.clips, longer)]
+    assert len({each.fingerprint() for each in sets}) == 4
+    assert len({windows(each).fingerprint for each in sets}) == 1  # of positions
+    assert len({windows(each, representation="6d").fingerprint for each in sets}) == 4
+    at_rest = replace(people_of_two_sizes, skeleton=people.skeleton)
+    assert at_rest.fingerprint() == people_of_two_sizes.fingerprint()  # nothing is turned
+
+
 def test_what_has_no_turns_is_refused(people_of_two_sizes):
     data = windows(people_of_two_sizes, representation="6d")
     model, batch = small(data), data.all()
