@@ -334,10 +334,10 @@ class Skeleton:
         return torch.atan2(across[..., 1], across[..., 0]) - towards_x
 
     def heading_near(self, positions: Tensor, frame: int) -> Tensor:
-        """The `heading` at a frame of motion some of whose joints are missing; 0 where no frame tells any.
+        """The `heading` at a frame of motion some of whose joints are missing; 0 where none up to it tells any.
 
         It is taken from the frame that has most of the `sides`, at least one left and one right; of several, from the
-        last one up to the frame that is asked for. Only where none of these tells a heading, from the first later one.
+        last one. Later frames are not read: what is turned so to be forecast knows nothing of its future.
 
         Args:
             positions: (..., T, J, 3), NaN where a joint was not observed.
@@ -346,11 +346,11 @@ class Skeleton:
         Returns:
             (...,).
         """
+        positions = positions[..., : frame + 1, :, :]
         time = torch.arange(positions.shape[-3], device=positions.device)
         level = positions[..., self.vertical - 1].isfinite()
         left, right = (level[..., side].sum(-1) for side in self.sides)
-        order = torch.where(time <= frame, time + len(time) * (left + right), -time)
-        chosen = torch.where((left > 0) & (right > 0), order, -len(time)).argmax(-1)
+        chosen = torch.where((left > 0) & (right > 0), time + len(time) * (left + right), -1).argmax(-1)
         pose = positions.take_along_dim(chosen[..., None, None, None], -3).squeeze(-3)
         return self.heading(pose).nan_to_num(0.0)
 

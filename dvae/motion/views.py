@@ -34,8 +34,8 @@ class Heading(View):
     windows by the same pose, and with no others.
 
     Missing entries stay missing, of every joint both horizontal coordinates or neither, as a turn mixes them. Where
-    hips and shoulders lack in that pose, the nearest one that has some of them tells the heading, an earlier one if
-    there is any; a window none of whose poses does stays as it is (`Skeleton.heading_near`).
+    hips and shoulders lack in that pose, the nearest earlier one that has some of them tells the heading; a window none
+    of whose poses up to that one does stays as it is (`Skeleton.heading_near`), and so does its past in a forecast.
 
     Args:
         skeleton: with left and right.
@@ -97,11 +97,7 @@ class Heading(View):
         """Headings (B,) of what was observed of the data."""
         source = self.pose or WHOLE
         x, seen = data[source], data.get("mask", {}).get(source)
-        if seen is None:
-            return self.of(x)
-        if not self.pose and "lengths" in data:
-            seen = seen & valid_steps(data["lengths"], x.shape[-2])[..., None]
-        return self.of(torch.where(seen, x, torch.nan))
+        return self.of(x if seen is None else torch.where(seen, x, torch.nan))
 
     def _joints(self, poses: Tensor) -> Tensor:
         """Joints (..., J, 3) of poses (..., D), with the root where that was dropped."""

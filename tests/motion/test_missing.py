@@ -200,6 +200,21 @@ def test_paths_start_where_the_root_is_first_seen():
     torch.testing.assert_close(x[:, 2], world[:, 2] - world[:, 1, [WALKER.root]])
 
 
+@pytest.mark.parametrize("unseen", [15, 10])  # frames of each clip in which no left side is, all of the past or not
+def test_the_future_does_not_turn_the_past(unseen):
+    lacking = without(PEOPLE, LHip=slice(unseen), LShoulder=slice(unseen))
+    turned = [np.concatenate([c.positions[:15], c.positions[15:] * [-1, 1, -1]]) for c in lacking]
+    other = [replace(clip, positions=positions) for clip, positions in zip(lacking, turned, strict=True)]
+    protocol = replace(motion.PROTOCOLS["simulated"], heading=True, train_stride=90)  # windows at the first frames
+    pasts = [
+        motion.windows(MotionSet(clips, WALKER, missing=True), protocol, "train").all()["x"][:, :15]
+        for clips in (lacking.clips, other)
+    ]
+    torch.testing.assert_close(*pasts)
+    plain = motion.windows(lacking, replace(protocol, heading=False), "train").all()["x"][:, :15]
+    assert torch.equal(pasts[0], plain) == (unseen == 15)
+
+
 def test_listed_windows_have_something_before_and_after_the_present():
     some = without(PEOPLE, Pelvis=slice(0, 18))
     windows = motion.windows(some, motion.PROTOCOLS["simulated"], "train")
