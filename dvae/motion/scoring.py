@@ -23,7 +23,8 @@ what lengths vary by about their mean does not count; ours is the paper's. The *
 frames and joints of the error of the angle between a limb and the next one, of the future with the least, in degrees:
 the mean angle error (MAE) of the public code. Ours: shares and not hundredths, of all limbs, where the code leaves out
 those at the pelvis and has angles along chains of its own choice. The *bone-length error* compares with the observed
-frames.
+frames. Bones that are shorter than `SHORTEST` in some window, whose ends some files have at one place, are in none of
+these, and a note says how many.
 
 A classifier adds two scores under its name (Bie et al. 2022, arXiv:2204.01565). *ACC* is the share of the K futures
 that it gives the window's true class. *FID* is the Fréchet distance between its features of the true futures and of all
@@ -49,7 +50,7 @@ from ..inference.scores import ENERGY, VARIOGRAM, Measure, means_of_those_that_c
 from .energies import pose_prior_energy
 from .exchange import Exchanged
 from .protocols import Windows
-from .skeleton import Skeleton
+from .skeleton import SHORTEST, Skeleton
 
 
 def scores(
@@ -83,7 +84,8 @@ def scores(
         found += [replace(measure, name=f"global {measure.name}", headline=False) for measure in (_ADE, _FDE)]
     if windows.given_joints:
         found.append(_path_error(windows))
-    found += [_bone_length_error(windows), *_limbs(windows)]
+    bones = _bones(windows)
+    found += [_bone_length_error(windows, *bones), *_limbs(windows, *bones)]
     if windows.protocol.predicted > 1:
         found.append(_cumulative_motion(windows))
     if pose_prior is not None:
@@ -176,23 +178,31 @@ def _path_error(windows: Windows | Exchanged) -> Measure:
     return Measure("path error", function, "m")
 
 
-def _bone_length_error(windows: Windows | Exchanged) -> Measure:
+def _bones(windows: Windows | Exchanged) -> tuple[list[int], str]:
+    """The bones that have a length in every window, as places among `Skeleton.edges`, and a note on the others."""
+    lengths = mean_of_known(windows.skeleton.bone_lengths(windows.positions(gapped(windows.all()))), 1)
+    short = (lengths < SHORTEST).any(0)
+    note = f"limbs and bone lengths: {int(short.sum())} of {len(short)} bones are shorter than {SHORTEST:g} m; left out"
+    return (~short).nonzero()[:, 0].tolist(), note if short.any() else ""
+
+
+def _bone_length_error(windows: Windows | Exchanged, bones: list[int], note: str) -> Measure:
     """Mean of |length / observed length - 1| over samples, frames and bones."""
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         both = forecasts, gapped(past)
-        lengths, reference = (windows.skeleton.bone_lengths(windows.positions(poses)) for poses in both)
+        lengths, reference = (windows.skeleton.bone_lengths(windows.positions(poses))[..., bones] for poses in both)
         return mean_of_known((lengths / mean_of_known(reference, 1)[:, None, None] - 1).abs(), (1, 2, 3))
 
-    return Measure("bone-length error", function, "relative", partial=windows.missing)
+    return Measure("bone-length error", function, "relative", partial=windows.missing, note=note)
 
 
-def _limbs(windows: Windows | Exchanged) -> list[Measure]:
+def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Measure]:
     """Stretch and jitter of limbs, and errors of the angles between them."""
     skeleton = windows.skeleton
 
     def lengths(x: Tensor) -> Tensor:
-        found: Tensor = skeleton.bone_lengths(windows.positions(x))
+        found: Tensor = skeleton.bone_lengths(windows.positions(x))[..., bones]
         return found
 
     def of_errors(score: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
@@ -212,10 +222,12 @@ def _limbs(windows: Windows | Exchanged) -> list[Measure]:
     if windows.protocol.predicted > 1:
         scores["limb jitter"] = lambda errors: errors.diff(dim=2).abs().mean(2)
         scores["limb jitter RMS"] = lambda errors: errors.diff(dim=2).square().mean(2).sqrt()
-    found = [Measure(name, of_errors(score), "relative", partial=windows.missing) for name, score in scores.items()]
+    shared: Any = {"partial": windows.missing, "note": note}
+    found = [Measure(name, of_errors(score), "relative", **shared) for name, score in scores.items()]
 
-    starts, ends = (list(joints) for joints in zip(*skeleton.edges, strict=True))
-    pairs = [(ends.index(parent), ends.index(child)) for parent, child in skeleton.edges if parent in ends]
+    edges = [skeleton.edges[bone] for bone in bones]
+    starts, ends = (list(joints) for joints in zip(*edges, strict=True))
+    pairs = [(ends.index(parent), ends.index(child)) for parent, child in edges if parent in ends]
     first, second = ([pair[side] for pair in pairs] for side in (0, 1))
 
     def angles(x: Tensor) -> Tensor:
@@ -227,7 +239,7 @@ def _limbs(windows: Windows | Exchanged) -> list[Measure]:
     def angle_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         return mean_of_known((angles(forecasts) - angles(truth)[:, None]).abs(), (2, 3)).amin(1)
 
-    angular = Measure("limb-angle error", angle_error, "degrees", partial=windows.missing)
+    angular = Measure("limb-angle error", angle_error, "degrees", **shared)
     return [*found, *([angular] if pairs else [])]
 
 

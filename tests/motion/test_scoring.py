@@ -106,6 +106,25 @@ def test_the_true_future_of_a_rigid_body_has_none_of_them(windows):
     assert [wide[name] for name in LIMBS] == pytest.approx([0.1, 0.1, 0, 0, 0], abs=1e-3)
 
 
+def test_bones_without_length_are_in_no_score_of_limbs(windows, futures):
+    """A joint at the place of another one, as the ends of some files' bones are, changes nothing."""
+    body = windows.skeleton
+    elbow = body.find("RElbow")
+    skeleton = replace(body, names=(*body.names, "RTwist"), parents=(*body.parents, elbow))
+    clips = [
+        motion.Clip(*clip.key, np.concatenate([clip.positions, clip.positions[:, [elbow]]], 1))
+        for clip in windows.clips
+    ]
+    more = motion.windows(motion.MotionSet(clips, skeleton), PROTOCOL, "test")
+    twisted = torch.cat([futures, torch.randn(*futures.shape[:-1], 3)], -1)
+    names = (*LIMBS, "bone-length error")
+    found, expected = scores(more, twisted), scores(windows, futures)
+    assert [found[name] for name in names] == pytest.approx([expected[name] for name in names], rel=1e-5)
+    notes = {measure.name: measure.note for measure in motion.scores(more)}
+    assert all("1 of 17 bones are shorter than 1e-06 m" in notes[name] for name in names)
+    assert not any("bones" in measure.note for measure in motion.scores(windows))
+
+
 def test_bodies_may_face_anywhere(windows, futures):
     turned = rotate_about_up(futures.unflatten(-1, (-1, 3)), torch.tensor(1.0), windows.skeleton.up).flatten(-2)
     found, expected = scores(windows, turned), scores(windows, futures)
