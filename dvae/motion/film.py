@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import chain
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
+from PIL.GifImagePlugin import getdata, getheader
 
 from .. import files
 from .plot import ELEVATION, FIXED, MARGIN, PAST, Scene, staged
@@ -45,13 +48,13 @@ def save_film(path: str | PathLike[str], skeleton: Any, *motions: Any, title: st
     stage = staged(skeleton, *motions, **options)
     with TemporaryDirectory() as folder:  # coders write to a path of their own
         film = Path(folder) / f"film{ending}"
-        writers[ending](film, _pictures(stage, title), stage.milliseconds)
+        writers[ending](film, partial(_pictures, stage, title), stage)
         with files.written(path) as file:
             file.write(film.read_bytes())
 
 
-def _pictures(stage: Scene, title: str) -> Iterator[Image.Image]:
-    """Every shown frame, as whoever stands `ELEVATION` above the people sees it from afar."""
+def _pictures(stage: Scene, title: str, frames: range) -> Iterator[Image.Image]:
+    """Frames as whoever stands `ELEVATION` above the people sees them from afar; each is drawn when it is asked for."""
     motion = _flat(stage.motion + stage.places[:, None, None])
     edges = np.array(stage.skeleton.edges)
     fixed = [[child in stage.shared(k) for child in edges[:, 1]] for k in range(len(motion))]
@@ -75,7 +78,7 @@ def _pictures(stage: Scene, title: str) -> Iterator[Image.Image]:
     time = figure.text(0.5, 1 - 28 / pixels[1], "", ha="center", va="top", fontsize=9)
     bones = LineCollection([], linewidths=widths, capstyle="round")
     axes.add_collection(bones, autolim=False)
-    for frame in stage.shown:
+    for frame in frames:
         bones.set_segments(list(motion[:, frame][:, edges].reshape(-1, 2, 2)))
         bones.set_color(PAST if frame <= stage.now else [colour for row in ahead for colour in row])
         time.set_text(f"{stage.seconds(frame):+.2f} s")
@@ -89,24 +92,38 @@ def _flat(points: np.ndarray) -> np.ndarray:
     return np.stack([x, z * np.cos(ELEVATION) + y * np.sin(ELEVATION)], -1)
 
 
-def _write_gif(path: Path, pictures: Iterator[Image.Image], milliseconds: float) -> None:
-    """A GIF counts in hundredths of a second: where a frame has no whole number, they are shared out."""
-    frames = list(pictures)
-    palette = frames[-1].quantize(COLOURS)  # the future has all the colours
-    first, *rest = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
-    ends = np.round(milliseconds / 10 * np.arange(len(frames) + 1))
-    durations = (10 * np.diff(ends)).astype(int).tolist()
-    first.save(path, save_all=True, append_images=rest, duration=durations, loop=0)
+def _write_gif(path: Path, pictures: Callable[[range], Iterator[Image.Image]], stage: Scene) -> None:
+    """A GIF counts in hundredths of a second: where a frame has no whole number, they are shared out.
+
+    Frame by frame, since Pillow's own writer holds them all: of each, what differs from the one before.
+    """
+    (last,) = pictures(stage.shown[-1:])
+    palette = last.quantize(COLOURS)  # the future has all the colours
+    ends = np.round(stage.milliseconds / 10 * np.arange(len(stage.shown) + 1)).astype(int)
+    before: Image.Image | None = None
+    with path.open("wb") as file:
+        for picture, hundredths in zip(pictures(stage.shown), np.diff(ends).tolist(), strict=True):
+            frame = picture.quantize(palette=palette, dither=Image.Dither.NONE)
+            if before is None:
+                file.writelines(getheader(frame, info={"loop": 0})[0])
+                box = (0, 0, *frame.size)
+            else:
+                changed = Image.fromarray(np.asarray(frame) != np.asarray(before))
+                box = changed.getbbox() or (0, 0, 1, 1)
+            file.writelines(getdata(frame.crop(box), box[:2], duration=10 * hundredths))
+            before = frame
+        file.write(b";")
 
 
-def _write_mp4(path: Path, pictures: Iterator[Image.Image], milliseconds: float) -> None:
+def _write_mp4(path: Path, pictures: Callable[[range], Iterator[Image.Image]], stage: Scene) -> None:
     from imageio_ffmpeg import write_frames
 
-    first = next(pictures)
-    writer = write_frames(str(path), first.size, fps=1000 / milliseconds, macro_block_size=_BLOCK)
+    drawn = pictures(stage.shown)
+    first = next(drawn)
+    writer = write_frames(str(path), first.size, fps=1000 / stage.milliseconds, macro_block_size=_BLOCK)
     writer.send(None)
     try:
-        for picture in (first, *pictures):
+        for picture in chain([first], drawn):
             writer.send(picture.tobytes())
     finally:
         writer.close()

@@ -1,5 +1,7 @@
 """Films of skeletons: every frame is there, at the motion's own speed, in the colours of the page."""
 
+import weakref
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
@@ -7,6 +9,7 @@ from PIL import Image
 
 from dvae import motion
 from dvae.cli import main
+from dvae.motion import film
 from dvae.motion.film import save_film
 from dvae.motion.plot import TRUTH, staged
 
@@ -48,6 +51,24 @@ def test_a_gif_has_every_frame_at_the_speed_of_the_motion(clips, bodies, tmp_pat
     assert not any(has(frame, colour) for frame in frames[:NOW] for colour in colours)
     assert all(has(frame, colour) for frame in frames[NOW:] for colour in colours)
     assert all((first != second).any() for first, second in zip(frames[NOW:], frames[NOW + 1 :], strict=False))
+
+
+@pytest.mark.parametrize("ending", ["gif", "mp4"])
+def test_a_film_holds_few_frames_at_once(clips, bodies, tmp_path, monkeypatch, ending):
+    if ending == "mp4":
+        pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed: pip install '.[video]'")
+    drawn, alive, draw = [], [], film._pictures
+
+    def watched(*arguments):
+        for picture in draw(*arguments):
+            drawn.append(weakref.ref(picture))
+            alive.append(sum(each() is not None for each in drawn))
+            yield picture
+
+    monkeypatch.setattr(film, "_pictures", watched)
+    save_film(tmp_path / f"film.{ending}", clips.skeleton, *bodies, every=1)
+    assert len(alive) >= NOW + HORIZON
+    assert max(alive) <= 3
 
 
 def test_an_mp4_has_every_frame_at_the_speed_of_the_motion(clips, bodies, tmp_path):
