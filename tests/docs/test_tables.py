@@ -19,6 +19,7 @@ from benchmarks.tables import (
     occlusion,
     overview,
     pages,
+    rotations,
     trajevae,
 )
 from dvae import Evaluation, motion
@@ -129,6 +130,15 @@ def test_hit_dvae(folder, page):
     hit_dvae.main(run, (evaluated(folder, "full", runs=[run]),), page, count=2, seconds=2.0)
     *_, seconds = tables(page)
     assert [row[0] for row in seconds[1:]] == ["1", "2"]
+
+
+def test_rotations(folder, page):
+    rotations.main(folder / "people.npz", page)
+    (table,) = tables(page)
+    assert [row[0] for row in table[1:]] == [*motion.WALKER.names, "all"]
+    assert (
+        float(table[1][2]) == 0 < max(float(row[2]) for row in table[1:]) == float(table[-1][2])
+    )  # the root is as it was
 
 
 def test_trajevae(folder, page):

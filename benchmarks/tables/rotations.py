@@ -1,0 +1,46 @@
+"""Writes the table of docs/rotations.md: how far joints are from where they were recorded, by their turns.
+
+Of every frame the turns are found, and joints are put back by them on bones of the rest pose.
+"""
+
+from pathlib import Path
+
+import torch
+import tyro
+from torch import Tensor
+
+from dvae import motion
+from dvae.motion import kinematics, rotations
+
+from .pages import DOCS, table, write
+
+
+def errors(people: motion.MotionSet) -> Tensor:
+    """(frames, joints), in metres."""
+    turned, found = people.with_rotations(), []
+    skeleton = turned.skeleton
+    for clip in turned:
+        positions, turns = torch.from_numpy(clip.positions).double(), torch.from_numpy(clip.rotations).double()
+        local = rotations.to_matrix(turns, "quaternion")
+        again, _ = kinematics.forward(skeleton.parents, local, skeleton.offsets, positions[:, skeleton.root])
+        found.append((again - positions).norm(dim=-1))
+    return torch.cat(found)
+
+
+def main(data: Path, page: Path = DOCS / "rotations.md") -> None:
+    """Write the table.
+
+    Args:
+        data: motion file of positions, of one body.
+        page: where.
+    """
+    people = motion.read_motion(data)
+    found = 1000 * errors(people)
+    columns = zip(people.skeleton.names, found.mean(0).tolist(), found.amax(0).tolist(), strict=True)
+    rows = [[name, f"{mean:.2f}", f"{most:.2f}"] for name, mean, most in columns]
+    whole = ["all", f"{found.mean():.2f}", f"{found.max():.2f}"]
+    write(page, f"{people.skeleton.name}, {len(found):,} frames.\n", table(["mm", "mean", "largest"], [*rows, whole]))
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
