@@ -179,7 +179,7 @@ def impute(
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         for some in torch.arange(len(windows)).split(64):
-            made = loaded.model.impute({name: value[some] for name, value in listed.items()}, samples)["x"]
+            made = loaded.model.impute(each(listed, itemgetter(some)), samples)["x"]
             parts.append(windows.positions(made).numpy())
     seen = windows.skeleton.with_root(listed["mask"].unflatten(-1, (-1, 3)), True)[..., 0].numpy()
     found = motion.Imputed(windows.skeleton, windows.keys, np.concatenate(parts, 1), seen)

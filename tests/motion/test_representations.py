@@ -8,6 +8,7 @@ import torch
 
 import dvae
 from dvae import motion
+from dvae.cli import main
 from dvae.cli.futures import draw_futures
 from dvae.data import leaves, past_of
 from dvae.inference import metrics
@@ -168,12 +169,25 @@ def test_a_run_of_turns_is_kept_with_its_rest_pose(people_of_two_sizes, tmp_path
     assert loaded.data.protocol.representation == "6d"
 
 
-def test_what_is_drawn_is_what_is_scored(people_of_two_sizes, tmp_path):
-    motion.save(tmp_path / "people.npz", twisted(people_of_two_sizes))
-    data = motion.MotionData.open(tmp_path / "people.npz", replace(PROTOCOL, representation="6d"))
+@pytest.fixture(scope="module")
+def run_of_turns(people_of_two_sizes, tmp_path_factory):
+    """Of data whose turns no inverse kinematics finds."""
+    folder = tmp_path_factory.mktemp("turns")
+    motion.save(folder / "people.npz", twisted(people_of_two_sizes))
+    data = motion.MotionData.open(folder / "people.npz", replace(PROTOCOL, representation="6d"))
     training = dvae.Training(steps=5, batch_size=4, progress=False)
-    dvae.runs.directory.fit_run(dvae.method("srnn", latent=2, warm_up=1), data, tmp_path / "run", training)
-    loaded, test = dvae.load(tmp_path / "run"), data.windows("test")
+    dvae.runs.directory.fit_run(dvae.method("srnn", latent=2, warm_up=1), data, folder / "run", training)
+    return folder / "run"
+
+
+def test_filling_what_has_no_gaps_is_refused(run_of_turns, tmp_path, capsys):
+    assert main(["impute", str(run_of_turns), "--out", str(tmp_path / "filled.npz")]) != 0
+    assert "nothing is missing in this batch" in capsys.readouterr().err
+
+
+def test_what_is_drawn_is_what_is_scored(run_of_turns):
+    loaded = dvae.load(run_of_turns)
+    test = loaded.data.windows("test")
     drawn = draw_futures(loaded, test, range(len(test)), samples=3, seed=0)
     errors = metrics.average_displacement_error(
         torch.from_numpy(drawn.forecasts[..., 1:, :]).movedim(0, 1).flatten(3),  # the root was dropped
