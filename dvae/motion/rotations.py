@@ -57,14 +57,14 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
         return values.unflatten(-1, (3, 3))
     import roma
 
-    shortest = torch.finfo(values.dtype).eps
     if form == "quaternion":
-        none = values.norm(dim=-1, keepdim=True) < shortest
+        none = values.norm(dim=-1, keepdim=True) < torch.finfo(values.dtype).eps
         values = torch.where(none, values.new_tensor([1.0, 0, 0, 0]), values)
         return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(values, dim=-1)))
     if form == "vector":
         return roma.rotvec_to_rotmat(values)
     if form == "6d":
+        shortest = torch.finfo(values.dtype).eps
         first, second = values.unflatten(-1, (2, 3)).unbind(-2)
         first = torch.where(first.norm(dim=-1, keepdim=True) < shortest, values.new_tensor([1.0, 0, 0]), first)
         axis = torch.nn.functional.normalize(first, dim=-1)
