@@ -367,13 +367,16 @@ def decode(
 ) -> Tensor:
     """x (B, T, D) run free from its own past, given context and latents; latents that are not given are drawn.
 
-    First frames that are context, as a pose from which motion starts, stay as they are.
+    It is as the data are, and not as the model sees them. First frames that are context, as a pose from which motion
+    starts, stay as they are.
     """
     data = model.read(batch)
     known = {name: value for name, value in data.items() if name in model.context}
     length, size = data.get("x", batch["x"]).shape[1], len(batch["x"])
-    x = model.model({**known, **latents}, length=length, size=size, mean_emission=mean_emission)["x"]
-    return torch.cat([batch["x"][:, : batch["x"].shape[1] - length], x], 1)
+    made = model.model({**known, **latents}, length=length, size=size, mean_emission=mean_emission)
+    x = model.shown({name: made[name] for name in model.observed}, data)["x"]
+    before = batch["x"].shape[1] - length
+    return torch.cat([batch["x"][:, :before], x], 1) if before else x
 
 
 def _quantiles(values: np.ndarray) -> list[str]:

@@ -12,6 +12,7 @@ from dvae.cli import main
 from dvae.cli.futures import draw_futures
 from dvae.data import leaves, past_of
 from dvae.inference import metrics
+from dvae.inference.checks import decode
 from dvae.inference.held import clip_places
 from dvae.motion import kinematics, rotations
 from dvae.motion.views import LENGTHS, TURNS, Rotations
@@ -231,3 +232,24 @@ def test_bounds_of_turns_do_not_compare_with_those_of_positions(people_of_two_si
     table = dvae.evaluate(models, positions, samples=2, references=False, progress=False)
     assert any("bounds of turns: densities of turns of joints (6d)" in note for note in table.notes)
     assert not any("bounds of positions" in note for note in table.notes)
+
+
+def test_replicates_and_traversals_of_a_model_of_turns_are_positions(people_of_two_sizes):
+    data = windows(people_of_two_sizes, representation="6d")
+    model = small(data, "dkf")
+    checks = dvae.predictive_checks(model, data, motion.statistics(data), samples=19, progress=False)
+    assert checks.table()
+    found = dvae.traverse(model, data.all(), "z", [0], steps=3, draws=4)
+    lengths = data.skeleton.bone_lengths(data.positions(found.frames))
+    torch.testing.assert_close(lengths, lengths[:, :, :, :1].expand_as(lengths), atol=1e-5, rtol=0)
+
+
+def test_what_is_decoded_faces_as_the_data_do(people_of_two_sizes):
+    """Of data that are turned, a model that turns them all one way decodes what is turned as they are."""
+    data = windows(people_of_two_sizes, root="relative", observed=1)
+    model, batch = dvae.method("trajevae", latent=2).build(data).eval(), data.all()
+    turned = motion.rotate_about_up(batch["x"].unflatten(-1, (-1, 3)), torch.tensor(1.0), data.skeleton.up).flatten(-2)
+    latents = {"z": torch.zeros(len(turned), batch["x"].shape[1] - 1, 2)}
+    here, there = (decode(model, {"x": x}, latents, True) for x in (batch["x"], turned))
+    again = motion.rotate_about_up(here.unflatten(-1, (-1, 3)), torch.tensor(1.0), data.skeleton.up).flatten(-2)
+    torch.testing.assert_close(there, again, atol=1e-5, rtol=0)
