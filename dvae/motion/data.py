@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import InitVar, dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -154,18 +154,19 @@ def fullest(positions: np.ndarray) -> np.ndarray:
     return positions if full.all() else positions[full]  # a copy only where it is another
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(init=False, frozen=True, eq=False)
 class MotionSet:
     """Clips of one skeleton.
 
     Iterating gives the clips, `motion["train", "walking_1"]` one of them.
 
     Args:
-        clips: the clips; copied as float32.
+        clips: the clips, asked for once; copied as float32.
         skeleton: the tree that all of them have.
         name: what to call the set.
         copy: False takes over arrays that are float32 already, which nobody else may hold.
-        skip_bad: leave out clips that cannot be used, and list them in `skipped`, as (split, name, reason).
+        skip_bad: leave out clips that cannot be used, and list them in `skipped`.
+        skipped: those that were left out before, as (split, name, reason).
         said: how the files' units and axes were understood, for people to check.
         missing: joints may be NaN where they were not observed, a joint as a whole: what lacks a coordinate lacks all.
             Windows then tell by a mask what was observed.
@@ -177,38 +178,46 @@ class MotionSet:
 
     clips: Sequence[Clip]
     skeleton: Skeleton
-    name: str = ""
-    skipped: Sequence[tuple[str, str, str]] = field(default=(), init=False)
-    copy: InitVar[bool] = True
-    skip_bad: InitVar[bool] = False
-    said: str = field(default="", kw_only=True)
-    missing: bool = field(default=False, kw_only=True)
+    name: str
+    skipped: Sequence[tuple[str, str, str]]
+    said: str
+    missing: bool
 
-    def __post_init__(self, copy: bool, skip_bad: bool) -> None:
-        single, skipped, what = [], [], self.name or "motion set"
-        for clip in self.clips:  # once: an iterator need not hold clips that were taken over
-            if reason := defect(clip, self.skeleton, self.missing):
+    def __init__(
+        self,
+        clips: Iterable[Clip],
+        skeleton: Skeleton,
+        name: str = "",
+        copy: bool = True,
+        skip_bad: bool = False,
+        *,
+        skipped: Iterable[tuple[str, str, str]] = (),
+        said: str = "",
+        missing: bool = False,
+    ) -> None:
+        single, left_out, what = [], list(skipped), name or "motion set"
+        for clip in clips:  # an iterator need not hold clips that were taken over
+            if reason := defect(clip, skeleton, missing):
                 if not skip_bad:
                     raise ValueError(f"{what}: {reason}")
-                skipped.append((*clip.key, reason))
+                left_out.append((*clip.key, reason))
                 del clip
                 continue
             positions = np.require(clip.positions, np.float32, ["C", "A", "W"])
             positions = positions.copy() if copy and np.may_share_memory(positions, clip.positions) else positions
-            if self.missing and (hidden := np.isnan(positions).any(axis=2)).any():
+            if missing and (hidden := np.isnan(positions).any(axis=2)).any():
                 positions[hidden] = np.nan
             turns = None if clip.rotations is None else clip.rotations.astype(np.float32)
             single.append(Clip(clip.split, clip.name, positions, clip.labels, clip.truth, turns))
             del clip, positions
         if not single:
-            dropped = f"; {len(skipped)} were skipped, the first: {skipped[0][2]}" if skipped else ""
+            dropped = f"; {len(left_out)} were skipped, the first: {left_out[0][2]}" if left_out else ""
             raise ValueError(f"{what}: no clips{dropped}")
         twice = [key for key, count in Counter(clip.key for clip in single).items() if count > 1]
         if twice:
             raise ValueError(f"{what}: clip {'/'.join(twice[0])} is there twice")
-        object.__setattr__(self, "clips", tuple(single))
-        object.__setattr__(self, "skipped", tuple(skipped))
-        object.__setattr__(self, "_index", {clip.key: clip for clip in single})
+        fields = {"clips": tuple(single), "skeleton": skeleton, "name": name, "skipped": tuple(left_out)}
+        vars(self).update(fields, said=said, missing=missing, _index={clip.key: clip for clip in single})
 
     def __len__(self) -> int:
         return len(self.clips)
@@ -256,7 +265,7 @@ class MotionSet:
                         clip = replace(clip, rotations=continuous(from_matrix(turns, "quaternion")).numpy())
                     yield clip
 
-            found = MotionSet(turned(), skeleton, self.name, said=self.said, missing=self.missing)  # type: ignore[arg-type]
+            found = MotionSet(turned(), skeleton, self.name, skipped=self.skipped, said=self.said, missing=self.missing)
             object.__setattr__(self, "_turned", found)
         return found
 

@@ -42,4 +42,4 @@ def occlude(motion: MotionSet, share: float = 0.2, length: float = 15.0, seed: i
             hidden[t] = draws[t] < np.where(hidden[t - 1], 1 - 1 / length, begin)
         hidden[:, root] = False
         clips.append(replace(clip, positions=np.where(hidden[..., None], np.float32(np.nan), clip.positions)))
-    return replace(motion, clips=clips, copy=False, missing=True)
+    return replace(motion, clips=clips, missing=True)

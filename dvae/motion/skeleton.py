@@ -13,13 +13,14 @@ import json
 import reprlib
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from math import pi
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import networkx as nx
 import torch
@@ -34,16 +35,16 @@ MOST_TEXT = 2**24
 """Bytes of a text file that are read."""
 
 
-def read_text(path: Path) -> str:
-    """What a text file holds.
+@contextmanager
+def text_of(path: Path, most: int = MOST_TEXT) -> Iterator[TextIO]:
+    """What a text file holds, to be read within the context.
 
     Raises:
         OSError: there is no such file.
-        ValueError: it is larger than any of this kind, or no UTF-8.
+        ValueError: it has more than `most` bytes, or is no UTF-8.
     """
-    content = files.read(path, MOST_TEXT, links=True)
     try:
-        return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig").read()
+        yield io.TextIOWrapper(io.BytesIO(files.read(path, most, links=True)), encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is no text ({error})") from error
 
@@ -371,7 +372,8 @@ class Skeleton:
         """
         path = Path(path)
         try:
-            fields = json.loads(read_text(path))
+            with text_of(path) as text:
+                fields = json.load(text)
         except RecursionError as error:
             raise ValueError(f"{path}: expected JSON with joint_names and parents (it is nested too deeply)") from error
         except json.JSONDecodeError as error:

@@ -25,6 +25,7 @@ from dvae.motion import (
     MotionSet,
     Protocol,
     Skeleton,
+    occlude,
     read_motion,
     rotate_about_up,
     save,
@@ -168,6 +169,19 @@ class TestMotionSet:
         assert kept.summary()[0]["skipped"] == len(BAD)
         with pytest.raises(ValueError, match="no clips; 1 were skipped, the first: clip train/walk has NaN"):
             MotionSet([damaged(with_nan)], WALKER, skip_bad=True)
+
+    def test_what_was_dropped_stays_said_whatever_becomes_of_the_others(self, tmp_path):
+        save(tmp_path / "a.npz", simulate(4, 30))
+        arrays = dict(np.load(tmp_path / "a.npz"))
+        arrays["train/person_0001"][5, 3] = np.nan
+        np.savez(tmp_path / "a.npz", **arrays)
+        kept = read_motion(tmp_path / "a.npz", skip_bad=True)
+        assert [name for _, name, _ in kept.skipped] == ["person_0001"]
+        onto = read_motion(tmp_path / "a.npz", skip_bad=True, onto=HUMAN36M)
+        for other in (kept.resampled(15), kept.with_rotations(), kept.divided(), onto, occlude(kept)):
+            assert list(other.skipped) == list(kept.skipped)
+        again = MotionSet([*kept, damaged(with_nan)], WALKER, skip_bad=True, skipped=kept.skipped)
+        assert [name for _, name, _ in again.skipped] == ["person_0001", "walk"]
 
     def test_a_lying_person_is_a_person(self):
         lying = simulate(1, 30).clips[0].positions[..., [1, 2, 0]]  # what was height is now along x

@@ -18,7 +18,7 @@ MOST_DISTANCES = 2**23
 """From which a tree is found: of a hundred markers, in 800 frames."""
 
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
-_BLOCK = 512
+_BLOCK, _MOST_BLOCKS = 512, 255  # bytes of a block, and how many hold the parameters, said in one byte
 _ORDERS = {84: "<", 86: ">"}  # Intel's and MIPS' bytes; DEC's numbers (85) are of the eighties
 
 
@@ -36,8 +36,8 @@ def read_c3d(path: str | Path) -> Recording:
     if not path.is_file():  # nor a pipe, which would never end
         raise FileNotFoundError(f"{path}: no such file")
     content = files.read(path, MOST_TEXT, links=True)
-    if len(content) < _BLOCK or content[1] != 0x50:
-        raise ValueError(f"{path}: no C3D file: its second byte is not 80")
+    if len(content) < _BLOCK or not content[0] or content[1] != 0x50:
+        raise ValueError(f"{path}: no C3D file: it does not begin with the block of its parameters and with 80")
     try:
         parameters, order = _parameters(content)
         markers, analog, first, last = struct.unpack_from(f"{order}4H", content, 2)
@@ -73,11 +73,12 @@ def read_c3d(path: str | Path) -> Recording:
 
 def _parameters(content: bytes) -> tuple[dict[str, list[str]], str]:
     """Texts of the group POINT by name, and the order of bytes."""
-    at = _BLOCK * (content[0] - 1)
-    order = _ORDERS[content[at + 3]]
-    at, point = at + 4, None
+    start = _BLOCK * (content[0] - 1)
+    content = content[start : start + _BLOCK * _MOST_BLOCKS]
+    content = content[: _BLOCK * content[2] or None]  # some programs write 0
+    order, at, point = _ORDERS[content[3]], 4, None
     found: dict[int, dict[str, list[str]]] = {}
-    while at >= 0 and content[at]:
+    while at < len(content) and content[at]:
         size, group = struct.unpack_from("bb", content, at)
         name = content[at + 2 : at + 2 + abs(size)].decode("latin1").strip().upper()
         here = at + 2 + abs(size)
@@ -87,7 +88,8 @@ def _parameters(content: bytes) -> tuple[dict[str, list[str]], str]:
         elif struct.unpack_from("b", content, here + 2)[0] == -1:  # text
             sizes = list(content[here + 4 : here + 4 + content[here + 3]])
             width, count = ([*sizes, 1, 1])[:2]
-            text = content[here + 4 + len(sizes) :][: width * count].decode("latin1")
+            begin = here + 4 + len(sizes)
+            text = content[begin : begin + width * count].decode("latin1")
             texts = [text[n * width : (n + 1) * width].strip(" \0") for n in range(count)]
             found.setdefault(group, {})[name] = texts
         if not further:

@@ -19,9 +19,9 @@ import numpy as np
 
 from ... import files
 from ..data import Clip, MotionSet
-from ..skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, read_text
+from ..skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, text_of
 from .archive import archive, write_arrays
-from .recording import Recording, check_joints
+from .recording import MOST_PLACES, MOST_TEXT, Recording, check_joints
 
 TURNS = ".rotations"
 """At the end of a member's name: the rotations of the clip."""
@@ -80,7 +80,7 @@ def read_archive(
             yield Clip(split, name, positions, labelled, rotations=turns if skeleton.rest else None)
             del positions, turns
 
-    return MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad, missing=missing)  # type: ignore[arg-type]
+    return MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad, missing=missing)
 
 
 def save(path: str | Path, motion: MotionSet) -> None:
@@ -110,10 +110,7 @@ def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], S
 
     def members() -> Iterator[tuple[str, np.ndarray]]:
         for clip in clips:
-            if unnamed := [name for name in clip.key if not is_name(name)]:
-                raise ValueError(
-                    f"{brief(unnamed[0])} is no name for a split and a clip: expected text that can be printed"
-                )
+            check_key(clip.key)
             if "/" in clip.name or clip.name.endswith(TURNS):
                 raise ValueError(
                     f"clip name {clip.name!r} has a slash, which separates split and clip in the file, or ends in "
@@ -135,6 +132,14 @@ def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], S
         writer.writerows(rows)
         with files.written(path.with_name("labels.csv")) as file:
             file.write(table.getvalue().encode())
+
+
+def check_key(key: tuple[str, str], path: Path | None = None) -> None:
+    """Refuses a split and a name of a clip, or of the file at this path, that cannot be shown."""
+    if not all(map(is_name, key)):
+        raise ValueError(
+            f"{brief(str(path or '/'.join(key)))} is no name for a split and a clip: expected text that can be printed"
+        )
 
 
 def _skeleton_of(path: Path, clips: Sequence[_Read]) -> tuple[Skeleton, tuple[int, ...] | None]:
@@ -171,7 +176,7 @@ def read_labels(beside: Path, labels: str | Path | None) -> dict[tuple[str | Non
 
 
 @contextmanager
-def _table(path: Path) -> Iterator[tuple[list[str], Iterator[tuple[int, list[str]]]]]:
+def _table(path: Path, *most: int) -> Iterator[tuple[list[str], Iterator[tuple[int, list[str]]]]]:
     """The header of a csv file, and its rows with their numbers: each as long as the header, or empty.
 
     Raises:
@@ -184,14 +189,15 @@ def _table(path: Path) -> Iterator[tuple[list[str], Iterator[tuple[int, list[str
                 raise ValueError(f"{path}: row {number} has {len(row)} cells, the header {len(header)}")
             yield number, row
 
-    reader = csv.reader(io.StringIO(read_text(path)), strict=True)
-    try:
-        header = next(reader, [])
-        if unnamed := [place for place, name in enumerate(header, 1) if not is_name(name)]:
-            raise ValueError(f"{path}: column {unnamed[0]} is {brief(header[unnamed[0] - 1])}, expected a name")
-        yield header, numbered()
-    except csv.Error as error:
-        raise ValueError(f"{path}: row {reader.line_num} is no row of a csv file ({error})") from error
+    with text_of(path, *most) as text:
+        reader = csv.reader(text, strict=True)
+        try:
+            header = next(reader, [])
+            if unnamed := [place for place, name in enumerate(header, 1) if not is_name(name)]:
+                raise ValueError(f"{path}: column {unnamed[0]} is {brief(header[unnamed[0] - 1])}, expected a name")
+            yield header, numbered()
+        except csv.Error as error:
+            raise ValueError(f"{path}: row {reader.line_num} is no row of a csv file ({error})") from error
 
 
 def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
@@ -236,9 +242,9 @@ def read_paths(path: str | Path) -> dict[str, np.ndarray]:
     return found
 
 
-def _read_columns(path: Path) -> dict[str, np.ndarray]:
-    """Three columns of a csv file for each joint."""
-    with _table(path) as (header, rows):
+def _read_columns(path: Path, numbers: int = MOST_NUMBERS, *most: int) -> dict[str, np.ndarray]:
+    """Three columns of a csv file for each joint: of so many numbers, and bytes."""
+    with _table(path, *most) as (header, rows):
         columns: dict[str, list[int]] = {}
         for place, name in enumerate(header):
             joint, _, axis = name.strip().rpartition("_")
@@ -254,11 +260,11 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
         values: list[np.ndarray] = []
         blank = 0
         for number, cells in rows:
+            if len(header) * (len(values) + blank) > numbers:
+                raise ValueError(f"{path}: it has more than {numbers:,} numbers")
             if not cells:  # frames of which nothing is known, if others follow
                 blank += 1
                 continue
-            if len(header) * (len(values) + blank) > MOST_NUMBERS:
-                raise ValueError(f"{path}: it has more than {MOST_NUMBERS:,} numbers")
             values += [np.full(len(header), np.nan)] * blank
             blank = 0
             row = np.full(len(header), np.nan)
@@ -281,7 +287,7 @@ def read_table(path: Path) -> Recording:
         FileNotFoundError: there is no such file.
         ValueError: the file is damaged, or has other joints than the skeleton.
     """
-    columns = _read_columns(path)
+    columns = _read_columns(path, 3 * MOST_PLACES, MOST_TEXT)
     check_joints(path, len(columns))
     if not (beside := path.with_name("skeleton.json")).is_file():
         raise ValueError(f"{path}: {WHICH}")

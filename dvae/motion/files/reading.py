@@ -11,12 +11,12 @@ import numpy as np
 
 from ..data import Clip, MotionSet, defect, extents, fullest
 from ..matching import Kept
-from ..skeleton import Skeleton, brief, is_name
+from ..skeleton import Skeleton
 from .amc import read_amc, read_expmap
 from .archive import LARGEST
 from .bvh import read_bvh
 from .markers import read_c3d
-from .plain import read_archive, read_labels, read_table
+from .plain import check_key, read_archive, read_labels, read_table
 from .recording import Recording
 from .settled import World, settle, sides, turned, understand
 from .smpl import is_amass, read_amass
@@ -145,9 +145,7 @@ def read_motion(
     if not collected.skeleton.rest:
         clips = [replace(clip, rotations=None) for clip in clips]
     said = collected.said(reader.world)
-    made = MotionSet(clips, collected.skeleton, path.stem, copy=False, skip_bad=skip_bad, said=said, missing=missing)
-    object.__setattr__(made, "skipped", (*made.skipped, *unread))
-    return made
+    return MotionSet(clips, collected.skeleton, path.stem, False, skip_bad, skipped=unread, said=said, missing=missing)
 
 
 def find_files(path: Path) -> list[File]:
@@ -163,7 +161,7 @@ def find_files(path: Path) -> list[File]:
         suffix = path.suffix.lower()
         if suffix not in READERS or (suffix == ".npz" and not is_amass(path)):
             return []
-        return [_named(File("all", path.stem, path))]
+        return _named([File("all", path.stem, path)])
     kinds: dict[str, list[File]] = {suffix: [] for suffix in READERS}
     count = 0
     for folder, inner, names in os.walk(path, followlinks=False):
@@ -184,15 +182,13 @@ def find_files(path: Path) -> list[File]:
         raise ValueError(f"{path}: it has {counts} files; put each kind into a folder of its own")
     if not there:
         raise FileNotFoundError(f"{path}: no file in it is one of {', '.join(READERS)}")
-    return [_named(file) for file in there[next(iter(there))]]
+    return _named(there[next(iter(there))])
 
 
-def _named(file: File) -> File:
-    if not all(is_name(name) for name in (file.split, file.name)):
-        raise ValueError(
-            f"{brief(str(file.path))} is no name for a split and a clip: expected text that can be printed"
-        )
-    return file
+def _named(files: list[File]) -> list[File]:
+    for file in files:
+        check_key((file.split, file.name), file.path)
+    return files
 
 
 def sampled(files: Sequence[File], skip_bad: bool = False) -> dict[str, Recording]:
@@ -398,4 +394,6 @@ def _chosen(
         clips.append(made)
     if not collected.skeleton.rest:
         clips = [replace(clip, rotations=None) for clip in clips]
-    return MotionSet(clips, collected.skeleton, motion.name, copy=False, said=motion.said, missing=motion.missing)
+    return MotionSet(
+        clips, collected.skeleton, motion.name, False, skipped=motion.skipped, said=motion.said, missing=motion.missing
+    )

@@ -320,6 +320,16 @@ def test_a_table_has_the_joints_of_its_skeleton(people, tmp_path):
         read_motion(tmp_path / "a.csv")
 
 
+def test_a_table_may_be_as_long_as_any_recording(people, tmp_path):
+    """Longer in bytes than a skeleton's file, or one of paths to follow."""
+    write_motion(tmp_path / "a.csv", MotionSet(people.clips[:1], people.skeleton))
+    whole = read_motion(tmp_path / "a.csv")
+    header, frames = (tmp_path / "a.csv").read_text().split("\n", 1)
+    (tmp_path / "a.csv").write_text(header + "\n" + frames.replace(",", "," + " " * 10_000))
+    assert (tmp_path / "a.csv").stat().st_size > 2**24
+    assert read_motion(tmp_path / "a.csv").fingerprint() == whole.fingerprint()
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes with names")
 def test_pipes_in_a_folder_are_refused_and_not_waited_for(bvh):
     os.mkfifo(bvh / "train" / "a.bvh")
