@@ -143,6 +143,18 @@ def against_world(parents: Sequence[int], rotations: Tensor) -> Tensor:
     return forward(parents, rotations, nowhere, rotations.new_zeros(len(rotations), 3))[1]
 
 
+def offsets_of(parents: Sequence[int], bones: Tensor) -> tuple[Tensor, float]:
+    """Mean places (J, 3) of joints against their parents, the root's 0; and how far one goes from its own.
+
+    Args:
+        parents: of the joints, -1 for the root.
+        bones: (F, J, 3), as parents see them.
+    """
+    bones = torch.where(torch.tensor(parents)[:, None] < 0, 0.0, bones)
+    offsets = bones[0] + (bones - bones[0]).mean(0)  # what does not change is kept to the last bit
+    return offsets, float((bones - offsets).norm(dim=-1).max())
+
+
 def find(names: Sequence[str], joint: str) -> int:
     """Place of a joint by its name as a file has it.
 
@@ -218,8 +230,8 @@ class Kept:
         above = [joint if parent < 0 else parent for joint, parent in enumerate(self.parents)]
         seen = torch.from_numpy(places).double()
         bones = (world[:, above].mT @ (seen - seen[:, above])[..., None]).squeeze(-1)  # as the parent sees them
-        offsets = bones.mean(0)
-        if (bones - offsets).norm(dim=-1).max() > RIGID:
+        offsets, loose = offsets_of(self.parents, bones)
+        if loose > RIGID:
             return places, None, None
         turns = world[:, above].mT @ world
         root = self.parents.index(-1)

@@ -184,7 +184,7 @@ def read_amc(path: str | Path, skeleton: str | Path | None = None) -> Recording:
             turns[:, names.index(name)] = bone.axes @ _turned(radians(read[name]), bone.turns) @ bone.axes.mT
     places = torch.from_numpy(offsets).repeat(frames, 1, 1)
     places[:, 0] = place
-    return Recording.turned(names, parents, offsets, places, turns, fps=FPS, metres=metres, up="y")
+    return Recording.turned(names, parents, places, turns, fps=FPS, metres=metres, up="y")
 
 
 SUBJECT_02 = {
@@ -250,7 +250,7 @@ def read_expmap(path: str | Path) -> Recording:
     turns[:, 0] = to_matrix(torch.stack([z, y, x], -1), "euler-zyx")
     places = torch.from_numpy(offsets).repeat(rows - 1, 1, 1)
     places[:, 0] = read[:, 0]
-    return Recording.turned(names, parents, offsets, places, turns, fps=FPS, metres=INCH / 0.45, up="y")
+    return Recording.turned(names, parents, places, turns, fps=FPS, metres=INCH / 0.45, up="y")
 
 
 def _turned(angles: Tensor, axes: str) -> Tensor:

@@ -2,7 +2,8 @@
 
 Read as animation programs do: a joint's turns are about its own axes in the order of its channels, and a joint with
 channels of position, which any may have, is placed by these in place of its offset. Ends are joints of their own,
-named after what ends. Known readers refuse files in circulation, such as those with one row more than they announce.
+named after what ends, but for those without a length, which say nothing. Known readers refuse files in circulation,
+such as those with one row more than they announce.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ class _Joint:
     parent: int
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     channels: list[int] = field(default_factory=list)  # places in _AXES
+    ends: bool = False
 
 
 def read_bvh(path: str | Path) -> Recording:
@@ -67,10 +69,9 @@ def read_bvh(path: str | Path) -> Recording:
             angles = torch.from_numpy(np.deg2rad(values[:, columns]))
             turns[:, which] = to_matrix(angles, f"euler-{order}")
     names, parents = [joint.name for joint in joints], [joint.parent for joint in joints]
-    offsets = np.stack([joint.offset for joint in joints])
     fps = 1 / seconds
     fps = float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else fps
-    return Recording.turned(names, parents, offsets, places, turns, fps=fps)
+    return Recording.turned(names, parents, places, turns, fps=fps)
 
 
 def write_bvh(
@@ -85,7 +86,7 @@ def write_bvh(
 ) -> None:
     """Write a BVH file in centimetres, as animation programs expect them; it replaces an older one once it is whole.
 
-    A joint from which nothing hangs becomes an end, whose own turn and name are not written.
+    At a joint from which nothing hangs stands an end without a length, which importers ask for.
 
     Args:
         names, parents: of the joints, the root first.
@@ -101,6 +102,8 @@ def write_bvh(
     for name in names:
         if not name or any(letter.isspace() or letter in "{}" for letter in name):
             raise ValueError(f"{path}: {name!r} is no name for a joint of a BVH file: no white space, no braces")
+        if names.count(name) > 1:
+            raise ValueError(f"{path}: {name!r} is the name of {names.count(name)} joints, expected names that differ")
     children: list[list[int]] = [[] for _ in names]
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -116,12 +119,11 @@ def write_bvh(
             lines.append(f"{tab}}}")
             continue
         offset = " ".join(f"{100 * value:.6f}" for value in (offsets[joint] if depth else np.zeros(3)))
-        ends = depth > 0 and not children[joint]
-        name = "End Site" if ends else ("JOINT " if depth else "ROOT ") + names[joint]
-        lines += [f"{tab}{name}", f"{tab}{{", f"{tab}\tOFFSET {offset}"]
-        if not ends:
-            turning.append(joint)
-            lines.append(f"{tab}\tCHANNELS {'3 ' if depth else '6 Xposition Yposition Zposition '}{turns}")
+        turning.append(joint)
+        lines += [f"{tab}{'JOINT' if depth else 'ROOT'} {names[joint]}", f"{tab}{{", f"{tab}\tOFFSET {offset}"]
+        lines.append(f"{tab}\tCHANNELS {'3 ' if depth else '6 Xposition Yposition Zposition '}{turns}")
+        if not children[joint]:
+            lines += [f"{tab}\t{line}" for line in ("End Site", "{", "\tOFFSET 0.000000 0.000000 0.000000", "}")]
         waiting += [(-1, depth), *((child, depth + 1) for child in reversed(children[joint]))]
     angles = from_matrix(to_matrix(torch.from_numpy(rotations).double(), "quaternion"), f"euler-{order}").numpy()
     rows = np.concatenate([100 * root, np.rad2deg(angles[:, turning]).reshape(len(root), -1)], 1)
@@ -159,7 +161,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
                 if kind != "END":
                     raise wrong(number, f"a name of its own; there is another joint {name!r}")
                 name += str(same + 1)
-            joints.append(_Joint(name, parent))
+            joints.append(_Joint(name, parent, ends=kind == "END"))
             check_joints(path, len(joints))
             named = True
         elif kind == "{":
@@ -170,7 +172,9 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
         elif kind == "}":
             if not open_ or named:
                 raise wrong(number, "a brace that was opened")
-            open_.pop()
+            closed = joints[open_.pop()]
+            if closed.ends and closed is joints[-1] and not (closed.offset.any() or closed.channels):
+                joints.pop()  # at its parent, which has a name
         elif kind == "OFFSET" and open_ and not named:
             found = numbers(rest, f"{path}: line {number}")
             if len(found) != 3:

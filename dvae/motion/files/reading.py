@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..data import Clip, MotionSet, defect, extents, fullest
-from ..matching import Kept
+from ..matching import RIGID, Kept
 from ..skeleton import Skeleton
 from .amc import read_amc, read_expmap
 from .archive import LARGEST
@@ -37,6 +37,8 @@ SAMPLE = 9
 
 SAME = 1e-3
 """Metres within which two files have one rest pose."""
+
+BENDS = "rotations are left out, as a joint moves against the one that it hangs from"
 
 LIKE = 1.6
 """Factor within which bodies of one folder are; inches are 2.54 centimetres."""
@@ -125,8 +127,8 @@ def read_motion(
     clips, unread, size = [], [], 0
     for file in files:
         try:
-            clip, own = reader(file, some.pop(str(file.path), None))
-            if reason := collected.add(file.path, clip, own):
+            clip, own, notes = reader(file, some.pop(str(file.path), None))
+            if reason := collected.add(file.path, clip, own, notes):
                 raise ValueError(reason)
         except ValueError as error:
             if not skip_bad:
@@ -226,8 +228,8 @@ class FileReader:
     resampled: float | None = None
     missing: bool = False
 
-    def __call__(self, file: File, recording: Recording | None = None) -> tuple[Clip, Skeleton]:
-        """The clip, and the skeleton of it alone.
+    def __call__(self, file: File, recording: Recording | None = None) -> tuple[Clip, Skeleton, list[str]]:
+        """The clip, the skeleton of it alone, and what is to be said of it.
 
         Args:
             file: which.
@@ -242,7 +244,7 @@ class FileReader:
         except ValueError as error:
             raise error if str(file.path) in str(error) else ValueError(f"{file.path}: {error}") from error
 
-    def _clip(self, file: File, recording: Recording) -> tuple[Clip, Skeleton]:
+    def _clip(self, file: File, recording: Recording) -> tuple[Clip, Skeleton, list[str]]:
         world = self.world
         if recording.metres is not None and not self.given:
             world = replace(world, unit="as the file says", metres=recording.metres)
@@ -263,7 +265,8 @@ class FileReader:
             clip, own = clip.resampled(fps / self.resampled), replace(own, fps=float(self.resampled))
         if reason := defect(clip, own, self.missing):
             raise ValueError(reason)
-        return clip, own
+        notes = [BENDS] if settled.rotations is not None and clip.rotations is None else []
+        return clip, own, notes
 
 
 def clip_of(
@@ -289,9 +292,7 @@ def clip_of(
     positions, rotations = recording.positions.astype(np.float32), None
     rest: tuple[float, ...] = ()
     if recording.rotations is not None and recording.offsets is not None:
-        rotations, offsets = recording.rotations.astype(np.float32), recording.offsets.copy()
-        offsets[list(recording.parents).index(-1)] = 0
-        rest = tuple(offsets.flatten().tolist())
+        rotations, rest = recording.rotations.astype(np.float32), tuple(recording.offsets.flatten().tolist())
     tree = tuple(recording.names), tuple(recording.parents), left, right
     own = Skeleton(*tree, recording.up or "y", float(fps), known.name if known else clip.name, rest=rest)
     return replace(clip, positions=positions, rotations=rotations), own
@@ -302,7 +303,7 @@ def kept(
 ) -> Recording:
     """A recording in metres with some of its joints, or with those of a known skeleton and its axis upwards."""
     if joints is None and onto is None:
-        return recording
+        return recording if recording.loose <= RIGID else replace(recording, rotations=None, offsets=None)
     names, parents = recording.names, recording.parents
     if onto is None:
         chosen = Kept.of(names, parents, joints or ())
@@ -332,13 +333,15 @@ class Collected:
         self._name, self._first = name, Path()
         self._skeleton: Skeleton | None = None
         self._bones, self._alike, self._extents = np.zeros(0), True, [0.0]
+        self._notes: dict[str, list[Path]] = {}
 
-    def add(self, path: Path, clip: Clip, skeleton: Skeleton) -> str | None:
+    def add(self, path: Path, clip: Clip, skeleton: Skeleton, notes: Sequence[str] = ()) -> str | None:
         """Takes a clip in, or says why it does not belong to those before."""
         bones = skeleton.bone_lengths(fullest(clip.positions)[0].astype(np.float64))
         own = float(np.median(extents(clip.positions).max(1)))
         if self._skeleton is None:
             self._first, self._skeleton, self._bones, self._extents = path, skeleton, bones, [own]
+            self._note(path, notes)
             return None
         first = self._skeleton
         if set(first.names) != set(skeleton.names):
@@ -363,7 +366,12 @@ class Collected:
         other, rest = np.array(first.rest), np.array(skeleton.rest)
         self._alike &= other.shape == rest.shape and not (np.abs(other - rest) > SAME).any()
         self._extents.append(own)
+        self._note(path, notes)
         return None
+
+    def _note(self, path: Path, notes: Sequence[str]) -> None:
+        for note in notes:
+            self._notes.setdefault(note, []).append(path)
 
     @property
     def skeleton(self) -> Skeleton:
@@ -375,8 +383,13 @@ class Collected:
 
     def said(self, world: World) -> str:
         """How the files were understood."""
-        apart = "" if self._alike else "; rotations are left out, as rest poses differ"
-        return f"{world}, a person of {np.median(self._extents):.2f} m{apart}"
+        found = [f"{world}, a person of {np.median(self._extents):.2f} m"]
+        if not self._alike and BENDS not in self._notes:
+            found.append("rotations are left out, as rest poses differ")
+        for note, paths in self._notes.items():
+            several = f" in {len(paths)} of {len(self._extents)} files, the first {paths[0].name}"
+            found.append(note + several * (len(self._extents) > 1))
+        return "; ".join(found)
 
 
 def _chosen(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ... import files
 from ..kinematics import forward
+from ..matching import offsets_of
 from ..rotations import continuous, from_matrix
 from ..skeleton import MOST_JOINTS, Skeleton
 
@@ -36,6 +37,7 @@ class Recording:
         positions: (F, J, 3) in the file's unit and axes.
         rotations: (F, J, 4), local quaternions w x y z, continuous; where the file has them.
         offsets: (J, 3) of the rest pose in the file's unit; with rotations.
+        loose: how far a joint goes from its offset, in the file's unit.
         fps: frames per second, where the file says.
         metres: of a unit, where the file says.
         up: the axis that is, where the file says.
@@ -47,6 +49,7 @@ class Recording:
     positions: np.ndarray
     rotations: np.ndarray | None = None
     offsets: np.ndarray | None = None
+    loose: float = 0.0
     fps: float | None = None
     metres: float | None = None
     up: str | None = None
@@ -57,17 +60,17 @@ class Recording:
         cls,
         names: Sequence[str],
         parents: Sequence[int],
-        offsets: np.ndarray,
         places: Tensor,
         rotations: Tensor,
         fps: float | None = None,
         metres: float | None = None,
         up: str | None = None,
     ) -> Recording:
-        """Of rotations (F, J, 3, 3) and of places against the parent (F, J, 3), or (J, 3) where they rest."""
+        """Of rotations (F, J, 3, 3) and of places against the parent (F, J, 3), the root's against the world."""
+        offsets, loose = offsets_of(parents, places)
         positions, _ = forward(parents, rotations, places, places[..., 0, :].expand(len(rotations), 3))
         quaternions = continuous(from_matrix(rotations, "quaternion"))
-        return cls(names, parents, positions.numpy(), quaternions.numpy(), offsets, fps, metres, up)
+        return cls(names, parents, positions.numpy(), quaternions.numpy(), offsets.numpy(), loose, fps, metres, up)
 
 
 def read_lines(path: Path) -> list[str]:

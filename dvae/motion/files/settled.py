@@ -159,6 +159,7 @@ def settle(recording: Recording, world: World) -> Recording:
         turned(recording, turn),
         positions=world.metres * (recording.positions @ turn.T),
         offsets=None if recording.offsets is None else world.metres * recording.offsets,
+        loose=world.metres * recording.loose,
         metres=1.0,
         up=world.up,
     )

@@ -104,7 +104,7 @@ def read_amass(path: str | Path) -> Recording:
     vectors = torch.from_numpy(poses[:, :numbers].astype(np.float64)).unflatten(-1, (-1, 3))
     rest = torch.from_numpy(offsets).repeat(frames, 1, 1)
     rest[:, 0] = torch.from_numpy(places.astype(np.float64))
-    return Recording.turned(JOINTS, PARENTS, offsets, rest, to_matrix(vectors, "vector"), fps, metres=1.0, up="z")
+    return Recording.turned(JOINTS, PARENTS, rest, to_matrix(vectors, "vector"), fps, metres=1.0, up="z")
 
 
 def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +94,10 @@ def write_clip(path: Path, clip: Clip, skeleton: Skeleton, format: str) -> Path:
         if skeleton.up != "y":  # as animation programs expect
             recording = upwards(recording, "y")
         assert recording.rotations is not None
-        names = [re.sub(r"[\s{}]+", "_", name) for name in skeleton.names]
+        names: list[str] = []
+        for name in skeleton.names:
+            plain = re.sub(r"[\s{}]+", "_", name)
+            names.append(plain + "_" * next(n for n in count() if plain + "_" * n not in names))
         root = recording.positions[:, skeleton.root]
         offsets = skeleton.offsets.numpy()
         write_bvh(path, names, list(skeleton.parents), offsets, recording.rotations, root, skeleton.fps)
@@ -198,16 +201,18 @@ def _told(source: Path, several: bool) -> list[File]:
     return files
 
 
-def _converted(reader: FileReader, file: File, out: Path, format: str, skip_bad: bool) -> tuple[Clip, Skeleton] | str:
+def _converted(
+    reader: FileReader, file: File, out: Path, format: str, skip_bad: bool
+) -> tuple[Clip, Skeleton, list[str]] | str:
     """One file, read and, where each clip has a file, written: what it holds; or why it does not."""
     try:
-        clip, skeleton = reader(file)
+        clip, skeleton, notes = reader(file)
         if format == "npz":
-            return clip, skeleton
+            return clip, skeleton, notes
         motion = MotionSet([clip], skeleton, file.name, copy=False, missing=reader.missing)
         write_motion(_place(out, clip, format), motion, format)
         fullest = int(np.isnan(clip.positions).any(2).sum(1).argmin())
-        return clip.between(fullest, fullest + 1), skeleton
+        return clip.between(fullest, fullest + 1), skeleton, notes
     except ValueError as error:
         if not skip_bad:
             raise

@@ -123,8 +123,8 @@ def test_samples_are_written_and_read_back_to_a_tenth_of_a_millimetre(sample, tm
         read.fps,
     )
     again = read_bvh(tmp_path / "a.bvh")
-    order = [again.names.index(name) for name in read.names]
-    np.testing.assert_allclose(again.positions[:, order], read.positions, atol=1e-3)
+    assert (again.names, again.parents) == (read.names, read.parents)
+    np.testing.assert_allclose(again.positions, read.positions, atol=1e-3)
     assert again.fps == read.fps
 
 
@@ -153,12 +153,29 @@ def test_what_is_written_has_the_layout_that_animation_programs_import(tmp_path)
         "OFFSET 0.000000 0.000000 0.000000",
         "CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation",
     ]
-    assert lines.count("CHANNELS 3 Zrotation Yrotation Xrotation") == 2
+    joints = [line.split()[1] for line in lines if line.startswith("JOINT ")]
+    assert joints == ["knee", "kneeEnd", "arm", "armEnd"]
+    assert lines.count("CHANNELS 3 Zrotation Yrotation Xrotation") == 4
+    for end in (place for place, line in enumerate(lines) if line == "End Site"):
+        assert lines[end + 1 : end + 5] == ["{", "OFFSET 0.000000 0.000000 0.000000", "}", "}"]
     assert lines.count("End Site") == 2
-    assert lines.count("{") == lines.count("}") == 5
+    assert lines.count("{") == lines.count("}") == 7
     motion = lines.index("MOTION")
     assert lines[motion + 1 : motion + 3] == ["Frames: 2", "Frame Time: 0.04000000"]
-    assert [len(line.split()) for line in lines[motion + 3 :]] == [12, 12]
+    assert [len(line.split()) for line in lines[motion + 3 :]] == [18, 18]
+
+
+def test_ends_without_a_length_are_no_joints(tmp_path):
+    (tmp_path / "a.bvh").write_text(SMALL.replace("OFFSET 0 -5 0", "OFFSET 0 -0.0 0"))
+    read = read_bvh(tmp_path / "a.bvh")
+    assert (read.names, read.parents) == (["hip", "a knee", "arm", "armEnd"], [-1, 0, 0, 2])
+    np.testing.assert_allclose(read.positions[0], [[0, 0, 0], [0, -10, 0], [3, 0, 0], [4, 0, 0]])
+
+
+def test_names_that_repeat_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match=r"a\.bvh: 'knee' is the name of 2 joints"):
+        write_bvh(tmp_path / "a.bvh", ["hip", "knee", "knee"], [-1, 0, 0], np.ones((3, 3)), None, None, 30)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

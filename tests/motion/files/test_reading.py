@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -72,6 +73,55 @@ def test_rigid_motion_is_the_same_in_bvh_to_a_tenth_of_a_millimetre(people, up, 
     npz = save(tmp_path / "c.npz", rigid) or read_motion(tmp_path / "c.npz")
     np.testing.assert_array_equal(npz.clips[0].rotations, rigid.clips[0].rotations)
     assert npz.fingerprint() == rigid.fingerprint()
+
+
+def placed(text, joint, moving):
+    """A BVH file in which channels of position place a joint, whose OFFSET is elsewhere."""
+    head, rows = text.split("Frame Time: 0.03333333\n")
+    before, after = head.split(f"JOINT {joint}\n")
+    columns = sum(int(line.split()[1]) for line in before.splitlines() if "CHANNELS" in line)
+    offset, after = re.search(r"OFFSET (.*)", after)[1].split(), re.sub("OFFSET .*", "OFFSET 0 0 0", after, count=1)
+    after = after.replace("CHANNELS 3 ", "CHANNELS 6 Xposition Yposition Zposition ", 1)
+    frames = []
+    for frame, row in enumerate(rows.splitlines()):
+        now = [str(float(value) + moving * (frame % 2)) for value in offset]
+        frames.append(" ".join([*row.split()[:columns], *now, *row.split()[columns:]]))
+    return f"{before}JOINT {joint}\n{after}Frame Time: 0.03333333\n" + "\n".join(frames) + "\n"
+
+
+def test_a_joint_rests_where_its_channels_place_it(people, tmp_path):
+    (path,) = write_motion(tmp_path / "a.bvh", MotionSet(people.clips[:1], people.skeleton))
+    whole, text = read_motion(path), path.read_text()
+    path.write_text(placed(text, "LKnee", 0))
+    read = read_motion(path)
+    np.testing.assert_allclose(read.clips[0].positions, whole.clips[0].positions, atol=1e-6)
+    np.testing.assert_allclose(read.skeleton.offsets, whole.skeleton.offsets, atol=1e-6)
+    again = read_motion(*write_motion(tmp_path / "b.bvh", read))
+    np.testing.assert_allclose(again.clips[0].positions, whole.clips[0].positions, atol=1e-4)
+    path.write_text(placed(text, "LKnee", 1.0))  # a centimetre along each axis, in every other frame
+    read = read_motion(path)
+    assert (read.clips[0].rotations, read.skeleton.rest) == (None, ())
+    assert "rotations are left out, as a joint moves against the one that it hangs from" in read.said
+    path.write_text(placed(text, "LKnee", 0.01))
+    assert read_motion(path).clips[0].rotations is not None
+    (tmp_path / "c").mkdir()
+    for name, moving in (("a", 0), ("b", 1.0)):
+        (tmp_path / "c" / f"{name}.bvh").write_text(placed(text, "LKnee", moving))
+    assert "hangs from in 1 of 2 files, the first b.bvh" in read_motion(tmp_path / "c").said
+
+
+def test_skeletons_survive_bvh(people, tmp_path):
+    """Names, tree and places, of ends too: what was fitted on the one reads the other."""
+    read = read_motion(*write_motion(tmp_path / "a.bvh", MotionSet(people.clips[:1], WALKER)))
+    assert (read.skeleton.names, read.skeleton.parents) == (WALKER.names, WALKER.parents)
+    assert (read.skeleton.left, read.skeleton.right) == (WALKER.left, WALKER.right)
+    np.testing.assert_allclose(read.clips[0].positions, people.clips[0].positions, atol=0.01)  # of inverse kinematics
+    names = [{"RKnee": "R Knee", "RFoot": "R_Knee", "Spine": "R{Knee"}.get(name, name) for name in WALKER.names]
+    alike = MotionSet(people.clips[:1], replace(WALKER, names=names))
+    found = read_motion(*write_motion(tmp_path / "b.bvh", alike)).skeleton.names
+    assert found == tuple(
+        {"RKnee": "R_Knee", "RFoot": "R_Knee_", "Spine": "R_Knee__"}.get(name, name) for name in WALKER.names
+    )
 
 
 @pytest.mark.data
