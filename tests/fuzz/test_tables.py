@@ -143,7 +143,7 @@ def test_what_is_no_skeleton_is_told_in_a_sentence_that_names_the_file(tmp_path,
 def test_files_that_are_no_json_are_told_too(tmp_path, content, message):
     path = tmp_path / "skeleton.json"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=rf"skeleton\.json: .*{message}"):
+    with pytest.raises(ValueError, match=rf"skeleton\.json:? .*{message}"):
         Skeleton.from_json(path)
     assert told(Skeleton.from_json, path)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -106,7 +106,7 @@ def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], S
         skeleton: asked for after the last of them.
     """
     path = Path(path)
-    rows: list[dict[str, str]] = []
+    labelled = []
 
     def members() -> Iterator[tuple[str, np.ndarray]]:
         for clip in clips:
@@ -116,7 +116,7 @@ def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], S
                     f"clip name {clip.name!r} has a slash, which separates split and clip in the file, or ends in "
                     f"{TURNS}"
                 )
-            rows.append({**clip.labels, "split": clip.split, "clip": clip.name})
+            labelled.append(replace(clip, positions=np.empty((0, 0, 3)), rotations=None, truth={}))
             yield f"{clip.split}/{clip.name}", clip.positions
             if clip.rotations is not None:
                 yield f"{clip.split}/{clip.name}{TURNS}", clip.rotations
@@ -124,13 +124,19 @@ def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], S
     with files.written(path) as file:
         write_arrays(file, members())
     skeleton().to_json(path.with_name("skeleton.json"))
+    write_labels(path.with_name("labels.csv"), labelled)
+
+
+def write_labels(path: Path, clips: Iterable[Clip]) -> None:
+    """Write what is known of clips, if anything is, as `read_labels` reads it."""
+    rows = [{**clip.labels, "split": clip.split, "clip": clip.name} for clip in clips]
     columns = list(dict.fromkeys(name for row in rows for name in row))
     if len(columns) > 2:
         table = io.StringIO(newline="")
         writer = csv.DictWriter(table, ["split", "clip", *(c for c in columns if c not in ("split", "clip"))])
         writer.writeheader()
         writer.writerows(rows)
-        with files.written(path.with_name("labels.csv")) as file:
+        with files.written(path) as file:
             file.write(table.getvalue().encode())
 
 

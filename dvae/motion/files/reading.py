@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -46,11 +46,12 @@ LIKE = 1.6
 
 @dataclass(frozen=True)
 class File:
-    """A file of one recording, and what its clip is called."""
+    """A file of one recording, what its clip is called, and what is known of it."""
 
     split: str
     name: str
     path: Path
+    labels: Mapping[str, str] = field(default_factory=dict)
 
     def read(self) -> Recording:
         """What it holds; the message of what is refused has the path."""
@@ -115,12 +116,11 @@ def read_motion(
             differ in joints or frames per second, or no skeleton is known; the message says which.
     """
     path = Path(path)
-    files = find_files(path)
+    files = find_files(path, labels)
     if not files:
         places = [joint for joint in joints or () if isinstance(joint, int)] if onto is None else []
         found = read_archive(path, skeleton, labels, skip_bad, places or None, metres, up, fps, missing)
         return found if places or (joints is None and onto is None) else _chosen(found, joints, onto)
-    known = read_labels((path if path.is_dir() else path.parent) / "labels.csv", labels)
     some = sampled(files, skip_bad)
     reader = FileReader(understand(some, metres, up), metres is not None, fps, skeleton, joints, onto, missing=missing)
     collected = Collected(path.stem)
@@ -141,7 +141,7 @@ def read_motion(
                 f"{path}: it has more than {LARGEST:,} bytes of motion, up to {file.path}; `dvae data convert --fps` "
                 "makes it smaller, or give its folders one by one"
             )
-        clips.append(replace(clip, labels=known.get(clip.key, known.get((None, clip.name), {}))))
+        clips.append(clip)
     if not clips:
         raise ValueError(f"{path}: no file of it can be read; the first: {unread[0][2]}")
     if not collected.skeleton.rest:
@@ -150,7 +150,7 @@ def read_motion(
     return MotionSet(clips, collected.skeleton, path.stem, False, skip_bad, skipped=unread, said=said, missing=missing)
 
 
-def find_files(path: Path) -> list[File]:
+def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
     """Files of one recording each: the path itself, or those of a folder; none if it is an archive of many clips.
 
     Raises:
@@ -163,7 +163,7 @@ def find_files(path: Path) -> list[File]:
         suffix = path.suffix.lower()
         if suffix not in READERS or (suffix == ".npz" and not is_amass(path)):
             return []
-        return _named([File("all", path.stem, path)])
+        return _known([File("all", path.stem, path)], path.with_name("labels.csv"), labels)
     kinds: dict[str, list[File]] = {suffix: [] for suffix in READERS}
     count = 0
     for folder, inner, names in os.walk(path, followlinks=False):
@@ -184,13 +184,17 @@ def find_files(path: Path) -> list[File]:
         raise ValueError(f"{path}: it has {counts} files; put each kind into a folder of its own")
     if not there:
         raise FileNotFoundError(f"{path}: no file in it is one of {', '.join(READERS)}")
-    return _named(there[next(iter(there))])
+    return _known(there[next(iter(there))], path / "labels.csv", labels)
 
 
-def _named(files: list[File]) -> list[File]:
+def _known(files: list[File], beside: Path, labels: str | Path | None) -> list[File]:
+    """Files with their labels."""
     for file in files:
         check_key((file.split, file.name), file.path)
-    return files
+    known = read_labels(beside, labels)
+    return [
+        replace(file, labels=known.get((file.split, file.name), known.get((None, file.name), {}))) for file in files
+    ]
 
 
 def sampled(files: Sequence[File], skip_bad: bool = False) -> dict[str, Recording]:
@@ -259,7 +263,7 @@ class FileReader:
             alike = list(known.parents) == list(settled.parents)
             settled = replace(settled, names=known.names, parents=known.parents)
             settled = settled if alike else replace(settled, rotations=None, offsets=None)
-        empty = Clip(file.split, file.name, np.empty((0, 0, 3)))
+        empty = Clip(file.split, file.name, np.empty((0, 0, 3)), file.labels)
         clip, own = clip_of(settled, empty, fps, known, self.joints, self.onto)
         if self.resampled and self.resampled != fps:
             clip, own = clip.resampled(fps / self.resampled), replace(own, fps=float(self.resampled))

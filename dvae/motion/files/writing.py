@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ from ...inference.result import progress_bar
 from ..data import Clip, MotionSet
 from ..skeleton import Skeleton, brief
 from .bvh import write_bvh
-from .plain import save, save_clips, write_table
+from .plain import save, save_clips, write_labels, write_table
 from .reading import Collected, File, FileReader, find_files, read_motion, sampled, upwards
 from .recording import Recording
 from .settled import understand
@@ -48,7 +50,8 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
     """Write motion for other programs: as npz, BVH, csv or in AMASS's layout.
 
     BVH is in centimetres and y up, and has one rigid body a clip: where there are no rotations, they are found as
-    `MotionSet.with_rotations` does, and bones have their mean lengths.
+    `MotionSet.with_rotations` does, and bones have their mean lengths in the clip. A folder gets labels.csv, where
+    there are labels. Where something cannot be written, nothing is.
 
     Args:
         path: a file; or, where it has no ending, a folder, which gets a file "split/clip" for each clip.
@@ -72,36 +75,55 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
             f"{path}: {format} holds one clip a file, and there are {len(motion)}; name a folder (without an ending) "
             "and the format"
         )
-    if format in ("bvh", "amass"):
-        if lacking := [clip for clip in motion if np.isnan(clip.positions).any()]:
-            raise ValueError(
-                f"clip {brief('/'.join(lacking[0].key))} lacks joints, and {format} has no gaps; fill them first "
-                "(`dvae impute RUN --filled FILE`), or write npz or csv, where they are NaN"
-            )
-        motion = motion.with_rotations()
-    return [write_clip(_place(path, clip, format), clip, motion.skeleton, format) for clip in motion]
+    with _staged(path) as stage:
+        for clip in motion:
+            write_clip(_place(stage, clip, format), replace(motion, clips=[clip]), format)
+        if not path.suffix:
+            write_labels(stage / "labels.csv", motion)
+    return [_place(path, clip, format) for clip in motion]
 
 
-def write_clip(path: Path, clip: Clip, skeleton: Skeleton, format: str) -> Path:
-    """Write one clip, with rotations where the format has them."""
+@contextmanager
+def _staged(out: Path) -> Iterator[Path]:
+    """Where files are written that go to a folder, or a file to its place, once all of them are whole."""
+    folder = out.parent if out.suffix else out
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=".new-", dir=folder, ignore_cleanup_errors=True) as stage:
+        yield Path(stage, out.name) if out.suffix else Path(stage)
+        for file in [file for file in Path(stage).rglob("*") if file.is_file()]:
+            place = folder / file.relative_to(stage)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            file.replace(place)
+
+
+def write_clip(path: Path, motion: MotionSet, format: str) -> None:
+    """Write a set of one clip, with rotations where the format has them."""
+    clip, skeleton = motion.clips[0], motion.skeleton
     if format == "csv":
         write_table(path, skeleton.names, clip.positions)
         skeleton.to_json(path.with_name("skeleton.json"))
-    elif format == "amass":
+        return
+    if np.isnan(clip.positions).any():
+        raise ValueError(
+            f"clip {brief('/'.join(clip.key))} lacks joints, and {format} has no gaps; fill them first "
+            "(`dvae impute RUN --filled FILE`), or write npz or csv, where they are NaN"
+        )
+    turning = motion.with_rotations()
+    clip, skeleton = turning.clips[0], turning.skeleton
+    if format == "amass":
         write_amass(path, clip, skeleton)
-    else:
-        recording = Recording(skeleton.names, skeleton.parents, clip.positions, clip.rotations, up=skeleton.up)
-        if skeleton.up != "y":  # as animation programs expect
-            recording = upwards(recording, "y")
-        assert recording.rotations is not None
-        names: list[str] = []
-        for name in skeleton.names:
-            plain = re.sub(r"[\s{}]+", "_", name)
-            names.append(plain + "_" * next(n for n in count() if plain + "_" * n not in names))
-        root = recording.positions[:, skeleton.root]
-        offsets = skeleton.offsets.numpy()
-        write_bvh(path, names, list(skeleton.parents), offsets, recording.rotations, root, skeleton.fps)
-    return path
+        return
+    recording = Recording(skeleton.names, skeleton.parents, clip.positions, clip.rotations, up=skeleton.up)
+    if skeleton.up != "y":  # as animation programs expect
+        recording = upwards(recording, "y")
+    assert recording.rotations is not None
+    names: list[str] = []
+    for name in skeleton.names:
+        plain = re.sub(r"[\s{}]+", "_", name)
+        names.append(plain + "_" * next(n for n in count() if plain + "_" * n not in names))
+    root = recording.positions[:, skeleton.root]
+    offsets = skeleton.offsets.numpy()
+    write_bvh(path, names, list(skeleton.parents), offsets, recording.rotations, root, skeleton.fps)
 
 
 def _place(path: Path, clip: Clip, format: str) -> Path:
@@ -168,27 +190,31 @@ def convert(
     world = understand(sampled(files, skip_bad), metres, up)
     reader = FileReader(world, metres is not None, recorded, onto=onto, resampled=fps, missing=missing)
     collected, skipped = Collected(out.stem), []
-    work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="2*n_jobs", batch_size=1)
-    results = work(delayed(_converted)(reader, file, out, format, skip_bad) for file in files)
 
-    def clips() -> Iterator[Clip]:
-        with progress_bar(True) as bar:
+    def clips(stage: Path) -> Iterator[Clip]:
+        work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="2*n_jobs", batch_size=1)
+        results = work(delayed(_converted)(reader, file, stage, format, skip_bad) for file in files)
+        with closing(results), progress_bar(True) as bar:
             for file, result in bar.track(zip(files, results, strict=True), len(files), description="clips"):
                 reason = result if isinstance(result, str) else collected.add(file.path, *result)
                 if reason and not skip_bad:
                     raise ValueError(reason)
                 if reason:
                     skipped.append(reason)
+                    if not isinstance(result, str) and format != "npz":
+                        _place(stage, result[0], format).unlink()
                 else:
                     yield result[0]
+        if len(skipped) == len(files):
+            raise ValueError(f"no file can be read; the first: {skipped[0]}")
 
     if format == "npz":
-        save_clips(out, clips(), lambda: collected.skeleton)
+        save_clips(out, clips(out), lambda: collected.skeleton)
     else:
-        for _ in clips():
-            pass
-    if len(skipped) == len(files):
-        raise ValueError(f"no file can be read; the first: {skipped[0]}")
+        with _staged(out) as stage:
+            known = list(clips(stage))
+            if not out.suffix:
+                write_labels(stage / "labels.csv", known)
     left = f"; {len(skipped)} skipped, the first: {skipped[0]}" if skipped else ""
     return f"{len(files) - len(skipped)} clips; read as {collected.said(world)}{left}"
 
@@ -204,13 +230,12 @@ def _told(source: Path, several: bool) -> list[File]:
 def _converted(
     reader: FileReader, file: File, out: Path, format: str, skip_bad: bool
 ) -> tuple[Clip, Skeleton, list[str]] | str:
-    """One file, read and, where each clip has a file, written: what it holds; or why it does not."""
+    """One file, read and, where each clip has a file, written: what it holds; or why it cannot be used."""
     try:
         clip, skeleton, notes = reader(file)
         if format == "npz":
             return clip, skeleton, notes
-        motion = MotionSet([clip], skeleton, file.name, copy=False, missing=reader.missing)
-        write_motion(_place(out, clip, format), motion, format)
+        write_clip(_place(out, clip, format), MotionSet([clip], skeleton, copy=False, missing=reader.missing), format)
         fullest = int(np.isnan(clip.positions).any(2).sum(1).argmin())
         return clip.between(fullest, fullest + 1), skeleton, notes
     except ValueError as error:

@@ -1,12 +1,13 @@
 """Motion written for other programs, and converted file by file on the command line."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dvae.cli import main
-from dvae.motion import HUMAN36M, WALKER, Clip, Forecasts, MotionSet, read_motion, simulate, write_motion
+from dvae.motion import HUMAN36M, WALKER, Clip, Forecasts, MotionSet, read_motion, save, simulate, write_motion
 from dvae.motion.files.plain import read_arrays
 from dvae.motion.files.smpl import JOINTS
 
@@ -99,6 +100,70 @@ def test_every_format_is_converted_to_every_other(recordings, three, tmp_path):
         np.testing.assert_allclose(
             last[clip.key].positions - last[clip.key].positions[:, :1], clip.positions - pelvis, atol=0.03
         )
+
+
+@pytest.mark.parametrize("format", ["bvh", "amass"])
+def test_everybody_keeps_their_own_body(format, three, tmp_path):
+    """Bones of several people differ by centimetres; inverse kinematics is within one."""
+    write_motion(tmp_path / "many", three, format)
+    for clip in three:
+        path = tmp_path / "many" / clip.split / f"{clip.name}{'.bvh' if format == 'bvh' else '.npz'}"
+        read = read_motion(path, onto=WALKER).clips[0].positions
+        (alone,) = write_motion(tmp_path / f"a{path.suffix}", MotionSet([clip], WALKER), format)
+        np.testing.assert_array_equal(read, read_motion(alone, onto=WALKER).clips[0].positions)
+        if format == "bvh":
+            assert np.linalg.norm(read - clip.positions, axis=-1).max() < 0.01
+
+
+@pytest.mark.parametrize("format", ["npz", "bvh", "csv", "amass"])
+def test_labels_go_with_the_clips(format, three, tmp_path):
+    moods = [replace(clip, labels={"mood": name}) for clip, name in zip(three, ("sad, or so", "glad", ""), strict=True)]
+    sad = MotionSet(moods, WALKER)
+    known = {clip.key: clip.labels["mood"] for clip in sad}
+
+    def told(path):
+        return {clip.key: clip.labels["mood"] for clip in read_motion(path)}
+
+    out = "a.npz" if format == "npz" else "a"
+    write_motion(tmp_path / "out" / out, sad, format)
+    assert told(tmp_path / "out" / out) == known
+    save(tmp_path / "npz" / "b.npz", sad)
+    for number, source in enumerate((tmp_path / "out" / out, tmp_path / "npz" / "b.npz")):
+        there = tmp_path / str(number) / out
+        assert main(["data", "convert", str(source), "--out", str(there), "--format", format, "--jobs", "1"]) == 0
+        assert told(there) == known
+    if format != "npz":
+        both = [str(tmp_path / "out" / "a" / split) for split in ("train", "test")]
+        (tmp_path / "out" / "a" / "train" / "labels.csv").write_text("clip,mood\nperson_0001,wild\n")
+        assert main(["data", "convert", *both, "--out", str(tmp_path / "both.npz"), "--jobs", "1"]) == 0
+        read = read_motion(tmp_path / "both.npz")
+        assert read["train", "person_0001"].labels["mood"] == "wild"
+
+
+def test_what_is_refused_leaves_nothing_and_what_is_skipped_no_file(recordings, three, tmp_path, capsys):
+    shutil.copytree(recordings, tmp_path / "in")
+    stranger = tmp_path / "in" / "train" / "stranger.bvh"
+    text = (tmp_path / "in" / "train" / "person_0000.bvh").read_text()
+    stranger.write_text(text.replace("JOINT LShoulder", "JOINT Wing"))
+    told = ["data", "convert", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--format", "csv", "--jobs", "1"]
+    assert main(told) == 1
+    assert "has Wing" in capsys.readouterr().err
+    assert not list((tmp_path / "out").rglob("*"))
+    assert main([*told, "--skip-bad"]) == 0
+    assert "3 clips" in capsys.readouterr().err
+    written = sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.*"))
+    assert written == [
+        "labels.csv",
+        "test/person_0002.csv",
+        "test/skeleton.json",
+        "train/person_0000.csv",
+        "train/person_0001.csv",
+        "train/skeleton.json",
+    ]
+    away = replace(three.clips[0], name="../b")
+    with pytest.raises(ValueError, match="leads out of the folder"):
+        write_motion(tmp_path / "many", MotionSet([*three, away], WALKER), "csv")
+    assert not list((tmp_path / "many").rglob("*"))
 
 
 def test_what_cannot_be_converted_is_said_or_skipped(recordings, tmp_path, capsys):
