@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .kinematics import forward
+from .naming import letters, readings
 from .rotations import continuous, from_matrix, to_matrix
 from .skeleton import Skeleton
 
@@ -50,36 +50,12 @@ _FURTHER |= {
 }
 """What is at the end of a bone that begins at a part."""
 
-_PREFIX = re.compile(r"^(.*[:|]|bip\d*[ _]|b_|j_|m_avg_|mixamorig\d*_?|cc_base_)", re.IGNORECASE)
-_SIDE = (
-    re.compile(r"^(?P<l>left)?(?P<r>right)?(?=.)", re.IGNORECASE),
-    re.compile(r"(?P<l>left)?(?P<r>right)?$", re.IGNORECASE),
-    re.compile(r"(?<=[ _.\-])(?:(?P<l>[lL])|(?P<r>[rR]))$"),
-    re.compile(r"^(?:(?P<l>[lL])|(?P<r>[rR]))(?=[ _.\-]|[A-Z])"),
-)
-
-
-def _split(name: str) -> list[tuple[str, str]]:
-    """Side ("l", "r" or nothing) and word that a name may mean, as "lhumerus" means l humerus."""
-    name = _PREFIX.sub("", name)
-    for pattern in _SIDE:
-        found = pattern.search(name)
-        if found and found.group():
-            word = name[: found.start()] + name[found.end() :]
-            return [("l" if found["l"] else "r", _plain(word))]
-    plain = _plain(name)
-    return [("", plain), *([(plain[0], plain[1:])] if plain[:1] in ("l", "r") else [])]
-
-
-def _plain(word: str) -> str:
-    return re.sub(r"[ _.\-]", "", word).lower()
-
 
 def parts(names: Sequence[str]) -> dict[str, int]:
     """Which joint is which part, as in {"pelvis": 0, "l hip": 1}; joints that mean no part are left out."""
     words: dict[tuple[str, str], int] = {}
     for joint, name in enumerate(names):
-        for meant in _split(name):
+        for meant in readings(name):
             words.setdefault(meant, joint)
     for side in ("l", "r"):
         if (side, "radius") in words:  # Acclaim's, in which the wrist is the second half of the forearm
@@ -99,7 +75,7 @@ def parts(names: Sequence[str]) -> dict[str, int]:
     for part, next_one in _FURTHER.items():  # files do not name ends, readers do
         for side in ("",) if part in _MIDDLE else ("l", "r"):
             if f"{side} {part}".strip() in found:
-                own = _split(names[found[f"{side} {part}".strip()]])
+                own = readings(names[found[f"{side} {part}".strip()]])
                 take(next_one, side, [f"{word}end" for _, word in own])
     return found
 
@@ -121,10 +97,10 @@ def match(names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | No
     if set(skeleton.names) - told.keys() <= set(names):
         told = {name: list(names).index(name) for name in skeleton.names if name not in told} | told
     there, meant = parts(names), {joint: part for part, joint in parts(skeleton.names).items()}
-    plain = {_plain(name): joint for joint, name in enumerate(names)}
+    alike = {letters(name): joint for joint, name in enumerate(names)}
     found, lacking = [], []
     for joint, name in enumerate(skeleton.names):
-        place = there.get(meant[joint]) if joint in meant else plain.get(_plain(name))
+        place = there.get(meant[joint]) if joint in meant else alike.get(letters(name))
         place = told.get(name, place)
         found.append(place)
         if place is None:

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from .. import files
+from .naming import readings
 
 MOST_JOINTS = 1000
 """A body scanner's suit has two hundred markers; matrices here grow with the square of the number."""
@@ -187,25 +188,19 @@ class Skeleton:
         return self.parents.index(-1)
 
     def find(self, joint: str) -> int:
-        """Index of a joint by its name, in any case, with "left_" and "right_" for L and R.
+        """Index of a joint by its name, or by one that means the same, such as left_wrist for LWrist.
 
         Raises:
             ValueError: an unknown name, with the nearest one.
         """
-
-        def plain(name: str) -> str:
-            name = name.lower().replace("_", "").replace("-", "")
-            for side in ("left", "right"):
-                name = side[0] + name.removeprefix(side) if name.startswith(side) else name
-            return name
-
-        names = [plain(name) for name in self.names]
         joint = str(joint)
         if joint in self.names:
             return self.names.index(joint)
-        if names.count(plain(joint)) == 1:
-            return names.index(plain(joint))
-        close = difflib.get_close_matches(plain(joint), names, n=1)
+        alike = [place for place, name in enumerate(self.names) if {*readings(name)} & {*readings(joint)}]
+        if len(alike) == 1:
+            return alike[0]
+        names = ["".join(readings(name)[0]) for name in self.names]
+        close = difflib.get_close_matches("".join(readings(joint)[0]), names, n=1)
         hint = f" (did you mean {self.names[names.index(close[0])]!r}?)" if close else ""
         raise ValueError(f"no joint {joint!r}{hint}; skeleton {self.name!r} has {', '.join(self.names)}")
 

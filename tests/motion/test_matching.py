@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from dvae.motion import HUMAN36M, HUMANEVA, WALKER, simulate
+from dvae.motion import HUMAN36M, HUMANEVA, WALKER, Skeleton, simulate
 from dvae.motion.files.smpl import JOINTS
 from dvae.motion.kinematics import forward
 from dvae.motion.matching import Kept, match, parts
+from dvae.motion.naming import sides
 from dvae.motion.rotations import to_matrix
 
 SIDED = ("{}Hip", "{}Knee", "{}Foot", "{}Shoulder", "{}Elbow", "{}Wrist")
@@ -42,6 +43,17 @@ def test_names_mean_the_same_in_every_dialect(dialect):
     assert set(there) == set(WALKER.names)
     names = [*OTHERS.get(dialect, []), *there.values()]  # others first, so that order decides nothing
     assert [names[joint] for joint in match(names, WALKER)] == [there[name] for name in WALKER.names]
+    assert sides([*there.values()]) == sides([*there])
+    assert len(sides([*there])[0]) == len(SIDED)
+    skeleton = Skeleton(tuple(there.values()), tuple(range(-1, len(there) - 1)))
+    for ours, word in zip(SIDED, sided.split(), strict=True):
+        assert skeleton.find(f"left_{word}") == skeleton.names.index(there[ours.format("L")])
+
+
+def test_sides_are_what_names_differ_in():
+    assert sides(["Hips", "LeftArm", "RightArm", "left", "Lowerback"]) == ((1,), (2,))
+    assert sides(["a", "lArm", "rArm", "leg_L", "leg_R"]) == ((1, 3), (2, 4))
+    assert sides(["ThighL", "ThighR", "UpperLeftArm", "UpperRightArm", "a.l.1", "a.r.1"]) == ((0, 2, 4), (1, 3, 5))
 
 
 @pytest.mark.parametrize("skeleton", [WALKER, HUMAN36M, HUMANEVA])

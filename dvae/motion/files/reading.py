@@ -11,6 +11,7 @@ import numpy as np
 
 from ..data import Clip, MotionSet, defect, extents, fullest
 from ..matching import RIGID, Kept
+from ..naming import sides
 from ..skeleton import Skeleton
 from .amc import read_amc, read_expmap
 from .archive import LARGEST
@@ -18,7 +19,7 @@ from .bvh import read_bvh
 from .markers import read_c3d
 from .plain import check_key, read_archive, read_labels, read_table
 from .recording import Recording
-from .settled import World, settle, sides, turned, understand
+from .settled import World, settle, turned, understand
 from .smpl import is_amass, read_amass
 
 READERS: dict[str, Callable[[Path], Recording]] = {

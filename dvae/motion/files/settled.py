@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import log
 
@@ -24,30 +24,6 @@ WITHIN = 1.35
 
 _TOP = re.compile(r"head|neck|skull|face", re.IGNORECASE)
 _BOTTOM = re.compile(r"foot|toe|ankle|heel", re.IGNORECASE)
-_SIDES = {
-    "left": (r"left", r"(?<=[:_.\-])l(?=$|[:_.\-A-Z])", r"^l(?=.)"),
-    "right": (r"right", r"(?<=[:_.\-])r(?=$|[:_.\-A-Z])", r"^r(?=.)"),
-}
-"""How names tell a side: by the word, or by its letter at the beginning or the end."""
-
-
-def sides(names: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Joints on the left and on the right, by names that differ in these words or letters alone."""
-    found: dict[str, set[int]] = {"left": set(), "right": set()}
-    for way in range(3):
-        plain = {
-            side: {
-                re.sub(ways[way], "", name, count=1, flags=re.I).lower(): place
-                for place, name in enumerate(names)
-                if re.search(ways[way], name, re.I)
-            }
-            for side, ways in _SIDES.items()
-        }
-        for name in plain["left"].keys() & plain["right"].keys():
-            for side, places in plain.items():
-                found[side].add(places[name])
-    left, right = (tuple(sorted(places)) for places in found.values())
-    return left, right
 
 
 def upright(recording: Recording) -> tuple[str, bool]:

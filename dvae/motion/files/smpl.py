@@ -18,11 +18,11 @@ from ... import files
 from ..data import Clip, MotionSet
 from ..kinematics import inverse
 from ..matching import Kept, against_world, parts
+from ..naming import sides
 from ..rotations import from_matrix, to_matrix
 from ..skeleton import Skeleton
 from .archive import archive, write_arrays
 from .recording import Recording, check_size
-from .settled import sides
 
 _HEIGHT = 1.7
 _BODY = {  # joint, parent, offset in heights: left towards +x, y up, facing +z

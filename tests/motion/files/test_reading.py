@@ -22,7 +22,7 @@ from dvae.motion import (
     write_motion,
 )
 from dvae.motion.files.recording import Recording
-from dvae.motion.files.settled import settle, sides, understand
+from dvae.motion.files.settled import settle, understand
 
 FORMATS = {"npz": "all.npz", "bvh": "folder", "csv": "folder", "amass": "folder"}
 
@@ -287,11 +287,6 @@ def test_joints_are_chosen_by_place_name_or_new_name(kind, people, tmp_path):
     assert (onto.skeleton.name, onto.skeleton.up, onto.skeleton.fps) == ("human36m", "z", 30)
     heights = whole.clips[0].positions[:, whole.skeleton.find("Pelvis"), 1]
     np.testing.assert_allclose(onto.clips[0].positions[:, 0, 2], heights, atol=1e-6)
-
-
-def test_sides_are_what_names_differ_in():
-    assert sides(["Hips", "LeftArm", "RightArm", "left", "Lowerback"]) == ((1,), (2,))
-    assert sides(["a", "lArm", "rArm", "leg_L", "leg_R"]) == ((1, 3), (2, 4))
 
 
 def test_motion_is_resampled_by_whole_frames_or_between_them(people):
