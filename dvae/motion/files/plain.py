@@ -22,6 +22,7 @@ from ..data import Clip, MotionSet
 from ..skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, text_of
 from .archive import archive, write_arrays
 from .recording import MOST_PLACES, MOST_TEXT, Recording, check_joints
+from .settled import doubt
 
 TURNS = ".rotations"
 """At the end of a member's name: the rotations of the clip."""
@@ -80,7 +81,10 @@ def read_archive(
             yield Clip(split, name, positions, labelled, rotations=turns if skeleton.rest else None)
             del positions, turns
 
-    return MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad, missing=missing)
+    motion = MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad, missing=missing)
+    doubts = Counter(doubt(skeleton.names, clip.positions, skeleton.up) for clip in motion)
+    said, count = doubts.most_common(1)[0]
+    return replace(motion, said=f"{said} in {count} of {len(motion)} clips") if said else motion
 
 
 def save(path: str | Path, motion: MotionSet) -> None:

@@ -19,7 +19,7 @@ from .bvh import read_bvh
 from .markers import read_c3d
 from .plain import check_key, read_archive, read_labels, read_table
 from .recording import Recording
-from .settled import World, settle, turned, understand
+from .settled import World, doubt, settle, turned, understand
 from .smpl import is_amass, read_amass
 
 READERS: dict[str, Callable[[Path], Recording]] = {
@@ -123,7 +123,8 @@ def read_motion(
         found = read_archive(path, skeleton, labels, skip_bad, places or None, metres, up, fps, missing)
         return found if places or (joints is None and onto is None) else _chosen(found, joints, onto)
     some = sampled(files, skip_bad)
-    reader = FileReader(understand(some, metres, up), metres is not None, fps, skeleton, joints, onto, missing=missing)
+    given = metres is not None, up is not None
+    reader = FileReader(understand(some, metres, up), *given, fps, skeleton, joints, onto, missing=missing)
     collected = Collected(path.stem)
     clips, unread, size = [], [], 0
     for file in files:
@@ -219,13 +220,14 @@ class FileReader:
 
     Args:
         world: how their units and axes are understood.
-        given: whether its unit goes before what a file says of its own.
+        given, up: whether its unit, and its axis, go before what a file says of its own.
         resampled: frames per second of what is returned; by default the file's.
         missing: whether joints may be missing.
     """
 
     world: World
     given: bool = False
+    up: bool = False
     fps: float | None = None
     skeleton: Skeleton | None = None
     joints: Sequence[int | str] | Mapping[str, str] | None = None
@@ -253,7 +255,11 @@ class FileReader:
         world = self.world
         if recording.metres is not None and not self.given:
             world = replace(world, unit="as the file says", metres=recording.metres)
+        if recording.up is not None and not self.up:
+            world = replace(world, axis=recording.up, upwards=True)
         settled = settle(recording, world)
+        if settled.up != self.world.up:
+            settled = upwards(settled, self.world.up)
         fps = self.fps or settled.fps
         if fps is None:
             raise ValueError("it does not say its frames per second; give fps=")
@@ -271,6 +277,7 @@ class FileReader:
         if reason := defect(clip, own, self.missing):
             raise ValueError(reason)
         notes = [BENDS] if settled.rotations is not None and clip.rotations is None else []
+        notes += [lying] if (lying := doubt(settled.names, settled.positions, self.world.up)) else []
         return clip, own, notes
 
 

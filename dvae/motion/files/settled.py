@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log
 
 import numpy as np
 import torch
 
-from ..data import extents
+from ..data import extents, fullest
 from ..rotations import continuous, from_matrix, to_matrix
 from .recording import Recording
 
@@ -21,6 +21,9 @@ HEIGHT = 1.65
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "1 / .45 inches": 0.0254 / 0.45}
 WITHIN = 1.35
 """Factor within which a person of `HEIGHT` must be, so that no recording fits two units."""
+
+STANDING = 0.8
+"""Cosine between an axis and the way from feet to head from which people stand along it."""
 
 _TOP = re.compile(r"head|neck|skull|face", re.IGNORECASE)
 _BOTTOM = re.compile(r"foot|toe|ankle|heel", re.IGNORECASE)
@@ -33,20 +36,54 @@ def upright(recording: Recording) -> tuple[str, bool]:
     """
     if recording.up:
         return recording.up, True
-    tops = [place for place, name in enumerate(recording.names) if _TOP.search(name)]
-    bottoms = [place for place, name in enumerate(recording.names) if _BOTTOM.search(name)]
-    if tops and bottoms:
-        ends = [np.ma.masked_invalid(recording.positions[:, places]).mean(1) for places in (tops, bottoms)]
-        along = (ends[0] - ends[1]).mean(0).filled(0.0)
-    else:
-        along = np.median(extents(recording.positions), axis=0)
+    bodies = _from_feet_to_head(recording.names, recording.positions)
+    along = np.median(extents(recording.positions), axis=0) if bodies is None else bodies.mean(0)
     axis = int(np.abs(along).argmax())
     return "xyz"[axis], bool(along[axis] > 0)
 
 
-def extent(recording: Recording) -> float:
-    """The body's largest extent along an axis, in the recording's unit: the median over frames."""
-    return float(np.median(extents(recording.positions).max(1)))
+def doubt(names: Sequence[str], positions: np.ndarray, up: str) -> str:
+    """What speaks against this axis being up: heads that are above feet along another one; nothing, as a rule.
+
+    Args:
+        names: of the joints.
+        positions: (F, J, 3).
+        up: the axis.
+    """
+    bodies = _from_feet_to_head(names, positions)
+    if bodies is None or not len(bodies):
+        return ""
+    along = np.median(bodies, axis=0) / max(float(np.median(np.linalg.norm(bodies, axis=1))), 1e-9)
+    axis = int(np.abs(along).argmax())
+    if np.abs(along[axis]) < STANDING or ("xyz"[axis] == up and along[axis] > 0):
+        return ""
+    return f"heads are above feet along {'' if along[axis] > 0 else '-'}{'xyz'[axis]}, not {up}, which was taken for up"
+
+
+def _from_feet_to_head(names: Sequence[str], positions: np.ndarray) -> np.ndarray | None:
+    """(frames that have both, 3), where names tell heads and feet."""
+    ends = [[place for place, name in enumerate(names) if kind.search(name)] for kind in (_TOP, _BOTTOM)]
+    if not all(ends):
+        return None
+    head, foot = (np.ma.masked_invalid(positions[:, places]).mean(1) for places in ends)
+    bodies = head - foot
+    found: np.ndarray = bodies.data[~np.ma.getmaskarray(bodies).any(1)].astype(np.float64)
+    return found
+
+
+def size(recording: Recording) -> float:
+    """About the body's height, in the recording's unit, however it crouches: along its bones from head to foot.
+
+    The median over all that names tell are heads and feet, and over frames; else the body's largest extent.
+    """
+    parents, places = recording.parents, fullest(recording.positions)
+    chains: list[set[int]] = []  # of each joint those up to the root
+    for joint, parent in enumerate(parents):
+        chains.append({joint} | (chains[parent] if parent >= 0 else set()))
+    bones = np.median(np.linalg.norm(places - places[:, [max(parent, 0) for parent in parents]], axis=2), axis=0)
+    ends = [[chains[joint] for joint, name in enumerate(recording.names) if of.search(name)] for of in (_TOP, _BOTTOM)]
+    ways = [sum(bones[joint] for joint in head ^ foot) for head in ends[0] for foot in ends[1]]
+    return float(np.median(ways or extents(places).max(1)))
 
 
 def unit(recording: Recording) -> tuple[str, float]:
@@ -57,12 +94,12 @@ def unit(recording: Recording) -> tuple[str, float]:
     """
     if recording.metres is not None:
         return "as the file says", recording.metres
-    size = extent(recording)
-    fitting = {name: abs(log(max(size, 1e-12) * metres / HEIGHT)) for name, metres in UNITS.items()}
+    height = size(recording)
+    fitting = {name: abs(log(max(height, 1e-12) * metres / HEIGHT)) for name, metres in UNITS.items()}
     name = min(fitting, key=fitting.__getitem__)
     if not fitting[name] <= log(WITHIN):
         raise ValueError(
-            f"the body's largest extent is {size:.4g} (median over frames), which is a person's in none of "
+            f"the body is about {height:.4g} tall (median over frames), which is a person's height in none of "
             f"{', '.join(UNITS)}; give the metres of the file's unit"
         )
     return name, UNITS[name]

@@ -22,7 +22,7 @@ from dvae.motion import (
     write_motion,
 )
 from dvae.motion.files.recording import Recording
-from dvae.motion.files.settled import settle, understand
+from dvae.motion.files.settled import settle, size, understand
 
 FORMATS = {"npz": "all.npz", "bvh": "folder", "csv": "folder", "amass": "folder"}
 
@@ -202,8 +202,56 @@ def test_a_unit_that_no_person_has_is_asked_for(tmp_path, people):
         for line in text
     ]
     (tmp_path / "a.bvh").write_text("\n".join(large))
-    with pytest.raises(ValueError, match=r"a\.bvh: the body's largest extent is .* give the metres"):
+    with pytest.raises(ValueError, match=r"a\.bvh: the body is about .* tall .* give the metres"):
         read_motion(tmp_path / "a.bvh")
+
+
+@pytest.mark.parametrize("scale", [1.0, 100.0, 1000.0])
+def test_who_crouches_or_lies_is_as_tall_as_before(people, scale):
+    places, skeleton = people.clips[0].positions.astype(float), people.skeleton
+    lying = places[..., [1, 2, 0]]
+    curled = places.copy()
+    for joint in range(skeleton.joints):  # all bones along one axis, up and down in turns
+        if (parent := skeleton.parents[joint]) >= 0:
+            length = np.linalg.norm(places[:, joint] - places[:, parent], axis=-1)
+            curled[:, joint] = curled[:, parent] + (-1) ** joint * length[:, None] * np.array([0, 1.0, 0])
+    assert np.median(np.ptp(curled, axis=1).max(1)) < 1
+    for pose in (places, lying, curled):
+        seen = Recording(skeleton.names, skeleton.parents, scale * pose, fps=30)
+        assert size(seen) == pytest.approx(scale * size(replace(seen, positions=places)))
+        assert understand({"a": seen}).metres == pytest.approx(1 / scale)
+
+
+def test_files_that_say_their_axis_are_turned_to_the_folders(people, tmp_path):
+    tilted = [replace(clip, positions=clip.positions[..., [2, 0, 1]]) for clip in people]  # z up
+    for name, up, clip in (("a", "y", people.clips[0]), ("b", "y", people.clips[1]), ("c", "z", tilted[2])):
+        whole = MotionSet([replace(clip, name=name, split="all")], replace(WALKER, up=up))
+        write_motion(tmp_path / "mixed" / name / "a.csv", whole)
+    read = read_motion(tmp_path / "mixed")
+    assert (read.skeleton.up, [clip.split for clip in read]) == ("y", ["a", "b", "c"])
+    for clip, own in zip(read, people, strict=True):
+        np.testing.assert_allclose(clip.positions[..., 1], own.positions[..., 1], atol=1e-6)
+    assert "heads" not in read.said
+    given = read_motion(tmp_path / "mixed", up="y")
+    assert "heads are above feet along z, not y, which was taken for up in 1 of 3 files, the first a.csv" in given.said
+
+
+def test_who_lies_is_said(people, tmp_path):
+    tilted = MotionSet([replace(clip, positions=clip.positions[..., [2, 0, 1]]) for clip in people], WALKER)
+    save(tmp_path / "a.npz", tilted)
+    read = read_motion(tmp_path / "a.npz")
+    assert read.said == "heads are above feet along z, not y, which was taken for up in 3 of 3 clips"
+    assert read.said in printed(read).replace("\n", " ")
+    assert read_motion(tmp_path / "a.npz", up="z").said == ""
+    write_motion(tmp_path / "b", people.with_rotations(), "bvh")
+    path = tmp_path / "b" / "test" / "person_0002.bvh"
+    lines = path.read_text().splitlines()
+    first = lines.index("MOTION") + 3
+    rows = [line.split() for line in lines[first:]]
+    turned = [" ".join([z, x, y, "90", *row[4:]]) for (x, y, z, *_), row in zip(rows, rows, strict=True)]
+    path.write_text("\n".join([*lines[:first], *turned]))
+    said = read_motion(tmp_path / "b").said
+    assert re.search("heads are above feet along -?x, not y, .* in 1 of 3 files, the first person_0002.bvh", said)
 
 
 def test_a_folder_is_read_to_its_last_subfolder_without_its_links(bvh, tmp_path):
