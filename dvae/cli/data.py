@@ -9,7 +9,7 @@ import tyro
 
 from .. import motion
 from ..motion.dataset import SIMULATED
-from ..motion.files import writing
+from ..motion.files import reading, writing
 from .console import ERROR, OUT, Missing, UsageError
 
 ONTO = {skeleton.name: skeleton for skeleton in (motion.WALKER, motion.HUMAN36M, motion.HUMANEVA)}
@@ -69,13 +69,17 @@ def data(
         return
     if url:
         raise UsageError("--url is of get")
+    known = _skeleton(onto)
     if files == (SIMULATED,):
+        if metres or up or recorded:
+            raise UsageError("--metres, --up and --recorded are of files, which may be wrong about them")
         people = motion.simulate() if fps is None else motion.simulate().resampled(fps)
+        people = people if known is None else reading.chosen(people, onto=known)
         said = f"{len(writing.write_motion(out, people, format))} files"
     else:
         told = {"metres": metres, "up": up, "recorded": recorded, "skip_bad": skip_bad, "missing": missing}
         paths = [Path(file) for file in files]
-        said = writing.convert(paths, out, format, fps, _skeleton(onto), jobs, **told)  # type: ignore[arg-type]
+        said = writing.convert(paths, out, format, fps, known, jobs, **told)  # type: ignore[arg-type]
     ERROR.print(f"wrote {out}: {said}", markup=False)
 
 

@@ -181,7 +181,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
                 raise wrong(number, "three numbers")
             joints[open_[-1]].offset = found
         elif kind == "CHANNELS" and open_ and not named:
-            count, *channels = rest.lower().split()
+            count, *channels = rest.lower().split() or [""]
             unknown = [channel for channel in channels if channel not in _AXES]
             if unknown or not count.isdecimal() or len(channels) != len(set(channels)) or str(len(channels)) != count:
                 raise wrong(number, "their number and as many of Xposition ... Zrotation, each once")

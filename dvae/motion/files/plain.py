@@ -81,7 +81,10 @@ def read_archive(
             yield Clip(split, name, positions, labelled, rotations=turns if skeleton.rest else None)
             del positions, turns
 
-    motion = MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad, missing=missing)
+    try:
+        motion = MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad, missing=missing)
+    except ValueError as error:
+        raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
     doubts = Counter(doubt(skeleton.names, clip.positions, skeleton.up) for clip in motion)
     said, count = doubts.most_common(1)[0]
     return replace(motion, said=f"{said} in {count} of {len(motion)} clips") if said else motion

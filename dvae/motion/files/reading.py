@@ -121,7 +121,7 @@ def read_motion(
     if not files:
         places = [joint for joint in joints or () if isinstance(joint, int)] if onto is None else []
         found = read_archive(path, skeleton, labels, skip_bad, places or None, metres, up, fps, missing)
-        return found if places or (joints is None and onto is None) else _chosen(found, joints, onto)
+        return found if places or (joints is None and onto is None) else chosen(found, joints, onto)
     some = sampled(files, skip_bad)
     given = metres is not None, up is not None
     reader = FileReader(understand(some, metres, up), *given, fps, skeleton, joints, onto, missing=missing)
@@ -318,12 +318,12 @@ def kept(
         return recording if recording.loose <= RIGID else replace(recording, rotations=None, offsets=None)
     names, parents = recording.names, recording.parents
     if onto is None:
-        chosen = Kept.of(names, parents, joints or ())
+        found = Kept.of(names, parents, joints or ())
     else:
-        chosen = Kept.onto(names, onto, joints if isinstance(joints, Mapping) else None)
-    positions, rotations, offsets = chosen.motion(parents, recording.positions, recording.rotations)
+        found = Kept.onto(names, onto, joints if isinstance(joints, Mapping) else None)
+    positions, rotations, offsets = found.motion(parents, recording.positions, recording.rotations)
     made = replace(
-        recording, names=chosen.names, parents=chosen.parents, positions=positions, rotations=rotations, offsets=offsets
+        recording, names=found.names, parents=found.parents, positions=positions, rotations=rotations, offsets=offsets
     )
     return upwards(made, onto.up) if onto is not None and onto.up != recording.up else made
 
@@ -404,10 +404,10 @@ class Collected:
         return "; ".join(found)
 
 
-def _chosen(
-    motion: MotionSet, joints: Sequence[int | str] | Mapping[str, str] | None, onto: Skeleton | None
+def chosen(
+    motion: MotionSet, joints: Sequence[int | str] | Mapping[str, str] | None = None, onto: Skeleton | None = None
 ) -> MotionSet:
-    """Clips with some of their joints."""
+    """Clips with some of their joints, or those of a known skeleton; see `read_motion`."""
     skeleton, collected, clips = motion.skeleton, Collected(motion.name), []
     offsets = skeleton.offsets.numpy() if skeleton.rest else None
     for clip in motion:

@@ -191,6 +191,7 @@ def test_names_that_repeat_are_not_written(tmp_path):
         ("OFFSET 3 0 0", "OFFSET 3 0 inf", "line 17: 'inf' is no number"),
         ("CHANNELS 2 ", "CHANNELS 3 ", "expected their number"),
         ("CHANNELS 2 Yrotation", "CHANNELS 2 Zrotation", "each once"),
+        ("CHANNELS 2 Yrotation Zrotation", "CHANNELS", "expected their number"),
         ("5 6 7 90", "5 6 7 x", "'x' is no number"),
         ("5 6 7 90", "5 6 90", "no 2 frames"),
         ("JOINT arm", "JOINT hip", "another joint 'hip'"),

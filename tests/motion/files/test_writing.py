@@ -166,6 +166,15 @@ def test_what_is_refused_leaves_nothing_and_what_is_skipped_no_file(recordings, 
     assert not list((tmp_path / "many").rglob("*"))
 
 
+def test_who_is_simulated_is_put_onto_what_is_asked_for(tmp_path):
+    told = ["data", "convert", "simulated", "--out", str(tmp_path / "a.npz"), "--onto", "human36m"]
+    assert main(told) == 0
+    read, walker = read_motion(tmp_path / "a.npz"), simulate()
+    assert (read.skeleton.name, read.skeleton.up) == ("human36m", "z")
+    np.testing.assert_allclose(read.clips[0].positions[..., 2], walker.clips[0].positions[..., 1], atol=1e-6)
+    assert main([*told, "--metres", "0.01"]) == 2
+
+
 def test_what_cannot_be_converted_is_said_or_skipped(recordings, tmp_path, capsys):
     (tmp_path / "in").mkdir()
     for file in recordings.rglob("*.bvh"):
