@@ -38,6 +38,8 @@ def data_of(path: str | None, *shared: runs.Loaded, missing: bool = False) -> An
             raise UsageError("--missing is about other data (--data); those of the run have no joint missing")
         return most.data
     found = most.on(path, **({"missing": True} if missing else {}))
+    if found.onto:
+        note(f"{path} has another skeleton; its joints are taken for those of {most.path} by what their names mean")
     for run in shared:
         if not own(run, found):
             note(f"{path} is not the data that {run.path} was fitted on")

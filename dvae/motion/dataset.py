@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 from ..options import check, tuples
 from .data import MotionSet
 from .files import read_motion
+from .files.reading import chosen
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, named_protocol, windows
 from .simulator import simulate
 
@@ -75,6 +76,7 @@ class MotionData:
         motion: its clips.
         protocol: how windows are cut from them.
         skip_bad: whether unusable clips were left out.
+        onto: whether they were put onto the skeleton of a run.
     """
 
     kind: ClassVar[str] = "motion"
@@ -85,6 +87,7 @@ class MotionData:
     motion: MotionSet
     protocol: Protocol
     skip_bad: bool = False
+    onto: bool = False
 
     @classmethod
     def open(
@@ -145,6 +148,9 @@ class MotionData:
     ) -> Self:
         """The data that were recorded, from there or from another path, whatever they are now.
 
+        Others that have another skeleton are put onto that of the schema, where its joints are among theirs by what
+        names mean; turns are then found anew.
+
         Args:
             source: as `recorded` gave it.
             schema: of the windows; of runs of format 1, the fields of the protocol.
@@ -154,4 +160,16 @@ class MotionData:
             FileNotFoundError, ValueError: see `open`.
         """
         protocol = Protocol(**tuples(schema)) if isinstance(schema, Mapping) else schema.protocol
-        return cls.open(path or source.path, protocol, source.skip_bad, source.missing)
+        found = cls.open(path or source.path, protocol, source.skip_bad, source.missing)
+        if isinstance(schema, Mapping) or found.schema.skeleton == schema.skeleton:
+            return found
+        known, motion = schema.skeleton, found.motion
+        if motion.skeleton.fps != known.fps or found.fingerprint == source.fingerprint:
+            return found
+        try:
+            put = chosen(motion, onto=known)
+        except ValueError:  # whoever compares the schemas says what differs
+            return found
+        clips = [replace(clip, rotations=None) for clip in put]
+        put = MotionSet(clips, known, motion.name, skipped=motion.skipped, said=motion.said, missing=motion.missing)
+        return replace(found, motion=put, onto=True)

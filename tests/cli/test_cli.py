@@ -540,6 +540,14 @@ def test_data_of_other_joints_are_refused(capsys, run, tmp_path):
     assert "skeleton.fps is 60.0, not 30.0" in error
 
 
+def test_data_whose_joints_mean_those_of_the_run_are_taken_and_it_is_said(capsys, run, tmp_path):
+    people = motion.simulate(clips=8, frames=90, seed=5)
+    motion.write_motion(tmp_path / "bvh", people, "bvh")
+    told = ["forecast", str(run), "--data", str(tmp_path / "bvh"), "--out", str(tmp_path / "f.npz"), "--samples", "1"]
+    assert main(told) == 0
+    assert "its joints are taken for those of" in capsys.readouterr().err
+
+
 def test_debug_shows_where_it_failed(capsys, tmp_path):
     assert main(["data", "info", str(tmp_path / "nowhere.npz"), "--debug"]) == 1
     assert "Traceback" in capsys.readouterr().err

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from dvae.motion import (
     HUMAN36M,
+    PROTOCOLS,
     WALKER,
     Clip,
     MotionData,
@@ -398,6 +399,25 @@ def test_one_recording_of_ones_own_has_windows_of_every_split(tmp_path):
     other = MotionSet(people.resampled(25).clips, people.resampled(25).skeleton)
     save(tmp_path / "slow.npz", other)
     assert MotionData.open(tmp_path / "slow.npz").protocol.predicted == 50
+
+
+@pytest.mark.parametrize("representation", ["positions", "6d"])
+def test_other_data_are_put_onto_the_skeleton_of_a_run(representation, tmp_path):
+    protocol = replace(PROTOCOLS["simulated"], representation=representation)
+    people, others = simulate(3, 100, seed=1), simulate(2, 100, seed=2)
+    write_motion(tmp_path / "a.npz", people)
+    own = MotionData.open(tmp_path / "a.npz", protocol)
+    names = [f"mixamorig:{name.replace('L', 'Left', 1)}" if name[0] == "L" else name for name in WALKER.names]
+    write_motion(tmp_path / "b", MotionSet(others.clips, replace(WALKER, names=names)), "bvh")
+    found = MotionData.reopened(own.recorded(), own.schema, tmp_path / "b")
+    assert (found.schema, found.onto) == (own.schema, True)
+    for clip in others:
+        assert np.linalg.norm(found.motion[clip.key].positions - clip.positions, axis=-1).max() < 0.01
+    again = MotionData.reopened(own.recorded(), own.schema, tmp_path / "a.npz")
+    assert (again.fingerprint, again.onto) == (own.fingerprint, False)
+    write_motion(tmp_path / "c", MotionSet(others.clips, replace(WALKER, names=[*names[:-1], "Paw"])), "bvh")
+    strange = MotionData.reopened(own.recorded(), own.schema, tmp_path / "c")
+    assert (strange.schema == own.schema, strange.onto) == (False, False)
 
 
 def test_a_table_has_the_joints_of_its_skeleton(people, tmp_path):
