@@ -71,7 +71,7 @@ def _from_feet_to_head(names: Sequence[str], positions: np.ndarray) -> np.ndarra
     return found
 
 
-def size(recording: Recording) -> float:
+def height_of(recording: Recording) -> float:
     """About the body's height, in the recording's unit, however it crouches: along its bones from head to foot.
 
     The median over all that names tell are heads and feet, and over frames; else the body's largest extent.
@@ -94,7 +94,7 @@ def unit(recording: Recording) -> tuple[str, float]:
     """
     if recording.metres is not None:
         return "as the file says", recording.metres
-    height = size(recording)
+    height = height_of(recording)
     fitting = {name: abs(log(max(height, 1e-12) * metres / HEIGHT)) for name, metres in UNITS.items()}
     name = min(fitting, key=fitting.__getitem__)
     if not fitting[name] <= log(WITHIN):

@@ -23,7 +23,7 @@ from dvae.motion import (
     write_motion,
 )
 from dvae.motion.files.recording import Recording
-from dvae.motion.files.settled import settle, size, understand
+from dvae.motion.files.settled import height_of, settle, understand
 
 FORMATS = {"npz": "all.npz", "bvh": "folder", "csv": "folder", "amass": "folder"}
 
@@ -219,7 +219,7 @@ def test_who_crouches_or_lies_is_as_tall_as_before(people, scale):
     assert np.median(np.ptp(curled, axis=1).max(1)) < 1
     for pose in (places, lying, curled):
         seen = Recording(skeleton.names, skeleton.parents, scale * pose, fps=30)
-        assert size(seen) == pytest.approx(scale * size(replace(seen, positions=places)))
+        assert height_of(seen) == pytest.approx(scale * height_of(replace(seen, positions=places)))
         assert understand({"a": seen}).metres == pytest.approx(1 / scale)
 
 
