@@ -235,7 +235,7 @@ def test_parameters_without_end_take_no_time(isolated, tmp_path):
     """Eight megabytes of them: time that grows with their square would be a minute."""
     changed, path = small("c3d", tmp_path)
     content = changed.read_bytes()
-    one = struct.pack("<bb", 1, -1) + b"A" + struct.pack("<h", 7) + struct.pack("<bBBB", -1, 2, 1, 1) + b"x\0"
+    one = struct.pack("<bb", 1, 1) + b"A" + struct.pack("<h", 8) + struct.pack("<bBBB", -1, 2, 1, 1) + b"x\0"
     first = content.index(b"\x04\x01USED")
     for blocks in (0, 1, 255):
         head = content[:514] + bytes([blocks]) + content[515:first]
