@@ -188,9 +188,7 @@ def convert(
         twice = next(key for key in keys if keys.count(key) > 1)
         raise ValueError(f"two files are clip {'/'.join(twice)}; put them into folders of different names")
     world = understand(sampled(files, skip_bad), metres, up)
-    reader = FileReader(
-        world, metres is not None, up is not None, recorded, onto=onto, resampled=fps, missing=missing
-    )
+    reader = FileReader(world, metres is not None, up is not None, recorded, onto=onto, resampled=fps, missing=missing)
     collected, skipped = Collected(out.stem), []
 
     def clips(stage: Path) -> Iterator[Clip]:
