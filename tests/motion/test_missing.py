@@ -765,7 +765,7 @@ def test_gaps_are_filled_in_the_motion_itself(tmp_path, capsys):
     read = motion.read_motion(tmp_path / "made" / "one.csv").clips[0].positions  # whole: nothing is NaN
     there = ~np.isnan(clip.positions)
     np.testing.assert_allclose(read[there], clip.positions[there], atol=1e-6)
-    bvh = motion.read_motion(tmp_path / "made" / "one.bvh")
+    bvh = motion.read_motion(tmp_path / "made" / "one.bvh", metres=0.01)  # bones are as long as a model of 5 steps has
     assert (bvh.clips[0].frames, bvh.skeleton.fps) == (clip.frames, WALKER.fps)
     capsys.readouterr()
     assert main([*impute, str(tmp_path / "made" / "all.bvh")]) == 2
