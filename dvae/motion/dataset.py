@@ -164,8 +164,13 @@ class MotionData:
         if isinstance(schema, Mapping) or found.schema.skeleton == schema.skeleton:
             return found
         known, motion = schema.skeleton, found.motion
-        if motion.skeleton.fps != known.fps or found.fingerprint == source.fingerprint:
+        if found.fingerprint == source.fingerprint:
             return found
+        if motion.skeleton.fps != known.fps:
+            raise ValueError(
+                f"{found.path} has {motion.skeleton.fps:g} frames per second, and windows here have {known.fps:g}; "
+                f"`dvae data convert {found.path} --fps {known.fps:g} --out FILE` resamples it"
+            )
         try:
             put = chosen(motion, onto=known)
         except ValueError:  # whoever compares the schemas says what differs
