@@ -117,7 +117,7 @@ class Views(View):
         *views: the first sees the data, the last one shows the model.
 
     Raises:
-        ValueError: a `FirstFrame`, whose frame nothing scores, behind a view that changes its volume.
+        ValueError: a `Past`, which nothing scores, behind a view that changes its volume.
     """
 
     def __init__(self, *views: View):
@@ -126,9 +126,9 @@ class Views(View):
         self.parts = next((view.parts for view in views if view.parts), None)
         self.history = next((view.history for view in views if view.history), None)
         self.measured = ", ".join(view.measured for view in views if view.measured)
-        firsts = [place for place, view in enumerate(views) if isinstance(view, FirstFrame)]
-        if not all(view.keeps_volume for view in views[: max(firsts, default=0)]):
-            raise ValueError(f"{self} changes the volume of a frame that nothing scores; let FirstFrame be the first")
+        pasts = [place for place, view in enumerate(views) if isinstance(view, Past)]
+        if not all(view.keeps_volume for view in views[: max(pasts, default=0)]):
+            raise ValueError(f"{self} changes the volume of frames that nothing scores; let Past be the first")
 
     def __repr__(self) -> str:
         return f"Views({', '.join(map(repr, self.views))})"
@@ -264,19 +264,24 @@ class History(View):
 
 
 @dataclass(frozen=True)
-class FirstFrame(View):
-    """The first frame of x as a static variable, from which the others go on.
+class Past(View):
+    """The first frames of x as a static variable, from which the others go on.
+
+    A model that reads its past so makes the future alone: bounds are of the future given the past, and forecasts, which
+    know nothing else, have latents from the prior.
 
     Args:
-        name: of the first frame, (B, D).
-        also: names of context over the same frames, of which the first says nothing more.
+        name: of the past, (B, O D), frame after frame.
+        frames: O.
+        also: names of context over the same frames, of which the past says nothing more.
 
     Example:
-        >>> {name: tuple(value.shape) for name, value in FirstFrame("s")({"x": torch.zeros(2, 5, 3)}).items()}
+        >>> {name: tuple(value.shape) for name, value in Past("s")({"x": torch.zeros(2, 5, 3)}).items()}
         {'x': (2, 4, 3), 's': (2, 3)}
     """
 
     name: str
+    frames: int = 1
     also: tuple[str, ...] = ()
 
     @override
@@ -284,19 +289,21 @@ class FirstFrame(View):
         if WHOLE not in data or self.name in data or beside is not None:
             return dict(data)
         if "lengths" in data:
-            raise ValueError("windows that go on from their first frame have one length; leave 'lengths' out")
-        whole, masks = data[WHOLE], data.get("mask", {})
+            raise ValueError("windows that go on from their first frames have one length; leave 'lengths' out")
+        whole, masks, now = data[WHOLE], data.get("mask", {}), self.frames
+        if whole.shape[1] < now:
+            raise ValueError(f"this model goes on from {now} frames, and was given {whole.shape[1]}")
         for name in self.also:
-            if name in data and data[name].shape[1] != whole.shape[1] > 1:
+            if name in data and data[name].shape[1] != whole.shape[1] > now:
                 raise ValueError(
-                    f"beside x {tuple(whole.shape)}, whose first frame is {self.name}, {name} is as long as the whole "
-                    f"window, (B, 1 + T, D); got {tuple(data[name].shape)}"
+                    f"beside x {tuple(whole.shape)}, whose first frames are {self.name}, {name} is as long as the "
+                    f"whole window, (B, {now} + T, D); got {tuple(data[name].shape)}"
                 )
-        later = {name: data[name][:, 1:] for name in (WHOLE, *self.also) if name in data}
-        seen = {**data, **later, self.name: whole[:, 0]}
+        later = {name: data[name][:, now:] for name in (WHOLE, *self.also) if name in data}
+        seen = {**data, **later, self.name: whole[:, :now].flatten(1)}
         if WHOLE in masks:
-            seen["mask"] = {**masks, WHOLE: masks[WHOLE][:, 1:], self.name: masks[WHOLE][:, 0]}
-        if whole.shape[1] == 1:
+            seen["mask"] = {**masks, WHOLE: masks[WHOLE][:, now:], self.name: masks[WHOLE][:, :now].flatten(1)}
+        if whole.shape[1] == now:
             del seen[WHOLE]
             seen.get("mask", {}).pop(WHOLE, None)
         return seen
@@ -305,5 +312,5 @@ class FirstFrame(View):
     def inverse(self, seen: Batch) -> dict[str, Any]:
         if self.name not in seen:
             return dict(seen)
-        first = seen[self.name][..., None, :]
+        first = seen[self.name].unflatten(-1, (self.frames, -1))
         return {**seen, WHOLE: torch.cat([first, seen[WHOLE]], -2) if WHOLE in seen else first}

@@ -170,7 +170,7 @@ def _traces(model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Tra
 
 
 def sites_of(trace: Any) -> dict[str, dict[str, Any]]:
-    """The sample sites of a trace by name.
+    """The sample sites of a trace by name, but for what all sequences share, which model and guide draw alike.
 
     Raises:
         ValueError: a site that a handler has scaled or masked.
@@ -178,7 +178,7 @@ def sites_of(trace: Any) -> dict[str, dict[str, Any]]:
     sites = {
         name: site
         for name, site in trace.nodes.items()
-        if site["type"] == "sample" and not poutine.util.site_is_subsample(site)
+        if site["type"] == "sample" and not (poutine.util.site_is_subsample(site) or "shared" in site["infer"])
     }
     for name, site in sites.items():
         if site["scale"] != 1.0 or site["mask"] is not None:

@@ -141,7 +141,7 @@ class SVI:
             self.module.train()
         where = f"step {state.step + 1}"
         with self.drawing():
-            terms = self._terms(batch, stage.objective, where, rates["self_feeding"])
+            terms = self._terms(batch, stage.objective, where, rates["self_feeding"], rates.get("curriculum"))
             loss = stage.objective(terms, state.step)
             self.optimizer.zero_grad()
             self.fabric.backward(loss)
@@ -209,11 +209,13 @@ class SVI:
         return {f"validation/{name}": value for name, value in row.items()}
 
     def rates(self, step: int) -> dict[str, float]:
-        """The learning rate and the probability of self-feeding at a global step."""
+        """The learning rate, the probability of self-feeding and the curriculum, if there is one, at a global step."""
         stage = stage_at(self.plan, step)
         given = {"learning_rate": self.training.rate, "self_feeding": self.training.self_feeding}
         own = {name: getattr(stage, name) for name in given}
-        return {name: schedule(given[name] if own[name] is None else own[name])(step) for name in given}
+        rates = {name: given[name] if own[name] is None else own[name] for name in given}
+        rates |= {} if stage.curriculum is None else {"curriculum": stage.curriculum}
+        return {name: schedule(rate)(step) for name, rate in rates.items()}
 
     @contextmanager
     def drawing(self) -> Iterator[None]:
@@ -253,12 +255,15 @@ class SVI:
         totals = self.total(torch.stack(list(sums.values())))
         return _per_frame(dict(zip(sums, totals, strict=True)))
 
-    def _terms(self, batch: Batch | Tensor, objective: Objective, where: str, feeding: float) -> Terms:
+    def _terms(
+        self, batch: Batch | Tensor, objective: Objective, where: str, feeding: float, curriculum: float | None = None
+    ) -> Terms:
         """Terms of a batch that the objective needs, on the device and in the precision of the model."""
         dtype = self.parameters[0].dtype
         named = {"x": batch} if isinstance(batch, Tensor) else batch
         placed = each(named, lambda v: v.to(dtype) if v.is_floating_point() else v)
         program: dict[str, Any] = {"self_feeding": feeding} if feeding else {}
+        program |= {} if curriculum is None else {"curriculum": curriculum}
         if isinstance(objective, Asking) and objective.draws:
             program["draws"] = objective.draws
         try:

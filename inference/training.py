@@ -93,6 +93,7 @@ class Stage:
         objective: what it minimises.
         learning_rate: that of `Training` if None.
         self_feeding: that of `Training` if None.
+        curriculum: how far draws of what sequences share have come, from 0 to 1 (`laws.Subset`); all the way if None.
         frozen: parameters whose names start with one of these stay as they are.
 
     Example:
@@ -104,6 +105,7 @@ class Stage:
     objective: Objective = field(default_factory=Evidence)
     learning_rate: float | Schedule | None = None
     self_feeding: float | Schedule | None = None
+    curriculum: float | Schedule | None = None
     frozen: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -31,6 +31,7 @@ METHODS = {
     "gsps": "dvae.models.gsps:GSPS",
     "trajevae": "dvae.models.trajevae:TrajeVAE",
     "cvae-rnn": "dvae.models.cvae_rnn:CVAERNN",
+    "mix-and-match": "dvae.models.mix_and_match:MixAndMatchMotion",
     "equations": "dvae.models.equations:Equations",
 }
 JUDGES = {

@@ -37,7 +37,7 @@ from ..program.batch import CHUNK, AnyBatch, in_chunks, repeat, rows
 from ..program.model import DynamicalVAE
 from ..schema import Schema
 from ..turns import alone
-from ..views import WHOLE, FirstFrame, View, Views
+from ..views import WHOLE, Past, View, Views
 from .poses import PoseMethod
 
 FIRST, GIVEN, REST = "s", "y", "r"
@@ -164,7 +164,7 @@ class TrajectoryModel(DynamicalVAE):
     """
 
     def __init__(self, method: TrajectoryMethod, skeleton: Skeleton, frames: int | None, **options: Any):
-        seen: list[View] = [FirstFrame(FIRST, also=(GIVEN,)), Rest(method.complement)]
+        seen: list[View] = [Past(FIRST, also=(GIVEN,)), Rest(method.complement)]
         if method.heading:
             seen.append(Heading(skeleton, pose=FIRST, turned=(FIRST, GIVEN, REST, WHOLE)))
         super().__init__(view=Views(*seen), **options)

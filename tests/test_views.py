@@ -12,7 +12,7 @@ from dvae.models.trajectories import Rest
 from dvae.motion import HUMANEVA, WALKER, Bones, Heading, rotate_about_up
 from dvae.networks import Recurrent
 from dvae.units import Units
-from dvae.views import LOG_DET, FirstFrame, History, Parts, View, Views
+from dvae.views import LOG_DET, History, Parts, Past, View, Views
 
 B, T, J = 3, 5, WALKER.joints
 D = 3 * J - 3
@@ -23,11 +23,11 @@ VIEWS = {
     "as it is": (View(), D),
     "parts": (Parts({"legs": LEGS, "arms": ARMS}), D),
     "parts and history": (Views(History("h"), Parts({"legs": LEGS, "arms": ARMS})), D),
-    "first frame": (FirstFrame("s"), D),
+    "first frame": (Past("s"), D),
     "heading": (Heading(WALKER, 3), D),
     "heading with the root": (Heading(WALKER, 9), 3 * J),
     "heading of parts": (Views(Heading(WALKER, 3, turned=TURNED), Parts({"legs": LEGS, "arms": ARMS})), D),
-    "heading of a first pose": (Views(FirstFrame("s"), Rest(True), Heading(WALKER, pose="s", turned=TURNED)), 3 * J),
+    "heading of a first pose": (Views(Past("s"), Rest(True), Heading(WALKER, pose="s", turned=TURNED)), 3 * J),
 }
 
 
@@ -65,7 +65,7 @@ def test_samples_of_the_future_go_back_as_the_past_was_seen(view_and_data):
     past, future = data["x"], people(B, 7, data["x"].shape[-1])
     seen = view({"x": past})
     added = {name: seen[name] for name in view.names if name in seen}
-    if isinstance(view, FirstFrame) or "s" in seen:  # frames that go on from it are seen as such
+    if isinstance(view, Past) or "s" in seen:  # frames that go on from it are seen as such
         later = {n: v for n, v in view({"x": torch.cat([past[:, :1], future], 1)}).items() if n != "s"}
     else:
         later = view({"x": future}, seen)
@@ -489,9 +489,9 @@ def test_views_in_a_row_add_their_volumes():
 
 
 def test_volumes_that_cannot_be_right_are_refused():
-    with pytest.raises(ValueError, match="changes the volume of a frame that nothing scores"):
-        Views(Scaled(), FirstFrame("s"))
-    assert Views(FirstFrame("s"), Scaled()).log_det({"x": people(B, T, 3)}).shape == (B,)
+    with pytest.raises(ValueError, match="changes the volume of frames that nothing scores"):
+        Views(Scaled(), Past("s"))
+    assert Views(Past("s"), Scaled()).log_det({"x": people(B, T, 3)}).shape == (B,)
 
 
 def test_what_a_scaled_model_makes_goes_back_and_it_is_fitted_by_the_bound_of_the_data():

@@ -8,6 +8,7 @@ from .base import Law, LawSpec, Shape, renamed
 from .families import Delta, Directions, FixedNormal, Normal, StandardNormal, StudentT
 from .flow import FlowDistribution, QRFlow
 from .priors import Flow, Mixture, Vamp
+from .subset import Subset
 
 __all__ = [
     "Delta",
@@ -23,6 +24,7 @@ __all__ = [
     "Shape",
     "StandardNormal",
     "StudentT",
+    "Subset",
     "Vamp",
     "renamed",
 ]

@@ -26,24 +26,37 @@ def forecast(
     fix: Mapping[str, Tensor] | None,
     chunk: int,
 ) -> dict[str, Tensor]:
-    """The latents of the past from the guide, then the model runs free."""
+    """The latents of the past from the guide, then the model runs free.
+
+    Where the view has the whole past as context (`views.Past`), there are no data for the guide to read, and latents
+    are from the prior.
+    """
     data = model.read(batch)
+    told: Any = batch if isinstance(batch, Mapping) else {}
+    redrawn = [name for name in model.shared if name not in told]  # for every sample anew
     if "lengths" in data:
         raise ValueError("forecast continues sequences of one length; cut the batch to it, or forecast them in turn")
     if horizon < 1 or samples < 1:
         raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
-    size, past = data[model.view.history or model.observed[0]].shape[:2]
+    first = data.get(model.view.history or model.observed[0])
+    size, past = (len(next(iter(data.values()))), 0) if first is None else first.shape[:2]
     given = {name: torch.as_tensor(value).to(like(model)) for name, value in (fix or {}).items()}
     fixed = _fixed(model, given, data, size, horizon)
     drawn = {n: model.generator[n].discrete if draw_emission is None else draw_emission for n in model.observed}
     means = [name for name in model.observed if not drawn[name]]
     local = {name for name in data if name in model.context and data[name].dim() == 3}
     seen = {name: value[:, :past] if name in local else value for name, value in data.items()}
-    model._rollout(model.inference, model.encoder, seen, None, 1)  # refuses what cannot be read, of all sequences
+    if past:
+        model._rollout(model.inference, model.encoder, seen, None, 1)  # refuses what cannot be read, of all sequences
 
     def futures(part: slice, count: int) -> dict[str, Tensor]:
         known, held, observed = (repeat(rows(each, part), count) for each in (data, fixed, seen))
-        latents = poutine.condition(model.guide, {n: v for n, v in held.items() if n in model.latents})(observed)
+        for name in redrawn:
+            law, some = model.shared[name].distribution(model.sizes[name]), len(known[name]) // count
+            known[name] = observed[name] = law.sample((count,)).to(known[name]).repeat_interleave(some, 0)
+        latents = {name: value for name, value in held.items() if name in model.latents}
+        if past:
+            latents = poutine.condition(model.guide, latents)(observed)
         statics = {name: value for name, value in latents.items() if not model.generative.local(name)}
         program = poutine.condition(model.model, data=statics) if statics else model.model
         prefix = {name: value for name, value in latents.items() if name not in statics}

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from ..laws.base import LawSpec
 from ..laws.families import Normal, StandardNormal
+from ..laws.subset import Subset
 from ..networks import NetworkSpec, Recurrent
 from ..notation import Factor, Factorization, check_pair
 from ..relations import MaskFunction
@@ -35,6 +36,8 @@ from .forecast import forecast, impute, reconstruct
 from .rollout import Rollout, SelfFeeding
 
 _COUNT = itertools.count()
+SHARED: Any = {"shared": True}
+"""What the site of a variable says that all sequences share."""
 
 
 class DynamicalVAE(nn.Module):
@@ -52,6 +55,8 @@ class DynamicalVAE(nn.Module):
         observed: names of the data variables; every other variable with a generative factor is a latent.
         masks: relations of one's own, name to function of T (see `Factorization.parse`).
         view: what the model sees of the data, such as their parts; as it is where nothing is said (see `dvae.views`).
+        shared: static context that the programs draw themselves, once for all sequences of a batch, where it does not
+            hold it: name to law. A forecast draws it once for each sample.
 
     Raises:
         ValueError: equations that cannot be read or do not fit together; sizes missing or unknown.
@@ -79,6 +84,7 @@ class DynamicalVAE(nn.Module):
         masks: Mapping[str, MaskFunction] | None = None,
         *,
         view: View | None = None,
+        shared: Mapping[str, Subset] | None = None,
     ):
         super().__init__()
         self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
@@ -102,6 +108,13 @@ class DynamicalVAE(nn.Module):
         for key in {*self.networks, *self.laws} - keys - {"p", "q", "default"}:
             raise ValueError(f"no factor {key!r}; keys are {', '.join(sorted(keys))}, 'p', 'q' and 'default'")
         self.view.check(self.sizes, self.context, self.generative)
+        self.shared = dict(shared or {})
+        for name in self.shared:
+            if name not in self.context or self.generative.local(name) or self.inference.local(name):
+                raise ValueError(
+                    f"{name} is to be drawn once for all sequences, so that it is static context: a parent without a "
+                    f"factor of its own, such as in p(x_t | {name}); context is {', '.join(self.context) or 'nothing'}"
+                )
         roots, rest = ([f for f in self.generative.factors if bool(f.parents) == more] for more in (False, True))
         self.generator: Any = self._conditionals(rest)
         guides = {} if inference is None else self._conditionals(self.inference.factors)
@@ -193,6 +206,7 @@ class DynamicalVAE(nn.Module):
         mean_emission: bool | Collection[str] = False,
         self_feeding: SelfFeeding | float | None = None,
         draws: Mapping[str, int] | None = None,
+        curriculum: float = 1.0,
     ) -> dict[str, Tensor]:
         """The generative program p. Teacher-forced where the data are given, free where they are not.
 
@@ -209,13 +223,14 @@ class DynamicalVAE(nn.Module):
                 model's attribute `feeding`.
             draws: latent to a number n: from there on the program goes on n times for each sequence, with a draw
                 of this variable each. Later variables have n times as many rows, draw by draw.
+            curriculum: how far the draws of what sequences share have come, see `laws.Subset`.
 
         Returns:
             Name to value of every variable.
         """
         self._register()
         self._check_draws(draws or {})
-        data = self.read(batch)
+        data = self.read(batch, size=size, curriculum=curriculum)
         rollout = self._rollout(self.generative, self.generator, data, length, size)
         for name, value in (prefix or {}).items():
             if name not in self.latents or value.dim() != 3 or value.shape[1] > rollout.length:
@@ -264,7 +279,9 @@ class DynamicalVAE(nn.Module):
             return pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 1).mask(False), obs=value, infer=infer)
         return pyro.sample(name, rollout.law(name), obs=data, infer=_note(self.generative, rollout))
 
-    def guide(self, batch: AnyBatch, *, draws: Mapping[str, int] | None = None, **_: Any) -> dict[str, Tensor]:
+    def guide(
+        self, batch: AnyBatch, *, draws: Mapping[str, int] | None = None, curriculum: float = 1.0, **_: Any
+    ) -> dict[str, Tensor]:
         """The inference program q, with the arguments of `model`.
 
         Returns:
@@ -272,7 +289,7 @@ class DynamicalVAE(nn.Module):
         """
         self._register()
         self._check_draws(draws or {})
-        rollout = self._rollout(self.inference, self.encoder, batch, None, 1)
+        rollout = self._rollout(self.inference, self.encoder, self.read(batch, curriculum=curriculum), None, 1)
         for name in self.observed:
             if name not in rollout.values and any(name in c.parents for c in self.encoder.values()):
                 raise ValueError(f"the guide reads {name}, the batch holds {', '.join(rollout.values) or 'nothing'}")
@@ -421,16 +438,27 @@ class DynamicalVAE(nn.Module):
     def _evaluating(self) -> Any:
         return evaluating(self) if self.training else nullcontext()
 
-    def read(self, batch: AnyBatch | None) -> dict[str, Any]:
+    def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0) -> dict[str, Any]:
         """A batch as programs read it: by name, in the model's precision, as the view shows it, missing entries filled.
 
-        What was read is read as it is.
+        What was read is read as it is. What sequences share is drawn, where it is not there, at a Pyro site of its own
+        outside the plate: model and guide have it in common, so that it costs nothing in a bound.
+
+        Args:
+            batch: see `model`.
+            size: B, where the batch does not tell.
+            curriculum: see `model`.
 
         Raises:
             ValueError: names that the model does not have, a mask of nothing, or data that the view cannot show.
         """
         means = {name: units.mean for name, units in self.units.items()}
-        return self.reader.read(batch, like(self).dtype, means)
+        data = self.reader.read(batch, like(self).dtype, means)
+        for name in [name for name in self.shared if name not in data]:
+            law = self.shared[name].distribution(self.sizes[name], curriculum)
+            size = next((len(value) for value in data.values() if isinstance(value, Tensor)), size)
+            data[name] = pyro.sample(name, law, infer=SHARED).to(like(self)).expand(size, -1)
+        return data
 
     def shown(self, values: Mapping[str, Tensor], data: Mapping[str, Any] | None = None) -> dict[str, Tensor]:
         """Values that the model made, with those of the data as the data are: back through the view.

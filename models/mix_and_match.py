@@ -1,0 +1,337 @@
+"""Mix-and-Match: futures of a moving body whose noise stands at random indices of the code of its past.
+
+With h the observed poses, x those that follow, and i indices that are drawn once for a batch,
+
+    p(z) p(x_t | x_{<t}, h, z, i)        q(z | x_{1:T}, h, i)
+
+Recurrent networks sum up past and future. The first code, perturbed by z at the drawn indices, is the state from which
+a recurrent decoder goes on from the last observed pose, by quaternions of all joints. Other ways for the noise to
+enter are options with the same networks, losses and representation (see `dvae.networks.noise`):
+
+    concatenate   p(z) p(x_t | x_{<t}, h, z)          q(z | x_{1:T}, h)
+    add           p(z) p(x_t | x_{<t}, h, z)          q(z), the prior
+    step          p(z_t) p(x_t | x_{<t}, h, z_t)      q(z_t | x_{<=t}, h)
+
+Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733; for the others see there. What the paper
+leaves open, and there is no public code for motion to tell, is ours: the layers of the blocks and of the code's
+decoder, that this ends in the range of a state, the likelihood's scale in place of a weight of the KL, and how long the
+schedules run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+from typing_extensions import override
+
+from ..inference.objectives import Evidence
+from ..inference.recipe import Recipe
+from ..inference.schedules import Logistic, Ramp
+from ..inference.training import Stage
+from ..laws import FixedNormal, LawSpec
+from ..motion.protocols import Poses
+from ..motion.views import LENGTHS, Rotations
+from ..networks import Input, Network, NetworkSpec
+from ..networks.base import AtOnce, once, share_modules
+from ..networks.noise import AddProjected, Concatenate, MixAndMatch, Noise, Residual
+from ..networks.recurrent import gru_cell
+from ..notation import Factorization
+from ..options import Amount, Positive, Share, Size
+from ..program.model import DynamicalVAE
+from ..program.rollout import Rollout, SelfFeeding
+from ..schema import Schema, SchemaError
+from ..views import WHOLE, Past, Views
+from .poses import PoseMethod
+
+HISTORY, INDICES = "h", MixAndMatch.indices_name
+EQUATIONS = {
+    "mix": ("p(z) p(x_t | x_{<t}, h, z, i)", "q(z | x_{1:T}, h, i)"),
+    "concatenate": ("p(z) p(x_t | x_{<t}, h, z)", "q(z | x_{1:T}, h)"),
+    "add": ("p(z) p(x_t | x_{<t}, h, z)", "q(z)"),
+    "step": ("p(z_t) p(x_t | x_{<t}, h, z_t)", "q(z_t | x_{<=t}, h)"),
+}
+"""How the noise enters, and the factorization that it has so."""
+
+
+@dataclass(frozen=True)
+class MixAndMatchMotion(PoseMethod):
+    """See the file.
+
+    Args:
+        noise: how it enters: "mix" (Mix-and-Match), "concatenate" (MT-VAE's way), "add" (HP-GAN's), "step"
+            (Pose-Knows').
+        alpha: of "mix": the share of the code that is perturbed. 0 for a deterministic model.
+        width: units of recurrent networks and of the code, L.
+        latent: size of z; by default floor((1 - alpha) L) with "mix", as in the paper, and L / 2 with the others.
+        scale: standard deviation of the quaternions' numbers; what it stands for is the weight of the KL.
+        skeleton: weight of the squared error of positions, with the root not turned, beside that of quaternions, each
+            the mean over its numbers.
+        velocity: what is added to the pose before, in place of the pose.
+        curriculum: share of training over which the drawn indices become random, from the first ones on; 0 for
+            random ones all the time.
+        annealing: share of training over which the weight of the KL rises to 1, by a logistic curve.
+        feeding: probability, at the end, that a pose of the past is the model's own mean; it rises from 0 over nine
+            tenths of training. 1 is the paper's.
+    """
+
+    name = "mix-and-match"
+    source = "Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733"
+    generative, inference = EQUATIONS["mix"]
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"human36m": {"width": 1024}, "": {"width": 256}}
+
+    noise: Literal["mix", "concatenate", "add", "step"] = "mix"
+    alpha: Share = 0.5
+    width: Size | None = None
+    latent: Size | None = None
+    scale: Positive = 0.1
+    skeleton: Amount = 1.0
+    velocity: bool = False
+    curriculum: Share = 0.5
+    annealing: Share = 0.5
+    feeding: Share = 1.0
+
+    @override
+    def equations(self) -> tuple[Factorization, Factorization]:
+        generative, inference = map(Factorization.parse, EQUATIONS[self.noise])
+        return generative, inference
+
+    def entering(self) -> Noise | None:
+        """How the noise enters the code; None where each step has its own."""
+        ways = {"mix": MixAndMatch(self.alpha), "concatenate": Concatenate(), "add": AddProjected()}
+        return ways.get(self.noise)
+
+    @override
+    def sizes(self) -> dict[str, int]:
+        width, way = self.width or 0, self.entering()
+        latent = self.latent or (max(width // 2, 1) if way is None else way.latent(width))
+        return {"z": latent, **({INDICES: width} if self.noise == "mix" else {})}
+
+    @override
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        way, width = self.entering(), self.width or 0
+        guide = {} if self.noise == "add" else {"q(z)": Encoder(width, way)}
+        return {**guide, "p(x)": Decoder(width, way, self.velocity)}
+
+    @override
+    def laws(self) -> Mapping[str, LawSpec]:
+        return {"p(x)": FixedNormal(self.scale, project=False)}
+
+    @override
+    def build(self, data: Any) -> DynamicalVAE:
+        """The model for windows whose representation is quaternions.
+
+        Of sizes alone it is one whose batches hold h, two frames of the size of x, beside x.
+
+        Raises:
+            SchemaError: windows with another representation.
+        """
+        schema = Schema.of(data)
+        if not isinstance(schema, Poses):
+            return self.filled(self.presets[""])._built(DynamicalVAE, schema.sizes[WHOLE], 2)
+        if schema.protocol.representation != "quaternion":
+            raise SchemaError(
+                f"{self.name} makes quaternions of joints, and the protocol {schema.protocol.name} shows models "
+                f"{schema.protocol.representation}; use one whose representation is quaternion (--representation)"
+            )
+        method = self.filled(self.preset(schema.skeleton))
+        return method._built(MixAndMatchModel, schema.sizes[WHOLE], schema.protocol.observed, method, schema)
+
+    def _built(self, kind: Any, size: int, frames: int, *arguments: Any) -> Any:
+        described = self.described({WHOLE: size, HISTORY: frames * size})
+        shared = {INDICES: MixAndMatch(self.alpha).indices} if self.noise == "mix" else {}
+        described |= {"inference": None} if self.noise == "add" else {}
+        model = kind(*arguments, **described, shared=shared)
+        if self.noise != "add":
+            share_modules([model.encoder["z"].network, model.generator[WHOLE].network], "past")
+        model.feeding = SelfFeeding(0.0)
+        return model
+
+    @override
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
+        """Minimises squared errors of quaternions and positions and the annealed KL, by the model's own poses."""
+        size = Schema.of(train).sizes[WHOLE]
+        objective = Evidence(
+            kl_weight=Logistic(0.0, 1.0, steps=int(self.annealing * steps)) if self.annealing else 1.0,
+            energy_weights={"skeleton": self.skeleton * size / (2 * self.scale**2)} if self.skeleton else {},
+            select="loss",
+        )
+        gradual = self.noise == "mix" and self.curriculum
+        swaps = Ramp(0.0, 1.0, steps=max(int(self.curriculum * steps), 1)) if gradual else None
+        feeding = Ramp(0.0, self.feeding, steps=max(9 * steps // 10, 1)) if self.feeding else 0.0
+        return Recipe(train, validation, [Stage(steps, objective, curriculum=swaps)], feeding)
+
+
+class MixAndMatchModel(DynamicalVAE):
+    """A model of quaternions that learns from positions too.
+
+    Args:
+        method: with no option left open.
+        schema: of the windows.
+        **options: of `DynamicalVAE`.
+    """
+
+    def __init__(self, method: MixAndMatchMotion, schema: Poses, **options: Any) -> None:
+        assert isinstance(schema.view, Rotations)
+        super().__init__(view=Views(schema.view, Past(HISTORY, schema.protocol.observed)), **options)
+        self.method, self.turns = method, schema.view
+
+    @override
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+        """The squared error of positions, mean over their numbers, where there is a future to compare with."""
+        if not self.method.skeleton or WHOLE not in data or LENGTHS not in data:
+            return {}
+        value = rollout.values[WHOLE]
+        made = rollout.parameters(WHOLE, value)[0]
+        ours, theirs = self._aligned(torch.stack([made, value]), data[LENGTHS])
+        return {"skeleton": (ours - theirs).square().mean(-1).sum(-1)}
+
+    def _aligned(self, quaternions: Tensor, lengths: Tensor) -> Tensor:
+        """Positions (2, B, T, 3 J') of poses (2, B, T, D) whose root is at the origin and not turned."""
+        view = self.turns
+        place = view.turning.index(view.skeleton.root)
+        start = 3 * view.root
+        unturned = quaternions.new_tensor([1.0, 0, 0, 0]).expand(*quaternions.shape[:-1], 4)
+        first = torch.zeros_like(quaternions[..., :start])
+        turns = quaternions[..., start:].unflatten(-1, (-1, 4))
+        turns = torch.cat([turns[..., :place, :], unturned[..., None, :], turns[..., place + 1 :, :]], -2)
+        found: Tensor = view.inverse({WHOLE: torch.cat([first, turns.flatten(-2)], -1), LENGTHS: lengths})[WHOLE]
+        return found
+
+
+class PastCode(nn.Module):
+    """The last state (B, L) of a recurrent network over the past."""
+
+    def __init__(self, size: int, width: int) -> None:
+        super().__init__()
+        self.size = size
+        self.network = nn.GRU(size, width, batch_first=True)
+
+    def forward(self, past: Tensor) -> Tensor:
+        """Of (B, O D)."""
+        return once(self, [past], lambda: self.network(past.unflatten(-1, (-1, self.size)))[1][0])
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """Features of z from the codes of past and future; of z_t, states of a network that goes on from the past.
+
+    Args:
+        width: units, L.
+        noise: how the noise enters; None where each step has its own.
+    """
+
+    width: int
+    noise: Noise | None
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
+        """The network of a factor with these parents."""
+        return FilterNetwork(self, inputs) if local else EncoderNetwork(self, inputs)
+
+
+class EncoderNetwork(Network):
+    """What `Encoder` describes, of one latent for all steps."""
+
+    def __init__(self, spec: Encoder, inputs: Sequence[Input]) -> None:
+        super().__init__(inputs, False, spec.width)
+        size = next(parent.size for parent in inputs if parent.name == WHOLE)
+        self.past = PastCode(size, spec.width)
+        self.future = nn.GRU(size, spec.width, batch_first=True)
+        assert spec.noise is not None
+        self.noise = spec.noise.encoder(spec.width)
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        states, last = self.future(parents[WHOLE])
+        code = last[0]
+        if lengths is not None:
+            code = states.take_along_dim((lengths - 1)[:, None, None], 1).squeeze(1)
+        features: Tensor = self.noise(self.past(parents[HISTORY]), code, parents.get(INDICES))
+        return features
+
+
+class FilterNetwork(AtOnce):
+    """What `Encoder` describes, of a latent for each step."""
+
+    def __init__(self, spec: Encoder, inputs: Sequence[Input]) -> None:
+        super().__init__(inputs, True, spec.width)
+        size = next(parent.size for parent in inputs if parent.name == WHOLE)
+        self.past = PastCode(size, spec.width)
+        self.network = nn.GRU(size, spec.width, batch_first=True)
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        states: Tensor = self.network(parents[WHOLE], self.past(parents[HISTORY])[None])[0]
+        return states
+
+
+@dataclass(frozen=True)
+class Decoder:
+    """Poses after the past, from states of a recurrent network that reads the pose before.
+
+    Args:
+        width: units, L.
+        noise: how the noise enters the first state; None where each step has its own, which joins behind the state.
+        velocity: add what is made to the pose before.
+    """
+
+    width: int
+    noise: Noise | None
+    velocity: bool
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> DecoderNetwork:
+        """The network of a factor with these parents."""
+        return DecoderNetwork(self, inputs, size)
+
+
+class DecoderNetwork(Network):
+    """What `Decoder` describes."""
+
+    def __init__(self, spec: Decoder, inputs: Sequence[Input], size: int) -> None:
+        super().__init__(inputs, True, size)
+        latent = next(parent.size for parent in inputs if parent.name == "z")
+        self.velocity = spec.velocity
+        self.past = PastCode(size, spec.width)
+        self.noise = None if spec.noise is None else spec.noise.decoder(spec.width, latent)
+        self.cell: Any = nn.GRU(size, spec.width, batch_first=True)
+        self.join = Residual(spec.width + latent, spec.width) if spec.noise is None else None
+        self.out = nn.Linear(spec.width, size)
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        before = torch.cat([self._last(parents)[:, None], parents[WHOLE][:, : length - 1]], 1)
+        states = self.cell(before, self.code(parents)[None].contiguous())[0]
+        return self._pose(states, parents["z"], before)
+
+    def code(self, parents: Mapping[str, Tensor]) -> Tensor:
+        """The first state (B, L)."""
+        code = self.past(parents[HISTORY])
+        if self.noise is None:
+            return code
+        entered: Tensor = self.noise(code, parents["z"], parents.get(INDICES))
+        return entered
+
+    def _last(self, parents: Mapping[str, Tensor]) -> Tensor:
+        """The last pose of the past (B, D)."""
+        return parents[HISTORY][:, -self.features :]
+
+    def _pose(self, state: Tensor, z: Tensor, before: Tensor) -> Tensor:
+        if self.join is not None:
+            state = self.join(torch.cat([state, z], -1))
+        made: Tensor = self.out(state)
+        return made + before if self.velocity else made
+
+    @override
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        return self.code(given), given["z"], given.get(WHOLE), self._last(given)
+
+    @override
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        hidden, z, given, first = state
+        before = first if t == 0 else drawn[WHOLE][t - 1] if given is None else given[:, t - 1]
+        gates = torch.nn.functional.linear(before, self.cell.weight_ih_l0, self.cell.bias_ih_l0)
+        hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
+        return self._pose(hidden, z if z.dim() == 2 else z[:, t], before), (hidden, z, given, first)
