@@ -43,7 +43,7 @@ from ..notation import Factorization
 from ..options import Amount, Positive, Share, Size
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, SelfFeeding
-from ..schema import Schema, SchemaError
+from ..schema import Schema
 from ..views import WHOLE, Past, Views
 from .poses import PoseMethod
 
@@ -81,6 +81,7 @@ class MixAndMatchMotion(PoseMethod):
     name = "mix-and-match"
     source = "Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733"
     generative, inference = EQUATIONS["mix"]
+    representation: ClassVar[str] = "quaternion"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"human36m": {"width": 1024}, "": {"width": 256}}
 
     noise: Literal["mix", "concatenate", "add", "step"] = "mix"
@@ -132,12 +133,7 @@ class MixAndMatchMotion(PoseMethod):
         schema = Schema.of(data)
         if not isinstance(schema, Poses):
             return self.filled(self.presets[""])._built(DynamicalVAE, schema.sizes[WHOLE], 2)
-        if schema.protocol.representation != "quaternion":
-            raise SchemaError(
-                f"{self.name} makes quaternions of joints, and the protocol {schema.protocol.name} shows models "
-                f"{schema.protocol.representation}; use one whose representation is quaternion (--representation)"
-            )
-        method = self.filled(self.preset(schema.skeleton))
+        schema, method = Poses.of(schema, self.name, self.representation), self.suited(schema)
         return method._built(MixAndMatchModel, schema.sizes[WHOLE], schema.protocol.observed, method, schema)
 
     def _built(self, kind: Any, size: int, frames: int, *arguments: Any) -> Any:

@@ -24,6 +24,8 @@ class PoseMethod(Method):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"": {}}
     """What they stand for, by the skeleton's name, and "" for any other."""
+    representation: ClassVar[str] = "positions"
+    """Of a protocol under which it can be used."""
 
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
         """What options that are None stand for, with poses of this skeleton."""
@@ -32,7 +34,7 @@ class PoseMethod(Method):
     @override
     def suited(self, data: Any) -> Self:
         """With the options that are left open chosen for the skeleton of these data."""
-        return self.filled(self.preset(Poses.of(data, self.name).skeleton))
+        return self.filled(self.preset(Poses.of(data, self.name, self.representation).skeleton))
 
     def filled(self, preset: Mapping[str, Any]) -> Self:
         """With options that are None taken from a preset."""

@@ -167,17 +167,17 @@ class Poses(Schema):
 
     @classmethod
     @override
-    def of(cls, data: Any, who: str = "this method") -> Self:
-        """The schema of poses whose positions a model sees.
+    def of(cls, data: Any, who: str = "this method", representation: str = "positions") -> Self:
+        """The schema of poses of which a model sees this representation.
 
         Raises:
-            SchemaError: nothing of which that is known, or turns of joints.
+            SchemaError: nothing of which that is known, or poses of another one.
         """
         found = super().of(data, who)
-        if found.protocol.representation != "positions":
+        if (shown := found.protocol.representation) != representation:
             raise SchemaError(
-                f"{who} reads positions of joints, and under this protocol models see their turns as "
-                f"{found.protocol.representation}; choose one whose representation is positions"
+                f"{who} reads {_said(representation)}, and under this protocol models see {_said(shown)}; choose one "
+                f"whose representation is {representation} (--representation)"
             )
         return found
 
@@ -211,6 +211,10 @@ class Poses(Schema):
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """The schema that `config` wrote."""
         return cls.under(Protocol(**tuples(config["protocol"])), Skeleton(**config["skeleton"]), config["length"])
+
+
+def _said(representation: str) -> str:
+    return "positions of joints" if representation == "positions" else f"turns of joints as {representation}"
 
 
 def windows(motion: MotionSet, protocol: Protocol, split: str, length: int | None = None) -> Windows:

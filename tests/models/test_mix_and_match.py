@@ -194,7 +194,7 @@ def test_futures_are_drawn_from_the_prior_and_the_guide_is_asked_where_frames_te
 
 def test_other_representations_are_refused(windows):
     data = motion.windows(motion.simulate(clips=6, frames=40), replace(PROTOCOL, representation="positions"), "train")
-    with pytest.raises(SchemaError, match="makes quaternions of joints"):
+    with pytest.raises(SchemaError, match=r"reads turns of joints as quaternion, .* see positions of joints"):
         small().build(data)
 
 
