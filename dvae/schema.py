@@ -41,6 +41,16 @@ class Schema:
         """What models see of the data."""
         return View()
 
+    def size(self, name: str) -> int:
+        """The size of a variable.
+
+        Raises:
+            SchemaError: it is not known.
+        """
+        if name not in self.sizes:
+            raise SchemaError(f"sizes missing for {name}; given are {', '.join(self.sizes) or 'none'}")
+        return self.sizes[name]
+
     @property
     def windows(self) -> Schema:
         """The schema of the same data where models see them as they are; runs that share it can be judged together."""

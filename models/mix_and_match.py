@@ -114,8 +114,8 @@ class MixAndMatchMotion(PoseMethod):
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         way, width = self.entering(), self.width or 0
-        guide = {} if self.noise == "add" else {"q(z)": Encoder(width, way)}
-        return {**guide, "p(x)": Decoder(width, way, self.velocity)}
+        guide = {} if self.noise == "add" else {"q(z)": FutureEncoder(width, way)}
+        return {**guide, "p(x)": FutureDecoder(width, way, self.velocity)}
 
     @override
     def laws(self) -> Mapping[str, LawSpec]:
@@ -132,9 +132,9 @@ class MixAndMatchMotion(PoseMethod):
         """
         schema = Schema.of(data)
         if not isinstance(schema, Poses):
-            return self.filled(self.presets[""])._built(DynamicalVAE, schema.sizes[WHOLE], 2)
+            return self.filled(self.presets[""])._built(DynamicalVAE, schema.size(WHOLE), 2)
         schema, method = Poses.of(schema, self.name, self.representation), self.suited(schema)
-        return method._built(MixAndMatchModel, schema.sizes[WHOLE], schema.protocol.observed, method, schema)
+        return method._built(MixAndMatchModel, schema.size(WHOLE), schema.protocol.observed, method, schema)
 
     def _built(self, kind: Any, size: int, frames: int, *arguments: Any) -> Any:
         described = self.described({WHOLE: size, HISTORY: frames * size})
@@ -149,7 +149,7 @@ class MixAndMatchMotion(PoseMethod):
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """Minimises squared errors of quaternions and positions and the annealed KL, by the model's own poses."""
-        size = Schema.of(train).sizes[WHOLE]
+        size = Schema.of(train).size(WHOLE)
         objective = Evidence(
             kl_weight=Logistic(0.0, 1.0, steps=int(self.annealing * steps)) if self.annealing else 1.0,
             energy_weights={"skeleton": self.skeleton * size / (2 * self.scale**2)} if self.skeleton else {},
@@ -212,7 +212,7 @@ class PastCode(nn.Module):
 
 
 @dataclass(frozen=True)
-class Encoder:
+class FutureEncoder:
     """Features of z from the codes of past and future; of z_t, states of a network that goes on from the past.
 
     Args:
@@ -225,13 +225,13 @@ class Encoder:
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
         """The network of a factor with these parents."""
-        return FilterNetwork(self, inputs) if local else EncoderNetwork(self, inputs)
+        return FutureFilterNetwork(self, inputs) if local else FutureEncoderNetwork(self, inputs)
 
 
-class EncoderNetwork(Network):
-    """What `Encoder` describes, of one latent for all steps."""
+class FutureEncoderNetwork(Network):
+    """What `FutureEncoder` describes, of one latent for all steps."""
 
-    def __init__(self, spec: Encoder, inputs: Sequence[Input]) -> None:
+    def __init__(self, spec: FutureEncoder, inputs: Sequence[Input]) -> None:
         super().__init__(inputs, False, spec.width)
         size = next(parent.size for parent in inputs if parent.name == WHOLE)
         self.past = PastCode(size, spec.width)
@@ -249,10 +249,10 @@ class EncoderNetwork(Network):
         return features
 
 
-class FilterNetwork(AtOnce):
-    """What `Encoder` describes, of a latent for each step."""
+class FutureFilterNetwork(AtOnce):
+    """What `FutureEncoder` describes, of a latent for each step."""
 
-    def __init__(self, spec: Encoder, inputs: Sequence[Input]) -> None:
+    def __init__(self, spec: FutureEncoder, inputs: Sequence[Input]) -> None:
         super().__init__(inputs, True, spec.width)
         size = next(parent.size for parent in inputs if parent.name == WHOLE)
         self.past = PastCode(size, spec.width)
@@ -265,7 +265,7 @@ class FilterNetwork(AtOnce):
 
 
 @dataclass(frozen=True)
-class Decoder:
+class FutureDecoder:
     """Poses after the past, from states of a recurrent network that reads the pose before.
 
     Args:
@@ -278,15 +278,15 @@ class Decoder:
     noise: Noise | None
     velocity: bool
 
-    def build(self, inputs: Sequence[Input], local: bool, size: int) -> DecoderNetwork:
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureDecoderNetwork:
         """The network of a factor with these parents."""
-        return DecoderNetwork(self, inputs, size)
+        return FutureDecoderNetwork(self, inputs, size)
 
 
-class DecoderNetwork(Network):
-    """What `Decoder` describes."""
+class FutureDecoderNetwork(Network):
+    """What `FutureDecoder` describes."""
 
-    def __init__(self, spec: Decoder, inputs: Sequence[Input], size: int) -> None:
+    def __init__(self, spec: FutureDecoder, inputs: Sequence[Input], size: int) -> None:
         super().__init__(inputs, True, size)
         latent = next(parent.size for parent in inputs if parent.name == "z")
         self.velocity = spec.velocity

@@ -91,11 +91,7 @@ class TrajectoryMethod(PoseMethod):
         """
         schema = Schema.of(data)
         if not isinstance(schema, Poses):
-            if WHOLE not in schema.sizes:
-                raise ValueError(
-                    f"sizes missing for {WHOLE}, 3 J of a pose; given are {', '.join(schema.sizes) or 'none'}"
-                )
-            return self.filled(self.presets[HUMAN36M.name])._built(DynamicalVAE, schema.sizes[WHOLE])
+            return self.filled(self.presets[HUMAN36M.name])._built(DynamicalVAE, schema.size(WHOLE))
         protocol = Poses.of(schema, self.name).protocol
         if (protocol.root, protocol.observed) != NEEDED:
             raise ValueError(
