@@ -47,6 +47,8 @@ class View:
     """Data variables that are coordinates of x, in place of it."""
     history: str | None = None
     """Name of the context that is the data themselves."""
+    past: int = 0
+    """Frames of x that are context, in place of data."""
     measured: str = ""
     """What densities are of, where it is not the data as they are given; bounds of other things do not compare."""
 
@@ -125,6 +127,7 @@ class Views(View):
         self.names = tuple(name for view in views for name in view.names)
         self.parts = next((view.parts for view in views if view.parts), None)
         self.history = next((view.history for view in views if view.history), None)
+        self.past = sum(view.past for view in views)
         self.measured = ", ".join(view.measured for view in views if view.measured)
         pasts = [place for place, view in enumerate(views) if isinstance(view, Past)]
         if not all(view.keeps_volume for view in views[: max(pasts, default=0)]):
@@ -283,6 +286,11 @@ class Past(View):
     name: str
     frames: int = 1
     also: tuple[str, ...] = ()
+
+    @property
+    def past(self) -> int:  # type: ignore[override]
+        """All of them."""
+        return self.frames
 
     @override
     def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:

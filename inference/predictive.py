@@ -62,11 +62,15 @@ def predictive_bound(
         )
     data = model.read(batch)
     size, length = data[model.observed[0]].shape[:2]
+    observed -= model.view.past  # the others are context, and given anyhow
     if "lengths" in data:
         raise ValueError("a log score needs sequences of one length, but these have lengths")
-    if particles < 1 or not 0 < observed < length:
+    first = 0 if model.view.past else 1
+    if particles < 1 or not first <= observed < length:
+        taken = model.view.past
         raise ValueError(
-            f"expected at least 1 particle, and observed frames from 1 to {length - 1}; got {particles} and {observed}"
+            f"expected at least 1 particle, and observed frames from {taken + first} to {taken + length - 1}; got "
+            f"{particles} and {taken + observed}"
         )
     log_det = data.get(LOG_DET, torch.zeros(size, length))
     if log_det.dim() == 1:
@@ -80,6 +84,8 @@ def predictive_bound(
         whole = repeat(data, count)
         proposed = poutine.trace(model.guide).get_trace(whole)
         joint = poutine.trace(poutine.replay(model.model, trace=proposed)).get_trace(whole)
+        if not observed:  # and latents are from the prior
+            return total(log_densities(joint)) - total(log_densities(proposed))
         drawn = {n: s["value"] for n, s in sites_of(proposed).items()}
         known = {n: v[:, :observed] if model.generative.local(n) else v for n, v in drawn.items()}
         seen = poutine.trace(poutine.condition(model.guide, data=known)).get_trace(repeat(past, count))

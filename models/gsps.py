@@ -252,13 +252,13 @@ class GSPSModel(EnergyModel):
         return found
 
     @override
-    def read(self, batch: AnyBatch | None) -> dict[str, Any]:
+    def read(self, batch: AnyBatch | None, **options: Any) -> dict[str, Any]:
         """The batch, whose observed frames have no gaps.
 
         Ours: across a gap a joint goes straight from where it was to where it is next among the observed frames. One
         that these never show is at its parent's place.
         """
-        data = super().read(batch)
+        data = super().read(batch, **options)
         mask = data.get("mask", {}).get(HISTORY)
         if mask is None or mask.all():
             return data

@@ -10,6 +10,7 @@ from pyro import poutine
 
 import dvae
 from dvae import motion
+from dvae.inference.predictive import predictive_bound
 from dvae.laws import Subset
 from dvae.motion.views import TURNS
 from dvae.networks.noise import CodeDecoder, MixAndMatch
@@ -228,3 +229,16 @@ def test_the_skeleton_is_that_of_bodies_that_face_one_way(windows):
     positions = windows["train"].skeleton.with_root(ours.unflatten(-1, (-1, 3)))
     lengths = windows["train"].skeleton.bone_lengths(positions)
     torch.testing.assert_close(lengths, data["bone_lengths"][:, None].expand_as(lengths), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("noise", ["mix", "step"])
+def test_the_log_score_of_a_model_of_futures_is_its_importance_bound(windows, noise):
+    model, batch = made(windows, noise=noise, latent=3), windows["test"].all()
+    found = []
+    for bound in (dvae.importance_bound, lambda model, data, particles: predictive_bound(model, data, 5, particles)):
+        torch.manual_seed(0)
+        found.append(bound(model, batch, particles=30).bound)
+    torch.testing.assert_close(found[1], found[0])
+    with pytest.raises(ValueError, match="observed frames from 5 to 11; got 30 and 4"):
+        predictive_bound(model, batch, 4, 30)
+    assert predictive_bound(model, batch, 8, 30).bound.isfinite().all()  # where some of the future is known
