@@ -203,7 +203,7 @@ class Comparison(Result):
     def __getitem__(self, name: str) -> dict[str, Estimate]:
         row = self._row(name)
         metrics = [metric for metric in row.bounds if metric != "k-hat"]
-        return {metric: self._estimate(self._parts(name, metric)) for metric in (*metrics, *row.free_running)}
+        return {metric: self._parts(name, metric).estimate() for metric in (*metrics, *row.free_running)}
 
     @property
     def ranking(self) -> list[str]:
@@ -219,7 +219,7 @@ class Comparison(Result):
         parts = [self._parts(name, metric) for name in (first, second)]
         if first == second:
             return Estimate(0.0, 0.0, 0.0, 0.0)
-        return self._estimate(*parts)
+        return parts[0].estimate(parts[1])
 
     def join(self, other: Comparison) -> Comparison:
         """This comparison with the rows of another one, made of other models on the same sequences in the same way.
@@ -399,7 +399,7 @@ class Comparison(Result):
     def _clips(self) -> list[str]:
         return [f"{split}/{clip}" for split, clip, _ in self.keys]
 
-    def _parts(self, name: str, metric: str) -> _Parts:
+    def _parts(self, name: str, metric: str) -> Parts:
         row = self._row(name)
         if metric not in {*row.bounds, *row.free_running} - {"k-hat"}:
             known = [known for known in (*row.bounds, *row.free_running) if known != "k-hat"]
@@ -410,25 +410,7 @@ class Comparison(Result):
             means = row.free_running[metric]
         else:
             means = np.stack([np.bincount(places, weights=seed) for seed in row.bounds[metric]]) / weights
-        return _Parts.of(means, weights)
-
-    @staticmethod
-    def _estimate(first: _Parts, second: _Parts | None = None) -> Estimate:
-        mean, deviations, between, rest = first.mean, first.deviations, first.seeds, first.rest
-        of_seeds = [(first.seeds, first.count - 1)]
-        if second is not None:
-            mean, deviations = mean - second.mean, deviations - second.deviations
-            between, rest = between + second.seeds, rest + second.rest
-            of_seeds.append((second.seeds, second.count - 1))
-        over = clustered_variance(deviations)
-        total = max(over + between - rest, over, between) if not math.isnan(over + between) else math.nan
-        of_sequences = (over, len(deviations) - 1)
-        freedom = (
-            _freedom(over, of_sequences),
-            _freedom(between, *of_seeds),
-            _freedom(total, of_sequences, *of_seeds),
-        )
-        return Estimate(mean, math.sqrt(over), math.sqrt(between), math.sqrt(total), freedom)
+        return Parts.of(means, weights)
 
     # Tables
 
@@ -515,7 +497,7 @@ def _freedom(total: float, *parts: tuple[float, float]) -> float:
 
 
 @dataclass(frozen=True)
-class _Parts:
+class Parts:
     """A model's mean, what each clip adds to its error (C,), the variances of its seeds and of the rest, and S."""
 
     mean: float
@@ -525,7 +507,7 @@ class _Parts:
     count: int
 
     @classmethod
-    def of(cls, means: np.ndarray, weights: np.ndarray) -> _Parts:
+    def of(cls, means: np.ndarray, weights: np.ndarray) -> Parts:
         """From means by seed and clip (S, C) and the clips' weights (C,)."""
         by_seed, deviations = linearised(means, weights)
         common = deviations.mean(0)
@@ -535,6 +517,24 @@ class _Parts:
         # As `clustered_variance`, of the seeds' own deviations from what they have in common.
         rest = sum(clustered_variance(own) for own in deviations - common) / (count * (count - 1))
         return cls(float(by_seed.mean()), common, float(by_seed.var(ddof=1)) / count, rest, count)
+
+    def estimate(self, other: Parts | None = None) -> Estimate:
+        """The mean, or its paired difference to that of another model, with the errors of the module's docstring."""
+        mean, deviations, between, rest = self.mean, self.deviations, self.seeds, self.rest
+        of_seeds = [(self.seeds, self.count - 1)]
+        if other is not None:
+            mean, deviations = mean - other.mean, deviations - other.deviations
+            between, rest = between + other.seeds, rest + other.rest
+            of_seeds.append((other.seeds, other.count - 1))
+        over = clustered_variance(deviations)
+        total = max(over + between - rest, over, between) if not math.isnan(over + between) else math.nan
+        of_sequences = (over, len(deviations) - 1)
+        freedom = (
+            _freedom(over, of_sequences),
+            _freedom(between, *of_seeds),
+            _freedom(total, of_sequences, *of_seeds),
+        )
+        return Estimate(mean, math.sqrt(over), math.sqrt(between), math.sqrt(total), freedom)
 
 
 def _number(value: float, decimals: int = 3) -> str:

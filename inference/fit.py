@@ -32,16 +32,19 @@ if TYPE_CHECKING:
 
 
 class Callback:
-    """Hooks of `fit`. Subclass it and define those you need."""
+    """Hooks of `fit`. Subclass it and define those you need; numbers by name that one returns are a row of the log."""
 
-    def on_step(self, state: State) -> None:
+    def on_step(self, state: State) -> Mapping[str, float] | None:
         """Run after each step; `state.terms` holds the terms of its batch."""
+        return None
 
-    def on_validation(self, state: State) -> None:
+    def on_validation(self, state: State) -> Mapping[str, float] | None:
         """Run after each validation; `state.row` holds its numbers."""
+        return None
 
-    def on_end(self, state: State) -> None:
+    def on_end(self, state: State) -> Mapping[str, float] | None:
         """Run once after the last step, also of an interrupted run, before the best weights are put back."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -266,15 +269,19 @@ def _train(
     """Steps, rows, validations and checkpoints, until the run ends."""
     state, training = svi.state, svi.training
 
-    def report(row: dict[str, float]) -> None:
-        state.row = row
+    def log(row: Mapping[str, float]) -> None:
         for tracker in receivers:
             tracker.log(state.step, row)
+
+    def report(row: dict[str, float]) -> None:
+        state.row = row
+        log(row)
 
     def call(hook: str) -> None:
         try:
             for callback in callbacks:
-                getattr(callback, hook)(state)
+                if row := getattr(callback, hook)(state):
+                    log(row)
         except KeyboardInterrupt:  # the step is complete, so this is as good a place to stop as any
             signals.received = signal.SIGINT
 

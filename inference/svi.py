@@ -111,8 +111,9 @@ class SVI:
         )
         self.fabric.launch()
         with _forked(self.fabric.device):
+            own: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
             optimizer = OPTIMISERS[training.optimizer](
-                self.parameters, lr=training.rate(0), weight_decay=training.weight_decay, fused=True
+                self.parameters, lr=training.rate(0), weight_decay=training.weight_decay, fused=True, **own
             )
             bound = _Bound(self.model, SequenceELBO(training.particles))
             self.module, self.optimizer = self.fabric.setup(bound, optimizer)

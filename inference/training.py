@@ -21,6 +21,7 @@ class Training:
         decay: last share of the run over which a learning rate that is a number falls linearly to 0; a resumed run
             with more steps falls later.
         optimizer: "adam", "adamw" or "sgd".
+        momentum: of "sgd", the share of the last step that the next one goes on with.
         weight_decay: the optimiser's weight decay.
         gradient_clip: largest norm of the gradient of the loss (nats per frame); None for no limit.
         self_feeding: probability that a frame of x's history is replaced by the program's own mean (scheduled
@@ -49,6 +50,7 @@ class Training:
     learning_rate: Amount | Schedule = 1e-3
     decay: Share = 0.0
     optimizer: Literal["adam", "adamw", "sgd"] = "adam"
+    momentum: Annotated[float, Range(0, 1, below=True)] = 0.0
     weight_decay: Amount = 0.0
     gradient_clip: Annotated[float, Range(0, above=True)] | None = 10.0
     self_feeding: Share | Schedule = 0.0
@@ -70,6 +72,8 @@ class Training:
             for value in levels(getattr(self, name)):
                 if value not in allowed:
                     raise ValueError(f"{name} is {value}; it must be {allowed}")
+        if self.momentum and self.optimizer != "sgd":
+            raise ValueError(f"momentum is an option of sgd; {self.optimizer} has its own, so leave momentum 0")
         if self.decay and isinstance(self.learning_rate, Schedule):
             raise ValueError(
                 "decay is for a learning rate that is a number; a schedule falls by itself, so leave decay 0"

@@ -225,6 +225,41 @@ def test_a_callback_can_end_the_run():
     assert (result.status, result.step) == ("stopped early", 7)
 
 
+def test_numbers_that_a_callback_returns_are_rows_of_the_log_and_change_nothing_else(tmp_path):
+    class Weighs(Callback):
+        def on_step(self, state):
+            torch.randn(3)
+            return {"weight/sum": float(state.step)} if state.step % 20 == 0 else None
+
+        def on_end(self, state):
+            return {"weight/end": 1.0}
+
+    plain, told = run(validation=HELD_OUT), run(validation=HELD_OUT, out=tmp_path / "told", callbacks=[Weighs()])
+    assert told.series("weight/sum") == ([20, 40, 60], [20.0, 40.0, 60.0])
+    assert told.series("weight/end") == ([60], [1.0])
+    assert [row for row in told.history if not any(name.startswith("weight") for name in row)] == plain.history
+    assert JSONLines(tmp_path / "told" / "log.jsonl").read() == told.history
+
+
+def test_momentum_is_that_of_sgd_and_goes_on_after_a_resume(tmp_path):
+    options = {"optimizer": "sgd", "momentum": 0.9, "learning_rate": 1e-3, "gradient_clip": None}
+    weights, gradients = [], []
+
+    class Watches(Callback):
+        def on_step(self, state):
+            weights.append(torch.cat([parameter.detach().flatten() for parameter in state.model.parameters()]))
+            gradients.append(torch.cat([parameter.grad.flatten() for parameter in state.model.parameters()]))
+
+    whole = run(out=tmp_path / "whole", steps=8, callbacks=[Watches()], **options)
+    velocity = gradients[0]
+    for before, after, gradient in zip(weights, weights[1:], gradients[1:]):
+        velocity = 0.9 * velocity + gradient
+        torch.testing.assert_close(after, before - 1e-3 * velocity)
+    run(out=tmp_path / "parts", steps=3, **options)
+    assert run(out=tmp_path / "parts", steps=8, resume=True, **options).step == whole.step
+    assert same(*(load_file(tmp_path / name / "last.safetensors") for name in ("whole", "parts")))
+
+
 def test_stages_follow_one_another_on_one_global_step():
     seen = []
 
@@ -520,8 +555,9 @@ def test_options_that_do_not_exist_or_make_sense_are_refused():
         *({"learning_rate": rate} for rate in (-1, math.nan, math.inf)),
         *({"weight_decay": -1.0}, {"decay": 1.5}, {"self_feeding": 2}, {"self_feeding": -0.1}),
         {"decay": 0.5, "learning_rate": Ramp(1e-3, 0.0, 10)},
+        *({"momentum": 0.9}, {"optimizer": "sgd", "momentum": 1.0}),
     ):
-        with pytest.raises(ValueError, match=r"must be|unknown optimizer|leave decay 0"):
+        with pytest.raises(ValueError, match=r"must be|unknown optimizer|leave (decay|momentum) 0"):
             Training(**wrong)
     for wrong in ({"steps": 2.5}, {"seed": "one"}, {"learning_rate": "fast"}):
         with pytest.raises(TypeError, match=r"must be a whole number|must be a number"):
