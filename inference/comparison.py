@@ -399,7 +399,7 @@ class Comparison(Result):
     def _clips(self) -> list[str]:
         return [f"{split}/{clip}" for split, clip, _ in self.keys]
 
-    def _parts(self, name: str, metric: str) -> Parts:
+    def _parts(self, name: str, metric: str) -> Crossed:
         row = self._row(name)
         if metric not in {*row.bounds, *row.free_running} - {"k-hat"}:
             known = [known for known in (*row.bounds, *row.free_running) if known != "k-hat"]
@@ -410,7 +410,7 @@ class Comparison(Result):
             means = row.free_running[metric]
         else:
             means = np.stack([np.bincount(places, weights=seed) for seed in row.bounds[metric]]) / weights
-        return Parts.of(means, weights)
+        return Crossed.of(means, weights)
 
     # Tables
 
@@ -497,7 +497,7 @@ def _freedom(total: float, *parts: tuple[float, float]) -> float:
 
 
 @dataclass(frozen=True)
-class Parts:
+class Crossed:
     """A model's mean, what each clip adds to its error (C,), the variances of its seeds and of the rest, and S."""
 
     mean: float
@@ -507,7 +507,7 @@ class Parts:
     count: int
 
     @classmethod
-    def of(cls, means: np.ndarray, weights: np.ndarray) -> Parts:
+    def of(cls, means: np.ndarray, weights: np.ndarray) -> Crossed:
         """From means by seed and clip (S, C) and the clips' weights (C,)."""
         by_seed, deviations = linearised(means, weights)
         common = deviations.mean(0)
@@ -518,7 +518,7 @@ class Parts:
         rest = sum(clustered_variance(own) for own in deviations - common) / (count * (count - 1))
         return cls(float(by_seed.mean()), common, float(by_seed.var(ddof=1)) / count, rest, count)
 
-    def estimate(self, other: Parts | None = None) -> Estimate:
+    def estimate(self, other: Crossed | None = None) -> Estimate:
         """The mean, or its paired difference to that of another model, with the errors of the module's docstring."""
         mean, deviations, between, rest = self.mean, self.deviations, self.seeds, self.rest
         of_seeds = [(self.seeds, self.count - 1)]

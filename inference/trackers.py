@@ -19,7 +19,7 @@ from rich.text import Text
 
 from .. import files
 from .checkpoints import CheckpointError
-from .result import Plain
+from .result import Plain, progress_bar
 
 LARGEST_LOG = 2**25
 """Bytes of a file of JSON lines."""
@@ -157,6 +157,32 @@ class TensorBoard:
         """Close the event file."""
         with files.naming(self.directory):
             self._writer.close()
+
+
+class Bar:
+    """Shows how far a fit is, and no numbers: of one that is a part of something else.
+
+    Args:
+        name: what is fitted.
+        steps: last step of the run.
+        shown: whether to show it.
+    """
+
+    def __init__(self, name: str, steps: int, shown: bool) -> None:
+        self._bar = progress_bar(shown)
+        self._task = self._bar.add_task(name, total=steps)
+
+    def start(self, step: int) -> None:
+        """Show the bar."""
+        self._bar.start()
+
+    def log(self, step: int, row: Mapping[str, float]) -> None:
+        """Move it on."""
+        self._bar.update(self._task, completed=step)
+
+    def close(self) -> None:
+        """Take it away."""
+        self._bar.stop()
 
 
 class Terminal:

@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from ...data import Batch, bridged
 from ...inference.checkpoints import Run, load_weights
 from ...inference.recipe import Recipe, Trainable
-from ...inference.result import progress_bar
+from ...inference.trackers import Bar
 from ...inference.training import Stage
 from ...laws import QRFlow, Shape
 from ...options import Layers, Range
@@ -205,7 +205,7 @@ def fit_pose_prior(
             weight_decay=1e-3,
             accelerator="cpu",
             progress=False,
-            trackers=[_Bar(steps, progress)],
+            trackers=[Bar("pose prior", steps, progress)],
         )
     return model
 
@@ -247,23 +247,3 @@ def load_pose_prior(path: str | Path, skeleton: Skeleton, heading: bool) -> Pose
     model = PosePriorModel(skeleton)
     load_weights(model, path)
     return model
-
-
-class _Bar:
-    """A tracker that shows how far a fit is, and no numbers."""
-
-    def __init__(self, steps: int, shown: bool) -> None:
-        self.bar = progress_bar(shown)
-        self.task = self.bar.add_task("pose prior", total=steps)
-
-    def start(self, step: int) -> None:
-        """Show the bar."""
-        self.bar.start()
-
-    def log(self, step: int, row: Mapping[str, float]) -> None:
-        """Move it on."""
-        self.bar.update(self.task, completed=step)
-
-    def close(self) -> None:
-        """Take it away."""
-        self.bar.stop()

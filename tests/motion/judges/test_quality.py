@@ -1,0 +1,154 @@
+"""The judge of quality: at guessing where nobody can tell, never wrong where everybody can, and reproducible."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import dvae
+from dvae import motion
+from dvae.motion.judges.quality import Qualities, RealOrMade, quality
+
+SHORT = replace(motion.PROTOCOLS["simulated"], observed=4, predicted=6, test_stride=5)
+
+
+class Makes(nn.Module):
+    """A model of nothing but futures."""
+
+    def __init__(self, futures):
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(()))
+        self.futures = futures
+
+    def forecast(self, batch, horizon, samples=1, **options):
+        assert options == {"draw_emission": False}
+        return {"x": self.futures(batch["x"], horizon).expand(samples, -1, -1, -1)}
+
+
+def noise(x, horizon):
+    return torch.randn(len(x), horizon, x.shape[2])
+
+
+@pytest.fixture(scope="module")
+def people():
+    clips = motion.simulate(clips=40, frames=40, test=0.5)
+    return {split: motion.windows(clips, SHORT, split) for split in ("train", "test")}
+
+
+def remembering(windows):
+    """Copies the future of whoever began so."""
+    x = torch.cat([each.all(1)["x"] for each in windows.values()])
+
+    def futures(past, horizon):
+        return x[torch.cdist(past.flatten(1), x[:, : past.shape[1]].flatten(1)).argmin(1), past.shape[1] :]
+
+    return futures
+
+
+def judged(models, people, **options):
+    options = {"examples": 300, "steps": 120, "seeds": (0, 1), "learning_rate": 0.2, "batch_size": 64, **options}
+    models = {name: Makes(futures) for name, futures in models.items()}
+    return quality(
+        models, people["train"], people["test"], method=RealOrMade(16), progress=False, accelerator="cpu", **options
+    )
+
+
+def test_noise_is_never_taken_for_real_and_true_futures_are_half_the_time(people):
+    copied = remembering(people)
+
+    def half(x, horizon):
+        return torch.where(torch.rand(len(x), 1, 1) < 0.5, noise(x, horizon), copied(x, horizon))
+
+    found = judged({"noise": noise, "copied": copied, "half of each": half}, people)
+    assert found["noise"]["quality"].mean < 8
+    assert found["copied"]["quality"].mean == pytest.approx(50)  # the same windows, so that half the answers are wrong
+    # who makes noise half the time can be told then, and then alone: at best with an accuracy of (1 + 1 / 2) / 2
+    mixed = found["half of each"]
+    assert 25 - 4 * mixed["quality"].sequences < mixed["quality"].mean < 40
+    assert 25 < mixed["taken for real"].mean < 75
+    worse = found.difference("noise", "half of each")
+    assert worse.mean == pytest.approx(found["noise"]["quality"].mean - found["half of each"]["quality"].mean)
+    assert worse.interval(error="sequences")[1] < 0
+
+
+def test_other_draws_of_real_motion_leave_the_judge_at_guessing():
+    """Where every frame is a draw of its own, futures drawn anew are as real as the true ones."""
+    clips = motion.simulate(clips=30, frames=40, test=0.5)
+    generator = np.random.default_rng(0)
+    made = [replace(clip, positions=generator.normal(0, 0.2, clip.positions.shape).astype("f4")) for clip in clips]
+    windows = motion.MotionSet(made, clips.skeleton, "noise")
+    windows = {split: motion.windows(windows, SHORT, split) for split in ("train", "test")}
+
+    def again(x, horizon):
+        joints, pelvis = torch.randn(len(x), horizon, 16, 3), torch.randn(len(x), horizon, 1, 3)
+        return 0.2 * (joints - pelvis).flatten(-2)
+
+    found = judged({"again": again}, windows, steps=40)["again"]["quality"]
+    assert abs(found.mean - 50) < 4 * found.sequences
+    assert found.sequences > 0
+
+
+def test_who_faces_where_and_where_the_pelvis_is_tell_nobody_apart(people):
+    judge = RealOrMade(8).build(people["train"]).double()
+    skeleton, x = people["train"].skeleton, people["test"].all()["x"][:5].double()
+    turned = motion.rotate_about_up(x.unflatten(-1, (-1, 3)), torch.rand(5, 1, 1).double(), skeleton.up)
+    torch.testing.assert_close(judge.logits(turned.flatten(-2)), judge.logits(x))
+    moved = skeleton.with_root(turned) + torch.randn(5, 10, 1, 3).double()
+    torch.testing.assert_close(judge.logits(moved.flatten(-2)), judge.logits(x))
+    fixed = RealOrMade(8, heading=False).build(people["train"]).double()
+    assert (fixed.logits(turned.flatten(-2)) != fixed.logits(x)).all()
+    with pytest.raises(ValueError, match="frames have 5 numbers; those of the skeleton 'walker' have 51, or 48"):
+        judge.logits(x[..., :5])
+
+
+def test_models_of_turns_are_judged_by_the_positions_that_they_make(people):
+    clips = motion.simulate(clips=8, frames=40, test=0.5)
+    protocol = replace(SHORT, representation="quaternion")
+    windows = {split: motion.windows(clips, protocol, split) for split in ("train", "test")}
+    model = dvae.method("mix-and-match", width=8).build(windows["train"])
+    found = quality({"mix": model}, *windows.values(), method=RealOrMade(4), examples=20, steps=3, progress=False)
+    assert 0 <= found["mix"]["quality"].mean <= 100
+    assert model.training  # as it was
+
+
+def test_the_same_seeds_give_the_same_scores_which_are_kept(people, tmp_path):
+    state = torch.get_rng_state()
+    first, again, other = (judged({"noise": noise}, people, steps=4, seeds=seeds) for seeds in ((3, 4), (3, 4), (3, 5)))
+    assert torch.equal(torch.get_rng_state(), state)
+    assert np.array_equal(first.rows["noise"]["quality"], again.rows["noise"]["quality"])
+    assert np.array_equal(first.rows["noise"]["quality"][0], other.rows["noise"]["quality"][0])
+    assert not np.array_equal(first.rows["noise"]["quality"][1], other.rows["noise"]["quality"][1])
+    first.save(tmp_path / "found.json")
+    read = Qualities.load(tmp_path / "found.json")
+    assert str(read) == str(first)
+    assert read["noise"] == first["noise"]
+    assert read.record["training"]["momentum"] == 0.9
+    one = judged({"noise": noise}, people, steps=2, seeds=(0,))["noise"]["quality"]
+    assert math.isnan(one.total)
+    assert not math.isnan(one.sequences)
+
+
+def test_what_it_refuses(people):
+    other = motion.windows(motion.simulate(clips=8, frames=40, test=0.5), replace(SHORT, observed=5), "test")
+    for options, message in (
+        ({"people": {**people, "test": other}}, "training and test windows differ in skeleton or frames"),
+        ({"examples": 0}, "at least one example and one seed"),
+        ({"seeds": ()}, "at least one example and one seed"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            judged({"noise": noise}, **{"people": people, **options})
+    gaps = motion.simulate(clips=8, frames=40, test=0.5)
+    lacking = motion.windows(motion.occlude(gaps, 0.2, 5.0), SHORT, "test")
+    with pytest.raises(ValueError, match="these lack joints; fill the gaps first"):
+        judged({"noise": noise}, {**people, "test": lacking})
+    with pytest.raises(FloatingPointError, match="the forecast of broken is not finite"):
+        judged({"broken": lambda x, horizon: noise(x, horizon) / 0}, people)
+    with pytest.raises(ValueError, match="a judge of quality needs to know what poses are, and was given sequences"):
+        RealOrMade().build({"x": 48})
+    with pytest.raises(ValueError, match="leave mask out"):
+        RealOrMade(4).build(people["train"]).model({"x": torch.zeros(2, 10, 48), "c": torch.ones(2), "mask": None})
+    with pytest.raises(KeyError, match=r"no model 'nois' here \(did you mean 'noise'\?\)"):
+        judged({"noise": noise}, people, steps=1)["nois"]
