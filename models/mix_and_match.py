@@ -302,6 +302,12 @@ class FutureDecoderNetwork(Network):
         states = self.cell(before, self.code(parents)[None].contiguous())[0]
         return self._pose(states, parents["z"], before)
 
+    @property
+    def entrance(self) -> nn.Module:
+        """Of which the noise becomes (B, L): the first state, or the features of each step that poses are made of."""
+        found: Any = self.noise if self.join is None else self.join
+        return found
+
     def code(self, parents: Mapping[str, Tensor]) -> Tensor:
         """The first state (B, L)."""
         code = self.past(parents[HISTORY])
