@@ -31,7 +31,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Self
 
@@ -46,6 +47,7 @@ from ...data import Batch
 from ...inference.comparison import Crossed, Estimate
 from ...inference.held import Held, clip_places, hold, on_device_of, plain, refuse_non_finite, reproducibly
 from ...inference.recipe import Recipe, Trainable
+from ...inference.references import zero_velocity
 from ...inference.result import Result, Table, progress_bar
 from ...inference.scores import clip_means
 from ...inference.trackers import Bar
@@ -68,6 +70,7 @@ TRAINING: Mapping[str, Any] = {
 }
 """The paper's, of `Training`."""
 SCORES = ("quality", "taken for real")
+STILL = "zero velocity"
 
 
 @dataclass(frozen=True)
@@ -280,6 +283,7 @@ def quality(
     seeds: Sequence[int] = (0, 1, 2),
     seed: int = 0,
     forecast: Mapping[str, Any] | None = None,
+    references: bool = True,
     progress: bool = True,
     **training: Any,
 ) -> Qualities:
@@ -298,11 +302,14 @@ def quality(
         seeds: of the classifiers.
         seed: of windows and futures.
         forecast: options of the models' `forecast`.
+        references: whether to judge zero velocity too, of which little passes a classifier that has learned anything.
         progress: whether to show progress bars.
         **training: of `Training`, in place of `TRAINING`.
 
     Raises:
-        ValueError: windows that lack joints, of another protocol or skeleton than the others, or no seed or example.
+        ValueError: windows that lack joints, of another protocol or skeleton than the others; no seed or example; or a
+            model with the name of the reference row.
+        FloatingPointError: a forecast that is not finite.
     """
     method = method or RealOrMade()
     if train.missing or test.missing:
@@ -311,13 +318,17 @@ def quality(
         raise ValueError(f"training and test windows differ in skeleton or frames: {train} and {test}")
     if examples < 1 or not seeds:
         raise ValueError(f"quality needs at least one example and one seed, got {examples} and {list(seeds)}")
+    if references and STILL in models:
+        raise ValueError(f"a model must not have the name of a reference row: {STILL}")
     held, places = hold(test), clip_places(test.keys)
     drawn = train.sample(examples, torch.Generator().manual_seed(seed))
     known = Held(train, drawn, held.observed, [(train.split, "drawn", n) for n in range(examples)])
     rows: dict[str, dict[str, np.ndarray]] = {}
-    for name, model in models.items():
-        with reproducibly(model, seed):
-            learned, judged = (_examples(name, model, each, forecast or {}, progress) for each in (known, held))
+    forecasters = {name: _forecaster(model, held.futures.shape[1], forecast or {}) for name, model in models.items()}
+    forecasters |= {STILL: lambda past: zero_velocity(past["x"], held.futures.shape[1])[0]} if references else {}
+    for name, futures in forecasters.items():
+        with reproducibly(models[name], seed) if name in models else nullcontext():
+            learned, judged = (_examples(name, futures, each, progress) for each in (known, held))
         found: dict[str, list[Sequence[float]]] = {score: [] for score in SCORES}
         for number in seeds:
             with torch.random.fork_rng():
@@ -343,14 +354,24 @@ def quality(
     return Qualities(rows, held.clips, plain(record))
 
 
-def _examples(name: str, model: Any, held: Held, options: Mapping[str, Any], progress: bool) -> Examples:
+def _forecaster(model: Any, horizon: int, options: Mapping[str, Any]) -> Callable[[Batch], Tensor]:
+    """From pasts to one future of each."""
+
+    def futures(past: Batch) -> Tensor:
+        found = model.forecast(on_device_of(model, past), horizon, 1, **{"draw_emission": False, **options})
+        made: Tensor = found["x"][0].cpu()
+        return made
+
+    return futures
+
+
+def _examples(name: str, forecast: Callable[[Batch], Tensor], held: Held, progress: bool) -> Examples:
     """Windows, and what a model makes of them."""
-    horizon, made = held.futures.shape[1], []
+    made = []
     with progress_bar(progress) as bar:
         for start in bar.track(range(0, len(held.keys), 256), description=f"{name}, forecasts"):
             part = slice(start, start + 256)
-            past = on_device_of(model, held.past(part))
-            futures = model.forecast(past, horizon, 1, **{"draw_emission": False, **options})["x"][0].cpu()
+            futures = forecast(held.past(part))
             refuse_non_finite(name, "forecast", futures.isfinite().all(-1).all(-1), held.keys[part])
             made.append(torch.cat([held.x[part, : held.observed], futures], 1))
     return Examples(held.x, torch.cat(made))

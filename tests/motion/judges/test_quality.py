@@ -49,22 +49,30 @@ def remembering(windows):
 
 
 def judged(models, people, **options):
-    options = {"examples": 300, "steps": 120, "seeds": (0, 1), "learning_rate": 0.2, "batch_size": 64, **options}
+    options = {
+        "references": False,
+        "examples": 300,
+        "steps": 120,
+        "seeds": (0, 1),
+        "learning_rate": 0.2,
+        "batch_size": 64,
+        **options,
+    }
     models = {name: Makes(futures) for name, futures in models.items()}
     return quality(
         models, people["train"], people["test"], method=RealOrMade(16), progress=False, accelerator="cpu", **options
     )
 
 
-def test_noise_is_never_taken_for_real_and_true_futures_are_half_the_time(people):
+def test_noise_is_told_and_noise_half_the_time_is_told_then(people):
     copied = remembering(people)
 
     def half(x, horizon):
         return torch.where(torch.rand(len(x), 1, 1) < 0.5, noise(x, horizon), copied(x, horizon))
 
-    found = judged({"noise": noise, "copied": copied, "half of each": half}, people)
+    found = judged({"noise": noise, "half of each": half}, people)
+    assert list(found.rows) == ["noise", "half of each"]
     assert found["noise"]["quality"].mean < 8
-    assert found["copied"]["quality"].mean == pytest.approx(50)  # the same windows, so that half the answers are wrong
     # who makes noise half the time can be told then, and then alone: at best with an accuracy of (1 + 1 / 2) / 2
     mixed = found["half of each"]
     assert 25 - 4 * mixed["quality"].sequences < mixed["quality"].mean < 40
@@ -72,6 +80,12 @@ def test_noise_is_never_taken_for_real_and_true_futures_are_half_the_time(people
     worse = found.difference("noise", "half of each")
     assert worse.mean == pytest.approx(found["noise"]["quality"].mean - found["half of each"]["quality"].mean)
     assert worse.interval(error="sequences")[1] < 0
+
+
+def test_true_futures_leave_the_judge_at_guessing_whatever_it_has_learned(people):
+    found = judged({"copied": remembering(people)}, people, steps=5)["copied"]
+    assert found["quality"].mean == pytest.approx(50)  # the same windows twice: half of the answers are wrong
+    assert found["quality"].sequences == pytest.approx(0)
 
 
 def test_other_draws_of_real_motion_leave_the_judge_at_guessing():
@@ -129,6 +143,17 @@ def test_the_same_seeds_give_the_same_scores_which_are_kept(people, tmp_path):
     one = judged({"noise": noise}, people, steps=2, seeds=(0,))["noise"]["quality"]
     assert math.isnan(one.total)
     assert not math.isnan(one.sequences)
+
+
+def test_zero_velocity_is_judged_beside_them(people):
+    def still(x, horizon):
+        return x[:, -1:].expand(-1, horizon, -1)
+
+    found = judged({"mine": still}, people, references=True, steps=5)
+    assert list(found.rows) == ["mine", "zero velocity"]
+    assert found["mine"] == found["zero velocity"]
+    with pytest.raises(ValueError, match="must not have the name of a reference row: zero velocity"):
+        judged({"zero velocity": still}, people, references=True)
 
 
 def test_what_it_refuses(people):
