@@ -117,6 +117,24 @@ class Evaluation(Result):
         Raises:
             KeyError: a method that was not evaluated, or a metric that one of the two lacks.
         """
+        ours, theirs = self._both(first, second, metric)
+        return self._score(metric, ours - theirs)
+
+    def ratio(self, first: str, second: str, metric: str) -> Score:
+        """Ratio of the means of two methods in a metric, first by second, with its standard error, linearised.
+
+        Raises:
+            KeyError: as `difference`.
+            ValueError: a second mean of 0.
+        """
+        ours, theirs = self._both(first, second, metric)
+        over, under = (self._score(metric, means).mean for means in (ours, theirs))
+        if not under:
+            raise ValueError(f"the mean {metric} of {second} is 0, by which nothing can be divided")
+        return self._score(metric, over / under + (ours - over / under * theirs) / under)
+
+    def _both(self, first: str, second: str, metric: str) -> list[np.ndarray]:
+        """The values of two methods by clip."""
         means = []
         for method in (first, second):
             row = self._row(method)
@@ -124,7 +142,7 @@ class Evaluation(Result):
                 meant = nearest(metric, row.clip_means)
                 raise KeyError(f"{method!r} has no score {metric!r}{meant}; it has {', '.join(row.clip_means)}")
             means.append(np.array(row.clip_means[metric]))
-        return self._score(metric, means[0] - means[1])
+        return means
 
     def table(self) -> Table:
         """Metrics down, methods across: mean ± standard error, the two programs apart."""

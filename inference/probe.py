@@ -2,12 +2,11 @@
 
 Where a model has learned to ignore a latent, it makes the same future whatever that latent is: drawn from N(50, 50) in
 place of its prior N(0, I), futures are as good and as much alike as ever (Aliakbarian, Saleh, Salzmann, Petersson and
-Gould, 2020, arXiv 1908.00733, section 4.1). A model that listens goes astray. So its diversity is to be compared,
-under the one and under the other:
+Gould, 2020, arXiv 1908.00733, section 4.1). A model that listens goes astray. So its diversities are to be compared:
 
     models = {"as it is": model, "probed": Redrawn(model, {"z": Normal(50.0, 50**0.5)})}
     found = dvae.evaluate(models, windows, scores=dvae.motion.displacements)
-    ratio = found["probed"]["APD"].mean / found["as it is"]["APD"].mean
+    found.ratio("probed", "as it is", "APD")
 
 The paper does not say whether the second 50 is a variance, as the I beside it is, or a standard deviation; both are far
 beyond the prior.

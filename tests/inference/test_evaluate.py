@@ -278,6 +278,29 @@ def test_differences_are_paired(model):
         result["c"]
 
 
+def test_the_error_of_a_ratio_is_its_spread_over_other_clips(model):
+    random = np.random.default_rng(0)
+    clips = {str(clip): int(count) for clip, count in enumerate(random.integers(1, 5, 60))}
+    record = replace(evaluation([1.0], None), clips=clips)
+
+    def ratio():
+        under = 1 + random.random(60)
+        over = 3 * under * (1 + 0.5 * random.random(60))
+        rows = {"a": Row(1, {"FDE": tuple(over)}), "b": Row(1, {"FDE": tuple(under)})}
+        weights = np.array(list(clips.values()))
+        found = replace(record, rows=rows).ratio("a", "b", "FDE")
+        assert found.mean == pytest.approx((over * weights).sum() / (under * weights).sum())
+        return found
+
+    found = [ratio() for _ in range(1000)]
+    spread = np.std([each.mean for each in found])
+    assert np.mean([each.standard_error for each in found]) == pytest.approx(spread, rel=0.1)
+    rows = {"a": Row(1, {"FDE": (2.0,) * 60}), "b": Row(1, {"FDE": (0.0,) * 60})}
+    assert replace(record, rows=rows).ratio("a", "a", "FDE") == Score(1, 0)
+    with pytest.raises(ValueError, match="the mean FDE of b is 0"):
+        replace(record, rows=rows).ratio("a", "b", "FDE")
+
+
 # Records
 
 
