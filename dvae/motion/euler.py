@@ -16,10 +16,10 @@ and Romero, 2017, arXiv 1705.02445, has it, from which later work takes it:
   forecast, here over those of all true windows, so that all methods are scored on the same angles.
 * A time is that of the nearest frame, counted from the last observed one.
 
-The best of K is the S-MSE of Yan et al., 2018, arXiv 1808.04545: of the K futures the one that is nearest to the true
-one is compared with it. Aliakbarian et al., 2020, arXiv 1908.00733, report it at these times (K = 50, and 1 to 500),
-and do not say whether one future is the best at all of them. Here it is: the best by its mean error over the times, so
-that what is scored at 1000 ms is the future that is scored at 80 ms. Fewer futures are the first of the most.
+The best of K futures stands for all of them in Aliakbarian et al., 2020, arXiv 1908.00733, who call it the S-MSE of Yan
+et al., 2018, arXiv 1808.04545: "at least one is close to the ground truth" (K = 50, and 1 to 500). They do not say
+whether one future is the best at all times. Here it is: the best by its mean error over the times, so that what is
+scored at 1000 ms is the future that is scored at 80 ms. Fewer futures are the first of the most.
 
 Turns are those of the data, and of models that make turns. Positions do not tell how a bone is turned about itself:
 models that make them are scored with `inverse`, by turns that inverse kinematics finds in positions, of what models
