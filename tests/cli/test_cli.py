@@ -60,9 +60,8 @@ def test_wrong_arguments_exit_with_2(capsys, tmp_path):
     assert "did you mean 'hit-dvae'" in failure(capsys, "show", "hitdvae", code=2)
     assert "both --generative and --inference" in failure(capsys, "show", code=2)
     assert "not both" in failure(capsys, "show", "srnn", "--generative", "p(z_t) p(x_t | z_t)", code=2)
-    assert "hit-dvae, gsps, trajevae, cvae-rnn, mix-and-match, equations" in failure(
-        capsys, "fit", "hitdvae", *out, code=2
-    )
+    unknown = failure(capsys, "fit", "hitdvae", *out, code=2)
+    assert all(name in unknown for name in dvae.methods())
     for command in ("fit", "resume", "data"):
         assert f"dvae {command} --help" in failure(capsys, command, code=2)
     assert "did you mean 'info'" in failure(capsys, "data", "inf", code=2)

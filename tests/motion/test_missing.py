@@ -114,7 +114,7 @@ def test_gaps_stay_where_motion_is_resampled_or_divided():
 
 def test_turns_are_refused_where_joints_lack():
     turned = replace(motion.PROTOCOLS["simulated"], representation="6d")
-    with pytest.raises(ValueError, match="lacks joints, without which their turns are not known"):
+    with pytest.raises(ValueError, match=r"lacks joints, without which their turns are not known"):
         motion.windows(GAPS, turned, "train")
     found = replace(PEOPLE.with_rotations(), missing=True)
     batch = motion.windows(found, turned, "test").all()
@@ -133,7 +133,7 @@ def _future_with_gaps():
 
 
 def test_rotations_need_whole_bodies():
-    with pytest.raises(ValueError, match="lacks joints, without which their turns are not known"):
+    with pytest.raises(ValueError, match=r"lacks joints, without which their turns are not known"):
         GAPS.with_rotations()
 
 
@@ -537,7 +537,7 @@ def test_every_method_goes_the_whole_way_with_gaps(name):
 def test_a_method_that_reads_turns_alone_says_what_to_do_about_gaps():
     protocol = replace(motion.PROTOCOLS["simulated"], representation="quaternion")
     with pytest.raises(
-        ValueError, match="lacks joints, without which their turns are not known; .* fill its gaps first"
+        ValueError, match=r"lacks joints, without which their turns are not known; .* fill its gaps first"
     ):
         dvae.method("mix-and-match").build(motion.MotionData("simulated", GAPS, protocol).windows("train"))
 
