@@ -333,7 +333,7 @@ class DynamicalVAE(nn.Module):
         Returns:
             Name to draws (n, T, D), or (n, D) of a static latent.
         """
-        data = self.read(batch)
+        data = self.read(batch, size=n)
         with self._evaluating():
             return self.shown(self.model(data, length=length, size=n), data)
 

@@ -133,6 +133,15 @@ def test_every_sample_of_a_forecast_has_indices_of_its_own_and_every_row_the_sam
     assert (seen[1].unflatten(0, (5, 4)) == indices[:4]).all()
 
 
+def test_what_is_shared_does_not_tell_how_many_sequences_there_are():
+    sizes, shared = {"z": 2, "x": 3, "i": 4}, {"i": Subset(0.5)}
+    model = dvae.DynamicalVAE("p(z) p(x_t | x_{t-1}, z, i)", "q(z | x_{1:T}, i)", sizes, shared=shared)
+    drawn = model.sample(5, length=6)
+    assert (drawn["x"].shape, drawn["z"].shape, drawn["i"].shape) == ((5, 6, 3), (5, 2), (5, 4))
+    assert (drawn["i"] == drawn["i"][0]).all()
+    assert drawn["i"][0].sum() == 2
+
+
 # ------------------------------------------------------------------------------------------------ how noise enters
 
 
