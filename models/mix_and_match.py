@@ -182,11 +182,13 @@ class MixAndMatchModel(DynamicalVAE):
             return {}
         value = rollout.values[WHOLE]
         made = rollout.parameters(WHOLE, value)[0]
-        ours, theirs = self._aligned(torch.stack([made, value]), data[LENGTHS])
+        with torch.no_grad():
+            theirs = self._aligned(value, data[LENGTHS])
+        ours = self._aligned(made, data[LENGTHS])
         return {"skeleton": (ours - theirs).square().mean(-1).sum(-1)}
 
     def _aligned(self, quaternions: Tensor, lengths: Tensor) -> Tensor:
-        """Positions (2, B, T, 3 J') of poses (2, B, T, D) whose root is at the origin and not turned."""
+        """Positions (B, T, 3 J') of poses (B, T, D) whose root is at the origin and not turned."""
         view = self.turns
         place = view.turning.index(view.skeleton.root)
         start = 3 * view.root

@@ -58,9 +58,7 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
     import roma
 
     if form == "quaternion":
-        none = values.norm(dim=-1, keepdim=True) < torch.finfo(values.dtype).eps
-        values = torch.where(none, values.new_tensor([1.0, 0, 0, 0]), values)
-        return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(values, dim=-1)))
+        return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit(values)))
     if form == "vector":
         return roma.rotvec_to_rotmat(values)
     if form == "6d":
@@ -98,6 +96,13 @@ def from_matrix(rotations: Tensor, form: str) -> Tensor:
     return roma.rotmat_to_euler(form[-3:].upper(), rotations)
 
 
+def unit(quaternions: Tensor) -> Tensor:
+    """(..., 4) of unit length; unturned where they are shorter than rounding."""
+    none = quaternions.norm(dim=-1, keepdim=True) < torch.finfo(quaternions.dtype).eps
+    quaternions = torch.where(none, quaternions.new_tensor([1.0, 0, 0, 0]), quaternions)
+    return torch.nn.functional.normalize(quaternions, dim=-1)
+
+
 def continuous(quaternions: Tensor, dim: int = -3) -> Tensor:
     """The same rotations by quaternions (..., 4) of which each lies nearer to the one before than its opposite does.
 
@@ -113,13 +118,21 @@ def continuous(quaternions: Tensor, dim: int = -3) -> Tensor:
     return quaternions * signs
 
 
-def in_time(rotations: Tensor, form: str) -> Tensor:
+def in_time(rotations: Tensor, form: str, given: str = "matrix") -> Tensor:
     """Rotations (..., T, J, 3, 3) in a form as `from_matrix` gives it, without its jumps from frame to frame.
 
     Where a rotation has several quaternions or vectors, a frame has the one nearest to that of the frame before; the
     first has the quaternion with w >= 0, or the vector of at most half a turn. So a frame depends on none after it.
+
+    Args:
+        rotations: (..., T, J, 3, 3), or (..., T, J, 4) where quaternions are given.
+        form: that is asked for.
+        given: "matrix" or "quaternion".
     """
-    values = from_matrix(rotations, form)
+    if given == form == "quaternion":
+        values = unit(rotations)
+    else:
+        values = from_matrix(rotations if given == "matrix" else to_matrix(rotations, given), form)
     if form == "quaternion":
         return continuous(torch.where(values[..., :1, :, :1] < 0, -values, values))
     return _unwrapped(values) if form == "vector" else values

@@ -298,12 +298,13 @@ class Rotations(View):
         positions = skeleton.with_root(x.unflatten(-1, (-1, 3)))
         turns = data.get(BESIDE, {}).get(TURNS)
         if turns is None:
-            found = kinematics.inverse(skeleton, positions, self._offsets.to(x))[..., self.turning, :, :]
+            matrices = kinematics.inverse(skeleton, positions, self._offsets.to(x))[..., self.turning, :, :]
+            found = in_time(matrices, self.form)
         else:
             turns = turns[:, : x.shape[1]].unflatten(-1, (-1, 4))  # of a past, no more than that
-            found = to_matrix(turns[..., self.turning, :], "quaternion").to(x)
+            found = in_time(turns[..., self.turning, :].to(x), self.form, "quaternion")
         place = [positions[..., skeleton.root, :]] if self.root else []
-        seen[WHOLE] = torch.cat([*place, in_time(found, self.form).flatten(-2)], -1)
+        seen[WHOLE] = torch.cat([*place, found.flatten(-2)], -1)
         seen[LENGTHS] = (beside or {}).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
         return seen
 

@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -51,6 +51,7 @@ class Input:
         return tuple(lag for low, high in self.relation.intervals for lag in range(int(low), int(high) + 1))
 
 
+Result = TypeVar("Result")
 _ONCE: ContextVar[dict[Any, Any] | None] = ContextVar("once", default=None)
 
 
@@ -67,8 +68,8 @@ def computing_once() -> Iterator[None]:
         _ONCE.reset(token)
 
 
-def once(module: nn.Module, inputs: Sequence[Tensor | None], compute: Callable[[], Tensor]) -> Tensor:
-    """compute(), or its result for the same module and the same input tensors within `computing_once`.
+def once(module: nn.Module, inputs: Sequence[Any], compute: Callable[[], Result]) -> Result:
+    """compute(), or its result for the same module and the very same inputs within `computing_once`.
 
     Factors that share a module (SRNN's h_t) then evaluate it once, without knowing of each other.
     """
@@ -78,7 +79,7 @@ def once(module: nn.Module, inputs: Sequence[Tensor | None], compute: Callable[[
     key = _key(module, inputs)
     if key not in kept:
         kept[key] = (inputs, compute())  # the inputs are held, so that their ids stay theirs
-    result: Tensor = kept[key][1]
+    result: Result = kept[key][1]
     return result
 
 
@@ -89,7 +90,7 @@ def keep(module: nn.Module, inputs: Sequence[Tensor | None], result: Tensor) -> 
         kept[_key(module, inputs)] = (inputs, result)
 
 
-def _key(module: nn.Module, inputs: Sequence[Tensor | None]) -> tuple[Any, ...]:
+def _key(module: nn.Module, inputs: Sequence[Any]) -> tuple[Any, ...]:
     return id(module), torch.is_grad_enabled(), *map(id, inputs)
 
 

@@ -25,6 +25,7 @@ from ..laws.base import LawSpec
 from ..laws.families import Normal, StandardNormal
 from ..laws.subset import Subset
 from ..networks import NetworkSpec, Recurrent
+from ..networks.base import once
 from ..notation import Factor, Factorization, check_pair
 from ..relations import MaskFunction
 from ..turns import alone
@@ -453,7 +454,8 @@ class DynamicalVAE(nn.Module):
             ValueError: names that the model does not have, a mask of nothing, or data that the view cannot show.
         """
         means = {name: units.mean for name, units in self.units.items()}
-        data = self.reader.read(batch, like(self).dtype, means)
+        # by guide and model both, but for what they share
+        data = dict(once(self, [batch], lambda: self.reader.read(batch, like(self).dtype, means)))
         for name in [name for name in self.shared if name not in data]:
             law = self.shared[name].distribution(self.sizes[name], curriculum)
             size = next((len(value) for value in data.values() if isinstance(value, Tensor)), size)

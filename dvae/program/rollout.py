@@ -209,11 +209,14 @@ class Rollout:
         """
         if not self.hidden:
             return {}
-        gradient = any(hidden.detached is not hidden.entries for hidden in self.hidden.values())
-        with torch.set_grad_enabled(gradient and torch.is_grad_enabled()):
+        with torch.set_grad_enabled(self._fed_with_gradient and torch.is_grad_enabled()):
             while self._block[name] in self._unfed:  # blocks read themselves and earlier ones
                 self._fed.update(self._feed(self._unfed.pop(0)))
         return self._fed
+
+    @cached_property
+    def _fed_with_gradient(self) -> bool:
+        return any(hidden.detached is not hidden.entries for hidden in self.hidden.values())
 
     @cached_property
     def hidden(self) -> dict[str, Hidden]:
@@ -313,11 +316,11 @@ class Rollout:
                     value = value * self._valid[:, t]  # type: ignore[index]
                 drawn[name][t] = value
         values = {name: self._hide(torch.stack(drawn[name], dim=1)) for name in live}
-        if hidden is None:
+        if hidden is None or self._fed_with_gradient:  # by which the data are scored too
             for name in live:
                 in_time = evaluated[name] if block.direction >= 0 else evaluated[name][::-1]
                 stacked = tuple(torch.stack(p, dim=1) for p in zip(*in_time, strict=True))
-                self._evaluated[name] = (values[name], stacked)
+                self._evaluated[name] = (values[name] if hidden is None else self.values[name], stacked)
         return values
 
     def _continue(self, name: str, steps: int | slice, value: Tensor) -> Tensor:

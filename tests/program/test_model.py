@@ -16,7 +16,7 @@ from pyro.infer import Predictive, Trace_ELBO
 from dvae import DynamicalVAE, laws
 from dvae.inference.bounds import SequenceELBO
 from dvae.networks import Attention, Dense, Linear, Recurrent
-from dvae.program.batch import in_chunks, rows
+from dvae.program.batch import Reader, in_chunks, rows
 from dvae.program.reference import reference
 from dvae.program.rollout import SelfFeeding
 from dvae.testing.strategies import factorizations
@@ -512,6 +512,23 @@ def test_gradients_flow_back_in_time_through_fed_means():
     detached = gradients(SelfFeeding(1.0, gradient=False))
     torch.testing.assert_close(loop, passes, rtol=1e-9, atol=1e-9)
     assert any(not torch.allclose(a, b) for a, b in zip(loop, detached, strict=True) if a is not None)
+
+
+def test_a_loop_on_own_means_is_what_the_data_are_scored_by(monkeypatch):
+    """Their network runs through time once, and not a second time over what that made."""
+    model = build("srnn")
+    x = draw(model)["x"]
+    expected = SequenceELBO().terms(model, x, self_feeding=SelfFeeding(1.0, passes=T)).log_likelihood["x"].shape
+    monkeypatch.setattr(model.generator["x"].network, "forward", None)
+    assert SequenceELBO().terms(model, x, self_feeding=1.0).log_likelihood["x"].shape == expected
+
+
+def test_guide_and_model_read_a_batch_once(monkeypatch):
+    model, read, seen = build("srnn"), Reader.read, []
+    x = draw(model)["x"]
+    monkeypatch.setattr(Reader, "read", lambda self, batch, *rest: seen.append(batch is x) or read(self, batch, *rest))
+    SequenceELBO().terms(model, x)
+    assert sum(seen) == 1
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,42 @@
+"""Speed of Mix-and-Match at the preset for small sets and 15 + 60 frames: `python benchmarks/mix_and_match.py`.
+
+    feeding    a training step (32 windows of quaternions; forward, backward, Adam) in which the decoder reads its own
+               poses, against one in which it reads the true ones, whose loop is torch's
+    step       seconds of the first
+
+Motion is simulated. Times are the least of several, in turns with what they compare to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from speed import report, seconds, start, training_step
+
+import dvae
+from dvae import motion
+
+TARGETS = {"feeding": ("at most", 1.75)}
+
+
+def main() -> None:
+    start(__doc__)
+    protocol = replace(motion.PROTOCOLS["simulated"], representation="quaternion")
+    windows = motion.windows(motion.simulate(), protocol, "train")
+    method = dvae.method("mix-and-match").suited(windows)
+    model = method.build(windows)
+    objective, bound = method.train(windows).objective, dvae.SequenceELBO()
+    batch = windows.sample(32, torch.Generator().manual_seed(0))
+    own, true = seconds(
+        *(
+            training_step(model, lambda p=p: objective(bound.terms(model, batch, self_feeding=p), 1000))
+            for p in (1.0, 0.0)
+        ),
+        repeat=5,
+    )
+    report({"feeding": own / true, "step": own}, TARGETS)
+
+
+if __name__ == "__main__":
+    main()
