@@ -26,6 +26,10 @@ those at the pelvis and has angles along chains of its own choice. The *bone-len
 frames. Bones that are shorter than `SHORTEST` in some window, whose ends some files have at one place, are in none of
 these, and a note says how many.
 
+*Jerk* is the mean over frames, joints and futures of the length of the third derivative of a joint's place, by third
+differences, in m/s³: that of a motion that shakes, or that does not go on as it was, is high, and that of one without
+movement low. The last three observed frames belong to it; that of real motion is in the table's notes.
+
 A classifier adds two scores under its name (Bie et al. 2022, arXiv:2204.01565). *ACC* is the share of the K futures
 that it gives the window's true class. *FID* is the Fréchet distance between its features of the true futures and of all
 K generated ones of all windows together, a number of the whole set, whose standard error is a jackknife over clips
@@ -51,6 +55,9 @@ from .energies import pose_prior_energy
 from .exchange import Exchanged
 from .protocols import Windows
 from .skeleton import SHORTEST, Skeleton
+
+SEAM = 3
+"""Observed frames of which the jerk of a future is, too, so that it has that of the seam."""
 
 
 def scores(
@@ -88,6 +95,8 @@ def scores(
     found += [_bone_length_error(windows, *bones), *_limbs(windows, *bones)]
     if windows.protocol.predicted > 1:
         found.append(_cumulative_motion(windows))
+    if windows.protocol.observed + windows.protocol.predicted > SEAM:
+        found.append(_jerk(windows))
     if pose_prior is not None:
         found.append(_pose_nll(pose_prior, windows.protocol.observed))
     judged = [_judged(name, classifier, windows) for name, classifier in sorted((classifiers or {}).items())]
@@ -272,6 +281,25 @@ def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
         note=f"CMD: {what}, against the pace of their true futures",
         basis={"CMD": {"label": label, "classes": names}},
     )
+
+
+def _jerk(windows: Windows | Exchanged) -> Measure:
+    """How joints shake, the seam included."""
+    body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
+    start = max(windows.protocol.observed - SEAM, 0)
+
+    def jerk(x: Tensor) -> Tensor:
+        """(...) of frames (..., T, D)."""
+        change: Tensor = body(x).unflatten(-1, (-1, 3)).diff(n=3, dim=-3) * windows.protocol.fps**3
+        return mean_of_known(change.norm(dim=-1), (-2, -1))
+
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        seen = gapped(past)[:, start:, None].expand(-1, -1, forecasts.shape[1], -1).transpose(1, 2)
+        return mean_of_known(jerk(torch.cat([seen, forecasts.masked_fill(truth[:, None].isnan(), torch.nan)], 2)), 1)
+
+    real = mean_of_known(jerk(gapped(windows.all())[:, start:]), 0)
+    note = f"jerk: {real:.1f} m/s³ of real motion"
+    return Measure("jerk", function, "m/s³", "", partial=windows.missing, note=note)
 
 
 def _pose_nll(prior: Any, observed: int) -> Measure:

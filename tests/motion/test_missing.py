@@ -15,7 +15,7 @@ from dvae import motion
 from dvae.cli import main
 from dvae.cli.app import COMMANDS, command
 from dvae.cli.console import Missing
-from dvae.data import bridged, gapped
+from dvae.data import bridged, gapped, past_of
 from dvae.inference import metrics
 from dvae.inference.checks import STATISTICS, Statistic
 from dvae.inference.held import clip_places
@@ -344,6 +344,18 @@ def test_scores_of_bodies_are_of_what_was_observed():
     for name in errors:
         assert measures[name].function(*args).abs().max() < (0.1 if "angle" in name else 1e-4), name
     assert measures["limb stretch"].function(1.1 * args[0], *args[1:]).sub(0.1).abs().max() < 1e-4
+
+
+def test_jerk_is_of_what_was_observed():
+    windows = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")
+    observed, x = windows.protocol.observed, gapped(windows.all())
+    (measure,) = (each for each in motion.scores(windows) if each.name == "jerk")
+    past, truth = past_of(windows.all(), observed), x[:, observed:]
+    forecasts = torch.randn(len(x), 3, *truth.shape[1:])
+    found = measure.function(forecasts, truth, past, torch.arange(len(x)))
+    anywhere = torch.where(truth[:, None].isnan(), 9.0, forecasts)
+    assert found.isfinite().all()
+    assert torch.equal(measure.function(anywhere, truth, past, torch.arange(len(x))), found)
 
 
 def test_cumulative_motion_is_of_joints_that_were_observed():

@@ -692,3 +692,14 @@ class TestRealData:
         best = torch.stack([errors.mean(-1).amin(1), errors[..., -1].amin(1)])
         spread = best.std(1) / best.shape[1] ** 0.5
         assert ((best.mean(1) - torch.tensor(neighbours)).abs() < 3 * spread).all()
+
+
+def test_what_a_set_says_of_itself_is_short():
+    """In a notebook or a traceback, and without the numbers."""
+    people = simulate(clips=2, frames=40)
+    assert (
+        repr(people)
+        == f"MotionSet({people.name}: 2 clips, 80 frames of {people.skeleton.joints} joints at 30 a second)"
+    )
+    clip = people.with_rotations().clips[0]
+    assert repr(clip) == f"Clip({clip.split}/{clip.name}: 40 frames of {people.skeleton.joints} joints, with rotations)"

@@ -170,8 +170,34 @@ def test_apde_is_of_windows_that_share_a_last_pose(windows, futures):
         assert found.get("APDE") == (pytest.approx(np.mean(errors), rel=1e-4) if errors else None)
 
 
+def test_jerk_is_the_third_derivative_and_counts_the_seam(windows):
+    (measure,) = (each for each in motion.scores(windows) if each.name == "jerk")
+    x, index, fps = windows.all()["x"].double(), torch.arange(len(windows)), PROTOCOL.fps
+    times = torch.arange(10, dtype=torch.float64)[:, None] / fps
+
+    def jerk(path):
+        """Of a pose of which all joints go along a path (10, 3), m."""
+        whole = x[:, :1] + path.repeat(1, x.shape[-1] // 3)
+        past, future = whole[:, :4], whole[:, None, 4:].repeat(1, 3, 1, 1)
+        found = measure.function(future, future[:, 0], {"x": past}, index)
+        torch.testing.assert_close(found, found[:1].expand(len(x)))
+        return found[0].item()
+
+    assert jerk(torch.cat([times, times**2, 0 * times], -1)) == pytest.approx(0, abs=1e-6)
+    assert jerk(torch.cat([0 * times, 2 * times**3, 0 * times], -1)) == pytest.approx(12)
+    leap = torch.zeros(10, 3, dtype=torch.float64)
+    leap[4:] = 0.1  # between the last observed frame and the first of the future: by 1, -2, 1 in six third differences
+    assert jerk(leap) == pytest.approx(0.1 * 3**0.5 * fps**3 * 4 / 6)
+    real = np.linalg.norm(np.diff(windows.positions(x)[:, 1:, 1:].numpy(), 3, axis=1), axis=-1).mean() * fps**3
+    assert measure.note == f"jerk: {real:.1f} m/s³ of real motion"
+
+
 def test_one_predicted_frame_has_no_steps(windows):
     short = motion.windows(motion.simulate(clips=4, frames=40, test=0.5), replace(PROTOCOL, predicted=1), "test")
     names = {measure.name for measure in _measures(motion.scores, short)}
     assert {"limb stretch", "limb-angle error"} <= names
     assert not {"limb jitter", "CMD"} & names
+    assert "jerk" in names  # with the seam there are four frames
+    once = replace(PROTOCOL, observed=1, predicted=2)
+    short = motion.windows(motion.simulate(clips=4, frames=40, test=0.5), once, "test")
+    assert "jerk" not in {measure.name for measure in _measures(motion.scores, short)}

@@ -333,7 +333,7 @@ def test_the_record_says_which_classifier(fitted):
     result = evaluate(test, {"b": fitted, "a": classifier()})
     assert fitted.training
     fitted.eval()
-    assert list(result.metrics)[-6:] == ["limb-angle error", "CMD", "ACC a", "ACC b", "FID a", "FID b"]
+    assert list(result.metrics)[-7:] == ["limb-angle error", "CMD", "jerk", "ACC a", "ACC b", "FID a", "FID b"]
     document = json.loads(result.to_json())
     used = {name: document["basis"][f"classifier {name}"] for name in "ab"}
     assert used["b"].keys() == {"label", "classes", "weights", "unknown"}
