@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from rich.console import Group, RenderableType
+from typing_extensions import override
 
 from ..inference.result import Table  # which shows what files say as it is
 from .kinematics import inverse, rest
@@ -49,6 +50,11 @@ class Clip:
     labels: Mapping[str, str] = field(default_factory=dict)
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     rotations: np.ndarray | None = None
+
+    @override
+    def __repr__(self) -> str:
+        turns = "" if self.rotations is None else ", with rotations"
+        return f"Clip({self.split}/{self.name}: {self.frames} frames of {self.positions.shape[1]} joints{turns})"
 
     @property
     def key(self) -> tuple[str, str]:
@@ -218,6 +224,12 @@ class MotionSet:
             raise ValueError(f"{what}: clip {'/'.join(twice[0])} is there twice")
         fields = {"clips": tuple(single), "skeleton": skeleton, "name": name, "skipped": tuple(left_out)}
         vars(self).update(fields, said=said, missing=missing, _index={clip.key: clip for clip in single})
+
+    @override
+    def __repr__(self) -> str:
+        frames, skeleton = sum(clip.frames for clip in self), self.skeleton
+        what = f"{len(self)} clips, {frames} frames of {skeleton.joints} joints at {skeleton.fps:g} a second"
+        return f"MotionSet({self.name or 'no name'}: {what})"
 
     def __len__(self) -> int:
         return len(self.clips)
