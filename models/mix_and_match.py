@@ -82,13 +82,13 @@ class MixAndMatchMotion(PoseMethod):
     source = "Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733"
     generative, inference = EQUATIONS["mix"]
     representation: ClassVar[str] = "quaternion"
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"human36m": {"width": 1024}, "": {"width": 256}}
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"human36m": {"width": 1024}, "": {"width": 128}}
 
     noise: Literal["mix", "concatenate", "add", "step"] = "mix"
     alpha: Share = 0.5
     width: Size | None = None
     latent: Size | None = None
-    scale: Positive = 0.1
+    scale: Positive = 0.01
     skeleton: Amount = 1.0
     velocity: bool = False
     curriculum: Share = 0.5
