@@ -58,7 +58,7 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
     import roma
 
     if form == "quaternion":
-        return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit(values)))
+        return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(normalised(values)))
     if form == "vector":
         return roma.rotvec_to_rotmat(values)
     if form == "6d":
@@ -96,7 +96,7 @@ def from_matrix(rotations: Tensor, form: str) -> Tensor:
     return roma.rotmat_to_euler(form[-3:].upper(), rotations)
 
 
-def unit(quaternions: Tensor) -> Tensor:
+def normalised(quaternions: Tensor) -> Tensor:
     """(..., 4) of unit length; unturned where they are shorter than rounding."""
     none = quaternions.norm(dim=-1, keepdim=True) < torch.finfo(quaternions.dtype).eps
     quaternions = torch.where(none, quaternions.new_tensor([1.0, 0, 0, 0]), quaternions)
@@ -130,7 +130,7 @@ def in_time(rotations: Tensor, form: str, given: str = "matrix") -> Tensor:
         given: "matrix" or "quaternion".
     """
     if given == form == "quaternion":
-        values = unit(rotations)
+        values = normalised(rotations)
     else:
         values = from_matrix(rotations if given == "matrix" else to_matrix(rotations, given), form)
     if form == "quaternion":

@@ -51,7 +51,7 @@ class Input:
         return tuple(lag for low, high in self.relation.intervals for lag in range(int(low), int(high) + 1))
 
 
-Result = TypeVar("Result")
+Computed = TypeVar("Computed")
 _ONCE: ContextVar[dict[Any, Any] | None] = ContextVar("once", default=None)
 
 
@@ -68,7 +68,7 @@ def computing_once() -> Iterator[None]:
         _ONCE.reset(token)
 
 
-def once(module: nn.Module, inputs: Sequence[Any], compute: Callable[[], Result]) -> Result:
+def once(module: nn.Module, inputs: Sequence[Any], compute: Callable[[], Computed]) -> Computed:
     """compute(), or its result for the same module and the very same inputs within `computing_once`.
 
     Factors that share a module (SRNN's h_t) then evaluate it once, without knowing of each other.
@@ -79,7 +79,7 @@ def once(module: nn.Module, inputs: Sequence[Any], compute: Callable[[], Result]
     key = _key(module, inputs)
     if key not in kept:
         kept[key] = (inputs, compute())  # the inputs are held, so that their ids stay theirs
-    result: Result = kept[key][1]
+    result: Computed = kept[key][1]
     return result
 
 
