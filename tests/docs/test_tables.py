@@ -16,6 +16,7 @@ from benchmarks.tables import (
     gsps,
     hit_dvae,
     house,
+    mix_and_match,
     occlusion,
     overview,
     pages,
@@ -130,6 +131,40 @@ def test_hit_dvae(folder, page):
     hit_dvae.main(run, (evaluated(folder, "full", runs=[run]),), page, count=2, seconds=2.0)
     *_, seconds = tables(page)
     assert [row[0] for row in seconds[1:]] == ["1", "2"]
+
+
+def test_mix_and_match(tmp_path, page, monkeypatch):
+    """Fitted and scored once, whatever is asked again; two alphas make a curve."""
+    monkeypatch.setattr(mix_and_match, "BODY", motion.WALKER.names)
+    monkeypatch.setattr(mix_and_match, "OPTIONS", {"width": 8})
+    monkeypatch.setattr(mix_and_match, "JUDGED", {"width": 4})
+    monkeypatch.setattr(mix_and_match, "TUNING", mix_and_match.RAW)
+    named = {name: mix_and_match.NAMED[name] for name in ("mix", "mix, velocity", "no noise")}
+    alphas = {name: mix_and_match.SWEEP[name] for name in ("alpha 0.1", "alpha 0.3")}
+    sections = {
+        name: mix_and_match.Section(mix_and_match.RAW, c)
+        for name, c in {mix_and_match.RAW: named, "alpha": alphas}.items()
+    }
+    monkeypatch.setattr(mix_and_match, "SECTIONS", sections)
+    motion.write_motion(tmp_path / "bvh", motion.simulate(clips=2, frames=240, seed=1), "bvh")
+    budget = mix_and_match.Budget(2, 20, 3, 8, 2, 3, 5, 2)
+    options = {"raw": tmp_path / "bvh", "runs": tmp_path / "runs", "page": page, "budget": budget}
+    mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
+    first, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
+    times = [file.stat().st_mtime_ns for file in files]
+    mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
+    assert page.read_text() == first
+    assert [file.stat().st_mtime_ns for file in files] == times
+    (tmp_path / "runs" / mix_and_match.RAW / "mix-0" / mix_and_match.MEASURED).unlink()
+    mix_and_match.main(sections=(mix_and_match.RAW,), cases=("mix",), seeds=(0, 1), **options)
+    ways, angles, swept = tables(page)
+    assert [row[0] for row in ways[1:]] == ["zero velocity", "mix", "mix, velocity", "no noise"]
+    assert all(float(row[4].split()[0]) == 0 for row in ways[1:] if row[0] in ("zero velocity", "no noise"))
+    assert all(float(row[4].split()[0]) > 0 for row in ways[1:] if "mix" in row[0])
+    counts = [["mix, velocity", "1"], ["mix, velocity", "5"], ["no noise", "1"]]
+    assert [row[:2] for row in angles[1:]] == [["zero velocity", "1"], ["mix", "1"], *counts]
+    assert [row[0] for row in swept[1:]] == ["alpha 0.1", "alpha 0.3"]
+    assert page.with_suffix(".png").stat().st_size > 10_000
 
 
 def test_rotations(folder, page):

@@ -1,0 +1,421 @@
+"""Fits and scores what docs/results/mix_and_match.md compares, how noise enters a forecast, and writes its tables.
+
+Every run has a directory under `--runs`, and measured.json in it: the script goes on where it was stopped, skips what
+is there, and two of it may work on other seeds at once (`--seeds 0`, `--seeds 1 2`). Tables are of what is there.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from torch.distributions import Normal
+
+import dvae
+from dvae import motion
+from dvae.data import past_of
+from dvae.inference.comparison import Crossed, Estimate
+from dvae.inference.probe import Redrawn
+from dvae.inference.result import canvas
+from dvae.inference.scores import Measure
+from dvae.models.codes import CodeDiversity
+from dvae.motion.euler import COUNTS, TIMES, euler_errors
+from dvae.motion.judges.quality import STILL, RealOrMade, quality
+from dvae.program.batch import rows
+
+from .pages import DOCS, table, write
+
+NAMED: dict[str, dict[str, Any]] = {
+    "mix": {},
+    "concatenate": {"noise": "concatenate"},
+    "add": {"noise": "add"},
+    "step": {"noise": "step", "scale": 0.1},
+    "mix, velocity": {"velocity": True},
+    "no noise": {"alpha": 0.0},
+    "no noise, velocity": {"alpha": 0.0, "velocity": True},
+}
+"""What is compared on all data. "mix" has alpha = 1/2, and a curriculum over half of the steps."""
+ALPHAS = (0.1, 0.3, 0.5, 0.7, 0.9)
+TUNING = "bandai2-tuning"
+OPTIONS: dict[str, Any] = {"width": 128, "scale": 0.01}
+"""Of all runs, chosen on the tuning protocol; others are those of the method."""
+TRAINING: dict[str, Any] = {"batch_size": 32, "learning_rate": 2e-3, "decay": 0.5}
+JUDGED: dict[str, Any] = {"width": 64}
+JUDGE: dict[str, Any] = {"optimizer": "adam", "learning_rate": 2e-3, "momentum": 0.0, "batch_size": 128}
+PROBE = {"z": Normal(50.0, 50**0.5)}
+SCORES = ("APD", "ADE", "FDE", "jerk")
+OURS, PROBED, FITTED, MEASURED = "ours", "probed", "fitted.json", "measured.json"
+BODY = (
+    *("hip", "abdomen", "chest", "neck", "head"),
+    *(side + joint for side in "lr" for joint in ("Collar", "Shldr", "ForeArm", "Hand")),
+    *(side + joint for side in "lr" for joint in ("Buttock", "Thigh", "Shin", "Foot", "FootEnd")),
+)
+"""Joints of cgspeed's conversion of CMU's recordings, without eyes and fingers."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a run may cost.
+
+    Args:
+        steps: of training.
+        every: test windows of bandai2, each so many-th.
+        samples: futures of each.
+        examples: windows of each kind that a judge of quality is fitted to.
+        judged: steps of its optimiser.
+        observations: whose codes are watched.
+        futures: of "mix, velocity", the most of whose errors of angles the best is taken; of others it is the samples.
+        thinned: of these windows each so many-th has errors of angles.
+    """
+
+    steps: int = 1000
+    every: int = 10
+    samples: int = 50
+    examples: int = 4000
+    judged: int = 400
+    observations: int = 50
+    futures: int = 500
+    thinned: int = 4
+
+
+def swept(alpha: float, curriculum: bool) -> str:
+    """The name of a case of the sweep over alpha."""
+    return f"alpha {alpha:g}" if curriculum else f"alpha {alpha:g}, no curriculum"
+
+
+SWEEP = {
+    swept(alpha, curriculum): {"alpha": alpha, **({} if curriculum else {"curriculum": 0.0})}
+    for curriculum in (True, False)
+    for alpha in ALPHAS
+}
+WEIGHTS = {
+    f"{way}, scale {scale:g}": {**NAMED[way], "scale": scale}
+    for way, scales in {"mix": (0.03, 0.1, 0.3), "concatenate": (0.03, 0.1, 0.3), "step": (0.01, 0.3, 1.0)}.items()
+    for scale in scales
+}
+"""What the weight of the KL does, 2 scale^2 / D beside mean squared errors of D numbers."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """What the page compares with one another.
+
+    Args:
+        protocol: of the windows.
+        cases: name to options.
+        share: of the steps of training.
+    """
+
+    protocol: str
+    cases: Mapping[str, Mapping[str, Any]]
+    share: float = 1.0
+
+    def steps(self, budget: Budget) -> int:
+        """Of a run."""
+        return max(round(self.share * budget.steps), 1)
+
+
+RAW = "cmu-bvh"
+SECTIONS = {
+    TUNING: Section(TUNING, NAMED),
+    "bandai2-by-style": Section("bandai2-by-style", NAMED),
+    RAW: Section(RAW, NAMED, 0.5),
+    "alpha": Section(TUNING, SWEEP, 0.5),
+    "weight of the KL": Section(TUNING, WEIGHTS),
+}
+
+
+def recorded(path: Path) -> motion.MotionSet:
+    """Turns as files have them: clips of BVH at 30 frames a second, of each the last third for test.
+
+    The rest pose that they start in, and the frames that settle out of it, are left out. Headers give all clips 120
+    frames a second, which is twice too many for salsa_10 (see the notes of the data).
+    """
+    people = [
+        motion.read_motion(file, joints=BODY, fps=60 if file.stem == "salsa_10" else None).resampled(30)
+        for file in sorted(path.rglob("*.bvh"))
+    ]
+    if not people:
+        sys.exit(f"there is no .bvh file in {path}")
+    clips = [clip.between(3, clip.frames) for each in people for clip in each]
+    return replace(people[0], clips=clips, name=RAW).divided(1 / 3, 75)
+
+
+def windows(name: str, data: Path | None, raw: Path | None, every: int) -> dict[str, motion.Windows]:
+    """Training and test windows under a protocol; none where there are no data."""
+    if name == RAW:
+        cut = replace(motion.PROTOCOLS["cmu8"], name=name, train_stride=1, test_stride=2)
+    else:
+        cut = motion.PROTOCOLS[name]
+        cut = replace(cut, test_stride=every * cut.test_stride)
+    file = raw if name == RAW else data
+    if file is None:
+        return {}
+    people = recorded(file) if name == RAW else motion.read_motion(file)
+    cut = replace(cut, representation="quaternion")
+    return {split: motion.windows(people, cut, split) for split in ("train", "test")}
+
+
+def folder(name: str) -> str:
+    """Of a section, or a case."""
+    return name.replace(", ", "-").replace(" ", "-")
+
+
+def fitted(
+    options: Mapping[str, Any], windows: Mapping[str, motion.Windows], seed: int, out: Path, budget: Budget
+) -> tuple[Any, dict[str, Any]]:
+    """A model, fitted, or gone on with where it was stopped; and what was seen on the way."""
+    method = dvae.method("mix-and-match", **{**OPTIONS, **options})
+    torch.manual_seed(seed)
+    model = method.build(windows["train"])
+    test = windows["test"]
+    some = torch.linspace(0, len(test) - 1, min(budget.observations, len(test))).long()
+    watch = CodeDiversity(rows(past_of(test.all(), test.protocol.observed), some), every=max(budget.steps // 15, 1))
+    start = time.process_time()
+    result = method.train(windows["train"], None, budget.steps).fit(
+        model,
+        out=out,
+        resume=(out / "state.json").exists(),
+        seed=seed,
+        callbacks=[watch],
+        progress=False,
+        validate_every=max(budget.steps // 3, 1),
+        config=method.config(),
+        **TRAINING,
+    )
+    if (out / FITTED).exists():
+        return model.eval(), json.loads((out / FITTED).read_text())
+    steps, diversity = result.series("codes/diversity")
+    late = [row["kl/z"] for row in result.history if "kl/z" in row and row["step"] > 0.9 * budget.steps]
+    seen = {
+        "seconds": time.process_time() - start,
+        "steps": steps,
+        "codes": {"diversity": diversity, "deviation": result.series("codes/deviation")[1]},
+        "KL": float(np.mean(late)) if late else None,
+    }
+    (out / FITTED).write_text(json.dumps(seen))
+    return model.eval(), seen
+
+
+def some_scores(held: Any) -> list[Measure]:
+    """Those of motion that the tables have."""
+    return [measure for measure in motion.scores(held) if measure.name in SCORES]
+
+
+def measured(case: str, model: Any, windows: Mapping[str, motion.Windows], seed: int, budget: Budget) -> dict[str, Any]:
+    """Scores of a run by clip, and in the runs of "mix" those of zero velocity."""
+    test, noise, full = windows["test"], not case.startswith("no noise"), case in NAMED
+    models = {OURS: model, **({PROBED: Redrawn(model, PROBE)} if noise and full else {})}
+    options: dict[str, Any] = {"seed": seed, "progress": False}
+    samples = budget.samples if noise else 1
+    scored = dvae.evaluate(models, test, scores=some_scores, samples=samples, batch_size=64, **options)
+    judged = quality(
+        {OURS: model},
+        windows["train"],
+        test,
+        method=RealOrMade(**JUDGED),
+        examples=budget.examples,
+        steps=budget.judged,
+        seeds=(seed,),
+        references=case == "mix",
+        **options,
+        **JUDGE,
+    )
+    most = budget.futures if case == "mix, velocity" else samples
+    counts = [count for count in COUNTS if count <= most]
+    fewer = test.with_protocol(replace(test.protocol, test_stride=budget.thinned * test.protocol.test_stride))
+    angles = euler_errors({OURS: model}, fewer, counts=counts, **options) if full else None
+    futures = {
+        name: {
+            **{score: row[score][0].tolist() for score in row},
+            **{score: list(scored.rows[name].clip_means[score]) for score in SCORES},
+        }
+        for name, row in judged.rows.items()
+    }
+    return {
+        "futures": {**futures, "clips": scored.clips},
+        "angles": {**{name: angles.rows[name].clip_means for name in futures}, "clips": angles.clips}
+        if angles
+        else None,
+        "jerk": next(note for note in scored.notes if note.startswith("jerk")),
+        PROBED: scored.ratio(PROBED, OURS, "APD").mean if PROBED in models else None,
+    }
+
+
+def run(
+    cases: Mapping[str, Mapping[str, Any]],
+    windows: Mapping[str, motion.Windows],
+    seeds: Sequence[int],
+    path: Path,
+    budget: Budget,
+) -> None:
+    """Fits and measures what is not there yet."""
+    for seed, (case, options) in itertools.product(seeds, cases.items()):
+        out = path / f"{folder(case)}-{seed}"
+        if not (out / MEASURED).exists():
+            model, seen = fitted(options, windows, seed, out, budget)
+            found = {**seen, **measured(case, model, windows, seed, budget)}
+            (out / MEASURED).write_text(json.dumps(found))
+            print(f"{out}: fitted in {seen['seconds']:.0f} s of processor time", flush=True)
+
+
+@dataclass(frozen=True)
+class Case:
+    """The runs of one way over seeds, or what a reference scores beside them."""
+
+    runs: list[dict[str, Any]]
+    row: str = OURS
+
+    @classmethod
+    def read(cls, path: Path, cases: Iterable[str]) -> dict[str, Case]:
+        """Those that are there, by name, behind zero velocity."""
+        found = {
+            case: [json.loads(file.read_text()) for file in sorted(path.glob(f"{folder(case)}-[0-9]*/{MEASURED}"))]
+            for case in cases
+        }
+        read = {case: cls(runs) for case, runs in found.items() if runs}
+        return {**({STILL: cls(found["mix"], STILL)} if found.get("mix") else {}), **read}
+
+    def estimate(self, score: str) -> Estimate:
+        """Mean over clips and seeds."""
+        part = "angles" if "ms" in score else "futures"
+        weights = np.array(list(self.runs[0][part]["clips"].values()))
+        return Crossed.of(np.array([run[part][self.row][score] for run in self.runs]), weights).estimate()
+
+    def said(self, score: str, digits: int = 3) -> str:
+        """Mean, and its errors over clips and over seeds."""
+        found = self.estimate(score)
+        return " ± ".join(
+            "–" if np.isnan(value) else f"{value:.{digits}f}" for value in (found.mean, found.sequences, found.seeds)
+        )
+
+    def interval(self, score: str) -> str:
+        """Of 95 %."""
+        low, high = self.estimate(score).interval()
+        return "–" if np.isnan(low) else f"{low:.1f} to {high:.1f}"
+
+    def number(self, *keys: str | int) -> str:
+        """The mean over seeds of one number of a run, and the least and the most."""
+        values: Any = self.runs if self.row == OURS else []
+        for key in keys:
+            values = [value[key] for value in values]
+        if None in values or not values:
+            return "–"
+        return f"{np.mean(values):.2f} ({min(values):.2f}, {max(values):.2f})"
+
+
+def scored(cases: Mapping[str, Case]) -> str:
+    """Ways down, scores across."""
+    header = ["", "quality (%)", "95 %", "taken for real (%)", "APD (m)", "ADE (m)", "FDE (m)", "jerk (m/s³)"]
+    header += ["codes, first", "codes, last", "KL (nats/frame)", "APD probed / as it is"]
+    lines = [
+        [
+            name,
+            case.said("quality", 1),
+            case.interval("quality"),
+            case.said("taken for real", 1),
+            *(case.said(score) for score in ("APD", "ADE", "FDE")),
+            case.said("jerk", 1),
+            *(case.number("codes", "diversity", place) for place in (0, -1)),
+            case.number("KL"),
+            case.number(PROBED),
+        ]
+        for name, case in cases.items()
+    ]
+    return table(header, lines)
+
+
+def angles(cases: Mapping[str, Case]) -> str:
+    """Ways and numbers of futures down, times across."""
+    lines = []
+    for name, case in cases.items():
+        counts = {"mix, velocity": COUNTS, STILL: (1,)}.get(name, (1, 50))
+        for count in counts:
+            if all(f"{TIMES[0]:g} ms, best of {count}" in run["angles"][case.row] for run in case.runs):
+                cells = [case.said(f"{time:g} ms, best of {count}", 2) for time in TIMES]
+                lines.append([name, str(count), *cells])
+    return table(["", "best of", *(f"{time:g} ms" for time in TIMES)], lines)
+
+
+def draw(cases: Mapping[str, Case], alphas: Mapping[str, Case], file: Path) -> None:
+    """Codes over training, one panel for each way; and quality against diversity."""
+    ways = {name: case for name, case in cases.items() if name in NAMED and case.runs[0]["codes"]["diversity"][-1] > 0}
+    figure = canvas(12, 3)
+    *panels, last = figure.subplots(1, len(ways) + 1)
+    for panel, (name, case) in zip(panels, ways.items(), strict=True):
+        for run in case.runs:
+            mean, spread = (np.array(run["codes"][key]) for key in ("diversity", "deviation"))
+            (line,) = panel.plot(run["steps"], mean)
+            panel.fill_between(run["steps"], mean - spread, mean + spread, color=line.get_color(), alpha=0.15, lw=0)
+        panel.set_ylim(0)
+        panel.set_title(f"{name}: codes", fontsize=9)
+        panel.set_xlabel("step")
+    for place, (label, curriculum) in enumerate((("curriculum", True), ("no curriculum", False))):
+        found = {alpha: alphas[name] for alpha in ALPHAS if (name := swept(alpha, curriculum)) in alphas}
+        points = [(case.estimate("APD").mean, case.estimate("quality").mean) for case in found.values()]
+        if points:
+            last.plot(*zip(*points, strict=True), marker="o", markersize=4, color=f"C{place}", label=f"alpha, {label}")
+            for alpha, point in zip(found, points, strict=True):
+                last.annotate(f"{alpha:g}", point, fontsize=7, xytext=(3, 3), textcoords="offset points")
+    for place, name in enumerate(name for name in ways if name != "mix"):
+        point = ways[name].estimate("APD").mean, ways[name].estimate("quality").mean
+        last.plot(*point, marker="s", linestyle="", color=f"C{place + 2}", label=name)
+    last.set_xlabel("APD (m)")
+    last.set_title("quality (%)", fontsize=9)
+    last.legend(fontsize=7)
+    figure.savefig(file, dpi=110)
+
+
+def main(
+    data: Path | None = None,
+    raw: Path | None = None,
+    runs: Path = Path("runs/mix-and-match"),
+    page: Path = DOCS / "results" / "mix_and_match.md",
+    sections: tuple[str, ...] = tuple(SECTIONS),
+    cases: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (0, 1, 2),
+    budget: Budget = Budget(),
+) -> None:
+    """Fit, score, and write the tables.
+
+    Args:
+        data: motion file with file groups (bandai2.npz); where it lacks, nothing is fitted for its protocols.
+        raw: folder of BVH files of CMU's recordings; likewise.
+        runs: where runs are kept.
+        page: where the tables stand.
+        sections: of the page, to fit.
+        cases: to fit, by name; all of a section where none is named.
+        seeds: of the runs to fit.
+        budget: what a run may cost.
+    """
+    torch.set_num_threads(1)
+    for name, section in ((name, SECTIONS[name]) for name in sections):
+        if found := windows(section.protocol, data, raw, budget.every):
+            chosen = {case: section.cases[case] for case in cases or section.cases}
+            run(chosen, found, seeds, runs / folder(name), replace(budget, steps=section.steps(budget)))
+    parts = []
+    there = {name: Case.read(runs / folder(name), section.cases) for name, section in SECTIONS.items()}
+    for name, read in ((name, read) for name, read in there.items() if read):
+        first = next(iter(read.values())).runs[0]
+        held, seconds = first["futures"]["clips"], [run["seconds"] for case in read.values() for run in case.runs]
+        said = (
+            f"{sum(held.values())} windows of {len(held)} clips; {first['jerk']}. {SECTIONS[name].steps(budget)} steps "
+        )
+        said += f"of training, {min(seconds):.0f} to {max(seconds):.0f} s of processor time."
+        parts += [f"### {name}\n", f"{said}\n", scored(read), *([angles(read)] if first["angles"] else [])]
+    write(page, *parts)
+    if there[TUNING]:
+        draw(there[TUNING], there["alpha"], page.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
