@@ -39,7 +39,7 @@ from ..inference.recipe import Recipe
 from ..inference.training import Stage
 from ..laws import Delta, Directions
 from ..motion import Skeleton, Windows, energies
-from ..motion.body import body_parts
+from ..motion.parts import body_parts
 from ..networks import GraphConv
 from ..notation import Factorization
 from ..options import Amount, Layers, Size

@@ -50,7 +50,7 @@ from ..inference.schedules import Ramp, Schedule
 from ..inference.training import Stage
 from ..laws import Directions
 from ..motion import Skeleton, energies
-from ..motion.body import body_parts
+from ..motion.parts import body_parts
 from ..motion.protocols import Poses
 from ..networks import Attention, FrameGraph, NetworkSpec, NodeGraph, Recurrent, SelfAttention
 from ..networks.extract import share

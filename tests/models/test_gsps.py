@@ -18,8 +18,8 @@ from dvae.inference.metrics import average_pairwise_distance
 from dvae.models.gsps import PRESETS, GSPSModel, part_by_part
 from dvae.models.registry import configured, judge
 from dvae.motion import energies
-from dvae.motion.body import LIMBS, body_parts
 from dvae.motion.judges.pose_prior import PosePriorModel, load_pose_prior
+from dvae.motion.parts import LIMBS, body_parts
 from dvae.networks import GraphConv
 from dvae.runs import directory as runs
 from dvae.testing import FactorizationContract

@@ -12,7 +12,7 @@ from dvae import motion
 from dvae.models.hit_dvae import PRESETS, HiTModel
 from dvae.models.registry import configured
 from dvae.motion import energies
-from dvae.motion.body import body_parts
+from dvae.motion.parts import body_parts
 from dvae.networks.graphs import NodeFeatures
 from dvae.runs import directory as runs
 
