@@ -6,6 +6,7 @@
 torch.Size([75, 48])
 """
 
+from . import bodies
 from .angles import AngleLimits, estimate_angle_limits
 from .criticism import draw_traversal, statistics
 from .data import Clip, MotionSet
@@ -43,6 +44,7 @@ __all__ = [
     "Skeleton",
     "Windows",
     "WithPseudoTruths",
+    "bodies",
     "displacements",
     "draw_traversal",
     "estimate_angle_limits",

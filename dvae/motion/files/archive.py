@@ -187,6 +187,11 @@ class Member:
     _archive: zipfile.ZipFile
     _info: zipfile.ZipInfo
 
+    @property
+    def size(self) -> int:
+        """Bytes that it unpacks to."""
+        return self._info.file_size
+
     def array(self) -> np.ndarray:
         """The array, of numbers or text.
 

@@ -1,0 +1,13 @@
+"""Bodies with a surface: linear blend skinning, a low-polygon person made by code, and files in the layout of `smplx`.
+
+>>> person = dvae.motion.bodies.human()
+>>> unturned = torch.eye(3).expand(2, 5, person.joints, 3, 3)
+>>> vertices, joints = person(torch.zeros(2, person.parameters_of_shape), unturned, torch.zeros(2, 5, 3))
+"""
+
+from .lofted import SHAPE, human
+from .measures import enclosed_volume, vertex_error
+from .skinning import Body
+from .smplx import read_body, write_body
+
+__all__ = ["SHAPE", "Body", "enclosed_volume", "human", "read_body", "vertex_error", "write_body"]

@@ -1,0 +1,326 @@
+"""A person made by code: closed parts lofted along the bones of SMPL's 22 joints, and eight parameters of shape.
+
+A part is a chain of rings of vertices, closed at either end about the ring's middle. Where a ring is, and how wide, is
+linear in the lengths of bones and in girths, and these in the parameters; so are vertices, whose changes are therefore
+blend shapes. About each joint lies a ring, of which the two vertices at its sides have the joint in their middle:
+that is the regressor.
+
+At 1, a parameter makes a person differ about as much as one in six does. These are numbers of ours, for a body that
+looks human, and not fitted to people. With all of them between -3 and 3, no part turns inside out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import pi
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..files.smpl import JOINTS, PARENTS
+from .measures import enclosed_volume
+from .skinning import Body
+
+SHAPE = ("size", "girth", "legs", "arms", "torso", "shoulders", "hips", "head")
+"""The parameters of shape, in order. Size is of everything, the head's of the head, girth of all else; legs, arms and
+torso are lengths, shoulders and hips are widths."""
+
+_SIZE = 0.04
+_LENGTHS = {  # parameter: share, along which axes, of which bones, named by their ends
+    "legs": (0.045, "xyz", ("Knee", "Ankle")),
+    "arms": (0.045, "xyz", ("Elbow", "Wrist", "Palm", "Fingers", "Thumb")),
+    "torso": (0.045, "y", ("Spine1", "Spine2", "Spine3", "Neck", "Collar")),
+    "shoulders": (0.06, "x", ("Collar", "Shoulder")),
+    "hips": (0.06, "x", ("Hip",)),
+    "head": (0.05, "xyz", ("Head", "Crown", "Nose")),
+}
+_GIRTHS = {  # parameter: share, of widths and depths, of rings of which parts, about bones that begin at
+    "girth": (0.1, 0.1, ("trunk", "leg", "arm"), ()),
+    "shoulders": (0.05, 0.0, ("trunk",), ("Spine2", "Spine3")),
+    "hips": (0.05, 0.0, ("trunk",), ("Pelvis",)),
+    "head": (0.05, 0.05, ("head", "nose"), ()),
+}
+
+_OFFSETS = {  # metres from the parent of a person of 1.7 m; of what there is twice, the left one, towards +x
+    "Hip": (0.088, -0.085, 0.0),
+    "Spine1": (0.0, 0.105, -0.01),
+    "Knee": (0.008, -0.395, 0.005),
+    "Spine2": (0.0, 0.12, 0.0),
+    "Ankle": (0.004, -0.395, -0.03),
+    "Spine3": (0.0, 0.06, 0.0),
+    "Foot": (0.012, -0.045, 0.125),
+    "Neck": (0.0, 0.205, -0.01),
+    "Collar": (0.065, 0.135, -0.005),
+    "Head": (0.0, 0.08, 0.015),
+    "Shoulder": (0.115, 0.015, -0.01),
+    "Elbow": (0.265, 0.0, -0.005),
+    "Wrist": (0.25, 0.0, 0.005),
+}
+_ENDS = {  # of bones beyond the last joint: the joint that they move with, and where they are from it
+    "Crown": ("Head", (0.0, 0.19, 0.01)),
+    "Nose": ("Head", (0.0, 0.045, 0.110)),
+    "Heel": ("Ankle", (0.0, -0.04, -0.055)),
+    "Toes": ("Foot", (0.004, -0.004, 0.085)),
+    "Palm": ("Wrist", (0.085, 0.0, 0.005)),
+    "Fingers": ("Wrist", (0.18, -0.004, 0.008)),
+    "Thumb": ("Wrist", (0.085, -0.005, 0.075)),
+}
+
+_BONES = {
+    name.removeprefix("L_"): (JOINTS[parent].removeprefix("L_"), _OFFSETS[name.removeprefix("L_")])
+    for name, parent in zip(JOINTS, PARENTS, strict=True)
+    if parent >= 0 and not name.startswith("R_")
+} | _ENDS
+"""In the middle and on the left, by what is at their ends: from where, and by how much."""
+
+
+class _Ring(NamedTuple):
+    """About a point of a bone.
+
+    Attributes:
+        start, end: of the bone.
+        along: where on the bone it is, 0 at its start and 1 at its end.
+        width: half of it, metres.
+        front, back: its depth in the direction of its second axis and against it, metres.
+    """
+
+    start: str
+    end: str
+    along: float
+    width: float
+    front: float
+    back: float
+
+
+class _Part(NamedTuple):
+    """A chain of rings.
+
+    Attributes:
+        around: vertices of a ring, an even number.
+        axes: of width and depth.
+        paired: whether there is one on the right, too; these numbers are the left one's.
+        rings: from one end to the other.
+    """
+
+    around: int
+    axes: str
+    paired: bool
+    rings: list[_Ring]
+
+
+# fmt: off
+_PARTS = {
+    "trunk": _Part(18, "xz", False, [
+        _Ring("Pelvis", "Spine1", -1.25, 0.110, 0.055, 0.085),
+        _Ring("Pelvis", "Spine1", -0.8, 0.170, 0.085, 0.125),
+        _Ring("Pelvis", "Spine1", -0.35, 0.174, 0.095, 0.132),
+        _Ring("Pelvis", "Spine1", 0.0, 0.166, 0.100, 0.118),
+        _Ring("Pelvis", "Spine1", 0.5, 0.150, 0.102, 0.090),
+        _Ring("Spine1", "Spine2", 0.0, 0.137, 0.102, 0.078),
+        _Ring("Spine1", "Spine2", 0.5, 0.133, 0.102, 0.080),
+        _Ring("Spine2", "Spine3", 0.0, 0.140, 0.107, 0.087),
+        _Ring("Spine3", "Neck", 0.0, 0.153, 0.116, 0.097),
+        _Ring("Spine3", "Neck", 0.25, 0.164, 0.123, 0.103),
+        _Ring("Spine3", "Neck", 0.5, 0.168, 0.115, 0.105),
+        _Ring("Spine3", "Neck", 0.7, 0.160, 0.090, 0.098),
+        _Ring("Spine3", "Neck", 0.85, 0.125, 0.066, 0.083),
+        _Ring("Spine3", "Neck", 0.94, 0.080, 0.055, 0.067),
+        _Ring("Neck", "Head", 0.0, 0.060, 0.054, 0.058),
+        _Ring("Neck", "Head", 0.5, 0.053, 0.056, 0.054),
+        _Ring("Head", "Crown", 0.0, 0.052, 0.058, 0.055),
+    ]),
+    "head": _Part(14, "xz", False, [
+        _Ring("Head", "Crown", -0.12, 0.032, 0.082, -0.005),
+        _Ring("Head", "Crown", 0.02, 0.052, 0.094, 0.050),
+        _Ring("Head", "Crown", 0.2, 0.065, 0.096, 0.078),
+        _Ring("Head", "Crown", 0.4, 0.072, 0.094, 0.092),
+        _Ring("Head", "Crown", 0.6, 0.076, 0.092, 0.098),
+        _Ring("Head", "Crown", 0.78, 0.072, 0.082, 0.094),
+        _Ring("Head", "Crown", 0.91, 0.055, 0.060, 0.074),
+        _Ring("Head", "Crown", 0.98, 0.030, 0.032, 0.042),
+    ]),
+    "nose": _Part(6, "xy", False, [
+        _Ring("Head", "Nose", 0.7, 0.015, 0.045, 0.010),
+        _Ring("Head", "Nose", 0.9, 0.015, 0.022, 0.012),
+        _Ring("Head", "Nose", 1.0, 0.009, 0.010, 0.010),
+    ]),
+    "leg": _Part(14, "xz", True, [
+        _Ring("Hip", "Knee", -0.07, 0.070, 0.065, 0.080),
+        _Ring("Hip", "Knee", 0.0, 0.084, 0.084, 0.108),
+        _Ring("Hip", "Knee", 0.14, 0.087, 0.090, 0.106),
+        _Ring("Hip", "Knee", 0.32, 0.080, 0.086, 0.088),
+        _Ring("Hip", "Knee", 0.6, 0.065, 0.073, 0.068),
+        _Ring("Hip", "Knee", 0.85, 0.054, 0.061, 0.055),
+        _Ring("Knee", "Ankle", 0.0, 0.052, 0.056, 0.050),
+        _Ring("Knee", "Ankle", 0.12, 0.051, 0.050, 0.056),
+        _Ring("Knee", "Ankle", 0.3, 0.052, 0.042, 0.072),
+        _Ring("Knee", "Ankle", 0.5, 0.046, 0.038, 0.062),
+        _Ring("Knee", "Ankle", 0.75, 0.035, 0.033, 0.044),
+        _Ring("Knee", "Ankle", 0.93, 0.032, 0.034, 0.040),
+        _Ring("Ankle", "Foot", 0.0, 0.034, 0.038, 0.040),
+    ]),
+    "foot": _Part(12, "xy", True, [
+        _Ring("Heel", "Foot", -0.07, 0.016, 0.018, 0.020),
+        _Ring("Heel", "Foot", 0.0, 0.028, 0.032, 0.028),
+        _Ring("Heel", "Foot", 0.15, 0.034, 0.050, 0.029),
+        _Ring("Heel", "Foot", 0.35, 0.036, 0.062, 0.028),
+        _Ring("Heel", "Foot", 0.6, 0.038, 0.050, 0.026),
+        _Ring("Foot", "Toes", 0.0, 0.045, 0.032, 0.024),
+        _Ring("Foot", "Toes", 0.4, 0.047, 0.021, 0.023),
+        _Ring("Foot", "Toes", 0.8, 0.038, 0.015, 0.021),
+        _Ring("Foot", "Toes", 1.0, 0.022, 0.011, 0.018),
+    ]),
+    "arm": _Part(12, "zy", True, [
+        _Ring("Collar", "Shoulder", 0.0, 0.052, 0.032, 0.060),
+        _Ring("Collar", "Shoulder", 0.5, 0.060, 0.046, 0.068),
+        _Ring("Shoulder", "Elbow", 0.0, 0.058, 0.046, 0.066),
+        _Ring("Shoulder", "Elbow", 0.18, 0.054, 0.045, 0.056),
+        _Ring("Shoulder", "Elbow", 0.45, 0.048, 0.042, 0.046),
+        _Ring("Shoulder", "Elbow", 0.8, 0.040, 0.036, 0.038),
+        _Ring("Elbow", "Wrist", 0.0, 0.039, 0.034, 0.036),
+        _Ring("Elbow", "Wrist", 0.2, 0.042, 0.036, 0.036),
+        _Ring("Elbow", "Wrist", 0.5, 0.036, 0.030, 0.030),
+        _Ring("Elbow", "Wrist", 0.85, 0.029, 0.022, 0.022),
+        _Ring("Wrist", "Palm", 0.0, 0.028, 0.020, 0.020),
+        _Ring("Wrist", "Palm", 0.4, 0.037, 0.018, 0.018),
+        _Ring("Palm", "Fingers", 0.0, 0.042, 0.015, 0.015),
+        _Ring("Palm", "Fingers", 0.5, 0.038, 0.011, 0.012),
+        _Ring("Palm", "Fingers", 0.85, 0.029, 0.008, 0.009),
+        _Ring("Palm", "Fingers", 1.0, 0.014, 0.005, 0.006),
+    ]),
+    "thumb": _Part(8, "xy", True, [
+        _Ring("Wrist", "Thumb", 0.2, 0.018, 0.013, 0.013),
+        _Ring("Wrist", "Thumb", 0.6, 0.016, 0.011, 0.011),
+        _Ring("Wrist", "Thumb", 0.9, 0.011, 0.008, 0.008),
+        _Ring("Wrist", "Thumb", 1.0, 0.006, 0.004, 0.004),
+    ]),
+}
+# fmt: on
+_MOST = 4
+"""Joints that a vertex goes with, at most."""
+
+_REACH = 0.015
+"""Metres by which a bone is further than the nearest one where a vertex goes with it e times less."""
+
+
+def human() -> Body:
+    """The person: SMPL's 22 joints, the parameters `SHAPE`, arms to the sides, and the pelvis at the origin.
+
+    Example:
+        >>> tall = human().at_rest(torch.tensor([2.0, 0, 0, 0, 0, 0, 0, 0]))[0]
+        >>> float(tall[:, 1].max() - tall[:, 1].min()) > 1.8
+        True
+    """
+    average = _vertices(torch.zeros(len(SHAPE), dtype=torch.float64))
+    changes = [_vertices(unit) - average for unit in torch.eye(len(SHAPE), dtype=torch.float64)]
+    faces, weights = [], []
+    regressor = torch.zeros(len(JOINTS), len(average))
+    first = 0
+    for name, side in _sided():
+        around, _, _, rings = part = _PARTS[name]
+        for place, ring in enumerate(rings):
+            joint = _joint(ring.start, side)
+            if joint is not None and ring.along == 0:
+                regressor[joint, [first + place * around, first + place * around + around // 2]] = 0.5
+        vertices = average[first : first + len(rings) * around + 2]
+        triangles = _triangles(len(rings), around)
+        faces.append(first + (triangles if enclosed_volume(vertices, triangles) > 0 else triangles.flip(-1)))
+        weights.append(_weights(part, side, vertices))
+        first += len(vertices)
+    shapes, shares = torch.stack(changes, -1).float(), torch.cat(weights).float()
+    return Body(JOINTS, PARENTS, average.float(), shapes, regressor, shares, torch.cat(faces))
+
+
+def _sided() -> list[tuple[str, str]]:
+    """Parts by name and side, in the order of vertices."""
+    return [(name, side) for name, part in _PARTS.items() for side in (("L_", "R_") if part.paired else ("",))]
+
+
+def _joint(name: str, side: str) -> int | None:
+    """The joint of a name on a side or in the middle; none for an end that is no joint."""
+    return next((JOINTS.index(known) for known in (name, side + name) if known in JOINTS), None)
+
+
+def _places(parameters: Tensor) -> dict[str, Tensor]:
+    """Of joints and ends in the middle and on the left, (3,) each."""
+    shape = dict(zip(SHAPE, parameters, strict=True))
+    places = {"Pelvis": parameters.new_zeros(3)}
+    for name, (parent, offset) in _BONES.items():
+        grown = (1 + _SIZE * shape["size"]).repeat(3)
+        for parameter, (share, axes, bones) in _LENGTHS.items():
+            if name in bones:
+                grown[["xyz".index(axis) for axis in axes]] += share * shape[parameter]
+        places[name] = places[parent] + grown * parameters.new_tensor(offset)
+    return places
+
+
+def _vertices(parameters: Tensor) -> Tensor:
+    """Those of a person with parameters (8,), (V, 3): of each part ring after ring, then the middles of both ends."""
+    places = _places(parameters)
+    found = []
+    for name, side in _sided():
+        part = _PARTS[name]
+        rings = [_ring(name, ring, places, parameters) for ring in part.rings]
+        whole = torch.cat([*rings, rings[0].mean(0, keepdim=True), rings[-1].mean(0, keepdim=True)])
+        found.append(whole * whole.new_tensor([-1.0, 1, 1]) if side == "R_" else whole)
+    return torch.cat(found)
+
+
+def _ring(name: str, ring: _Ring, places: Mapping[str, Tensor], parameters: Tensor) -> Tensor:
+    """The vertices of a ring of a part, (around, 3)."""
+    around, axes, *_ = _PARTS[name]
+    shape = dict(zip(SHAPE, parameters, strict=True))
+    grown = (1 + _SIZE * shape["size"]).repeat(2)  # width and depth
+    for parameter, (*shares, parts, bones) in _GIRTHS.items():
+        if name in parts and (not bones or ring.start in bones):
+            grown += shape[parameter] * parameters.new_tensor(shares)
+    angle = 2 * pi / around * torch.arange(around).to(parameters)
+    depth = torch.where(angle <= pi, ring.front, ring.back)
+    vertices = torch.lerp(places[ring.start], places[ring.end], ring.along).repeat(around, 1)
+    vertices[:, "xyz".index(axes[0])] += grown[0] * ring.width * angle.cos()
+    vertices[:, "xyz".index(axes[1])] += grown[1] * depth * angle.sin()
+    return vertices
+
+
+def _triangles(rings: int, around: int) -> Tensor:
+    """Of a chain of rings with a middle at either end, (F, 3)."""
+    place = torch.arange(rings * around).reshape(rings, around)
+    after = place.roll(-1, 1)
+    low, low_after, high, high_after = place[:-1], after[:-1], place[1:], after[1:]
+    ends = [torch.full((around,), rings * around + end) for end in (0, 1)]
+    triangles = [
+        torch.stack([low, high_after, low_after], -1).flatten(0, 1),
+        torch.stack([low, high, high_after], -1).flatten(0, 1),
+        torch.stack([ends[0], place[0], after[0]], -1),
+        torch.stack([ends[1], after[-1], place[-1]], -1),
+    ]
+    return torch.cat(triangles)
+
+
+def _weights(part: _Part, side: str, vertices: Tensor) -> Tensor:
+    """How much vertices (V, 3) of a part go with each joint (V, J), by their distances to what hangs from it.
+
+    They go with the joints about whose bones the part's rings lie, and with the one that the first of these hangs from.
+    """
+    places = _places(vertices.new_zeros(len(SHAPE)))
+    joints = list(dict.fromkeys(_BONES[ring.start][0] if ring.start in _ENDS else ring.start for ring in part.rings))
+    if joints[0] in _BONES:
+        joints.insert(0, _BONES[joints[0]][0])
+    mirrored = torch.cat([vertices[:, :1].abs(), vertices[:, 1:]], -1)  # as places are on the left
+    distances = []
+    for joint in joints:
+        bones = [places[end] for end, (start, _) in _BONES.items() if start == joint]
+        distances.append(torch.stack([_distance(mirrored, places[joint], end) for end in bones]).amin(0))
+    nearest, which = torch.stack(distances, -1).topk(min(_MOST, len(joints)), largest=False)
+    columns = torch.tensor([_joint(joint, side) for joint in joints])
+    weights = vertices.new_zeros(len(vertices), len(JOINTS))
+    return weights.scatter(1, columns[which], (-nearest / _REACH).softmax(-1))
+
+
+def _distance(points: Tensor, start: Tensor, end: Tensor) -> Tensor:
+    """Of points (V, 3) to a segment, (V,)."""
+    bone = end - start
+    along = ((points - start) @ bone / bone.square().sum()).clamp(0, 1)
+    distances: Tensor = (points - start - along[:, None] * bone).norm(dim=-1)
+    return distances

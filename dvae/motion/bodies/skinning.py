@@ -1,0 +1,123 @@
+"""Linear blend skinning with blend shapes, as in SMPL (Loper et al. 2015, doi 10.1145/2816795.2818013) without its
+corrections by pose.
+
+    v(beta) = template + shapes beta,    j(beta) = regressor v(beta),    x_v = sum_j weights_vj (W_j (v_v - j_j) + p_j)
+
+with W_j the turn of a joint against the world and p_j its place, both by forward kinematics. For one body this is a
+single product of matrices over all frames: of what poses say, (3 T, 4 J), and what the body says, (4 J, V).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ..kinematics import forward
+
+
+class Body(nn.Module):
+    """A surface that hangs on a tree of joints, and how shape parameters change it. Metres, y up, facing +z.
+
+    Its tensors are buffers that no state dict holds: a body's file may be somebody's under a licence of its own, and a
+    model's weights would carry it along.
+
+    Args:
+        names: of the joints.
+        parents: index of each joint's parent, -1 for the root.
+        template: vertices of the average body at rest, (V, 3).
+        shapes: what a unit of each parameter adds to them, (V, 3, S).
+        regressor: joints as means of vertices, (J, V), each row with sum 1.
+        weights: how much a vertex goes with each joint, (V, J), each row with sum 1.
+        faces: triangles, counterclockwise from outside, (F, 3) places of vertices.
+
+    Raises:
+        ValueError: shapes that do not fit each other.
+    """
+
+    template: Tensor
+    shapes: Tensor
+    regressor: Tensor
+    weights: Tensor
+    faces: Tensor
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        parents: Sequence[int],
+        template: Tensor,
+        shapes: Tensor,
+        regressor: Tensor,
+        weights: Tensor,
+        faces: Tensor,
+    ):
+        super().__init__()
+        vertices, joints = len(template), len(names)
+        expected: dict[str, tuple[Tensor, tuple[int, ...]]] = {
+            "template": (template, (vertices, 3)),
+            "shapes": (shapes, (vertices, 3, shapes.shape[-1])),
+            "regressor": (regressor, (joints, vertices)),
+            "weights": (weights, (vertices, joints)),
+            "faces": (faces, (len(faces), 3)),
+        }
+        for name, (tensor, sizes) in expected.items():
+            if tensor.shape != sizes:
+                known = f"{vertices} vertices and {joints} joints"
+                raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {sizes} for {known}")
+            self.register_buffer(name, tensor, persistent=False)
+        self.names, self.parents = tuple(names), tuple(parents)
+
+    @property
+    def parameters_of_shape(self) -> int:
+        """Number of shape parameters S."""
+        return self.shapes.shape[-1]
+
+    @property
+    def joints(self) -> int:
+        """Number of joints J."""
+        return len(self.names)
+
+    def at_rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
+        """Vertices (..., V, 3) and joints (..., J, 3) of bodies (..., S), nothing turned."""
+        if shape.shape[-1:] != (self.parameters_of_shape,):
+            raise ValueError(f"shape is {tuple(shape.shape)}, expected (..., {self.parameters_of_shape})")
+        vertices = self.template + (self.shapes.flatten(0, 1) @ shape[..., None]).unflatten(-2, (-1, 3)).squeeze(-1)
+        return vertices, self.regressor @ vertices
+
+    def forward(self, shape: Tensor, rotations: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+        """Surfaces and joints of moving bodies, differentiable in everything given.
+
+        Args:
+            shape: of each body, (..., S).
+            rotations: matrices (..., T, J, 3, 3), of joints against their parents and of the root against the world;
+                other forms by `rotations.to_matrix`.
+            translation: by which a body is moved from where it rests, after it is turned about its root, metres
+                (..., T, 3). The root itself is at its place at rest plus this, as in `smplx`.
+
+        Returns:
+            vertices (..., T, V, 3) and joints (..., T, J, 3), in metres.
+
+        Raises:
+            ValueError: shapes that do not fit the body or each other.
+        """
+        frames = translation.shape[:-1]
+        if rotations.shape != (*frames, self.joints, 3, 3) or shape.shape[:-1] != frames[:-1] or not frames:
+            raise ValueError(
+                f"expected shape (..., {self.parameters_of_shape}), rotations (..., T, {self.joints}, 3, 3) and "
+                f"translation (..., T, 3), got {tuple(shape.shape)}, {tuple(rotations.shape)} and "
+                f"{tuple(translation.shape)}"
+            )
+        resting, pivots = self.at_rest(shape)
+        pivots = pivots[..., None, :, :]
+        root = self.parents.index(-1)
+        offsets = pivots - pivots[..., [max(parent, 0) for parent in self.parents], :]
+        joints, turns = forward(self.parents, rotations, offsets, pivots[..., root, :].expand_as(translation))
+        moved = joints - (turns @ pivots[..., None]).squeeze(-1)
+        poses = torch.cat([turns, moved[..., None]], -1)  # (..., T, J, 3, 4)
+        poses = poses.movedim(-2, -3).flatten(-2).flatten(-3, -2)  # (..., 3 T, 4 J)
+        surface = torch.cat([resting, torch.ones_like(resting[..., :1])], -1)
+        surface = (self.weights[..., None] * surface[..., None, :]).flatten(-2)  # (..., V, 4 J)
+        vertices = (poses @ surface.mT).unflatten(-2, (-1, 3)).mT
+        # last, as rounding would grow with how far somebody walks
+        return vertices + translation[..., None, :], joints + translation[..., None, :]

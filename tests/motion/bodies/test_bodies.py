@@ -1,0 +1,319 @@
+"""Bodies with a surface: skinning follows joints, the person is a person, files of others are read or refused."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+
+from dvae.motion import kinematics, rotations
+from dvae.motion.bodies import SHAPE, Body, enclosed_volume, human, read_body, vertex_error, write_body
+
+B, T = 3, 4
+PERSON = human().double()
+
+
+def poses(body=PERSON, spread=0.7):
+    """Shapes (B, S), rotations (B, T, J, 3, 3) and translations (B, T, 3) of anybody."""
+    vectors = spread * torch.randn(B, T, body.joints, 3, dtype=torch.float64)
+    shape = torch.randn(B, body.parameters_of_shape, dtype=torch.float64)
+    return shape, rotations.to_matrix(vectors, "vector"), torch.randn(B, T, 3, dtype=torch.float64)
+
+
+def edges(faces):
+    """Of triangles, each from one corner to the next one."""
+    return Counter(map(tuple, torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()))
+
+
+def parts(body):
+    """The faces of each part: those that hang together."""
+    part = torch.arange(len(body.template))
+    while True:
+        least = part[body.faces].amin(1)
+        spread = part.scatter_reduce(0, body.faces.flatten(), least.repeat_interleave(3), "amin")
+        if torch.equal(spread, part):
+            return [body.faces[part[body.faces[:, 0]] == one] for one in part.unique()]
+        part = spread
+
+
+def height(vertices):
+    return vertices[..., 1].amax(-1) - vertices[..., 1].amin(-1)
+
+
+# ------------------------------------------------------------------------------------------------------- the person
+
+
+def test_every_part_of_the_person_is_closed_whoever_it_is():
+    """Each edge lies between two triangles that go along it in opposite directions, and something is inside."""
+    assert len(parts(PERSON)) == 11  # trunk, head, nose; legs, feet, arms and thumbs
+    for faces in parts(PERSON):
+        found = edges(faces)
+        assert set(found.values()) == {1}
+        assert {(end, start) for start, end in found} == set(found)
+        corners = torch.cartesian_prod(*[torch.tensor([-3.0, 3.0], dtype=torch.float64)] * len(SHAPE))
+        assert (enclosed_volume(PERSON.at_rest(corners)[0], faces) > 0).all()
+
+
+def test_the_person_is_low_polygon_and_of_human_size():
+    vertices, joints = PERSON.at_rest(torch.zeros(8).double())
+    assert 500 <= len(vertices) <= 1500
+    assert PERSON.faces.unique().tolist() == list(range(len(vertices)))
+    assert 1.6 < height(vertices) < 1.8
+    assert 0.05 < enclosed_volume(vertices, PERSON.faces) < 0.08  # cubic metres of 50 to 80 kg
+    mirror = [PERSON.names.index(name.translate(str.maketrans("LR", "RL"))) for name in PERSON.names]
+    torch.testing.assert_close(joints[mirror] * torch.tensor([-1.0, 1, 1]).double(), joints)
+
+
+@pytest.mark.parametrize("name", SHAPE)
+def test_volume_and_height_grow_with_their_parameters(name):
+    shapes = torch.zeros(13, len(SHAPE), dtype=torch.float64)
+    shapes[:, SHAPE.index(name)] = torch.linspace(-3, 3, 13)
+    vertices = PERSON.at_rest(shapes)[0]
+    assert (enclosed_volume(vertices, PERSON.faces).diff() > 0).all()
+    if name in ("size", "legs", "torso", "head"):
+        assert (height(vertices).diff() > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "ends"),
+    [
+        ("legs", ("L_Hip", "L_Ankle")),
+        ("arms", ("R_Shoulder", "R_Wrist")),
+        ("torso", ("Pelvis", "Neck")),
+        ("shoulders", ("L_Shoulder", "R_Shoulder")),
+        ("hips", ("L_Hip", "R_Hip")),
+    ],
+)
+def test_a_length_is_changed_by_its_parameter_and_by_size_alone(name, ends):
+    start, end = (PERSON.names.index(joint) for joint in ends)
+    joints = PERSON.at_rest(torch.eye(len(SHAPE)).double())[1] - PERSON.at_rest(torch.zeros(8).double())[1]
+    moved = (joints[:, end] - joints[:, start]).norm(dim=-1) > 1e-6
+    assert {SHAPE[k] for k in moved.nonzero()} == {"size", name}
+
+
+def test_vertices_go_with_few_joints_near_them():
+    weights = PERSON.weights
+    torch.testing.assert_close(weights.sum(1), torch.ones(len(weights)).double(), atol=1e-6, rtol=0)
+    assert (weights >= 0).all()
+    assert (weights > 0).sum(1).max() <= 4
+    for side, other in (("L_", "R_"), ("R_", "L_")):
+        arm = weights[:, PERSON.names.index(f"{side}Elbow")] > 0
+        others = [joint for joint, name in enumerate(PERSON.names) if name.startswith(other)]
+        assert arm.any()
+        assert not weights[arm][:, others].any()
+
+
+# --------------------------------------------------------------------------------------------------------- skinning
+
+
+def test_no_turns_and_no_shape_are_the_template():
+    unturned = torch.eye(3).double().expand(1, T, PERSON.joints, 3, 3)
+    vertices, joints = PERSON(torch.zeros(1, 8).double(), unturned, torch.zeros(1, T, 3).double())
+    torch.testing.assert_close(vertices, PERSON.template.expand(1, T, -1, 3))
+    torch.testing.assert_close(joints, (PERSON.regressor @ PERSON.template).expand(1, T, -1, 3))
+    torch.testing.assert_close(joints[..., 0, :], torch.zeros(1, T, 3).double())  # the pelvis
+
+
+def test_joints_are_those_of_forward_kinematics():
+    shape, turns, translation = poses()
+    pivots = PERSON.at_rest(shape)[1]
+    offsets = pivots - pivots[:, [max(parent, 0) for parent in PERSON.parents]]
+    expected, _ = kinematics.forward(PERSON.parents, turns, offsets[:, None], pivots[:, None, 0] + translation)
+    torch.testing.assert_close(PERSON(shape, turns, translation)[1], expected)
+
+
+def test_what_goes_with_one_joint_moves_rigidly_with_it():
+    """Every vertex keeps its place as seen from its joint, and so its distances to all that go with the same one."""
+    bones = torch.arange(len(PERSON.template)) % PERSON.joints
+    weights = torch.nn.functional.one_hot(bones, PERSON.joints).double()
+    body = Body(PERSON.names, PERSON.parents, PERSON.template, PERSON.shapes, PERSON.regressor, weights, PERSON.faces)
+    shape, turns, translation = poses()
+    resting, pivots = body.at_rest(shape)
+    vertices, joints = body(shape, turns, translation)
+    world = kinematics.forward(body.parents, turns, torch.zeros(22, 3).double(), translation)[1]
+    seen = (world[:, :, bones].mT @ (vertices - joints[:, :, bones])[..., None]).squeeze(-1)
+    torch.testing.assert_close(seen, (resting - pivots[:, bones])[:, None].expand_as(seen))
+
+
+def test_a_surface_is_the_weighted_sum_of_rigid_ones():
+    """The product of matrices against the formula, vertex by vertex and joint by joint."""
+    shape, turns, translation = poses()
+    resting, pivots = PERSON.at_rest(shape)
+    vertices, joints = PERSON(shape, turns, translation)
+    world = kinematics.forward(PERSON.parents, turns, torch.zeros(22, 3).double(), translation)[1]
+    expected = torch.zeros_like(vertices)
+    for joint in range(PERSON.joints):
+        rigid = (resting - pivots[:, joint, None])[:, None] @ world[:, :, joint].mT + joints[:, :, joint, None]
+        expected += PERSON.weights[:, joint, None] * rigid
+    torch.testing.assert_close(vertices, expected)
+
+
+def test_turning_the_root_turns_everything_about_it():
+    shape, turns, translation = poses()
+    turn = rotations.to_matrix(torch.tensor([0.3, -1.2, 0.8], dtype=torch.float64), "vector")
+    vertices, joints = PERSON(shape, turns, translation)
+    turns[:, :, 0] = turn @ turns[:, :, 0]
+    root = joints[:, :, :1]
+    torch.testing.assert_close(PERSON(shape, turns, translation)[0], (vertices - root) @ turn.T + root)
+
+
+def test_whoever_walks_far_keeps_the_same_surface():
+    """But for rounding places so far away, 2^-24 of them each time; weights that add up to 1 - 1e-7 stretch nobody."""
+    body, (shape, turns, translation) = human(), (tensor.float() for tensor in poses())
+    near, far = (body(shape, turns, translation + move)[0] for move in (0, 1024))
+    torch.testing.assert_close(far - 1024, near, atol=3 * 1024 / 2**24, rtol=0)
+
+
+def test_a_batch_is_one_by_one():
+    shape, turns, translation = poses()
+    together = PERSON(shape, turns, translation)
+    for b in range(B):
+        for t in range(T):
+            alone = PERSON(shape[b], turns[b, t : t + 1], translation[b, t : t + 1])
+            for one, many in zip(alone, together, strict=True):
+                torch.testing.assert_close(one[0], many[b, t])
+
+
+def test_gradients_are_right():
+    shape, turns, translation = poses()
+    given = (shape[:2], rotations.from_matrix(turns[:2, :2], "6d"), translation[:2, :2])
+
+    def surface(shape, numbers, translation):
+        return PERSON(shape, rotations.to_matrix(numbers, "6d"), translation)
+
+    assert torch.autograd.gradcheck(surface, [tensor.requires_grad_() for tensor in given], fast_mode=True)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_are_finite_where_nothing_is_turned_and_nothing_is_wrong(dtype):
+    body = human().to(dtype)
+    given = [torch.zeros(2, 8), torch.eye(3).repeat(2, T, 22, 1, 1), torch.zeros(2, T, 3)]
+    given = [tensor.to(dtype).requires_grad_() for tensor in given]
+    vertices, _ = body(*given)
+    assert vertices.dtype == dtype
+    vertex_error(vertices, vertices.detach()).sum().backward(retain_graph=True)
+    assert all(tensor.grad.isfinite().all() for tensor in given)
+    (enclosed_volume(vertices, body.faces) + vertices.square().mean((-2, -1))).sum().backward()
+    assert all(tensor.grad.isfinite().all() and tensor.grad.any() for tensor in given)
+
+
+def test_a_body_is_no_part_of_what_a_model_saves():
+    assert not torch.nn.Sequential(human()).state_dict()
+
+
+def test_sizes_that_do_not_fit_are_refused():
+    shape, turns, translation = poses()
+    with pytest.raises(ValueError, match=r"rotations \(..., T, 22, 3, 3\)"):
+        PERSON(shape, turns[:, :, :20], translation)
+    with pytest.raises(ValueError, match=r"translation"):
+        PERSON(shape[:2], turns, translation)
+    with pytest.raises(ValueError, match=r"expected \(..., 8\)"):
+        PERSON(shape[:, :7], turns, translation)
+    with pytest.raises(ValueError, match="regressor has shape"):
+        Body(PERSON.names, PERSON.parents, PERSON.template, PERSON.shapes, PERSON.weights, PERSON.weights, PERSON.faces)
+
+
+# --------------------------------------------------------------------------------------------------------- measures
+
+
+def test_the_volume_of_a_cube_and_how_far_it_is_moved():
+    corners = torch.cartesian_prod(*[torch.tensor([0.0, 2.0])] * 3)
+    squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = torch.tensor([[a, *rest] for a, b, c, d in squares for rest in ((b, c), (c, d))])
+    assert enclosed_volume(corners, faces) == 8
+    torch.testing.assert_close(enclosed_volume(corners + torch.tensor([5.0, -7.0, 3.0]), faces), torch.tensor(8.0))
+    frames = corners.repeat(2, 3, 1, 1)  # two sequences of three frames
+    moved = frames.clone()
+    moved[0, 0] += torch.tensor([0.3, 0.4, 0.0])
+    torch.testing.assert_close(vertex_error(moved, frames), torch.tensor([0.5 / 3, 0.0]))
+    with pytest.raises(ValueError, match="not of one shape"):
+        vertex_error(moved, frames[:1])
+
+
+# ------------------------------------------------------------------------------------------------------------ files
+
+
+def arrays(path):
+    with np.load(path) as file:
+        return dict(file)
+
+
+def test_a_body_in_the_layout_of_smplx_is_read_as_it_was(tmp_path):
+    written = human()
+    write_body(tmp_path / "body.npz", written)
+    body = read_body(tmp_path / "body.npz")
+    assert (body.names, body.parents) == (written.names, written.parents)
+    for name, tensor in written.named_buffers():
+        torch.testing.assert_close(getattr(body, name), tensor, atol=0, rtol=0)
+    assert read_body(tmp_path / "body.npz", shapes=3).shapes.equal(written.shapes[..., :3])
+
+
+def test_hands_that_are_not_turned_move_with_the_wrist(tmp_path):
+    """As SMPL-H has it: more joints, of which nothing is turned; numbers are float64, and other members pickled."""
+    write_body(tmp_path / "body.npz", human())
+    members = arrays(tmp_path / "body.npz")
+    wrist, vertices = human().names.index("L_Wrist"), len(members["v_template"])
+    finger = np.flatnonzero(members["weights"][:, wrist] > 0.9)
+    extra = np.zeros((vertices, 3))
+    extra[finger, :2] = members["weights"][finger, wrist, None] * [0.5, 0.25]
+    members["weights"][finger, wrist] *= 0.25
+    members["weights"] = np.concatenate([members["weights"], extra], 1).astype(np.float64)
+    members["J_regressor"] = np.concatenate([members["J_regressor"], members["J_regressor"][-3:]]).astype(np.float64)
+    tree = np.concatenate([members["kintree_table"], [[wrist, 22, 15], [22, 23, 24]]], 1).astype(np.uint32)
+    members |= {"kintree_table": tree, "f": members["f"].astype(np.uint32), "part2num": np.array({"hand": 1})}
+    members["shapedirs"] = np.asfortranarray(np.concatenate([members["shapedirs"]] * 2, -1).astype(np.float64))
+    np.savez(tmp_path / "hands.npz", **members)
+    body = read_body(tmp_path / "hands.npz")
+    assert body.joints == 22
+    for name, tensor in human().named_buffers():
+        torch.testing.assert_close(getattr(body, name), tensor)
+
+
+def changed(name, change):
+    return lambda members: members.update({name: change(members[name])})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda members: members.pop("weights"), "it lacks weights"),
+        (changed("v_template", lambda a: a[:-1]), "shapedirs holds"),
+        (changed("v_template", lambda a: a + np.float32(np.nan)), "v_template holds numbers that are NaN"),
+        (changed("shapedirs", lambda a: 1e30 * a), "beyond 1000"),
+        (changed("shapedirs", lambda a: a[..., :2]), "2 parameters of shape, not 8"),
+        (changed("shapedirs", lambda a: a[..., 0]), "expected numbers"),
+        (changed("f", lambda a: a + 1), "hangs on what is not there"),
+        (changed("f", lambda a: a - 1), "hangs on what is not there"),
+        (changed("f", lambda a: a[:0]), "f holds"),
+        (changed("f", lambda a: a.astype(float)), "expected whole numbers"),
+        (changed("weights", lambda a: 2 * a), "do not add up to 1"),
+        (changed("J_regressor", lambda a: 0 * a), "do not add up to 1"),
+        (changed("J_regressor", lambda a: np.array({"sparse": 1})), "pickled objects"),
+        (changed("kintree_table", lambda a: a[:, ::-1]), "its tree is not SMPL's"),
+        (changed("kintree_table", lambda a: a[:, :5]), "expected whole numbers"),
+    ],
+)
+def test_files_that_are_no_body_are_refused_in_a_sentence(tmp_path, change, message):
+    write_body(tmp_path / "body.npz", human())
+    members = arrays(tmp_path / "body.npz")
+    change(members)
+    np.savez(tmp_path / "wrong.npz", **members)
+    with pytest.raises(ValueError, match=message) as error:
+        read_body(tmp_path / "wrong.npz")
+    assert "wrong.npz" in str(error.value)
+
+
+def test_an_array_larger_than_any_body_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    write_body(tmp_path / "body.npz", human())
+    monkeypatch.setattr("dvae.motion.bodies.smplx.LARGEST", 100)
+    monkeypatch.setattr("dvae.motion.files.archive.Member.array", lambda self: pytest.fail("it was read"))
+    with pytest.raises(ValueError, match="of a body at most 100"):
+        read_body(tmp_path / "body.npz")
+
+
+def test_no_file_is_no_body(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        read_body(tmp_path / "none.npz")
+    (tmp_path / "text.npz").write_text("SMPL")
+    with pytest.raises(ValueError, match="damaged"):
+        read_body(tmp_path / "text.npz")
