@@ -23,7 +23,7 @@ from torch import Tensor
 from .. import files
 from .skeleton import Skeleton, rotate_about_up
 
-PAST, TRUTH, FIXED, GIVEN = "black", "#1a7f37", "#4a4f57", "#cf222e"
+PAST, TRUTH, FIXED, GIVEN, SKIN = "black", "#1a7f37", "#4a4f57", "#cf222e", "#c3b2a1"
 
 SPACING = 1.15
 """Metres between the skeletons of a figure."""
@@ -329,10 +329,7 @@ def animate(
         trace |= {"mode": "lines", "name": _literal(stage.names[k]), "hoverinfo": "skip"}
         trace["line"]["width"] = width
     floors = np.unique(places[:, 2]) + low[2]
-    labels = [
-        {"text": _literal(name), "font": {"size": 14}, "showarrow": False, "x": x, "y": y, "z": z + high[2] + MARGIN}
-        for name, (x, y, z) in zip(stage.names, places, strict=True)
-    ]
+    labels = _labels(stage.names, places, high[2])
     low, high = low + places.min(0) - MARGIN, high + places.max(0) + MARGIN
     scene, fill = _scene(low, high)
     return go.Figure(
@@ -350,8 +347,69 @@ def animate(
     )
 
 
+def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = "y", title: str = "") -> go.Figure:
+    """Bodies that stand side by side, to turn.
+
+    Args:
+        faces: triangles, (F, 3).
+        vertices: of one pose (V, 3) or of P bodies or poses (P, V, 3), metres, numpy or torch without gradients.
+        names: what to call them; by default they are not named.
+        up: the vertical axis, "y" or "z".
+        title: above the figure.
+
+    Returns:
+        A plotly figure in metres as that of `animate`: a mesh for each, seen from the front of who faces heading zero.
+
+    Raises:
+        ValueError: the shapes do not fit each other, a place is not finite, or there are too few names.
+    """
+    corners, people = np.asarray(faces), np.asarray(vertices, np.float64)
+    people = people[None] if people.ndim == 2 else people
+    names = names or [""] * len(people)
+    if corners.shape[1:] != (3,) or people.ndim != 3 or people.shape[2] != 3 or not (people.size and corners.size):
+        raise ValueError(f"expected faces (F, 3) and vertices (P, V, 3), got {corners.shape} and {people.shape}")
+    if not (0 <= corners.min() <= corners.max() < people.shape[1]):
+        raise ValueError(f"a face has corner {corners.max()} of {people.shape[1]} vertices")
+    if not np.isfinite(people).all():
+        raise ValueError("vertices have NaN or infinite places, which cannot be drawn")
+    if len(names) != len(people):
+        raise ValueError(f"{len(names)} names for {len(people)} bodies; give each its own")
+    people = people if up == "z" else people[..., [0, 2, 1]] * [1, -1, 1]
+    middle = (people.min(1, keepdims=True) + people.max(1, keepdims=True)) / 2
+    people = people - middle * [1, 1, 0]
+    low, high = people.min((0, 1)), people.max((0, 1))
+    places = _places(len(people), high - low + 0.2)
+    people = people + places[:, None]
+    meshes = [
+        {
+            **{"type": "mesh3d", "name": _literal(name), "color": SKIN, "hoverinfo": "skip"},
+            **dict(zip("xyz", body.T.astype(np.float32), strict=True)),
+            **dict(zip("ijk", corners.T, strict=True)),
+            # normals of triangles of a square centimetre are else taken for rounding
+            "lighting": {"facenormalsepsilon": 0, "vertexnormalsepsilon": 0, "ambient": 0.4, "specular": 0.05},
+            "lightposition": {"x": -5e4, "y": 7e4, "z": -7e4},  # as the viewer has it: left, above, in front
+        }
+        for name, body in zip(names, people, strict=True)
+    ]
+    labels = _labels(names, places, high[2])
+    floors = np.unique(places[:, 2]) + low[2]
+    low, high = low + places.min(0) - MARGIN, high + places.max(0) + MARGIN
+    scene, fill = _scene(low, high)
+    return go.Figure(
+        data=[*meshes, *(_floor(low[:2], high[:2], height) for height in floors)],
+        layout={
+            "title": {"text": _literal(title), "x": 0.5, "font": {"size": 16}},
+            "template": "none",
+            "showlegend": False,
+            "margin": {"l": 0, "r": 0, "t": 40 if title else 0, "b": 0},
+            "scene": {**scene, "annotations": labels},
+            "meta": {"milliseconds": 0, "high": fill},
+        },
+    )
+
+
 def save_html(figure: go.Figure, path: str | PathLike[str]) -> None:
-    """Write the figure of `animate` as one HTML file, which needs no network and plays at the motion's own speed."""
+    """Write a figure of `animate` or `surfaces` as one HTML file, which needs no network; motion has its own speed."""
     page = figure.to_html(auto_play=False, post_script=_PLAYER, config={"displaylogo": False})
     with files.written(path) as file:
         file.write(page.encode())
@@ -437,6 +495,14 @@ def _scene(low: np.ndarray, high: np.ndarray) -> tuple[dict[str, Any], float]:
         "camera": {"eye": eye, "projection": {"type": "orthographic"}},
     }
     return scene, 1.9 * height / fit
+
+
+def _labels(names: Sequence[str], places: np.ndarray, top: float) -> list[dict[str, Any]]:
+    """Names over the heads of those who stand at places (P, 3)."""
+    return [
+        {"text": _literal(name), "font": {"size": 14}, "showarrow": False, "x": x, "y": y, "z": z + top + MARGIN}
+        for name, (x, y, z) in zip(names, places, strict=True)
+    ]
 
 
 def _literal(text: str) -> str:
