@@ -17,8 +17,11 @@ from ..files.archive import archive, write_arrays
 from ..files.smpl import JOINTS, PARENTS
 from .skinning import Body
 
-LARGEST = 2**29
-"""Bytes of an array that is read; the largest of SMPL-X has a fifth of it."""
+LARGEST = 2**27
+"""Bytes of an array that is read; the largest of SMPL-X has three quarters of it."""
+
+MOST_VERTICES = 2**17
+"""SMPL-X has a twelfth of them."""
 
 FURTHEST = 1e3
 """Of a body's numbers, none of which is more in metres or shares."""
@@ -103,6 +106,8 @@ def _defect(found: dict[str, np.ndarray], shapes: int) -> str:
             return f"{name} holds {array.dtype} {array.shape}, expected {kind} ({', '.join(map(str, axes))})"
         if not whole and not (np.abs(array) <= FURTHEST).all():
             return f"{name} holds numbers that are NaN or beyond {FURTHEST:g}"
+    if sizes["V"] > MOST_VERTICES:
+        return f"it has {sizes['V']:,} vertices, of a body at most {MOST_VERTICES:,}"
     if not 1 <= shapes <= sizes["S"]:
         return f"it has {sizes['S']} parameters of shape, not {shapes}; say how many with shapes="
     parents = found["kintree_table"][0].astype(np.int64)

@@ -311,6 +311,13 @@ def test_an_array_larger_than_any_body_is_refused_before_it_is_read(tmp_path, mo
         read_body(tmp_path / "body.npz")
 
 
+def test_a_body_of_too_many_vertices_is_refused(tmp_path, monkeypatch):
+    write_body(tmp_path / "body.npz", human())
+    monkeypatch.setattr("dvae.motion.bodies.smplx.MOST_VERTICES", 1000)
+    with pytest.raises(ValueError, match="1,486 vertices, of a body at most 1,000"):
+        read_body(tmp_path / "body.npz")
+
+
 def test_no_file_is_no_body(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_body(tmp_path / "none.npz")
