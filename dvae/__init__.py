@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from .inference.evaluate import evaluate
     from .inference.evaluation import Evaluation
     from .inference.fit import Fit, fit
+    from .inference.gradnorm import GradNorm
     from .inference.objectives import Evidence
     from .inference.particles import particle_bound
     from .inference.svi import SVI
@@ -58,6 +59,7 @@ __all__ = [
     "Evidence",
     "Factorization",
     "Fit",
+    "GradNorm",
     "Oracle",
     "SelfFeeding",
     "SequenceELBO",
@@ -99,6 +101,7 @@ _PLACES = {
         "inference.evaluate": "evaluate",
         "inference.evaluation": "Evaluation",
         "inference.fit": "Fit fit",
+        "inference.gradnorm": "GradNorm",
         "inference.objectives": "Evidence",
         "inference.particles": "particle_bound",
         "inference.svi": "SVI",

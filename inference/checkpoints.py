@@ -3,7 +3,8 @@
     config.json        what was run: method, schema, data, training options
     best.safetensors   weights at the best unweighted validation bound (absent without validation data)
     last.safetensors   weights at the last checkpoint
-    last.state.pt      optimiser and random number generators, read with torch's restricted unpickler
+    last.state.pt      optimiser, random number generators and what an objective has of its own, read with torch's
+                       restricted unpickler
     state.json         step, best step and bound, status, and the SHA-256 of the three files above
 
 `state.json` is the commit record. New files are first written whole under a temporary name, then `state.json`

@@ -4,13 +4,16 @@ An objective is a function of `Terms` and the global step. `Evidence` is the neg
 with a weight on each KL term (warm-up; Bowman et al. 2016, arXiv 1511.06349; beta-VAE, Higgins et al. 2017)
 and free bits (Kingma et al. 2016, arXiv 1606.04934). The weights never touch the bound that is recorded:
 model selection reads `Terms.bound`.
+
+An objective with a state, such as weights that adapt (`gradnorm`), is `Adaptive`: a description, which a stage of a run
+begins as `Adapting`. The state is the run's own, in its checkpoints, and two runs may have one description.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from torch import Tensor
+from torch import Tensor, nn
 from typing_extensions import Protocol, runtime_checkable
 
 from .schedules import Schedule, schedule, to_config
@@ -37,6 +40,40 @@ class Asking(Protocol):
     @property
     def select(self) -> Literal["bound", "loss"]:
         """What tells the best weights."""
+
+
+@runtime_checkable
+class Adapting(Objective, Protocol):
+    """An objective in a stage of a run, with a state of its own; see `gradnorm.Balance`.
+
+    It is called once a step, with a graph: whatever it needs of gradients it takes then.
+    """
+
+    @property
+    def state(self) -> Mapping[str, Tensor]:
+        """All that a later call depends on, by name, finite; their names, shapes and types stay as they begin."""
+
+    @property
+    def row(self) -> Mapping[str, float]:
+        """Numbers for the log, by name, as they are in the step."""
+
+    def adapt(self, mean: Callable[[Tensor], Tensor]) -> None:
+        """Change the state, after the backward pass and before the optimiser's step, which is sure to be taken.
+
+        Args:
+            mean: of a tensor over the processes, for which all of them have to ask.
+        """
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on with a checkpoint's state, which has the names, shapes and types of this one, or raise ValueError."""
+
+
+@runtime_checkable
+class Adaptive(Protocol):
+    """An objective that each stage begins anew; called itself, it is the one whose losses validation compares."""
+
+    def begin(self, model: nn.Module) -> Adapting:
+        """The objective in a stage of a run of this model, or ValueError: it lacks what is needed."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ Example:
 """
 
 import io
+import reprlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -22,7 +23,9 @@ from torch import Tensor
 
 from ..laws.base import renamed
 from .checkpoints import BEST, LAST, OPTIMISER, CheckpointError, Run, read_weights, state_bytes, weights
+from .objectives import Adapting
 from .svi import SVI, NonFiniteError
+from .training import stage_at
 
 # what an optimiser needs of every parameter that it has moved
 _KEPT: dict[str, set[str]] = {"adam": {"step", "exp_avg", "exp_avg_sq"}, "sgd": set()}
@@ -40,6 +43,8 @@ def store(svi: SVI, run: Run) -> None:
         return
     buffer = io.BytesIO()
     content = {"name": svi.training.optimizer, "optimizer": svi.optimizer.state_dict(), "random": random}
+    if isinstance(svi.objective, Adapting):
+        content["objective"] = {name: value.detach().cpu().clone() for name, value in svi.objective.state.items()}
     torch.save(content, buffer)
     files = {LAST: save_tensors(weights(svi.model)), OPTIMISER: buffer.getvalue()}
     if state.best is not None and state.waited == 0:
@@ -51,8 +56,8 @@ def restore(svi: SVI, run: Run) -> None:
     """Return to the last checkpoint of a run, after `SVI.init`.
 
     Raises:
-        CheckpointError: when its files are damaged, of another model, another optimiser or another number
-            of processes.
+        CheckpointError: when its files are damaged, of another model, another optimiser, another objective with a
+            state or another number of processes.
         ValueError: when it has taken more steps than it is to take.
     """
     stored, state, model, training = run.state, svi.state, svi.model, svi.training
@@ -90,6 +95,8 @@ def restore(svi: SVI, run: Run) -> None:
         raise _damaged(run, str(error)) from error
     for name in _STORED:
         setattr(state, name, stored[name])
+    if isinstance(svi.objective, Adapting) and state.step > stage_at(svi.plan, state.step)[0]:
+        _take_up(svi.objective, run, content.get("objective", {}))
     if BEST in stored["fingerprints"]:
         state.best = read_weights(model, run.read(BEST, state_bytes(model)), run.path / BEST)
 
@@ -152,6 +159,31 @@ def _check_state(svi: SVI, run: Run, content: Any) -> None:
         raise _damaged(run, f"random has no {' and no '.join(sorted(missing))}")
     if len(set(rows.values())) > 1:
         raise _damaged(run, f"random has states of {' and '.join(map(str, rows.values()))} processes")
+
+
+def _take_up(objective: Adapting, run: Run, found: Any) -> None:
+    """Has an objective go on with the state that a checkpoint holds of it.
+
+    Raises:
+        CheckpointError: it is of another objective, or no state that one writes.
+    """
+    own = objective.state
+    if not isinstance(found, dict) or found.keys() != own.keys():
+        held = reprlib.repr(list(found)) if isinstance(found, dict) and found else "none"
+        raise CheckpointError(
+            f"{run.path} was fitted with another objective: the state of this one is {', '.join(own)}, the run's "
+            f"{held}; resume with the objective and the stages that it was fitted with"
+        )
+    for name, value in own.items():
+        given = found[name]
+        as_written = isinstance(given, Tensor) and (given.dtype, given.shape) == (value.dtype, value.shape)
+        if not as_written or not torch.isfinite(given).all():
+            shape = f"finite, {value.dtype} and of shape {tuple(value.shape)}"
+            raise _damaged(run, f"objective[{name!r}] is not as the objective writes it, {shape}")
+    try:
+        objective.restore({name: value.detach().clone() for name, value in found.items()})
+    except ValueError as error:
+        raise _damaged(run, str(error)) from error
 
 
 def _reorder(svi: SVI, content: Any, last: bytes) -> None:

@@ -19,7 +19,7 @@ from ..data import Batch, Sequences, each, sequences
 from ..turns import alone
 from .bounds import SequenceELBO, Terms
 from .checkpoints import weights
-from .objectives import Asking, Objective
+from .objectives import Adapting, Adaptive, Asking, Objective
 from .result import reason
 from .schedules import schedule
 from .training import Stage, lay_out, stage_at
@@ -89,9 +89,12 @@ class SVI:
                 raise ValueError(f"no parameter's name starts with {', '.join(missing)}; they are {', '.join(trained)}")
             if all(name.startswith(stage.frozen) for name in trained):
                 raise ValueError(f"a stage of {stage.steps} steps has every parameter frozen; there is nothing to fit")
+            if isinstance(stage.objective, Adaptive):
+                stage.objective.begin(model)  # which is refused now, not when its stage comes
         self.parameters = list(trained.values())
         self.final_feeding = self.rates(self.training.steps - 1)["self_feeding"]
         self._state: State | None = None
+        self._begun: dict[int, Objective] = {}
 
     @property
     def state(self) -> State:
@@ -99,6 +102,15 @@ class SVI:
         if self._state is None:
             raise RuntimeError("the run has not begun; call init() first, which makes its optimiser")
         return self._state
+
+    @property
+    def objective(self) -> Objective:
+        """What the next step minimises, with its state, where it has one, that begins with its stage."""
+        first, stage = stage_at(self.plan, self.state.step)
+        if first not in self._begun:
+            described = stage.objective
+            self._begun = {first: described.begin(self.model) if isinstance(described, Adaptive) else described}
+        return self._begun[first]
 
     @alone
     def init(self) -> State:
@@ -121,7 +133,7 @@ class SVI:
             # Another seed than the generator's own: equal seeds would tie the latent draws to the choice of the batch.
             torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
             self.random = self._random_state()
-        self._state = State(self.model)
+        self._state, self._begun = State(self.model), {}
         return self._state
 
     @alone
@@ -135,7 +147,7 @@ class SVI:
             NonFiniteError: the loss or a gradient is NaN or infinite; the weights stay as they are.
         """
         state, training = self.state, self.training
-        stage, rates = stage_at(self.plan, state.step), self.rates(state.step)
+        (_, stage), rates, objective = stage_at(self.plan, state.step), self.rates(state.step), self.objective
         for group in self.optimizer.param_groups:
             group["lr"] = rates["learning_rate"]
         if not self.model.training:
@@ -143,7 +155,7 @@ class SVI:
         where = f"step {state.step + 1}"
         with self.drawing():
             terms = self._terms(batch, stage.objective, where, rates["self_feeding"], rates.get("curriculum"))
-            loss = stage.objective(terms, state.step)
+            loss = objective(terms, state.step)
             self.optimizer.zero_grad()
             self.fabric.backward(loss)
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
@@ -160,6 +172,10 @@ class SVI:
         if training.gradient_clip is not None and norm > training.gradient_clip:
             for gradient in gradients:
                 gradient.mul_(training.gradient_clip / norm)
+        self._weights = dict[str, float]()
+        if isinstance(objective, Adapting):
+            self._weights |= objective.row
+            objective.adapt(self.mean)
         self.optimizer.step()
         state.step += 1
         state.terms = terms
@@ -171,7 +187,7 @@ class SVI:
             raise RuntimeError("no step has been taken since init(), so there are no numbers of one")
         loss, norm = self._numbers.tolist()
         rates = self.rates(self.state.step - 1)
-        return {"loss": loss, "gradient_norm": norm, **rates, **_per_frame(_sums(self.state.terms))}
+        return {"loss": loss, "gradient_norm": norm, **rates, **self._weights, **_per_frame(_sums(self.state.terms))}
 
     @alone
     def evaluate(self, data: Any) -> dict[str, float]:
@@ -211,7 +227,7 @@ class SVI:
 
     def rates(self, step: int) -> dict[str, float]:
         """The learning rate, the probability of self-feeding and the curriculum, if there is one, at a global step."""
-        stage = stage_at(self.plan, step)
+        _, stage = stage_at(self.plan, step)
         given = {"learning_rate": self.training.rate, "self_feeding": self.training.self_feeding}
         own = {name: getattr(stage, name) for name in given}
         rates = {name: given[name] if own[name] is None else own[name] for name in given}
@@ -232,6 +248,10 @@ class SVI:
         """The sum over the processes."""
         return self.fabric.all_reduce(value.clone(), reduce_op="sum")  # type: ignore[return-value]
 
+    def mean(self, value: Tensor) -> Tensor:
+        """The mean over the processes."""
+        return self.total(value) / self.fabric.world_size
+
     def _random_state(self) -> dict[str, Tensor]:
         on_cuda = self.fabric.device.type == "cuda"
         cuda = {"cuda": torch.cuda.get_rng_state(self.fabric.device)} if on_cuda else {}
@@ -240,7 +260,7 @@ class SVI:
     def _score(self, data: Sequences, feeding: float) -> dict[str, float]:
         """The unweighted terms on held-out data, per frame, with the same draws each time."""
         sums = dict[str, Tensor]()
-        objective = stage_at(self.plan, self.state.step).objective
+        objective = stage_at(self.plan, self.state.step)[1].objective
         last = self.training.steps  # of the weights, so that losses can be compared
         self.module.eval()
         with _forked(self.fabric.device), torch.no_grad():

@@ -3,7 +3,7 @@ terminal.
 
 A row maps names to numbers: `bound`, `log_likelihood/x`, `kl/z` are those of a training batch, the same names
 under `validation/` those of the validation data, in nats per frame; `loss`, `gradient_norm`, `learning_rate`,
-`self_feeding` are of the step.
+`self_feeding` are of the step, and so is `weight/x` where an objective's weights adapt.
 """
 
 import io

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal
 
 from ..options import Amount, Count, Range, Share, check, nearest
+from .gradnorm import GradNorm
 from .objectives import Evidence, Objective
 from .schedules import Piecewise, Schedule, clamp, levels, schedule, to_config
 
@@ -149,13 +150,14 @@ def lay_out(
     return clamp(replace(training, steps=total), total), plan
 
 
-def stage_at(plan: Sequence[Stage], step: int) -> Stage:
-    """The stage that a global step belongs to; after the last step, the last one."""
-    for stage in plan:
-        if step < stage.steps:
-            return stage
-        step -= stage.steps
-    return plan[-1]
+def stage_at(plan: Sequence[Stage], step: int) -> tuple[int, Stage]:
+    """The first step and the stage that a global step belongs to; after the last step, of the last one."""
+    first = 0
+    for stage in plan[:-1]:
+        if step < first + stage.steps:
+            return first, stage
+        first += stage.steps
+    return first, plan[-1]
 
 
 def recorded(training: Training, plan: Sequence[Stage]) -> dict[str, Any]:
@@ -163,7 +165,7 @@ def recorded(training: Training, plan: Sequence[Stage]) -> dict[str, Any]:
 
     def config(stage: Stage) -> dict[str, Any]:
         objective = stage.objective
-        said = objective.to_config() if isinstance(objective, Evidence) else repr(objective)
+        said = objective.to_config() if isinstance(objective, Evidence | GradNorm) else repr(objective)
         return to_config(vars(stage) | {"objective": said})
 
     return {"training": to_config(vars(training)), "stages": [config(stage) for stage in plan]}
