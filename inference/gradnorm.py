@@ -138,13 +138,16 @@ class Balance:
         self.first = torch.zeros_like(self.weights)  # L_i(0), zeros before the first step
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
-        """Return the loss, a scalar; while its graph is there, each task's gradient by W is taken for `adapt`."""
+        """Return the loss, a scalar."""
+        return self.objective.weighted(terms, step, self.weights)
+
+    def measure(self, terms: "Terms") -> None:
+        """Take the losses of the tasks, and their gradients by W, of a batch."""
         losses = self.objective.losses(terms)
         self._losses = torch.stack([loss.detach() for loss in losses])
         self._gradients = torch.stack(
             [self._gradient(*each) for each in zip(self.objective.tasks, losses, strict=True)]
         )
-        return self.objective.weighted(terms, step, self.weights)
 
     def adapt(self, mean: Callable[[Tensor], Tensor]) -> None:
         """Take a step of the weights, which the loss of the next step has.

@@ -46,7 +46,7 @@ class Asking(Protocol):
 class Adapting(Objective, Protocol):
     """An objective in a stage of a run, with a state of its own; see `gradnorm.Balance`.
 
-    It is called once a step, with a graph: whatever it needs of gradients it takes then.
+    A step asks it to `measure`, for its loss, and to `adapt`, in this order.
     """
 
     @property
@@ -56,6 +56,9 @@ class Adapting(Objective, Protocol):
     @property
     def row(self) -> Mapping[str, float]:
         """Numbers for the log, by name, as they are in the step."""
+
+    def measure(self, terms: "Terms") -> None:
+        """Take what it needs of gradients of a batch, whose graph has to be kept, before the backward pass."""
 
     def adapt(self, mean: Callable[[Tensor], Tensor]) -> None:
         """Change the state, after the backward pass and before the optimiser's step, which is sure to be taken.

@@ -288,7 +288,7 @@ class SVI:
         if isinstance(objective, Asking) and objective.draws:
             program["draws"] = objective.draws
         try:
-            return Terms(**self.module(self.fabric.to_device(placed), program))
+            return Terms(**self.module(self.fabric.to_device(placed), program, self.objective))
         except ValueError as error:
             # torch's distributions refuse NaN parameters and values before there is a term to look at
             if "invalid values" not in str(error) and "within the support" not in str(error):
@@ -307,8 +307,13 @@ class _Bound(nn.Module):
         self.model = model
         self.estimator = estimator
 
-    def forward(self, batch: Batch, program: Mapping[str, Any]) -> dict[str, Any]:
-        return dict(vars(self.estimator.terms(self.model, batch, **program)))
+    def forward(self, batch: Batch, program: Mapping[str, Any], objective: Objective) -> dict[str, Any]:
+        terms = self.estimator.terms(self.model, batch, **program)
+        # here, as from what leaves the module fabric alone may take gradients
+        if isinstance(objective, Adapting) and torch.is_grad_enabled():
+            with torch.autocast(terms.frames.device.type, enabled=False):
+                objective.measure(terms)
+        return dict(vars(terms))
 
 
 def _forked(device: torch.device) -> AbstractContextManager[None]:
