@@ -366,9 +366,10 @@ def draw(cases: Mapping[str, Case], alphas: Mapping[str, Case], file: Path) -> N
             last.plot(*zip(*points, strict=True), marker="o", markersize=4, color=f"C{place}", label=f"alpha, {label}")
             for alpha, point in zip(found, points, strict=True):
                 last.annotate(f"{alpha:g}", point, fontsize=7, xytext=(3, 3), textcoords="offset points")
-    for place, name in enumerate(name for name in ways if name != "mix"):
+    for place, name in enumerate(ways):
         point = ways[name].estimate("APD").mean, ways[name].estimate("quality").mean
         last.plot(*point, marker="s", linestyle="", color=f"C{place + 2}", label=name)
+    last.set_ylim(0)
     last.set_xlabel("APD (m)")
     last.set_title("quality (%)", fontsize=9)
     last.legend(fontsize=7)
@@ -380,6 +381,7 @@ def main(
     raw: Path | None = None,
     runs: Path = Path("runs/mix-and-match"),
     page: Path = DOCS / "results" / "mix_and_match.md",
+    picture: Path = DOCS / "img" / "mix_and_match.png",
     sections: tuple[str, ...] = tuple(SECTIONS),
     cases: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0, 1, 2),
@@ -392,6 +394,7 @@ def main(
         raw: folder of BVH files of CMU's recordings; likewise.
         runs: where runs are kept.
         page: where the tables stand.
+        picture: of codes over training, and of quality against diversity.
         sections: of the page, to fit.
         cases: to fit, by name; all of a section where none is named.
         seeds: of the runs to fit.
@@ -414,7 +417,7 @@ def main(
         parts += [f"### {name}\n", f"{said}\n", scored(read), *([angles(read)] if first["angles"] else [])]
     write(page, *parts)
     if there[TUNING]:
-        draw(there[TUNING], there["alpha"], page.with_suffix(".png"))
+        draw(there[TUNING], there["alpha"], picture)
 
 
 if __name__ == "__main__":

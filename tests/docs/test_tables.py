@@ -148,7 +148,13 @@ def test_mix_and_match(tmp_path, page, monkeypatch):
     monkeypatch.setattr(mix_and_match, "SECTIONS", sections)
     motion.write_motion(tmp_path / "bvh", motion.simulate(clips=2, frames=240, seed=1), "bvh")
     budget = mix_and_match.Budget(2, 20, 3, 8, 2, 3, 5, 2)
-    options = {"raw": tmp_path / "bvh", "runs": tmp_path / "runs", "page": page, "budget": budget}
+    options = {
+        "raw": tmp_path / "bvh",
+        "runs": tmp_path / "runs",
+        "page": page,
+        "budget": budget,
+        "picture": tmp_path / "a.png",
+    }
     mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
     first, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
     times = [file.stat().st_mtime_ns for file in files]
@@ -164,7 +170,7 @@ def test_mix_and_match(tmp_path, page, monkeypatch):
     counts = [["mix, velocity", "1"], ["mix, velocity", "5"], ["no noise", "1"]]
     assert [row[:2] for row in angles[1:]] == [["zero velocity", "1"], ["mix", "1"], *counts]
     assert [row[0] for row in swept[1:]] == ["alpha 0.1", "alpha 0.3"]
-    assert page.with_suffix(".png").stat().st_size > 10_000
+    assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_rotations(folder, page):
