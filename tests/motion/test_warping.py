@@ -1,0 +1,67 @@
+"""Dynamic time warping against the recursion written out."""
+
+import numpy as np
+import pytest
+import torch
+
+from dvae.motion.warping import aligned, subsequence_costs
+
+
+def slow(local):
+    """Sakoe and Chiba's symmetric form, cell by cell."""
+    total = np.full(local.shape, np.inf)
+    total[0, 0] = 2 * local[0, 0]
+    for i, j in np.ndindex(*local.shape):
+        ways = [(total[i - 1, j], 1)] * (i > 0) + [(total[i, j - 1], 1)] * (j > 0)
+        ways += [(total[i - 1, j - 1], 2)] * (i > 0 and j > 0)
+        if ways:
+            total[i, j] = min(before + weight * local[i, j] for before, weight in ways)
+    return total[-1, -1] / sum(local.shape)
+
+
+@pytest.mark.parametrize(("rows", "frames", "longest"), [(5, 12, 7), (1, 6, 3), (6, 3, 9), (4, 1, 1), (3, 9, 9)])
+def test_the_cost_of_every_subsequence_is_that_of_the_recursion(rows, frames, longest):
+    local = torch.rand(rows, frames).double().numpy()
+    costs = subsequence_costs(local, longest)
+    assert costs.shape == (frames, longest)
+    for start, more in np.ndindex(frames, longest):
+        if start + more < frames:
+            np.testing.assert_allclose(costs[start, more], slow(local[:, start : start + more + 1]), rtol=1e-12)
+        else:
+            assert costs[start, more] == np.inf
+
+
+def test_what_lingers_costs_nothing():
+    reference = torch.rand(6, 2).numpy()
+    sequence = np.repeat(reference, [1, 3, 1, 2, 1, 4], axis=0)
+    local = np.linalg.norm(reference[:, None] - sequence, axis=-1)
+    assert subsequence_costs(local, len(sequence))[0, -1] == 0
+
+
+def test_a_pace_within_its_limits_is_found():
+    time = np.linspace(0, 1, 60)
+    pace = time + 0.08 * np.sin(2 * np.pi * time)  # from .5 to 1.5
+    local = np.abs(time[:, None] - pace)
+    places, cost = aligned(local)
+    assert (np.diff(places) > 0).all()
+    assert cost < 0.01
+    np.testing.assert_allclose(np.interp(places, np.arange(60), pace), time, atol=2 / 60)
+    even, _ = aligned(np.abs(time[:, None] - time))
+    np.testing.assert_array_equal(even, np.arange(60))
+
+
+def test_a_path_is_never_steeper_than_two():
+    places, _ = aligned(torch.rand(40, 55).numpy())
+    assert places[0] == 0
+    assert places[-1] == 54
+    assert (np.diff(places) >= 0.5).all()
+    assert (np.diff(places) <= 2).all()
+
+
+def test_what_cannot_be_warped_is_refused():
+    with pytest.raises(ValueError, match="expected \\(M, F\\), none 0"):
+        subsequence_costs(np.zeros((0, 4)), 3)
+    with pytest.raises(ValueError, match="leave out frames that lack joints"):
+        subsequence_costs(np.full((2, 4), np.nan), 3)
+    with pytest.raises(ValueError, match="cannot be warped onto 4 at a pace"):
+        aligned(np.zeros((4, 20)))
