@@ -14,6 +14,7 @@ from .dataset import MotionData
 from .exchange import Exchanged
 from .files import read_motion, read_paths, save, write_motion
 from .forecasts import Forecasts, Imputed, is_forecasts
+from .gait import Cycles, gait_cycles, reference_cycles
 from .occlusion import occlude
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
 from .scoring import displacements, scores
@@ -31,6 +32,7 @@ __all__ = [
     "AngleLimits",
     "Bones",
     "Clip",
+    "Cycles",
     "Exchanged",
     "Forecasts",
     "Heading",
@@ -48,10 +50,12 @@ __all__ = [
     "displacements",
     "draw_traversal",
     "estimate_angle_limits",
+    "gait_cycles",
     "is_forecasts",
     "occlude",
     "read_motion",
     "read_paths",
+    "reference_cycles",
     "rotate_about_up",
     "save",
     "scores",

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
+import networkx as nx
 import numpy as np
 import torch
 from rich.console import Group, RenderableType
@@ -28,6 +29,9 @@ SMALLEST, TALLEST = 0.3, 3.0
 
 MOST_FRAMES = 20_000
 """From which a rest pose is found."""
+
+STIFF = 1e-3
+"""Metres of deviation, in a clip, below which a distance between joints is taken for constant."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,6 +284,46 @@ class MotionSet:
             found = MotionSet(turned(), skeleton, self.name, skipped=self.skipped, said=self.said, missing=self.missing)
             object.__setattr__(self, "_turned", found)
         return found
+
+    def loosened(self) -> MotionSet:
+        """The same positions with a joint more wherever bones that leave from one place move against each other.
+
+        A joint has one turn, and takes all that hangs from it along. Where recordings have left joints out, as a spine
+        that bends against the hips right at the pelvis, `with_rotations` can only find turns in between. Here the
+        most bones that keep their angles (distances of their ends within a millimetre, in every clip) stay with the
+        joint, and each further group of them gets one of its own in the same place, by the name of the first end.
+
+        Raises:
+            ValueError: there are rotations already, or joints are missing.
+        """
+        skeleton = self.skeleton
+        if skeleton.rest or self.missing:
+            raise ValueError(
+                f"{self.name or 'this motion'} has {'rotations' if skeleton.rest else 'missing joints'}; joints are "
+                "added where turns are still to be found, of whole poses"
+            )
+        names, parents, places = list(skeleton.names), list(skeleton.parents), list(range(skeleton.joints))
+        for joint in skeleton.order:
+            below = [child for parent, child in skeleton.edges if parent == joint]
+            if len(below) > 1:
+                for group in self._rigid(below)[1:]:
+                    for child in group:
+                        parents[child] = len(names)
+                    names.append(f"{skeleton.names[joint]}-{skeleton.names[group[0]]}")
+                    parents.append(joint)
+                    places.append(joint)
+        loose = replace(skeleton, names=tuple(names), parents=tuple(parents), lengths=())
+        clips = [replace(clip, positions=clip.positions[:, places], rotations=None) for clip in self]
+        return MotionSet(clips, loose, self.name, copy=False, skipped=self.skipped, said=self.said)
+
+    def _rigid(self, joints: Sequence[int]) -> list[list[int]]:
+        """Joints in groups whose distances stay, the largest first."""
+        varies = np.zeros((len(joints), len(joints)))
+        for clip in self:
+            ends = clip.positions[:, joints].astype(np.float64)
+            varies = np.maximum(varies, np.linalg.norm(ends[:, :, None] - ends[:, None], axis=-1).std(0))
+        groups = nx.connected_components(nx.from_numpy_array(varies < STIFF))
+        return sorted(([joints[place] for place in sorted(group)] for group in groups), key=len, reverse=True)
 
     def resampled(self, fps: float) -> MotionSet:
         """The same motion at another number of frames per second; see `Clip.resampled`.

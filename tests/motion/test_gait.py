@@ -1,0 +1,176 @@
+"""Gait cycles: found where they are, of either foot, and nowhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dvae.motion import Clip, Cycles, MotionSet, gait_cycles, kinematics, reference_cycles, rotations, simulate
+from dvae.motion.gait import alike, find_cycles
+
+SKELETON = simulate(clips=4, frames=60).with_rotations().skeleton
+
+
+def walk(seconds=5.0, period=1.0, swing=0.4, fps=30.0, start=0.0, name="walk"):
+    """Somebody whose left thigh is furthest forward at the start and after every period, the right one between."""
+    time = torch.arange(round(seconds * fps) + 1, dtype=torch.float64) / fps
+    phase = 2 * torch.pi * time / period + start
+    vectors = torch.zeros(len(time), SKELETON.joints, 3, dtype=torch.float64)
+    for side, own in (("L", phase), ("R", phase + torch.pi)):
+        vectors[:, SKELETON.names.index(f"{side}Hip"), 0] = -swing * own.cos()
+        vectors[:, SKELETON.names.index(f"{side}Knee"), 0] = swing * (1 - own.sin())
+    turns = rotations.to_matrix(vectors, "vector")
+    root = torch.stack([0 * time, 1 + 0 * time, time], -1)
+    positions, _ = kinematics.forward(SKELETON.parents, turns, SKELETON.offsets, root)
+    quaternions = rotations.from_matrix(turns, "quaternion").numpy()
+    return Clip("train", name, positions.numpy(), {"content": "walk"}, rotations=quaternions)
+
+
+def of(*clips, fps=30.0):
+    return MotionSet(clips, replace(SKELETON, fps=fps), "people")
+
+
+@pytest.mark.parametrize("period", [0.7, 1.0, 1.6])
+def test_a_gait_is_cut_into_cycles_of_its_period_by_either_foot(period):
+    people = of(walk(period=period, seconds=5 * period))
+    left, right = reference_cycles(people)
+    assert (left.side, right.side) == ("left", "right")
+    assert left.seconds == pytest.approx(period, abs=1 / 30 + 1e-9)
+    found = find_cycles(people.clips[0], people.skeleton, (left, right), Cycles())
+    for side, first, many in (("left", 0.0, 5), ("right", 0.5, 4)):
+        own = [cycle for cycle in found if cycle.side == side]
+        assert len(own) == many
+        starts = np.array([cycle.first for cycle in own])
+        np.testing.assert_allclose(starts, 30 * period * (first + np.arange(many)), atol=2)
+        np.testing.assert_allclose([cycle.last - cycle.first for cycle in own], 30 * period, atol=2)
+        assert max(cycle.cost for cycle in own) < 0.05
+
+
+@pytest.mark.parametrize("stretched", [0.5, 0.8, 1.5, 2.5])
+def test_what_is_stretched_in_time_costs_little(stretched):
+    references = reference_cycles(of(walk()))
+    slow = walk(period=stretched, seconds=4 * stretched)
+    found = find_cycles(slow, SKELETON, references, Cycles(threshold=0.06))
+    assert len(found) == 7  # four of the left foot, three of the right
+    np.testing.assert_allclose([cycle.last - cycle.first for cycle in found], 30 * stretched, atol=3)
+
+
+def test_who_stands_or_marches_on_one_leg_walks_no_cycle():
+    references = reference_cycles(of(walk()))
+    still = walk(swing=0.0)
+    assert not find_cycles(still, SKELETON, references, Cycles())
+    stepping = walk()
+    lame = stepping.rotations.copy()
+    lame[:, [SKELETON.names.index("RHip")]] = (1.0, 0, 0, 0)
+    lame[:, [SKELETON.names.index("LHip")]] = (1.0, 0, 0, 0)
+    assert not find_cycles(replace(stepping, rotations=lame), SKELETON, references, Cycles())
+    with pytest.raises(ValueError, match=r"people has no gait cycle of 0.3 to 3 s whose hips are within 0.25 rad"):
+        gait_cycles(of(still), references)
+    with pytest.raises(ValueError, match=r"in no clip of people legs swing by 0.2 rad and more, twice .* references="):
+        reference_cycles(of(still))
+
+
+def test_half_a_cycle_is_none():
+    references = reference_cycles(of(walk()))
+    assert not find_cycles(walk(seconds=0.6), SKELETON, references, Cycles())
+
+
+def test_no_cycle_is_shorter_or_longer_than_the_limits():
+    references = reference_cycles(of(walk()))
+    for period in (0.5, 1.0, 2.0):
+        clip = walk(period=period, seconds=4 * period)
+        for shortest, longest in ((0.3, 3.0), (0.8, 1.5), (1.8, 2.2), (0.4, 0.4)):
+            cycles = Cycles(shortest=shortest, longest=longest, overlap=0)
+            for found in find_cycles(clip, SKELETON, references, cycles):
+                assert shortest * 30 - 1e-6 <= found.last - found.first <= longest * 30 + 1e-6
+    assert not find_cycles(walk(seconds=0.2), SKELETON, references, Cycles())
+
+
+def test_cycles_of_one_foot_overlap_no_more_than_said():
+    people = simulate(clips=12, frames=150, seed=1).with_rotations()
+    references = reference_cycles(people)
+    for share in (0.0, 0.1, 0.5):
+        for clip in people:
+            found = find_cycles(clip, people.skeleton, references, Cycles(threshold=0.4, overlap=share))
+            for side in ("left", "right"):
+                own = [cycle for cycle in found if cycle.side == side]
+                for one in own:
+                    for other in own:
+                        if one is not other:
+                            shared = min(one.last, other.last) - max(one.first, other.first)
+                            assert shared <= share * min(one.last - one.first, other.last - other.first)
+
+
+def test_any_rate_has_the_same_cycles():
+    slow, fast = of(walk()), of(walk(fps=120.0), fps=120.0)
+    for people, fps in ((slow, 30.0), (fast, 120.0)):
+        references = reference_cycles(people)
+        assert [len(reference.hips) for reference in references] == pytest.approx([31, 31], abs=1)
+        starts = [cycle.first / fps for cycle in find_cycles(people.clips[0], people.skeleton, references, Cycles())]
+        np.testing.assert_allclose(starts, np.arange(9) / 2, atol=2 / 30)
+
+
+def test_cycles_are_clips_that_know_where_they_are_from():
+    people = of(walk(), replace(walk(period=1.2, name="later"), split="test"))
+    segments = gait_cycles(people, cycles=Cycles(threshold=0.1))
+    assert segments.splits == ["train", "test"]
+    for segment in segments:
+        assert segment.labels["content"] == "walk"
+        source = people[segment.split, segment.labels["source"]]
+        start = int(segment.labels["start"])
+        np.testing.assert_array_equal(segment.positions, source.positions[start : start + segment.frames])
+        np.testing.assert_array_equal(segment.rotations, source.rotations[start : start + segment.frames])
+        assert float(segment.labels["cost"]) < 0.1
+    assert {segment.labels["cycle"] for segment in segments} == {"left", "right"}
+
+
+def test_references_are_of_training_clips_and_typical():
+    odd = walk(swing=0.7, name="odd")
+    people = of(walk(), walk(start=1.0, name="second"), odd, replace(walk(swing=0.9, name="held out"), split="test"))
+    assert {reference.source for reference in reference_cycles(people)} <= {("train", "walk"), ("train", "second")}
+
+
+def test_what_cannot_be_cut_is_refused():
+    people = of(walk())
+    references = reference_cycles(people)
+    bare = MotionSet([replace(people.clips[0], rotations=None)], SKELETON)
+    with pytest.raises(ValueError, match=r"clip train/walk has no turns of joints; MotionSet.with_rotations"):
+        gait_cycles(bare, references)
+    with pytest.raises(ValueError, match="a reference has 30 frames a second, and cycles 25"):
+        gait_cycles(people, references, Cycles(rate=25.0))
+    with pytest.raises(ValueError, match="expected the shorter first"):
+        Cycles(shortest=2.0, longest=1.0)
+    with pytest.raises(ValueError, match="threshold is -1"):
+        Cycles(threshold=-1.0)
+
+
+def test_of_real_motion_walks_and_runs_alone_are_cut(real):
+    motion = real("bandai/bandai2.npz")
+    some = []
+    for content in ("walk", "run", "wave-both-hands", "raise-up-left-hand"):
+        some += [clip for clip in motion if clip.labels["content"] == content][::10]
+    people = MotionSet(some, motion.skeleton).with_rotations()
+    segments = gait_cycles(people)
+    assert {segment.labels["content"] for segment in segments} == {"walk", "run"}
+    walks = {clip.key for clip in people if clip.labels["content"] == "walk"}
+    assert walks <= {(segment.split, segment.labels["source"]) for segment in segments}
+    seconds = np.array([(segment.frames - 1) / 30 for segment in segments])
+    assert 0.6 < np.median(seconds[[segment.labels["content"] == "run" for segment in segments]]) < 0.95
+    assert 0.85 < np.median(seconds[[segment.labels["content"] == "walk" for segment in segments]]) < 1.3
+
+
+def test_two_sources_get_one_tree_and_rest_poses_of_their_own(real):
+    bandai, cmu = real("bandai/bandai2.npz"), real("cmu/cmu8.npz")
+    bandai = MotionSet([clip for clip in bandai if clip.labels["content"] == "walk"][::10], bandai.skeleton, "bandai")
+    cmu = MotionSet([clip for clip in cmu if clip.labels["content"] == "walking"], cmu.skeleton, "cmu")
+    first, second = alike(bandai, cmu)
+    assert (first.skeleton.names, first.skeleton.parents) == (second.skeleton.names, second.skeleton.parents)
+    assert first.skeleton.rest != second.skeleton.rest
+    assert [clip.key for clip in second] == [clip.key for clip in cmu]
+    for motion, given in ((first, bandai), (second, cmu)):
+        shared = [name for name in motion.skeleton.names if name in given.skeleton.names]
+        assert len(shared) == 19
+        theirs, ours = ([each.names.index(name) for name in shared] for each in (given.skeleton, motion.skeleton))
+        np.testing.assert_array_equal(motion.clips[0].positions[:, ours], given.clips[0].positions[:, theirs])
+        assert len(gait_cycles(motion)) > 4 * len(motion) / 2
