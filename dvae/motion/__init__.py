@@ -18,6 +18,7 @@ from .gait import Cycles, gait_cycles, reference_cycles
 from .occlusion import occlude
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
 from .scoring import displacements, scores
+from .segments import TimedFrames
 from .simulator import simulate
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
 from .truths import PseudoTruths, WithPseudoTruths
@@ -44,6 +45,7 @@ __all__ = [
     "PseudoTruths",
     "Rotations",
     "Skeleton",
+    "TimedFrames",
     "Windows",
     "WithPseudoTruths",
     "bodies",

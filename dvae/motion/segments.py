@@ -1,0 +1,322 @@
+"""Segments of motion as time-stamped frames, chi of a latent space of 4D motion.
+
+Marsot, Wuhrer, Franco and Durocher (2021), arXiv 2106.04387, section 3:
+
+    chi = [Theta, Gamma, Phi]     N frames of turns of joints, place of the root, and time
+
+* Theta: the turn of every joint from which others hang as six numbers, less those of no turn, 1 0 0 0 1 0. Ends, whose
+  turns move nothing, are left out, and come back unturned.
+* Gamma: where the root is from where it was in the first frame, in units that leave it between -1 and 1.
+* Phi: how long after the frame before a frame is; 0 in the first. So all of them add up to how long a segment lasts,
+  from its first frame to its last: (F - 1) / fps of F frames.
+
+A segment starts facing one way: the heading of its first frame is taken from it, and nothing else of how its root is
+turned, so that down stays down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from torch import Tensor
+
+from ..data import Batch
+from ..options import Positive, Size, check
+from ..views import WHOLE
+from . import kinematics
+from .data import Clip, MotionSet
+from .gait import Reference, stamps
+from .rotations import continuous, from_matrix, to_matrix
+from .skeleton import Skeleton, rotate_about_up
+from .views import HEADING
+
+OFFSETS = "offsets"
+"""Name in batches of rest poses (B, J, 3) in metres: where joints are, on average, from their parents as these turn."""
+
+ORIGIN = "origin"
+"""Name in batches of where roots are in first frames, (B, 3) in metres."""
+
+ROUNDS = 4
+"""Of correcting what interpolation there and back loses, each of which leaves a third or less of it: of bandai2 and
+cmu8, at 91 frames of 30 a second, .1 of the largest errors of 4 and 13 mm."""
+
+STEADY = 1e-3
+"""Deviation, of numbers of turns, below which one is taken for so much."""
+
+BRIEFEST = 0.01
+"""Share of an even increment of the longest segment that an increment has at least, whatever a decoder makes of it."""
+
+
+@dataclass(frozen=True)
+class TimedFrames:
+    """Segments of motion, and back to motion.
+
+    Args:
+        skeleton: of the segments, with a rest pose, left and right.
+        frames: N.
+        metres: by which places are divided.
+        seconds: how long the segment lasts whose even increments are 1.
+        mean, deviation: of the six numbers of each turning joint; empty for those of no turn, and 1.
+        references: cycles along which time is warped: a frame of chi is where the same frame of the nearest of them,
+            brought to N frames, is found in the segment (`gait.stamps`). None: N frames evenly in time.
+
+    Raises:
+        ValueError: a skeleton without rest pose or sides, or as many numbers as no turns have.
+
+    Example:
+        >>> people = dvae.motion.simulate(clips=2, frames=60).with_rotations()
+        >>> frames = TimedFrames.of(people)
+        >>> frames.to(people)["x"].shape, frames.back(frames.to(people), fps=60).clips[0].frames
+        (torch.Size([2, 100, 76]), 119)
+    """
+
+    skeleton: Skeleton
+    frames: Size = 100
+    metres: Positive = 1.0
+    seconds: Positive = 3.0
+    mean: Sequence[float] = ()
+    deviation: Sequence[float] = ()
+    references: Sequence[Reference] = ()
+
+    def __post_init__(self) -> None:
+        check(self)
+        for needed in ("offsets", "sides"):
+            getattr(self.skeleton, needed)  # which say what to do where there are none
+        if self.frames < 2:
+            raise ValueError(f"{self.frames} frame has no time between frames; expected at least 2")
+        for name in ("mean", "deviation"):
+            if (numbers := len(getattr(self, name))) not in (0, 6 * len(self.turning)):
+                raise ValueError(
+                    f"{name} has {numbers} numbers, expected 6 for each of {len(self.turning)} joints that turn"
+                )
+        if any(value <= 0 for value in self.deviation):
+            raise ValueError(f"a deviation is {min(self.deviation)}, by which nothing can be divided")
+
+    @classmethod
+    def of(
+        cls,
+        motion: MotionSet,
+        frames: int = 100,
+        scaling: Literal["identity", "deviation"] = "identity",
+        references: Sequence[Reference] = (),
+    ) -> Self:
+        """In units of these segments, which are those for training.
+
+        Args:
+            motion: segments, with rotations.
+            frames: N.
+            scaling: of turns: "identity" takes no turn from them, "deviation" their mean, and divides by their
+                deviation, which the paper found unstable.
+            references: see the class.
+
+        Raises:
+            ValueError: another scaling; or see `to`.
+        """
+        if scaling not in ("identity", "deviation"):
+            raise ValueError(f"scaling is {scaling!r}; expected 'identity' or 'deviation'")
+        made = cls(motion.skeleton, frames, references=references)
+        x = made.to(motion)[WHOLE].double()
+        parts = made.parts
+        metres = max(float(x[..., parts["place"]].abs().max()), 1e-3)
+        made = replace(made, metres=metres, seconds=float(made.lasts(x).max()))
+        if scaling == "identity":
+            return made
+        turns = made._turns(x).flatten(-2).flatten(0, 1)
+        deviation = turns.std(0, correction=0).clamp(STEADY)
+        return replace(made, mean=tuple(turns.mean(0).tolist()), deviation=tuple(deviation.tolist()))
+
+    @property
+    def turning(self) -> list[int]:
+        """The K joints from which others hang."""
+        return sorted({parent for parent, _ in self.skeleton.edges})
+
+    @property
+    def size(self) -> int:
+        """Numbers of a frame, 6 K + 4."""
+        return 6 * len(self.turning) + 4
+
+    @property
+    def parts(self) -> Mapping[str, list[int]]:
+        """Coordinates of a frame by what they are of: turns (Theta), place (Gamma), time (Phi)."""
+        turns = 6 * len(self.turning)
+        return {"turns": [*range(turns)], "place": [*range(turns, turns + 3)], "time": [turns + 3]}
+
+    def to(self, motion: MotionSet) -> dict[str, Any]:
+        """Segments, each a clip, as time-stamped frames.
+
+        Args:
+            motion: at any rate, with rotations.
+
+        Returns:
+            A batch: x (B, N, D), and what the way back needs: the heading (B,) in radians and the origin (B, 3) in
+            metres of first frames, and the body, as offsets (B, J, 3) of its rest pose.
+
+        Raises:
+            ValueError: clips without rotations, of one frame, or of another skeleton.
+        """
+        skeleton = motion.skeleton
+        if (skeleton.names, skeleton.parents, skeleton.up) != tuple(
+            getattr(self.skeleton, name) for name in ("names", "parents", "up")
+        ):
+            raise ValueError(
+                f"{motion.name or 'these segments'} have the tree of joints {skeleton.name!r}, and frames here are of "
+                f"{self.skeleton.name!r}; dvae.motion.gait.alike brings two sources onto one tree"
+            )
+        for clip in motion:
+            where = f"segment {'/'.join(clip.key)}"
+            if clip.rotations is None:
+                raise ValueError(f"{where} has no turns of joints; MotionSet.with_rotations() finds them")
+            if clip.frames < 2:
+                raise ValueError(f"{where} has {clip.frames} frame, expected at least 2, between which time passes")
+        first = torch.from_numpy(np.stack([clip.positions[0] for clip in motion])).double()
+        heading = skeleton.heading(first)
+        found = {
+            WHOLE: torch.stack([self._seen(clip, skeleton.fps, -h) for clip, h in zip(motion, heading, strict=True)]),
+            HEADING: heading,
+            ORIGIN: first[:, skeleton.root],
+            OFFSETS: torch.stack([self._body(clip) for clip in motion]),
+        }
+        return {name: value.float() for name, value in found.items()}
+
+    def back(self, seen: Batch, fps: float | None = None) -> MotionSet:
+        """Motion of time-stamped frames: what `to` made, or a decoder.
+
+        Args:
+            seen: x (B, N, D). Without a heading, everybody starts facing heading zero; without an origin, at 0; without
+                offsets, with the body of the skeleton's rest pose.
+            fps: of the motion; that of the skeleton by default.
+
+        Returns:
+            A clip for each, with positions and rotations, from time 0 to the last that is not after its end.
+
+        Raises:
+            ValueError: x of another shape, or with what is no number.
+        """
+        skeleton, x = replace(self.skeleton, fps=fps or self.skeleton.fps), seen[WHOLE].detach().cpu().double()
+        if not x.isfinite().all():
+            raise ValueError(f"{int((~x.isfinite()).sum())} of the numbers of frames are NaN or infinite")
+        turns, places, times = self.unpack(x)
+        clips = []
+        for b in range(len(x)):
+            values = _joined(continuous(from_matrix(turns[b][:, self.turning], "quaternion")), places[b])
+            at = np.arange(int(float(times[b, -1]) * skeleton.fps + 1e-3) + 1) / skeleton.fps
+            local, place = self._taken(_through(values, times[b].numpy(), at.clip(max=float(times[b, -1]))))
+            if HEADING in seen:
+                local, place = self._faced(local, place, seen[HEADING][b].cpu().double())
+            if ORIGIN in seen:
+                place = place + seen[ORIGIN][b].cpu().double()
+            offsets = seen[OFFSETS][b].cpu().double() if OFFSETS in seen else skeleton.offsets
+            positions, _ = kinematics.forward(skeleton.parents, local, offsets, place)
+            quaternions = continuous(from_matrix(local, "quaternion"))
+            clips.append(Clip("all", f"{b:04d}", positions.numpy(), rotations=quaternions.numpy()))
+        return MotionSet(clips, skeleton, "segments")
+
+    def unpack(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What frames (..., N, D) say, with gradients.
+
+        Returns:
+            local rotations of all joints (..., N, J, 3, 3), of ends none; places of the root from where it was at
+            first (..., N, 3) in metres; and times from the first frame (..., N) in seconds.
+
+        Raises:
+            ValueError: another shape.
+        """
+        if x.shape[-2:] != (self.frames, self.size):
+            raise ValueError(
+                f"segments have shape {tuple(x.shape)}, expected (..., {self.frames}, {self.size}) for the skeleton "
+                f"{self.skeleton.name!r}"
+            )
+        rotations = torch.eye(3).to(x).repeat(*x.shape[:-1], self.skeleton.joints, 1, 1)
+        rotations[..., self.turning, :, :] = to_matrix(self._turns(x), "6d")
+        even = self.seconds / (self.frames - 1)
+        later = x[..., 1:, -1].clamp(BRIEFEST) * even
+        times = torch.nn.functional.pad(later.cumsum(-1), (1, 0))
+        return rotations, x[..., self.parts["place"]] * self.metres, times
+
+    def lasts(self, x: Tensor) -> Tensor:
+        """How long segments (..., N, D) last, (...,) in seconds: the sum of their increments."""
+        return self.unpack(x)[2][..., -1]
+
+    def _body(self, clip: Clip) -> Tensor:
+        """Offsets (J, 3) of a clip."""
+        parents, children = (list(ends) for ends in zip(*self.skeleton.edges, strict=True))
+        places = torch.from_numpy(clip.positions).double()
+        local = to_matrix(torch.from_numpy(clip.rotations).double(), "quaternion")
+        _, world = kinematics.forward(self.skeleton.parents, local, self.skeleton.offsets, places[:, 0])
+        found = torch.zeros_like(places[0])
+        limbs = (places[:, children] - places[:, parents])[..., None]
+        found[children] = (world[:, parents].mT @ limbs).squeeze(-1).mean(0)
+        return found
+
+    def _seen(self, clip: Clip, fps: float, angle: Tensor) -> Tensor:
+        """(N, D) of a clip turned by an angle."""
+        assert clip.rotations is not None
+        local = to_matrix(torch.from_numpy(clip.rotations).double(), "quaternion")
+        place = torch.from_numpy(clip.positions[:, self.skeleton.root]).double()
+        local, place = self._faced(local, place - place[:1], angle)
+        given = _joined(continuous(from_matrix(local[:, self.turning], "quaternion")), place)
+        times = np.arange(clip.frames) / fps
+        at = times[-1] * np.linspace(0, 1, self.frames)
+        if self.references:
+            at = stamps(clip, self.skeleton, self.references, self.frames) / fps
+        values = _through(given, times, at)
+        for _ in range(ROUNDS):  # what comes back less or more than it was, goes in more or less
+            values = _normed(values + _spline(given - _through(values, at, times), times, at))
+        local, place = self._taken(values)
+        turns = from_matrix(local[:, self.turning], "6d").flatten(-2)
+        increments = torch.from_numpy(np.diff(at, prepend=0.0)) * (self.frames - 1) / self.seconds
+        mean, deviation = self._scaling(turns)
+        return torch.cat([(turns - mean) / deviation, place / self.metres, increments[:, None]], -1)
+
+    def _faced(self, local: Tensor, place: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotations (F, J, 3, 3) and places (F, 3) of whoever turns about the up axis by an angle."""
+        root, up = self.skeleton.root, self.skeleton.up
+        axes = rotate_about_up(torch.eye(3).to(local), angle.expand(3), up).mT
+        local = local.clone()
+        local[:, root] = axes @ local[:, root]
+        return local, rotate_about_up(place, angle.expand(len(place)), up)
+
+    def _taken(self, values: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Rotations (F, J, 3, 3), of ends none, and places (F, 3) of joined ones."""
+        given = torch.from_numpy(values)
+        local = torch.eye(3).to(given).repeat(len(given), self.skeleton.joints, 1, 1)
+        local[:, self.turning] = to_matrix(given[:, :-3].unflatten(-1, (-1, 4)), "quaternion")
+        return local, given[:, -3:]
+
+    def _turns(self, x: Tensor) -> Tensor:
+        """Six numbers of each turning joint (..., K, 6)."""
+        mean, deviation = self._scaling(x)
+        found: Tensor = (x[..., :-4] * deviation + mean).unflatten(-1, (-1, 6))
+        return found
+
+    def _scaling(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        unturned = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0) * len(self.turning)
+        return like.new_tensor(self.mean or unturned), like.new_tensor(self.deviation or [1.0] * len(unturned))
+
+
+def _joined(quaternions: Tensor, place: Tensor) -> np.ndarray:
+    """(F, 4 K + 3) of (F, K, 4) and (F, 3)."""
+    found: np.ndarray = torch.cat([quaternions.flatten(-2), place], -1).numpy()
+    return found
+
+
+def _normed(values: np.ndarray) -> np.ndarray:
+    """Joined ones with quaternions of unit length."""
+    turns = values[:, :-3].reshape(len(values), -1, 4)
+    turns = turns / np.linalg.norm(turns, axis=-1, keepdims=True)
+    return np.concatenate([turns.reshape(len(values), -1), values[:, -3:]], axis=1)
+
+
+def _spline(values: np.ndarray, times: np.ndarray, at: np.ndarray) -> np.ndarray:
+    found: np.ndarray = CubicSpline(times, values, axis=0)(at)
+    return found
+
+
+def _through(values: np.ndarray, times: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Joined ones at other times, on a cubic through those that are given, the nearer way round where they turn."""
+    return _normed(_spline(values, times, at))
