@@ -257,7 +257,7 @@ def _legs(skeleton: Skeleton) -> list[list[int]]:
                 f"skeleton {skeleton.name!r} has no joint below {skeleton.names[hip]}, so nobody sees legs swing"
             )
         path = [below[0], hip]
-        while (above := skeleton.parents[path[-1]]) != skeleton.root:
+        while (above := skeleton.parents[path[-1]]) not in (skeleton.root, -1):
             path.append(above)
         legs.append(path[::-1])
     return legs

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from dvae.motion import Clip, Cycles, MotionSet, gait_cycles, kinematics, reference_cycles, rotations, simulate
+from dvae.motion import (
+    Clip,
+    Cycles,
+    MotionSet,
+    Skeleton,
+    gait_cycles,
+    kinematics,
+    reference_cycles,
+    rotations,
+    simulate,
+)
 from dvae.motion.gait import alike, find_cycles
 
 SKELETON = simulate(clips=4, frames=60).with_rotations().skeleton
@@ -135,6 +145,15 @@ def test_references_are_of_training_clips_and_typical():
 def test_what_cannot_be_cut_is_refused():
     people = of(walk())
     references = reference_cycles(people)
+    assert not find_cycles(people.clips[0].between(0, 1), SKELETON, references, Cycles())
+    assert not find_cycles(people.clips[0], SKELETON, (), Cycles())
+    with pytest.raises(ValueError, match="has no rest pose"):
+        find_cycles(people.clips[0], replace(SKELETON, rest=()), references, Cycles())
+    with pytest.raises(ValueError, match="has no left and right joints"):
+        find_cycles(people.clips[0], replace(SKELETON, left=(), right=()), references, Cycles())
+    armless = Skeleton(("Root", "LHip", "RHip"), (-1, 0, 0), (1,), (2,), rest=(0, 0, 0, 0.1, 0, 0, -0.1, 0, 0))
+    with pytest.raises(ValueError, match="has no joint below LHip, so nobody sees legs swing"):
+        find_cycles(people.clips[0], armless, references, Cycles())
     bare = MotionSet([replace(people.clips[0], rotations=None)], SKELETON)
     with pytest.raises(ValueError, match=r"clip train/walk has no turns of joints; MotionSet.with_rotations"):
         gait_cycles(bare, references)
