@@ -7,7 +7,7 @@ changes nothing, nor the reverse.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -288,7 +288,8 @@ class SVI:
         if isinstance(objective, Asking) and objective.draws:
             program["draws"] = objective.draws
         try:
-            return Terms(**self.module(self.fabric.to_device(placed), program, self.objective))
+            measure = self.objective.measure if isinstance(self.objective, Adapting) else None
+            return Terms(**self.module(self.fabric.to_device(placed), program, measure))
         except ValueError as error:
             # torch's distributions refuse NaN parameters and values before there is a term to look at
             if "invalid values" not in str(error) and "within the support" not in str(error):
@@ -307,12 +308,14 @@ class _Bound(nn.Module):
         self.model = model
         self.estimator = estimator
 
-    def forward(self, batch: Batch, program: Mapping[str, Any], objective: Objective) -> dict[str, Any]:
+    def forward(
+        self, batch: Batch, program: Mapping[str, Any], measure: Callable[[Terms], None] | None
+    ) -> dict[str, Any]:
         terms = self.estimator.terms(self.model, batch, **program)
         # here, as from what leaves the module fabric alone may take gradients
-        if isinstance(objective, Adapting) and torch.is_grad_enabled():
+        if measure is not None and torch.is_grad_enabled():
             with torch.autocast(terms.frames.device.type, enabled=False):
-                objective.measure(terms)
+                measure(terms)
         return dict(vars(terms))
 
 

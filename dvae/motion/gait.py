@@ -30,7 +30,7 @@ from .data import Clip, MotionSet
 from .kinematics import forward
 from .rotations import continuous, from_matrix, to_matrix
 from .skeleton import Skeleton, rotate_about_up
-from .warping import aligned, subsequence_costs
+from .warping import alignment, subsequence_costs
 
 MOST_CYCLES = 400
 """Of which the most typical is found."""
@@ -229,7 +229,7 @@ def stamps(clip: Clip, skeleton: Skeleton, references: Sequence[Reference], fram
         return found
 
     own = even(_hips(clip, skeleton))
-    warped = [aligned(_apart(even(reference.hips), own)) for reference in references]
+    warped = [alignment(_apart(even(reference.hips), own)) for reference in references]
     places, _ = min(warped, key=lambda each: each[1])
     return places * ((clip.frames - 1) / (frames - 1))
 

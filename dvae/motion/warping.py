@@ -53,7 +53,7 @@ def subsequence_costs(local: np.ndarray, longest: int) -> np.ndarray:
     return found
 
 
-def aligned(local: np.ndarray) -> tuple[np.ndarray, float]:
+def alignment(local: np.ndarray) -> tuple[np.ndarray, float]:
     """Where in a sequence each frame of a reference is, at a pace from half to twice the reference's.
 
     Steps are one frame on in both, or one in one and two in the other; the ends of both meet.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dvae.motion.warping import aligned, subsequence_costs
+from dvae.motion.warping import alignment, subsequence_costs
 
 
 def slow(local):
@@ -42,16 +42,16 @@ def test_a_pace_within_its_limits_is_found():
     time = np.linspace(0, 1, 60)
     pace = time + 0.08 * np.sin(2 * np.pi * time)  # from .5 to 1.5
     local = np.abs(time[:, None] - pace)
-    places, cost = aligned(local)
+    places, cost = alignment(local)
     assert (np.diff(places) > 0).all()
     assert cost < 0.01
     np.testing.assert_allclose(np.interp(places, np.arange(60), pace), time, atol=2 / 60)
-    even, _ = aligned(np.abs(time[:, None] - time))
+    even, _ = alignment(np.abs(time[:, None] - time))
     np.testing.assert_array_equal(even, np.arange(60))
 
 
 def test_a_path_is_never_steeper_than_two():
-    places, _ = aligned(torch.rand(40, 55).numpy())
+    places, _ = alignment(torch.rand(40, 55).numpy())
     assert places[0] == 0
     assert places[-1] == 54
     assert (np.diff(places) >= 0.5).all()
@@ -64,4 +64,4 @@ def test_what_cannot_be_warped_is_refused():
     with pytest.raises(ValueError, match="leave out frames that lack joints"):
         subsequence_costs(np.full((2, 4), np.nan), 3)
     with pytest.raises(ValueError, match="cannot be warped onto 4 at a pace"):
-        aligned(np.zeros((4, 20)))
+        alignment(np.zeros((4, 20)))
