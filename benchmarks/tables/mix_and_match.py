@@ -414,7 +414,7 @@ def main(
             f"{sum(held.values())} windows of {len(held)} clips; {first['jerk']}. {SECTIONS[name].steps(budget)} steps "
         )
         said += f"of training, {min(seconds):.0f} to {max(seconds):.0f} s of processor time."
-        parts += [f"### {name}\n", f"{said}\n", scored(read), *([angles(read)] if first["angles"] else [])]
+        parts += [f"## {name}\n", f"{said}\n", scored(read), *([angles(read)] if first["angles"] else [])]
     write(page, *parts)
     if there[TUNING]:
         draw(there[TUNING], there["alpha"], picture)
