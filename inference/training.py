@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal
 
 from ..options import Amount, Count, Range, Share, check, nearest
-from .gradnorm import GradNorm
 from .objectives import Evidence, Objective
 from .schedules import Piecewise, Schedule, clamp, levels, schedule, to_config
 
@@ -165,7 +164,7 @@ def recorded(training: Training, plan: Sequence[Stage]) -> dict[str, Any]:
 
     def config(stage: Stage) -> dict[str, Any]:
         objective = stage.objective
-        said = objective.to_config() if isinstance(objective, Evidence | GradNorm) else repr(objective)
+        said = getattr(objective, "to_config", objective.__repr__)()
         return to_config(vars(stage) | {"objective": said})
 
     return {"training": to_config(vars(training)), "stages": [config(stage) for stage in plan]}

@@ -1,4 +1,4 @@
-"""Mix-and-Match: futures of a moving body whose noise stands at random indices of the code of its past.
+"""Mix-and-Match: futures of a moving body whose noise perturbs random indices of the code of its past.
 
 With h the observed poses, x those that follow, and i indices that are drawn once for a batch,
 

@@ -2,11 +2,11 @@
 
 A sequence model that starts from a code h of its past makes many futures by having a latent z change that code. It may
 learn to ignore z where both come in the same way every time; Mix-and-Match (Aliakbarian et al. 2020, arXiv 1908.00733)
-therefore lets z stand at indices of the code that are drawn anew for every batch.
+therefore perturbs the code at indices that are drawn anew for every batch.
 
 | | code | from (arXiv) |
 |---|---|---|
-| `MixAndMatch` | z stands at random indices of h, and what a network makes of both at the others | 1908.00733 |
+| `MixAndMatch` | at random indices what a network makes of h there and z elsewhere; h at the others | 1908.00733 |
 | `Concatenate` | a network on [h, z] | MT-VAE: Yan et al. 2018, 1808.04545 |
 | `AddProjected` | h + W z; nothing encodes z, which is drawn from its prior | HP-GAN: Barsoum et al. 2018, 1711.09561 |
 
@@ -68,12 +68,12 @@ class CodeDecoder(nn.Module):
 
 @dataclass(frozen=True)
 class MixAndMatch:
-    """A share of the code's indices is drawn; the code stands there, and z at the others.
+    """A share of the code's indices is drawn; a network reads the code there and z at the others.
 
-    A network makes of the two what stands at the drawn indices of the code in place of what was there. So a share
-    alpha of the code is perturbed, and the rest goes on as it is: with 0 the code is that of the past alone. Of a code
-    of L numbers z has the L - ceil(alpha L) that stand at the other indices; another number is brought there by a
-    layer. With alpha = 1 no place is left for z.
+    What it makes takes the code's place at the drawn indices. So a share alpha of the code is perturbed, and the rest
+    goes on as it is: with 0 the code is that of the past alone. Of a code of L numbers z has the L - ceil(alpha L)
+    that the network reads at the other indices; another size is brought there by a layer. With alpha = 1 no place is
+    left for z.
 
     The guide reads the code of the past at the drawn indices and that of the future at the others. All of it is by the
     same indices, which the programs draw once for a batch: `DynamicalVAE(shared={"i": noise.indices})`.
