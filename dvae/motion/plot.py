@@ -328,22 +328,16 @@ def animate(
     for trace, (k, _, _, width) in zip(first, drawn, strict=True):
         trace |= {"mode": "lines", "name": _literal(stage.names[k]), "hoverinfo": "skip"}
         trace["line"]["width"] = width
-    floors = np.unique(places[:, 2]) + low[2]
-    labels = _labels(stage.names, places, high[2])
-    low, high = low + places.min(0) - MARGIN, high + places.max(0) + MARGIN
-    scene, fill = _scene(low, high)
-    return go.Figure(
-        data=[*first, *(_floor(low[:2], high[:2], height) for height in floors)],
+    return _figure(
+        first,
+        (low, high),
+        places,
+        stage.names,
+        title,
+        margin=110,
+        milliseconds=stage.milliseconds,
         frames=[go.Frame(name=str(f), data=traces(f), traces=list(range(len(drawn)))) for f in shown],
-        layout={
-            "title": {"text": _literal(title), "x": 0.5, "font": {"size": 16}},
-            "template": "none",
-            "showlegend": False,
-            "margin": {"l": 0, "r": 0, "t": 40 if title else 0, "b": 110},
-            "scene": {**scene, "annotations": labels},
-            **_player({str(f): stage.seconds(f) for f in shown}, stage.milliseconds),
-            "meta": {"milliseconds": stage.milliseconds, "high": fill},
-        },
+        **_player({str(f): stage.seconds(f) for f in shown}, stage.milliseconds),
     )
 
 
@@ -391,21 +385,7 @@ def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = 
         }
         for name, body in zip(names, people, strict=True)
     ]
-    labels = _labels(names, places, high[2])
-    floors = np.unique(places[:, 2]) + low[2]
-    low, high = low + places.min(0) - MARGIN, high + places.max(0) + MARGIN
-    scene, fill = _scene(low, high)
-    return go.Figure(
-        data=[*meshes, *(_floor(low[:2], high[:2], height) for height in floors)],
-        layout={
-            "title": {"text": _literal(title), "x": 0.5, "font": {"size": 16}},
-            "template": "none",
-            "showlegend": False,
-            "margin": {"l": 0, "r": 0, "t": 40 if title else 0, "b": 0},
-            "scene": {**scene, "annotations": labels},
-            "meta": {"milliseconds": 0, "high": fill},
-        },
-    )
+    return _figure(meshes, (low, high), places, names, title)
 
 
 def save_html(figure: go.Figure, path: str | PathLike[str]) -> None:
@@ -413,6 +393,38 @@ def save_html(figure: go.Figure, path: str | PathLike[str]) -> None:
     page = figure.to_html(auto_play=False, post_script=_PLAYER, config={"displaylogo": False})
     with files.written(path) as file:
         file.write(page.encode())
+
+
+def _figure(
+    drawn: list[Any],
+    box: tuple[np.ndarray, np.ndarray],
+    places: np.ndarray,
+    names: Sequence[str],
+    title: str,
+    *,
+    margin: int = 0,
+    milliseconds: float = 0,
+    frames: Sequence[go.Frame] = (),
+    **layout: Any,
+) -> go.Figure:
+    """Traces on a floor, each in a box (two corners) about its place (P, 3), with names above."""
+    low, high = box
+    floors, labels = np.unique(places[:, 2]) + low[2], _labels(names, places, high[2])
+    low, high = low + places.min(0) - MARGIN, high + places.max(0) + MARGIN
+    scene, fill = _scene(low, high)
+    return go.Figure(
+        data=[*drawn, *(_floor(low[:2], high[:2], height) for height in floors)],
+        frames=frames,
+        layout={
+            "title": {"text": _literal(title), "x": 0.5, "font": {"size": 16}},
+            "template": "none",
+            "showlegend": False,
+            "margin": {"l": 0, "r": 0, "t": 40 if title else 0, "b": margin},
+            "scene": {**scene, "annotations": labels},
+            **layout,
+            "meta": {"milliseconds": milliseconds, "high": fill},
+        },
+    )
 
 
 def _key(ax: Axes, samples: int, truth: bool, paths: bool) -> None:

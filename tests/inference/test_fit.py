@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 from safetensors.torch import load_file
+from stopping import At, interrupt
 
 from dvae.data import Sequences
 from dvae.inference import checkpoints
@@ -61,21 +62,6 @@ def run(model=None, train=TRAIN, validation=None, **options):
     if "stages" not in options:
         defaults["steps"] = 60
     return fit(model or build(), train, validation, **(defaults | options))
-
-
-class At(Callback):
-    """Calls a function after one step."""
-
-    def __init__(self, step, action):
-        self.step, self.action = step, action
-
-    def on_step(self, state):
-        if state.step == self.step:
-            self.action(state)
-
-
-def interrupt(state):
-    raise KeyboardInterrupt
 
 
 def ruin(state):

@@ -14,10 +14,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import load_file
+from stopping import At, interrupt
 
 import dvae
 from dvae.inference.checkpoints import OPTIMISER, CheckpointError, Run, weights
-from dvae.inference.fit import Callback, Interrupted, fit
+from dvae.inference.fit import Interrupted, fit
 from dvae.inference.gradnorm import GradNorm
 from dvae.inference.objectives import Adapting, Adaptive, Evidence
 from dvae.inference.resuming import restore, store
@@ -97,21 +98,6 @@ TRAIN = torch.randn(24, 4, 3, generator=torch.Generator().manual_seed(0), dtype=
 BALANCED = GradNorm(("small", "large"), "generator.x.", asymmetry=0.0, learning_rate=RATE)
 MIXED = GradNorm(("x", "other", "large"), "generator.x.", Evidence(kl_weight=Ramp(0.0, 0.1, 4)), asymmetry=0.0)
 CERTAIN = GradNorm(("x", "other", "large"), "generator.x.", asymmetry=0.0)
-
-
-class At(Callback):
-    """Calls a function after one step."""
-
-    def __init__(self, step, action):
-        self.step, self.action = step, action
-
-    def on_step(self, state):
-        if state.step == self.step:
-            self.action(state)
-
-
-def interrupt(state):
-    raise KeyboardInterrupt
 
 
 def weighing(result, name):
@@ -497,7 +483,7 @@ def test_another_objective_is_refused_where_it_would_go_on(tmp_path):
 SCRIPT = """
 import sys
 import torch
-sys.path.insert(0, sys.argv[2])
+sys.path[:0] = sys.argv[2:]
 import dvae
 from dvae.inference.checkpoints import Run
 from dvae.inference.resuming import restore, store
@@ -536,7 +522,7 @@ def test_two_processes_have_the_weights_of_one_that_has_both_their_batches(tmp_p
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(script), str(tmp_path), str(Path(__file__).parent)]
+    command = [sys.executable, str(script), str(tmp_path), *map(str, Path(__file__).parents[:2])]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     (first, model), (second, other) = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))

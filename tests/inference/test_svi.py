@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from stopping import At, interrupt
 
 import dvae
 from dvae.data import Sequences
@@ -90,26 +91,11 @@ def test_by_hand_goes_on_from_the_checkpoint_of_a_fit(tmp_path):
     options = {**SHARED, **RUNS["clipped"]}
     whole = dvae.fit(build(), TRAIN, HELD_OUT, **options)
     with pytest.raises(KeyboardInterrupt):
-        dvae.fit(build(), TRAIN, HELD_OUT, out=tmp_path, callbacks=[At(13)], **options)
+        dvae.fit(build(), TRAIN, HELD_OUT, out=tmp_path, callbacks=[At(13, interrupt)], **options)
     loop = dvae.SVI(build(seed=9), **options)
     loop.init()
     restore(loop, Run(tmp_path))
     assert by_hand(loop) == [row for row in whole.history if row["step"] > 13]
-
-
-class At:
-    """Interrupts a run after a step."""
-
-    def __init__(self, step):
-        self.step = step
-
-    def on_step(self, state):
-        if state.step == self.step:
-            raise KeyboardInterrupt
-
-    def on_validation(self, state): ...
-
-    def on_end(self, state): ...
 
 
 def test_the_callers_random_state_is_left_alone():

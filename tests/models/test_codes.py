@@ -1,25 +1,13 @@
 """The diversity of codes: of what a forecast starts from, zero where noise has no way in, and watched over training."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 import dvae
-from dvae import motion
 from dvae.models.codes import CodeDiversity, code_diversity, codes
 
-PROTOCOL = replace(
-    motion.PROTOCOLS["simulated"], observed=5, predicted=7, train_stride=3, test_stride=6, representation="quaternion"
-)
 WAYS = ("mix", "concatenate", "add", "step")
-
-
-@pytest.fixture(scope="module")
-def windows():
-    people = motion.simulate(clips=8, frames=40, test=0.3)
-    return {split: motion.windows(people, PROTOCOL, split) for split in ("train", "test")}
 
 
 def made(windows, **options):

@@ -1,6 +1,5 @@
 """Mix-and-Match and the three ways it compares with: their contract, and how noise enters each."""
 
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -16,10 +15,6 @@ from dvae.motion.views import TURNS
 from dvae.networks.noise import CodeDecoder, MixAndMatch
 from dvae.schema import SchemaError
 from dvae.testing import FactorizationContract
-
-PROTOCOL = replace(
-    motion.PROTOCOLS["simulated"], observed=5, predicted=7, train_stride=3, test_stride=6, representation="quaternion"
-)
 
 
 def small(**options):
@@ -51,12 +46,6 @@ class TestAdded(Contract):
 
 class TestALatentForEachStep(Contract):
     options: ClassVar = {"noise": "step", "latent": 3, "velocity": True}
-
-
-@pytest.fixture(scope="module")
-def windows():
-    people = motion.simulate(clips=8, frames=40, test=0.3)
-    return {split: motion.windows(people, PROTOCOL, split) for split in ("train", "test")}
 
 
 def made(windows, **options):
@@ -203,7 +192,7 @@ def test_futures_are_drawn_from_the_prior_and_the_guide_is_asked_where_frames_te
 
 
 def test_other_representations_are_refused(windows):
-    data = motion.windows(motion.simulate(clips=6, frames=40), replace(PROTOCOL, representation="positions"), "train")
+    data = motion.windows(motion.simulate(clips=6), motion.PROTOCOLS["simulated"], "train")
     with pytest.raises(SchemaError, match=r"reads turns of joints as quaternion, .* see positions of joints"):
         small().build(data)
 

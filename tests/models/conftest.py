@@ -1,0 +1,16 @@
+"""Short windows of simulated motion for methods of quaternions."""
+
+from dataclasses import replace
+
+import pytest
+
+from dvae import motion
+
+
+@pytest.fixture(scope="session")
+def windows():
+    """Windows of 5 + 7 frames, "train" and "test", whose representation is quaternions."""
+    changes = {"observed": 5, "predicted": 7, "train_stride": 3, "test_stride": 6, "representation": "quaternion"}
+    people = motion.simulate(clips=8, frames=40, test=0.3)
+    protocol = replace(motion.PROTOCOLS["simulated"], **changes)
+    return {split: motion.windows(people, protocol, split) for split in ("train", "test")}

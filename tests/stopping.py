@@ -1,0 +1,18 @@
+"""Stops a run at a step, or does something else there."""
+
+from dvae.inference.fit import Callback
+
+
+class At(Callback):
+    """Calls a function after one step."""
+
+    def __init__(self, step, action):
+        self.step, self.action = step, action
+
+    def on_step(self, state):
+        if state.step == self.step:
+            self.action(state)
+
+
+def interrupt(state):
+    raise KeyboardInterrupt
