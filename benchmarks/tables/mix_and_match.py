@@ -10,8 +10,9 @@ import itertools
 import json
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,15 @@ WEIGHTS = {
     for scale in scales
 }
 """What the weight of the KL does, 2 scale^2 / D beside mean squared errors of D numbers."""
+SCHEDULES = {
+    "mix": NAMED["mix"],
+    "mix, KL almost free": {"scale": 0.001},
+    "mix, no annealing": {"annealing": 0.0},
+    "mix, no curriculum": {"curriculum": 0.0},
+    "mix, true poses": {"feeding": 0.0},
+    "mix, no schedule": {"annealing": 0.0, "curriculum": 0.0, "feeding": 0.0},
+}
+"""Which schedule it is that moves the codes of "mix"."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +141,7 @@ SECTIONS = {
     RAW: Section(RAW, NAMED, 0.5),
     "alpha": Section(TUNING, SWEEP, 0.5),
     "weight of the KL": Section(TUNING, WEIGHTS),
+    "schedules": Section(TUNING, SCHEDULES),
 }
 
 
@@ -303,20 +314,24 @@ class Case:
         low, high = self.estimate(score).interval()
         return "–" if np.isnan(low) else f"{low:.1f} to {high:.1f}"
 
-    def number(self, *keys: str | int) -> str:
-        """The mean over seeds of one number of a run, and the least and the most."""
-        values: Any = self.runs if self.row == OURS else []
-        for key in keys:
-            values = [value[key] for value in values]
-        if None in values or not values:
-            return "–"
-        return f"{np.mean(values):.2f} ({min(values):.2f}, {max(values):.2f})"
+    def number(self, name: str) -> str:
+        """One number of a run."""
+        values = [run[name] for run in self.runs]
+        return "–" if None in values else spread(values)
+
+    def codes(self, of: Callable[[Sequence[float]], float]) -> str:
+        """One number of how diverse codes were over training."""
+        return spread([of(run["codes"]["diversity"]) for run in self.runs])
+
+
+def spread(values: Sequence[float]) -> str:
+    """Their mean, the least and the greatest."""
+    return f"{np.mean(values):.2f} ({min(values):.2f}, {max(values):.2f})"
 
 
 def scored(cases: Mapping[str, Case]) -> str:
-    """Ways down, scores across."""
+    """Ways down, scores of futures across."""
     header = ["", "quality (%)", "95 %", "taken for real (%)", "APD (m)", "ADE (m)", "FDE (m)", "jerk (m/s³)"]
-    header += ["codes, first", "codes, last", "KL (nats/frame)", "APD probed / as it is"]
     lines = [
         [
             name,
@@ -325,11 +340,24 @@ def scored(cases: Mapping[str, Case]) -> str:
             case.said("taken for real", 1),
             *(case.said(score) for score in ("APD", "ADE", "FDE")),
             case.said("jerk", 1),
-            *(case.number("codes", "diversity", place) for place in (0, -1)),
+        ]
+        for name, case in cases.items()
+    ]
+    return table(header, lines)
+
+
+def heard(cases: Mapping[str, Case]) -> str:
+    """Ways that have noise down; across, what tells whether it is heard."""
+    header = ["", "codes, first", "greatest", "least", "last", "KL (nats/frame)", "APD probed / as it is"]
+    lines = [
+        [
+            name,
+            *(case.codes(of) for of in (itemgetter(0), max, min, itemgetter(-1))),
             case.number("KL"),
             case.number(PROBED),
         ]
         for name, case in cases.items()
+        if case.row == OURS and any(run["codes"]["diversity"][-1] for run in case.runs)
     ]
     return table(header, lines)
 
@@ -414,7 +442,7 @@ def main(
             f"{sum(held.values())} windows of {len(held)} clips; {first['jerk']}. {SECTIONS[name].steps(budget)} steps "
         )
         said += f"of training, {min(seconds):.0f} to {max(seconds):.0f} s of processor time."
-        parts += [f"## {name}\n", f"{said}\n", scored(read), *([angles(read)] if first["angles"] else [])]
+        parts += [f"## {name}\n", f"{said}\n", scored(read), heard(read), *([angles(read)] if first["angles"] else [])]
     write(page, *parts)
     if there[TUNING]:
         draw(there[TUNING], there["alpha"], picture)

@@ -163,8 +163,9 @@ def test_mix_and_match(tmp_path, page, monkeypatch):
     assert [file.stat().st_mtime_ns for file in files] == times
     (tmp_path / "runs" / mix_and_match.RAW / "mix-0" / mix_and_match.MEASURED).unlink()
     mix_and_match.main(sections=(mix_and_match.RAW,), cases=("mix",), seeds=(0, 1), **options)
-    ways, angles, swept = tables(page)
+    ways, noise, angles, swept, _ = tables(page)
     assert [row[0] for row in ways[1:]] == ["zero velocity", "mix", "mix, velocity", "no noise"]
+    assert [row[0] for row in noise[1:]] == ["mix", "mix, velocity"]
     assert all(float(row[4].split()[0]) == 0 for row in ways[1:] if row[0] in ("zero velocity", "no noise"))
     assert all(float(row[4].split()[0]) > 0 for row in ways[1:] if "mix" in row[0])
     counts = [["mix, velocity", "1"], ["mix, velocity", "5"], ["no noise", "1"]]
