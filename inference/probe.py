@@ -42,6 +42,9 @@ class Redrawn(nn.Module):
 
     def __init__(self, model: Any, laws: Mapping[str, Distribution]) -> None:
         super().__init__()
+        for name, law in laws.items():
+            if not isinstance(law, Distribution) or law.event_shape:
+                raise ValueError(f"the law of {name} is {law!r}; expected that of one number, such as Normal(50., 7.)")
         if not laws or not laws.keys() <= {*model.latents}:
             raise ValueError(
                 f"latents to draw from elsewhere are some of {', '.join(model.latents)}; got "

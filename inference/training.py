@@ -115,6 +115,9 @@ class Stage:
     def __post_init__(self) -> None:
         if self.steps < 1:
             raise ValueError(f"a stage has {self.steps} steps; it needs at least 1")
+        for value in () if self.curriculum is None else levels(self.curriculum):
+            if value not in Range(0, 1):
+                raise ValueError(f"the curriculum of a stage is {value}; it goes from 0 to 1")
 
 
 def lay_out(

@@ -1,4 +1,4 @@
-"""The diversity of what a decoder starts from: whether a model that draws noise still listens to it as it learns.
+"""The diversity of what a decoder starts from: how much what a model draws, as it learns, makes of one past.
 
 A conditional model that makes a future from a code of its past and noise may learn to ignore the noise. With h_1, ...,
 h_K the codes that K draws make of one observation, their diversity is
@@ -8,6 +8,9 @@ h_K the codes that K draws make of one observation, their diversity is
 of which the mean and the standard deviation over 50 observations, K = 50, are Figure 1 of Aliakbarian, Saleh, Salzmann,
 Petersson and Gould, 2020, arXiv 1908.00733. It is in the code's own unit, so that a model compares with itself over
 training, and with others by whether it rises or falls.
+
+Where indices are drawn too, as Mix-and-Match does, each code has its own: they alone make codes differ, and those of a
+decoder that is deaf to z as well. What z makes of it is told with the indices drawn once for all K.
 """
 
 from __future__ import annotations
@@ -37,7 +40,8 @@ def codes(model: Any, batch: AnyBatch, samples: int = 50) -> Tensor:
     Args:
         model: whose network of x has an `entrance`, the module through which the noise enters, such as those of
             "mix-and-match".
-        batch: the past (B, O, D), as `forecast` takes it.
+        batch: the past (B, O, D), as `forecast` takes it; what all codes are to share in it, such as indices, as
+            `model.read(batch)` has drawn them.
         samples: K.
 
     Returns:
@@ -63,7 +67,13 @@ def codes(model: Any, batch: AnyBatch, samples: int = 50) -> Tensor:
 
 
 def code_diversity(model: Any, batch: AnyBatch, samples: int = 50) -> Tensor:
-    """The mean distance of two of K `codes` of each observation, (B,)."""
+    """The mean distance of two of K `codes` of each observation, (B,).
+
+    Raises:
+        ValueError: less than two codes.
+    """
+    if samples < 2:
+        raise ValueError(f"samples is {samples}; codes differ where there are two of them or more")
     found: Tensor = average_pairwise_distance(codes(model, batch, samples).movedim(0, 1)[:, :, None])
     return found
 
@@ -72,22 +82,34 @@ class CodeDiversity(Callback):
     """Writes the diversity of codes into the log of a fit: "codes/diversity" and "codes/deviation", every few steps.
 
     They are the mean and the standard deviation over the observations of a batch, of which the draws are the same each
-    time. The run itself goes as it would without.
+    time. Where sequences share what a model draws, "codes/latent" is the mean with that drawn once, which is what the
+    latents make. The run itself goes as it would without.
 
     Args:
-        batch: the past of held-out windows, as `forecast` takes it; 50 of them in the paper.
+        batch: the past of at least two held-out windows, as `forecast` takes it; 50 of them in the paper.
         every: steps from one to the next.
         samples: K.
         seed: of the draws.
     """
 
     def __init__(self, batch: Mapping[str, Any], every: int = 100, samples: int = 50, seed: int = 0) -> None:
+        if every < 1 or samples < 2 or len(batch[WHOLE]) < 2:
+            raise ValueError(
+                f"codes of {len(batch[WHOLE])} pasts, {samples} each, every {every} steps; give at least two pasts, "
+                "two samples and one step"
+            )
         self.batch, self.every, self.samples, self.seed = batch, every, samples, seed
 
     @override
     def on_step(self, state: State) -> Mapping[str, float] | None:
         if state.step % self.every:
             return None
-        with reproducibly(state.model, self.seed):
-            found = code_diversity(state.model, on_device_of(state.model, self.batch), self.samples)
-        return {"codes/diversity": float(found.mean()), "codes/deviation": float(found.std())}
+        model: Any = state.model
+        batch = on_device_of(model, self.batch)
+        with reproducibly(model, self.seed):
+            found = code_diversity(model, batch, self.samples)
+        row = {"codes/diversity": float(found.mean()), "codes/deviation": float(found.std())}
+        if getattr(model, "shared", None):
+            with reproducibly(model, self.seed):
+                row["codes/latent"] = float(code_diversity(model, model.read(batch), self.samples).mean())
+        return row

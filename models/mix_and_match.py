@@ -6,7 +6,7 @@ With h the observed poses, x those that follow, and i indices that are drawn onc
 
 Recurrent networks sum up past and future. The first code, perturbed by z at the drawn indices, is the state from which
 a recurrent decoder goes on from the last observed pose, by quaternions of all joints. Other ways for the noise to
-enter are options with the same networks, losses and representation (see `dvae.networks.noise`):
+enter are options, with the same recurrent networks, losses and representation (see `dvae.networks.noise`):
 
     concatenate   p(z) p(x_t | x_{<t}, h, z)          q(z | x_{1:T}, h)
     add           p(z) p(x_t | x_{<t}, h, z)          q(z), the prior
@@ -15,7 +15,7 @@ enter are options with the same networks, losses and representation (see `dvae.n
 Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733; for the others see there. What the paper
 leaves open, and there is no public code for motion to tell, is ours: the layers of the blocks and of the code's
 decoder, that this ends in the range of a state, the likelihood's scale in place of a weight of the KL, and how long the
-schedules run.
+schedules run. Quaternions are brought to unit length where poses are shown, and fed back as they were made.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from ..motion.protocols import Poses
 from ..motion.views import LENGTHS, Rotations
 from ..networks import Input, Network, NetworkSpec
 from ..networks.base import AtOnce, once, share_modules
-from ..networks.noise import AddProjected, Concatenate, MixAndMatch, Noise, Residual
+from ..networks.noise import AddProjected, Concatenate, MixAndMatch, Noise, Residual, half
 from ..networks.recurrent import gru_cell
 from ..notation import Factorization
 from ..options import Amount, Positive, Share, Size
@@ -65,7 +65,8 @@ class MixAndMatchMotion(PoseMethod):
         noise: how it enters: "mix" (Mix-and-Match), "concatenate" (MT-VAE's way), "add" (HP-GAN's), "step"
             (Pose-Knows').
         alpha: of "mix": the share of the code that is perturbed. 0 for a deterministic model.
-        width: units of recurrent networks and of the code, L.
+        width: units of recurrent networks and of the code, L; by default 1024 with Human3.6M's skeleton, as in the
+            paper, and 128 with others.
         latent: size of z; by default floor((1 - alpha) L) with "mix", as in the paper, and L / 2 with the others.
         scale: standard deviation of the quaternions' numbers; what it stands for is the weight of the KL.
         skeleton: weight of the squared error of positions, with the root not turned, beside that of quaternions, each
@@ -95,6 +96,15 @@ class MixAndMatchMotion(PoseMethod):
     annealing: Share = 0.5
     feeding: Share = 1.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, default in (("alpha", 0.5), ("curriculum", 0.5)):
+            if self.noise != "mix" and (value := getattr(self, name)) != default:
+                raise ValueError(
+                    f"{name} is {value}, but noise that is {self.noise!r} draws no indices; {name} is an option of "
+                    "noise='mix'"
+                )
+
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
         generative, inference = map(Factorization.parse, EQUATIONS[self.noise])
@@ -108,7 +118,7 @@ class MixAndMatchMotion(PoseMethod):
     @override
     def sizes(self) -> dict[str, int]:
         width, way = self.width or 0, self.entering()
-        latent = self.latent or (max(width // 2, 1) if way is None else way.latent(width))
+        latent = self.latent or (half(width) if way is None else way.latent(width))
         return {"z": latent, **({INDICES: width} if self.noise == "mix" else {})}
 
     @override
@@ -151,7 +161,7 @@ class MixAndMatchMotion(PoseMethod):
         """Minimises squared errors of quaternions and positions and the annealed KL, by the model's own poses."""
         size = Schema.of(train).size(WHOLE)
         objective = Evidence(
-            kl_weight=Logistic(0.0, 1.0, steps=int(self.annealing * steps)) if self.annealing else 1.0,
+            kl_weight=Logistic(0.0, 1.0, steps=max(int(self.annealing * steps), 1)) if self.annealing else 1.0,
             energy_weights={"skeleton": self.skeleton * size / (2 * self.scale**2)} if self.skeleton else {},
             select="loss",
         )
@@ -239,7 +249,7 @@ class FutureEncoderNetwork(Network):
         self.past = PastCode(size, spec.width)
         self.future = nn.GRU(size, spec.width, batch_first=True)
         assert spec.noise is not None
-        self.noise = spec.noise.encoder(spec.width)
+        self.noise: Any = spec.noise.encoder(spec.width)
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:

@@ -24,11 +24,13 @@ from torch.distributions import Normal
 import dvae
 from dvae import motion
 from dvae.data import past_of
+from dvae.inference.checkpoints import LAST, load_weights
 from dvae.inference.comparison import Crossed, Estimate
+from dvae.inference.held import reproducibly
 from dvae.inference.probe import Redrawn
 from dvae.inference.result import canvas
 from dvae.inference.scores import Measure
-from dvae.models.codes import CodeDiversity
+from dvae.models.codes import CodeDiversity, code_diversity
 from dvae.motion.euler import COUNTS, TIMES, euler_errors
 from dvae.motion.judges.quality import STILL, RealOrMade, quality
 from dvae.program.batch import rows
@@ -52,9 +54,10 @@ OPTIONS: dict[str, Any] = {"width": 128, "scale": 0.01}
 TRAINING: dict[str, Any] = {"batch_size": 32, "learning_rate": 2e-3, "decay": 0.5}
 JUDGED: dict[str, Any] = {"width": 64}
 JUDGE: dict[str, Any] = {"optimizer": "adam", "learning_rate": 2e-3, "momentum": 0.0, "batch_size": 128}
-PROBE = {"z": Normal(50.0, 50**0.5)}
+PROBE, NOTHING = {"z": Normal(50.0, 50**0.5)}, {"z": Normal(0.0, 1e-6)}
 SCORES = ("APD", "ADE", "FDE", "jerk")
-OURS, PROBED, FITTED, MEASURED = "ours", "probed", "fitted.json", "measured.json"
+OURS, PROBED, UNSAID = "ours", "probed", "unsaid"
+FITTED, MEASURED, HEARD = "fitted.json", "measured.json", "heard.json"
 BODY = (
     *("hip", "abdomen", "chest", "neck", "head"),
     *(side + joint for side in "lr" for joint in ("Collar", "Shldr", "ForeArm", "Hand")),
@@ -176,6 +179,11 @@ def windows(name: str, data: Path | None, raw: Path | None, every: int) -> dict[
     return {split: motion.windows(people, cut, split) for split in ("train", "test")}
 
 
+def method_of(options: Mapping[str, Any]) -> Any:
+    """The method of a case."""
+    return dvae.method("mix-and-match", **{**OPTIONS, **options})
+
+
 def folder(name: str) -> str:
     """Of a section, or a case."""
     return name.replace(", ", "-").replace(" ", "-")
@@ -185,12 +193,10 @@ def fitted(
     options: Mapping[str, Any], windows: Mapping[str, motion.Windows], seed: int, out: Path, budget: Budget
 ) -> tuple[Any, dict[str, Any]]:
     """A model, fitted, or gone on with where it was stopped; and what was seen on the way."""
-    method = dvae.method("mix-and-match", **{**OPTIONS, **options})
+    method = method_of(options)
     torch.manual_seed(seed)
     model = method.build(windows["train"])
-    test = windows["test"]
-    some = torch.linspace(0, len(test) - 1, min(budget.observations, len(test))).long()
-    watch = CodeDiversity(rows(past_of(test.all(), test.protocol.observed), some), every=max(budget.steps // 15, 1))
+    watch = CodeDiversity(observations(windows["test"], budget), every=max(budget.steps // 15, 1))
     start = time.process_time()
     result = method.train(windows["train"], None, budget.steps).fit(
         model,
@@ -262,6 +268,30 @@ def measured(case: str, model: Any, windows: Mapping[str, motion.Windows], seed:
     }
 
 
+def heard(model: Any, windows: Mapping[str, motion.Windows], seed: int, budget: Budget) -> dict[str, float]:
+    """What z and what the drawn indices make of it, where both differ from draw to draw.
+
+    "latent" is the diversity of codes with indices drawn once, in units of that with all drawn, and "indices" that of
+    futures with z at 0, whose indices alone differ, likewise.
+    """
+    test = windows["test"]
+    past = observations(test, budget)
+    with reproducibly(model, seed):
+        drawn, once = (code_diversity(model, batch).mean() for batch in (past, model.read(past)))
+    fewer = test.with_protocol(replace(test.protocol, test_stride=budget.thinned * test.protocol.test_stride))
+    models = {OURS: model, UNSAID: Redrawn(model, NOTHING)}
+    found = dvae.evaluate(
+        models, fewer, scores=some_scores, samples=budget.samples, batch_size=64, seed=seed, progress=False
+    )
+    return {"latent": float(once / drawn), "indices": found.ratio(UNSAID, OURS, "APD").mean}
+
+
+def observations(test: motion.Windows, budget: Budget) -> Any:
+    """The pasts of some windows, evenly over all of them."""
+    some = torch.linspace(0, len(test) - 1, min(budget.observations, len(test))).long()
+    return rows(past_of(test.all(), test.protocol.observed), some)
+
+
 def run(
     cases: Mapping[str, Mapping[str, Any]],
     windows: Mapping[str, motion.Windows],
@@ -277,6 +307,17 @@ def run(
             found = {**seen, **measured(case, model, windows, seed, budget)}
             (out / MEASURED).write_text(json.dumps(found))
             print(f"{out}: fitted in {seen['seconds']:.0f} s of processor time", flush=True)
+        method = method_of(options)
+        if method.noise == "mix" and method.alpha and not (out / HEARD).exists():
+            model = method.build(windows["train"])
+            load_weights(model, out / LAST)
+            (out / HEARD).write_text(json.dumps(heard(model.eval(), windows, seed, budget)))
+
+
+def measurements(out: Path) -> dict[str, Any]:
+    """Of a run."""
+    beside = out / HEARD
+    return json.loads((out / MEASURED).read_text()) | (json.loads(beside.read_text()) if beside.exists() else {})
 
 
 @dataclass(frozen=True)
@@ -290,7 +331,7 @@ class Case:
     def read(cls, path: Path, cases: Iterable[str]) -> dict[str, Case]:
         """Those that are there, by name, behind zero velocity."""
         found = {
-            case: [json.loads(file.read_text()) for file in sorted(path.glob(f"{folder(case)}-[0-9]*/{MEASURED}"))]
+            case: [measurements(file.parent) for file in sorted(path.glob(f"{folder(case)}-[0-9]*/{MEASURED}"))]
             for case in cases
         }
         read = {case: cls(runs) for case, runs in found.items() if runs}
@@ -310,13 +351,13 @@ class Case:
         )
 
     def interval(self, score: str) -> str:
-        """Of 95 %."""
-        low, high = self.estimate(score).interval()
+        """Of 95 %, within what percentages can be."""
+        low, high = np.clip(self.estimate(score).interval(), 0, 100)
         return "–" if np.isnan(low) else f"{low:.1f} to {high:.1f}"
 
     def number(self, name: str) -> str:
         """One number of a run."""
-        values = [run[name] for run in self.runs]
+        values = [run.get(name) for run in self.runs]
         return "–" if None in values else spread(values)
 
     def codes(self, of: Callable[[Sequence[float]], float]) -> str:
@@ -346,15 +387,16 @@ def scored(cases: Mapping[str, Case]) -> str:
     return table(header, lines)
 
 
-def heard(cases: Mapping[str, Case]) -> str:
+def listening(cases: Mapping[str, Case]) -> str:
     """Ways that have noise down; across, what tells whether it is heard."""
-    header = ["", "codes, first", "greatest", "least", "last", "KL (nats/frame)", "APD probed / as it is"]
+    header = ["", "codes, first", "greatest", "least", "last", "indices held", "KL (nats/frame)"]
+    header += ["APD, z probed", "APD, z at 0"]
     lines = [
         [
             name,
             *(case.codes(of) for of in (itemgetter(0), max, min, itemgetter(-1))),
-            case.number("KL"),
-            case.number(PROBED),
+            case.number("latent"),
+            *(case.number(name) for name in ("KL", PROBED, "indices")),
         ]
         for name, case in cases.items()
         if case.row == OURS and any(run["codes"]["diversity"][-1] for run in case.runs)
@@ -442,7 +484,13 @@ def main(
             f"{sum(held.values())} windows of {len(held)} clips; {first['jerk']}. {SECTIONS[name].steps(budget)} steps "
         )
         said += f"of training, {min(seconds):.0f} to {max(seconds):.0f} s of processor time."
-        parts += [f"## {name}\n", f"{said}\n", scored(read), heard(read), *([angles(read)] if first["angles"] else [])]
+        parts += [
+            f"## {name}\n",
+            f"{said}\n",
+            scored(read),
+            listening(read),
+            *([angles(read)] if first["angles"] else []),
+        ]
     write(page, *parts)
     if there[TUNING]:
         draw(there[TUNING], there["alpha"], picture)

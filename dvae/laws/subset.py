@@ -17,23 +17,24 @@ from torch.distributions import constraints
 from torch.distributions.utils import lazy_property
 from typing_extensions import override
 
+from ..options import Share, check
+
 
 @dataclass(frozen=True)
 class Subset:
     """Which indices of a variable are chosen: a share of them, uniformly without replacement.
 
     A curriculum begins with the first ones and swaps more and more of them for others: at its end as many as differ,
-    in the mean, in a uniform draw.
+    in the mean, in a uniform draw. Each process of several draws for its own share of a batch.
 
     Args:
         share: of the indices, from 0 to 1; of L of them, that times L is rounded up.
     """
 
-    share: float
+    share: Share
 
     def __post_init__(self) -> None:
-        if not 0 <= self.share <= 1:
-            raise ValueError(f"a share is between 0 and 1, not {self.share}")
+        check(self)
 
     def chosen(self, size: int) -> int:
         """How many of so many indices."""

@@ -272,7 +272,7 @@ def euler_errors(
 def _measures(angles: Angles, counts: Sequence[int]) -> list[Measure]:
     """A score for each time and number."""
 
-    @lru_cache(maxsize=len(counts))
+    @lru_cache(maxsize=1)  # times come one after the other
     def best(forecasts: Tensor, truth: Tensor, count: int) -> Tensor:
         """Errors (B, times) of the best of the first futures."""
         errors: Tensor = (forecasts[:, :count] - truth[:, None]).norm(dim=-1)

@@ -18,7 +18,7 @@ decoder makes of the code of the past and z (`decoder`). A fourth way, a latent 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -86,6 +86,9 @@ class MixAndMatch:
 
     alpha: float = 0.5
 
+    def __post_init__(self) -> None:
+        Subset(self.alpha)  # which refuses what is no share
+
     @property
     def indices(self) -> Subset:
         """The law of the drawn indices, as (L,) of ones and zeros."""
@@ -110,7 +113,7 @@ class _MixedEncoder(nn.Module):
         self.block = Residual(width, width)
 
     def forward(self, past: Tensor, future: Tensor, chosen: Tensor | None = None) -> Tensor:
-        assert chosen is not None
+        chosen = _told(chosen)
         features: Tensor = self.block(chosen * past + (1 - chosen) * future)
         return features
 
@@ -118,12 +121,15 @@ class _MixedEncoder(nn.Module):
 class _MixedDecoder(nn.Module):
     def __init__(self, width: int, latent: int, count: int) -> None:
         super().__init__()
+        self.latent = latent
         self.layer = None if latent == max(width - count, 1) else nn.Linear(latent, width)
         self.block = Residual(width, count) if count else None
         self.last = CodeDecoder(width)
 
     def forward(self, past: Tensor, z: Tensor, chosen: Tensor | None = None) -> Tensor:
-        assert chosen is not None
+        chosen = _told(chosen)
+        if z.shape[-1] != self.latent:
+            raise ValueError(f"z has {z.shape[-1]} numbers, and this code is made for {self.latent}")
         placed = _laid_out(z, chosen < 0.5) if self.layer is None else functional.relu(self.layer(z))
         mixed, code = chosen * past + (1 - chosen) * placed, past
         if self.block is not None:
@@ -132,10 +138,21 @@ class _MixedDecoder(nn.Module):
         return made
 
 
+def _told(chosen: Tensor | None) -> Tensor:
+    if chosen is None:
+        raise ValueError("Mix-and-Match perturbs drawn indices; give them, (B, L) of ones and zeros")
+    return chosen
+
+
 def _laid_out(values: Tensor, places: Tensor) -> Tensor:
     """(B, L) with values (B, n) one after the other at n places (B, L)."""
     order = (places.cumsum(-1) - 1).clamp(0, values.shape[-1] - 1)
     return values.gather(-1, order)
+
+
+def half(width: int) -> int:
+    """Of a code, at least 1."""
+    return max(width // 2, 1)
 
 
 @dataclass(frozen=True)
@@ -143,8 +160,8 @@ class Concatenate:
     """A network reads the code and z beside each other."""
 
     def latent(self, width: int) -> int:
-        """Half as many as the code has, unless another number is given."""
-        return max(width // 2, 1)
+        """Half as many as the code has."""
+        return half(width)
 
     def encoder(self, width: int) -> nn.Module:
         """The guide's features."""
@@ -170,16 +187,11 @@ class AddProjected:
     """A linear layer of z is added to the code. There is no encoder: the guide is the prior."""
 
     def latent(self, width: int) -> int:
-        """Half as many as the code has, unless another number is given."""
-        return max(width // 2, 1)
+        """Half as many as the code has."""
+        return half(width)
 
-    def encoder(self, width: int) -> nn.Module:
-        """There is none.
-
-        Raises:
-            ValueError: always.
-        """
-        raise ValueError("noise that is added is drawn from its prior alone; give the model no inference")
+    def encoder(self, width: int) -> None:
+        """There is none."""
 
     def decoder(self, width: int, latent: int) -> nn.Module:
         """The code that the future starts from."""
@@ -196,4 +208,14 @@ class _Added(nn.Module):
         return made
 
 
-Noise: Any = MixAndMatch | Concatenate | AddProjected
+class Noise(Protocol):
+    """How noise enters a code: a frozen dataclass such as these."""
+
+    def latent(self, width: int) -> int:
+        """Size of z for a code of so many numbers, unless another is given."""
+
+    def encoder(self, width: int) -> nn.Module | None:
+        """Of codes of past and future and the drawn indices, the guide's features; None where it is the prior."""
+
+    def decoder(self, width: int, latent: int) -> nn.Module:
+        """Of the code of the past, z and the drawn indices, the code that the future starts from."""

@@ -424,9 +424,10 @@ class DynamicalVAE(nn.Module):
             raise ValueError(f"the log joint needs a value of every latent; missing are {', '.join(missing)}")
         for name, value in latents.items():
             self.reader.check(name, value)
-        trace = poutine.trace(poutine.condition(self.model, data=dict(latents))).get_trace(batch)
-        names = [name for name in (*self.generative.variables, LOG_DET) if name in trace]
-        trace.compute_log_prob(site_filter=lambda name, site: name in names)
+        with self._evaluating():
+            trace = poutine.trace(poutine.condition(self.model, data=dict(latents))).get_trace(batch)
+            names = [name for name in (*self.generative.variables, LOG_DET) if name in trace]
+            trace.compute_log_prob(site_filter=lambda name, site: name in names)
         return {name: trace.nodes[name]["log_prob"] for name in names}
 
     def _register(self) -> None:
@@ -443,7 +444,8 @@ class DynamicalVAE(nn.Module):
         """A batch as programs read it: by name, in the model's precision, as the view shows it, missing entries filled.
 
         What was read is read as it is. What sequences share is drawn, where it is not there, at a Pyro site of its own
-        outside the plate: model and guide have it in common, so that it costs nothing in a bound.
+        outside the plate: model and guide have it in common, so that it costs nothing in a bound. It is given as it is
+        drawn, (D,), or for each sequence, (B, D).
 
         Args:
             batch: see `model`.
@@ -456,10 +458,13 @@ class DynamicalVAE(nn.Module):
         means = {name: units.mean for name, units in self.units.items()}
         # by guide and model both, but for what they share
         data = dict(once(self, [batch], lambda: self.reader.read(batch, like(self).dtype, means)))
-        for name in [name for name in self.shared if name not in data]:
-            law = self.shared[name].distribution(self.sizes[name], curriculum)
-            size = next((len(value) for value in data.values() if isinstance(value, Tensor)), size)
-            data[name] = pyro.sample(name, law, infer=SHARED).to(like(self)).expand(size, -1)
+        one = {name: data.pop(name) for name in self.shared if name in data and data[name].dim() == 1}
+        size = next((len(value) for value in data.values() if isinstance(value, Tensor)), size)
+        for name, spec in self.shared.items():
+            if name not in data:
+                law = spec.distribution(self.sizes[name], curriculum)
+                value = one[name] if name in one else pyro.sample(name, law, infer=SHARED)
+                data[name] = value.to(like(self)).expand(size, -1)
         return data
 
     def shown(self, values: Mapping[str, Tensor], data: Mapping[str, Any] | None = None) -> dict[str, Tensor]:

@@ -116,6 +116,19 @@ class FactorizationContract:
         vectorised = torch.stack(list(model.log_joint(data, latents).values())).sum(0)
         self._close({"joint": torch.stack(list(logs.values())).sum(0)}, {"joint": vectorised})
 
+    def test_a_sequence_scores_the_same_whatever_is_beside_it(self) -> None:
+        """Of a model in training too, which scoring leaves as it is."""
+        model = self._model()
+        data = self._data(model)
+        latents, _ = _run(model.guide, data)
+        model.train()
+        buffers = {name: value.clone() for name, value in model.named_buffers()}
+        both = model.log_joint(data, latents)
+        first = ({name: value[:1] for name, value in each.items()} for each in (data, latents))
+        self._close(model.log_joint(*first), {name: value[:1] for name, value in both.items()})
+        assert model.training
+        assert all(torch.equal(value, buffers[name]) for name, value in model.named_buffers())
+
     def test_every_size_may_be_one(self) -> None:
         """One sequence, one step, one dimension."""
         model = self._model(1)

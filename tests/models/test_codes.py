@@ -54,6 +54,23 @@ def test_noise_that_nothing_reads_has_no_diversity(windows):
         torch.testing.assert_close(code_diversity(model, past(windows), 4), torch.zeros(4))
 
 
+def test_drawn_indices_alone_make_codes_differ_and_are_told_from_z(windows):
+    model = made(windows, latent=5)
+    assert code_diversity(model, model.read(past(windows)), 4).min() > 0
+    layer = model.generator["x"].network.noise.layer  # through which z goes
+    torch.nn.init.zeros_(layer.weight)
+    assert code_diversity(model, past(windows), 4).min() > 0
+    torch.testing.assert_close(code_diversity(model, model.read(past(windows)), 4), torch.zeros(4))
+
+
+def test_what_cannot_be_told_is_refused(windows):
+    with pytest.raises(ValueError, match="samples is 1; codes differ where there are two"):
+        code_diversity(made(windows), past(windows), 1)
+    for options in ({"every": 0}, {"samples": 1}, {"batch": past(windows, 1)}):
+        with pytest.raises(ValueError, match="give at least two pasts, two samples and one step"):
+            CodeDiversity(**{"batch": past(windows), **options})
+
+
 def test_it_is_written_into_the_log_as_a_model_learns_and_changes_nothing(windows, tmp_path):
     method = dvae.method("mix-and-match", width=8)
     recipe = method.train(windows["train"], windows["test"], steps=6)
@@ -67,6 +84,7 @@ def test_it_is_written_into_the_log_as_a_model_learns_and_changes_nothing(window
     plain, watched = fitted(), fitted(out=tmp_path / "run", callbacks=[watch])
     steps, means = watched.series("codes/diversity")
     assert steps == [2, 4, 6]
+    assert min(watched.series("codes/latent")[1]) > 0
     assert [row for row in watched.history if "codes/diversity" not in row] == plain.history
     log = (tmp_path / "run" / "log.jsonl").read_text()
     assert log.count("codes/deviation") == 3

@@ -12,7 +12,7 @@ from dvae import motion
 from dvae.inference.predictive import predictive_bound
 from dvae.laws import Subset
 from dvae.motion.views import TURNS
-from dvae.networks.noise import CodeDecoder, MixAndMatch
+from dvae.networks.noise import CodeDecoder, MixAndMatch, Residual
 from dvae.schema import SchemaError
 from dvae.testing import FactorizationContract
 
@@ -23,6 +23,7 @@ def small(**options):
 
 class Contract(FactorizationContract):
     options: ClassVar = {}
+    missing: ClassVar = {}
 
     def build(self, size):
         return small(**self.options).build({"x": size})
@@ -42,6 +43,7 @@ class TestConcatenated(Contract):
 
 class TestAdded(Contract):
     options: ClassVar = {"noise": "add"}
+    missing: ClassVar = {"z": ("h", "x_{1:T}")}
 
 
 class TestALatentForEachStep(Contract):
@@ -131,6 +133,20 @@ def test_what_is_shared_does_not_tell_how_many_sequences_there_are():
     assert drawn["i"][0].sum() == 2
 
 
+def test_what_is_shared_may_be_given_as_it_was_drawn(windows):
+    model, data = made(windows), past(windows)
+    drawn = poutine.trace(model.model).get_trace(data, length=7).nodes["i"]["value"]
+    assert torch.equal(model.read({**data, "i": drawn})["i"], drawn.expand(4, -1))
+    with pytest.raises(ValueError, match=r"i has shape \(4, 5\), expected \(B, 24\)"):
+        model.forecast({**data, "i": torch.ones(5)}, 3)
+
+
+def test_options_of_drawn_indices_are_refused_where_none_are_drawn():
+    for options in ({"noise": "step", "curriculum": 0.9}, {"noise": "add", "alpha": 0.1}):
+        with pytest.raises(ValueError, match=r"draws no indices; (alpha|curriculum) is an option of noise='mix'"):
+            small(**options)
+
+
 # ------------------------------------------------------------------------------------------------ how noise enters
 
 
@@ -154,6 +170,82 @@ def test_what_was_not_drawn_goes_on_as_it_was():
     jacobian = torch.autograd.functional.jacobian(lambda z: decoder(code, z, chosen.expand(3, -1)).sum(0), z)
     assert (jacobian[chosen == 0] == 0).all()
     assert (jacobian[chosen == 1].abs().sum((1, 2)) > 0).all()
+
+
+def test_the_guide_reads_the_past_at_drawn_indices_and_the_future_at_the_others():
+    torch.manual_seed(0)
+    encoder, codes = MixAndMatch(0.5).encoder(6), (torch.randn(1, 6), torch.randn(1, 6))
+    chosen = torch.tensor([[1.0, 0, 1, 0, 0, 1]])
+    jacobians = torch.autograd.functional.jacobian(lambda past, future: encoder(past, future, chosen), codes)
+    past, future = (each.abs().sum((0, 1, 2)) > 0 for each in jacobians)
+    assert torch.equal(past, chosen[0] == 1)
+    assert torch.equal(future, chosen[0] == 0)
+
+
+def test_what_does_not_fit_a_code_is_refused():
+    decoder = MixAndMatch(0.5).decoder(8, 4)
+    with pytest.raises(ValueError, match="z has 3 numbers, and this code is made for 4"):
+        decoder(torch.randn(2, 8), torch.randn(2, 3), torch.ones(2, 8))
+    with pytest.raises(ValueError, match="perturbs drawn indices; give them"):
+        decoder(torch.randn(2, 8), torch.randn(2, 4))
+    with pytest.raises(ValueError, match="share is 2; it must be between 0 and 1"):
+        MixAndMatch(2)
+
+
+def test_a_residual_block_has_two_paths():
+    torch.manual_seed(0)
+    block, value = Residual(3, 4), torch.randn(5, 3)
+    torch.testing.assert_close(block(value), block.short(value) + block.long(value))
+    assert (block(value) != block.short(value)).all()
+
+
+def test_one_encoder_reads_the_past_for_guide_and_model(windows):
+    model = made(windows)
+    assert model.encoder["z"].network.past is model.generator["x"].network.past
+
+
+@pytest.mark.parametrize("velocity", [True, False])
+def test_a_decoder_of_velocities_that_makes_nothing_stands_still(windows, velocity):
+    model, data = made(windows, velocity=velocity), past(windows)
+    out = model.generator["x"].network.out
+    torch.nn.init.zeros_(out.weight)
+    torch.nn.init.constant_(out.bias, 0.0 if velocity else 0.5)
+    futures = model.forecast(data, 4, 2)["x"]
+    away = (futures - data["x"][None, :, -1:]).abs().max()
+    assert (away < 1e-3) == velocity
+
+
+def test_the_loss_is_of_quaternions_and_positions_and_the_annealed_kl(windows):
+    """L_rot + L_skl, each the mean over its numbers, in units of D / 2 scale^2."""
+    method = small(skeleton=0.5)
+    model = method.build(windows["train"]).eval()
+    batch = windows["train"].sample(5, torch.Generator().manual_seed(0))
+    objective = method.train(windows["train"], steps=40).objective
+    torch.manual_seed(0)
+    terms = dvae.SequenceELBO().terms(model, batch)
+    torch.manual_seed(0)
+    guide = poutine.trace(model.guide).get_trace(batch)
+    trace = poutine.trace(poutine.replay(model.model, guide)).get_trace(batch)
+    sequence, data = trace.nodes["x"]["fn"], model.read(batch)
+    means = sequence.rollout.parameters("x", data["x"])[0]
+    size, lengths = model.sizes["x"], data["bone_lengths"]
+    rotations = (means - data["x"]).square().mean()
+    positions = (model._aligned(means, lengths) - model._aligned(data["x"], lengths)).square().mean()
+    errors = size / (2 * 0.01**2) * (rotations + 0.5 * positions)
+    constant = size * (np.log(0.01) + 0.5 * np.log(2 * np.pi))
+    kl = (terms.kl["z"].sum() / terms.frames.sum()).detach()
+    for step, weight in ((0, 0.0), (10, 0.5), (39, 1.0)):
+        expected = errors + constant + weight * kl
+        torch.testing.assert_close(objective(terms, step), expected, rtol=1e-5, atol=0.02 * float(kl))
+
+
+def test_schedules_begin_and_end_as_they_should(windows):
+    recipe = small().train(windows["train"], steps=100)
+    feeding, curriculum = recipe.feeding, recipe.stages[0].curriculum
+    assert [feeding(step) for step in (0, 45, 90, 99)] == pytest.approx([0, 0.5, 1, 1])
+    assert [curriculum(step) for step in (0, 25, 50, 99)] == pytest.approx([0, 0.5, 1, 1])
+    for option in ("annealing", "curriculum", "feeding"):  # a share that is less than a step
+        assert small(**{option: 0.001}).train(windows["train"], steps=1)
 
 
 @pytest.mark.parametrize("noise", ["mix", "concatenate"])
