@@ -112,7 +112,7 @@ class MixAndMatchMotion(PoseMethod):
 
     def entering(self) -> Noise | None:
         """How the noise enters the code; None where each step has its own."""
-        ways = {"mix": MixAndMatch(self.alpha), "concatenate": Concatenate(), "add": AddProjected()}
+        ways: dict[str, Noise] = {"mix": MixAndMatch(self.alpha), "concatenate": Concatenate(), "add": AddProjected()}
         return ways.get(self.noise)
 
     @override
