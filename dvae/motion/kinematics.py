@@ -72,14 +72,14 @@ def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
             seen = positions[..., below, :] - positions[..., joint, None, :]
             seen = seen * inverse_lengths(seen)[..., None]
             if len(below) == 1:
-                world[joint] = _swing(above @ rest[0], seen[..., 0, :]) @ above
+                world[joint] = swing(above @ rest[0], seen[..., 0, :]) @ above
             else:
                 world[joint] = procrustes(seen.transpose(-1, -2) @ rest + TIE * above)
         local[joint] = above.transpose(-1, -2) @ world[joint]
     return torch.stack([local[joint] for joint in range(skeleton.joints)], -3)
 
 
-def _swing(start: Tensor, end: Tensor) -> Tensor:
+def swing(start: Tensor, end: Tensor) -> Tensor:
     """The smallest rotation (..., 3, 3) from one unit vector to another: half a turn about it, then about their middle.
 
     Of the many onto a vector's opposite, one; none, where the end is zero.

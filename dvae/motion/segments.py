@@ -179,7 +179,7 @@ class TimedFrames:
             WHOLE: torch.stack([self._seen(clip, skeleton.fps, -h) for clip, h in zip(motion, heading, strict=True)]),
             HEADING: heading,
             ORIGIN: first[:, skeleton.root],
-            OFFSETS: torch.stack([self._body(clip) for clip in motion]),
+            OFFSETS: torch.stack([resting_offsets(clip, self.skeleton) for clip in motion]),
         }
         return {name: value.float() for name, value in found.items()}
 
@@ -242,17 +242,6 @@ class TimedFrames:
         """How long segments (..., N, D) last, (...,) in seconds: the sum of their increments."""
         return self.unpack(x)[2][..., -1]
 
-    def _body(self, clip: Clip) -> Tensor:
-        """Offsets (J, 3) of a clip."""
-        parents, children = (list(ends) for ends in zip(*self.skeleton.edges, strict=True))
-        places = torch.from_numpy(clip.positions).double()
-        local = to_matrix(torch.from_numpy(clip.rotations).double(), "quaternion")
-        _, world = kinematics.forward(self.skeleton.parents, local, self.skeleton.offsets, places[:, 0])
-        found = torch.zeros_like(places[0])
-        limbs = (places[:, children] - places[:, parents])[..., None]
-        found[children] = (world[:, parents].mT @ limbs).squeeze(-1).mean(0)
-        return found
-
     def _seen(self, clip: Clip, fps: float, angle: Tensor) -> Tensor:
         """(N, D) of a clip turned by an angle."""
         assert clip.rotations is not None
@@ -297,6 +286,18 @@ class TimedFrames:
     def _scaling(self, like: Tensor) -> tuple[Tensor, Tensor]:
         unturned = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0) * len(self.turning)
         return like.new_tensor(self.mean or unturned), like.new_tensor(self.deviation or [1.0] * len(unturned))
+
+
+def resting_offsets(clip: Clip, skeleton: Skeleton) -> Tensor:
+    """Where joints of a clip with rotations are, on average, from their parents as these turn, (J, 3) in metres."""
+    parents, children = (list(ends) for ends in zip(*skeleton.edges, strict=True))
+    places = torch.from_numpy(clip.positions).double()
+    local = to_matrix(torch.from_numpy(clip.rotations).double(), "quaternion")
+    _, world = kinematics.forward(skeleton.parents, local, skeleton.offsets, places[:, 0])
+    found = torch.zeros_like(places[0])
+    limbs = (places[:, children] - places[:, parents])[..., None]
+    found[children] = (world[:, parents].mT @ limbs).squeeze(-1).mean(0)
+    return found
 
 
 def _joined(quaternions: Tensor, place: Tensor) -> np.ndarray:

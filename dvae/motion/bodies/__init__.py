@@ -5,9 +5,22 @@
 >>> vertices, joints = person(torch.zeros(2, person.parameters_of_shape), unturned, torch.zeros(2, 5, 3))
 """
 
+from .fitting import betas, fitted, retargeted, shapes_of
 from .lofted import SHAPE, human
 from .measures import enclosed_volume, vertex_error
 from .skinning import Body
 from .smplx import read_body, write_body
 
-__all__ = ["SHAPE", "Body", "enclosed_volume", "human", "read_body", "vertex_error", "write_body"]
+__all__ = [
+    "SHAPE",
+    "Body",
+    "betas",
+    "enclosed_volume",
+    "fitted",
+    "human",
+    "read_body",
+    "retargeted",
+    "shapes_of",
+    "vertex_error",
+    "write_body",
+]

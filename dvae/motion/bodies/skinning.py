@@ -16,6 +16,9 @@ from torch import Tensor, nn
 
 from ..kinematics import forward
 
+UNTOLD = 1e-5
+"""Share of what joints move by the parameters that move them most, below which they do not tell one."""
+
 
 class Body(nn.Module):
     """A surface that hangs on a tree of joints, and how shape parameters change it. Metres, y up, facing +z.
@@ -84,6 +87,29 @@ class Body(nn.Module):
             raise ValueError(f"shape is {tuple(shape.shape)}, expected (..., {self.parameters_of_shape})")
         vertices = self.template + (self.shapes.flatten(0, 1) @ shape[..., None]).unflatten(-2, (-1, 3)).squeeze(-1)
         return vertices, self.regressor @ vertices
+
+    def offsets(self, shape: Tensor) -> Tensor:
+        """Where joints rest, from their parents: of bodies (..., S), (..., J, 3) in metres, the root's 0."""
+        average, changes = self._bones()
+        return (average + (changes @ shape[..., None, :, None].to(average)).squeeze(-1)).to(shape)
+
+    def shape_of(self, offsets: Tensor) -> Tensor:
+        """The parameters (..., S) of bodies whose joints rest so far from their parents, (..., J, 3) in metres.
+
+        They are linear in each other, so that this is the way back from `offsets`: where joints tell a parameter, which
+        they do of all but the person's girth. What they do not tell is 0. Of offsets that no shape has, the nearest's.
+        """
+        average, changes = self._bones()
+        parameters = torch.linalg.pinv(changes.flatten(0, 1), rtol=UNTOLD)
+        found: Tensor = parameters @ (offsets.to(average) - average).flatten(-2)[..., None]
+        return found.squeeze(-1).to(offsets)
+
+    def _bones(self) -> tuple[Tensor, Tensor]:
+        """Offsets of the average body (J, 3), and what parameters add to them (J, 3, S); float64, for the way back."""
+        regressor, vertices = self.regressor.double(), torch.cat([self.template[..., None], self.shapes], -1).double()
+        joints = (regressor @ vertices.flatten(1)).unflatten(-1, vertices.shape[1:])
+        bones = joints - joints[[joint if parent < 0 else parent for joint, parent in enumerate(self.parents)]]
+        return bones[..., 0], bones[..., 1:]
 
     def forward(self, shape: Tensor, rotations: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
         """Surfaces and joints of moving bodies, differentiable in everything given.

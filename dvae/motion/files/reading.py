@@ -307,7 +307,8 @@ def clip_of(
         rotations, rest = recording.rotations.astype(np.float32), tuple(recording.offsets.flatten().tolist())
     tree = tuple(recording.names), tuple(recording.parents), left, right
     own = Skeleton(*tree, recording.up or "y", float(fps), known.name if known else clip.name, rest=rest)
-    return replace(clip, positions=positions, rotations=rotations), own
+    labels = {**recording.labels, **clip.labels}
+    return replace(clip, positions=positions, labels=labels, rotations=rotations), own
 
 
 def kept(

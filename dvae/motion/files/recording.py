@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,7 @@ class Recording:
         metres: of a unit, where the file says.
         up: the axis that is, where the file says.
         skeleton: of these joints, where it stands beside the file.
+        labels: what the file says about it.
     """
 
     names: Sequence[str]
@@ -54,6 +55,7 @@ class Recording:
     metres: float | None = None
     up: str | None = None
     skeleton: Skeleton | None = None
+    labels: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def turned(

@@ -1,14 +1,16 @@
 """AMASS's layout (Mahmood et al. 2019, arXiv 1904.03278): turns of SMPL's joints, read and written without its body.
 
-The files have no lengths of bones; these come from a body under a licence of its own, and the shape parameters `betas`.
-Without it, people are of one average body here: a height of 1.7 m, and segments by Drillis and Contini (1966), as
-figure 4.1 of Winter, Biomechanics and Motor Control of Human Movement, has them. So is the place of the pelvis but for
-a constant: SMPL adds its template's to `trans`. Files that are written here hold `offsets` too, and are read by them.
+The files have no lengths of bones; these come from a body under a licence of its own, and the shape parameters `betas`,
+which clips have as a label (see `bodies.betas`). Without it, people are of one average body here: a height of 1.7 m,
+and segments by Drillis and Contini (1966), as figure 4.1 of Winter, Biomechanics and Motor Control of Human Movement,
+has them. So is the place of the pelvis but for a constant: SMPL adds its template's to `trans`. Files that are written
+here hold `offsets` too, and are read by them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +56,9 @@ PARENTS = tuple(JOINTS.index(parent) if parent else -1 for parent, *_ in _BODY.v
 OFFSETS = _HEIGHT * np.array([place for _, *place in _BODY.values()], float)
 """Of the average body, standing with arms to the sides, (22, 3) in metres."""
 
+MOST_BETAS = 16
+"""Parameters of shape that AMASS's files have."""
+
 _FPS = ("mocap_framerate", "mocap_frame_rate")
 
 
@@ -67,7 +72,7 @@ def is_amass(path: Path) -> bool:
 
 
 def read_amass(path: str | Path) -> Recording:
-    """Read an npz of AMASS: the 22 joints of the body, z up.
+    """Read an npz of AMASS: the 22 joints of the body, z up; `betas` is a label, numbers with spaces between them.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -80,7 +85,7 @@ def read_amass(path: str | Path) -> Recording:
                 f"{path}: no file of AMASS, which has poses and trans; an npz of many clips is read by itself, "
                 "not in a folder"
             )
-        wanted = ("poses", "trans", "offsets", *_FPS)
+        wanted = ("poses", "trans", "offsets", "betas", *_FPS)
         found = {name: members[name].array() for name in wanted if name in members}
     poses, places = found["poses"], found["trans"]
     frames, numbers = len(places) if places.ndim else 0, 3 * len(JOINTS)
@@ -104,11 +109,13 @@ def read_amass(path: str | Path) -> Recording:
     vectors = torch.from_numpy(poses[:, :numbers].astype(np.float64)).unflatten(-1, (-1, 3))
     rest = torch.from_numpy(offsets).repeat(frames, 1, 1)
     rest[:, 0] = torch.from_numpy(places.astype(np.float64))
-    return Recording.turned(JOINTS, PARENTS, rest, to_matrix(vectors, "vector"), fps, metres=1.0, up="z")
+    read = Recording.turned(JOINTS, PARENTS, rest, to_matrix(vectors, "vector"), fps, metres=1.0, up="z")
+    betas = found.get("betas", np.zeros(0)).reshape(-1)[:MOST_BETAS]
+    return replace(read, labels={"betas": " ".join(map(str, betas.tolist()))} if betas.size else {})
 
 
 def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
-    """Write a clip in AMASS's layout: poses (F, 156), trans, mocap_framerate, betas of zeros; and offsets.
+    """Write a clip in AMASS's layout: poses (F, 156), trans, mocap_framerate, betas of its label or zeros; and offsets.
 
     Joints are found by what their names mean; those that a skeleton lacks are not turned. Where a bone between two of
     them bends, all turns are found anew from positions, as by `MotionSet.with_rotations`.
@@ -153,7 +160,8 @@ def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
         all_offsets[JOINTS.index(name)] = bones[place]
     poses = np.zeros((len(world), 156))
     poses[:, : 3 * len(JOINTS)] = from_matrix(turns, "vector").flatten(1).numpy()
-    arrays = {"poses": poses, "trans": places.numpy(), "betas": np.zeros(16), "offsets": all_offsets}
+    betas = np.array([float(value) for value in clip.labels.get("betas", "").split()] or [0.0] * 16)
+    arrays = {"poses": poses, "trans": places.numpy(), "betas": betas, "offsets": all_offsets}
     arrays |= {"mocap_framerate": np.array(skeleton.fps), "gender": np.array("neutral")}
     with files.written(path) as file:
         write_arrays(file, arrays.items())

@@ -1,0 +1,440 @@
+"""Motion put onto a body: the turns of its own joints, its place, and the parameters of its shape.
+
+What a source has are places of joints, which anatomy names and every source puts elsewhere. So no joint is pulled to
+where the source has it. Turns are taken from what means the same on any skeleton, against the same on the body at rest:
+
+* **pelvis**: the line through the hips, and the way from their middle to where the spine begins.
+* **chest**: the line through the clavicles, or else the shoulders, and the way from where the spine begins to the
+  neck. Joints of the spine share the turn between pelvis and chest evenly, and are then turned together so that the
+  neck is in its direction (in cmu8, 12 mm off instead of 28).
+* **limbs**: along their bones. About itself, a thigh or an upper arm is turned as little as possible against the trunk
+  while it is stretched, and as its hinge says where knee or elbow is bent.
+* **neck**: along the way to the head. **Ankles**: along the way to the toes, less how steep that is in a foot that
+  stands flat.
+* **Ends**, and joints that the source lacks, stay against their parents as they rest.
+
+The middle of the hips is where the source has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from ..data import Clip, MotionSet
+from ..kinematics import forward, swing
+from ..matching import parts
+from ..naming import sides
+from ..rotations import continuous, from_matrix, to_matrix
+from ..segments import resting_offsets
+from ..skeleton import Skeleton
+from .skinning import Body
+
+WITHIN = 0.01
+"""Metres by which a length of a body may be off for what a parameter of 1 costs."""
+
+MOST = 3.0
+"""Of a fitted parameter, either way; one person in four hundred has more."""
+
+SAME = 1e-3
+"""Metres within which lengths are of one body, and joints at rest those of a shape."""
+
+STRETCHED = 0.25
+"""Sine of a knee's or an elbow's bend at which it says as much of how its limb is turned about itself as the trunk."""
+
+STILL = 0.15
+"""Metres a second, below which ankle and toes are those of a foot that stands flat."""
+
+ALIKE = 0.5
+"""Cosine between bones at rest from which turns against two rest poses mean the same; arms that hang are at 0."""
+
+_LIMBS = {"hip knee ankle": (1.0, 0.0, 0.0), "shoulder elbow wrist": (0.0, -1.0, 0.0)}
+"""Of the left side, and the axis about which they bend at rest, where the right one's is mirrored."""
+
+_NEEDED = ["pelvis", *(f"{side} {part}" for limb in _LIMBS for part in limb.split() for side in "lr")]
+
+
+def fitted(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> MotionSet:
+    """Motion on the joints of a body, with its turns; how is said at the head of this file.
+
+    Motion on these joints whose turns are from about the same rest pose, as AMASS's are, keeps its turns.
+
+    Args:
+        motion: on any skeleton with pelvis, hips, knees, ankles, shoulders, elbows and wrists.
+        body: such as `human()`.
+        shapes: its parameters, one for all clips (S,) or one each (N, S), such as `betas`; by default they are fitted
+            to the lengths of bones, and the same for all clips in which these are.
+
+    Returns:
+        The same clips with y up: positions of the body's joints in metres, and rotations. `shapes_of` says whose they
+        are; the rest pose of the skeleton is that of the mean of them. The translation of the body is the place of its
+        root less that at rest.
+
+    Raises:
+        ValueError: a joint that is needed is not there, or missing in a frame; or shapes do not fit.
+    """
+    if lacking := [clip for clip in motion if np.isnan(clip.positions).any()]:
+        raise ValueError(
+            f"clip {'/'.join(lacking[0].key)} lacks joints, without which it is put onto no body; leave it out, or "
+            "fill its gaps first (`dvae impute RUN --filled FILE`)"
+        )
+    motion = _y_up(motion)
+    if _turned_alike(motion, body):
+        each = _kept(motion, body) if shapes is None else _shapes(shapes, motion, body)
+        return _made(motion, body, each, (_turns(clip, motion.skeleton) for clip in motion))
+    source = _Source.of(motion.skeleton, body)
+    seen = [source.seen(torch.from_numpy(clip.positions).double()) for clip in motion]
+    each = torch.zeros(len(motion), body.parameters_of_shape, dtype=torch.float64)
+    steep = torch.zeros(len(motion), dtype=torch.float64)
+    for people in _bodies(motion):
+        lengths = torch.cat([source.lengths(seen[n]) for n in people])
+        each[people] = source.shape(body, lengths.mean(0))
+        steep[people] = source.steepness([seen[n] for n in people], motion.skeleton.fps)
+    each = each if shapes is None else _shapes(shapes, motion, body)
+    of_each = zip(seen, _joints(body, each), steep, strict=True)
+    return _made(motion, body, each, (source.turns(body, *own) for own in of_each))
+
+
+def shapes_of(motion: MotionSet, body: Body) -> Tensor:
+    """Parameters (N, S) of the bodies of clips that `fitted` or `retargeted` made, or `TimedFrames` brought back.
+
+    They are told by where joints are from their parents; see `Body.shape_of`. Of other motion they mean nothing.
+
+    Raises:
+        ValueError: the clips are on other joints, or have no rotations.
+    """
+    _check(motion, body)
+    return torch.stack([body.shape_of(resting_offsets(clip, motion.skeleton)) for clip in motion])
+
+
+def retargeted(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
+    """The same turns on other bodies, whose places are scaled about the origin.
+
+    That is by the height of the root above the soles at rest. So speeds, in lengths of legs, are the same; and whoever
+    stood on a floor of height 0 stands on it.
+
+    Args:
+        motion: on the body's joints, as from `fitted`.
+        body: the same.
+        shapes: its parameters, one for all clips (S,) or one each (N, S).
+
+    Raises:
+        ValueError: the clips are on other joints, or have no rotations; or shapes do not fit.
+    """
+    _check(motion, body)
+    each = _shapes(shapes, motion, body)
+    scales = _standing(body, each) / _standing(body, shapes_of(motion, body))
+    turns = (_turns(clip, motion.skeleton) for clip in motion)
+    return _made(
+        motion, body, each, ((local, scale * place) for scale, (local, place) in zip(scales, turns, strict=True))
+    )
+
+
+def betas(motion: MotionSet, parameters: int = 8) -> Tensor:
+    """What AMASS's files say of shapes, (N, S): the first parameters of each clip's label `betas`.
+
+    They are of the body that the files were fitted with, SMPL-H as a rule (`read_body`), and of no other.
+
+    Raises:
+        ValueError: a clip has none, or fewer.
+    """
+    found = []
+    for clip in motion:
+        said = clip.labels.get("betas", "").split()
+        if len(said) < parameters:
+            raise ValueError(
+                f"clip {'/'.join(clip.key)} has {len(said) or 'no'} betas, expected {parameters}; files in AMASS's "
+                "layout have them, and fitted(motion, body) does without"
+            )
+        found.append([float(value) for value in said[:parameters]])
+    return torch.tensor(found, dtype=torch.float64)
+
+
+class _Source(NamedTuple):
+    """Which joints of a skeleton and of a body mean the same.
+
+    Attributes:
+        there: joints of the skeleton by part, of those parts that both have.
+        own: joints of the body.
+        waist, top: where the spine begins and ends.
+        girdle: what is on both sides of the chest.
+    """
+
+    there: Mapping[str, int]
+    own: Mapping[str, int]
+    waist: str
+    top: str
+    girdle: str
+
+    @classmethod
+    def of(cls, skeleton: Skeleton, body: Body) -> _Source:
+        """By what names mean."""
+        there, own = parts(skeleton.names), parts(body.names)
+        for part, higher in (("neck", "upperneck"), ("head", "headtop")):  # with two of them, the lower is in the chest
+            there |= {part: there[higher]} if higher in there else {}
+        for what, found, names, needed in (
+            (f"skeleton {skeleton.name!r}", there, skeleton.names, _NEEDED),
+            ("the body", own, body.names, [*_NEEDED, "neck"]),
+        ):
+            if lacking := [part for part in needed if part not in found]:
+                raise ValueError(
+                    f"{what} has no {', '.join(lacking)}, by which motion is put onto a body; there are "
+                    f'{", ".join(names)[:600]}. read_motion(..., joints={{"name there": "LHip", ...}}) renames joints'
+                )
+        both = there.keys() & own.keys()
+        return cls(
+            {part: joint for part, joint in there.items() if part in both},
+            own,
+            "spine" if "spine" in both else "pelvis",
+            "neck" if "neck" in both else "shoulders",
+            "clavicle" if both >= {"l clavicle", "r clavicle"} else "shoulder",
+        )
+
+    def seen(self, places: Tensor) -> dict[str, Tensor]:
+        """Places (..., 3) by part, of those of the skeleton's joints (..., J, 3)."""
+        return _marks(places, self.there)
+
+    def lengths(self, marks: Mapping[str, Tensor]) -> Tensor:
+        """Of limbs (the mean of both sides), of widths, and of the trunk to shoulders and top, (..., 8) in metres."""
+
+        def length(start: str, end: str) -> Tensor:
+            found: Tensor = (marks[end] - marks[start]).norm(dim=-1)
+            return found
+
+        bones = [bone for limb in _LIMBS for bone in pairwise(limb.split())]
+        limbs = [(length(f"l {a}", f"l {b}") + length(f"r {a}", f"r {b}")) / 2 for a, b in bones]
+        widths = [length(f"l {part}", f"r {part}") for part in ("hip", "shoulder")]
+        trunk = [length("hips", self.waist) + length(self.waist, top) for top in ("shoulders", self.top)]
+        return torch.stack([*limbs, *widths, *trunk], -1)
+
+    def shape(self, body: Body, lengths: Tensor) -> Tensor:
+        """Parameters (S,) of the body of about these lengths (8,)."""
+        size = body.parameters_of_shape
+        average, *units = _joints(body, torch.cat([lengths.new_zeros(1, size), torch.eye(size).to(lengths)]))
+        changes = torch.stack(units, -1) - average[..., None]
+
+        def off(shape: np.ndarray) -> np.ndarray:
+            found = self.lengths(_marks(average + changes @ torch.from_numpy(shape), self.own))
+            return np.concatenate([(found - lengths).numpy() / WITHIN, shape])
+
+        return torch.from_numpy(least_squares(off, np.zeros(size), bounds=(-MOST, MOST)).x)
+
+    def steepness(self, seen: Iterable[Mapping[str, Tensor]], fps: float) -> Tensor:
+        """Angle from ankles down to the toes of feet that stand flat; NaN where none does."""
+        found = [torch.zeros(0, dtype=torch.float64)]
+        if self.there.keys() >= {"l toe", "r toe"}:
+            for marks in seen:
+                for side in "lr":
+                    ends = marks[f"{side} ankle"], marks[f"{side} toe"]
+                    speeds = [fps * end.diff(dim=0).norm(dim=-1) for end in ends]
+                    found.append(_down(ends[1] - ends[0])[1:][torch.maximum(*speeds) < STILL])
+        every = torch.cat(found)
+        return every.median() if len(every) else every.new_tensor(torch.nan)
+
+    def turns(self, body: Body, seen: Mapping[str, Tensor], joints: Tensor, steep: Tensor) -> tuple[Tensor, Tensor]:
+        """Local rotations (F, J, 3, 3) of a clip, and places of its root (F, 3).
+
+        Args:
+            body: with its joints at rest.
+            seen: places by part, (F, 3) each.
+            joints: (J, 3).
+            steep: see `steepness`.
+        """
+        rest, parents, root = _marks(joints, self.own), body.parents, body.parents.index(-1)
+
+        def across(girdle: str, low: str, high: str) -> Tensor:
+            return _turn(
+                *((marks[f"l {girdle}"] - marks[f"r {girdle}"], marks[high] - marks[low]) for marks in (rest, seen))
+            )
+
+        world = {root: across("hip", "hips", self.waist)}
+
+        def carried(joint: int) -> Tensor:
+            """Its turn, or that of what carries it."""
+            while joint not in world:
+                joint = parents[joint]
+            return world[joint]
+
+        def point(start: str, end: str, resting: Tensor | None = None) -> None:
+            """Turn a part so that another is in its direction, as little as possible."""
+            turn, bone = carried(self.own[start]), rest[end] - rest[start] if resting is None else resting
+            world[self.own[start]] = (
+                swing(turn @ normalize(bone, dim=-1), normalize(seen[end] - seen[start], dim=-1)) @ turn
+            )
+
+        bent = from_matrix(world[root].mT @ across(self.girdle, self.waist, self.top), "vector")
+        spine = [parents[self.own["neck"]]]
+        while parents[spine[0]] != root:
+            spine.insert(0, parents[spine[0]])
+        ends = [*(joints[joint] for joint in spine), rest[self.top]]
+        for n, joint in enumerate(spine, 1):
+            world[joint] = world[root] @ to_matrix(n / len(spine) * bent, "vector")
+        bones = [world[joint] @ (end - start) for joint, (start, end) in zip(spine, pairwise(ends), strict=True)]
+        lags = swing(normalize(torch.stack(bones).sum(0), dim=-1), normalize(seen[self.top] - seen[self.waist], dim=-1))
+        world |= {joint: lags @ world[joint] for joint in spine}
+        if {"neck", "head"} <= self.there.keys():
+            point("neck", "head")
+        for side, mirror in (("l ", 1.0), ("r ", -1.0)):
+            if self.girdle == "clavicle":
+                point(f"{side}clavicle", f"{side}shoulder")
+            for limb, about in _LIMBS.items():
+                start, middle, end = (side + part for part in limb.split())
+                hinge = joints.new_tensor([about[0], mirror * about[1], mirror * about[2]])
+                point(start, middle)
+                upper, lower = (normalize(seen[b] - seen[a], dim=-1) for a, b in ((start, middle), (middle, end)))
+                bend = upper.cross(lower, dim=-1) + STRETCHED * world[self.own[start]] @ hinge
+                world[self.own[start]] = _turn((rest[middle] - rest[start], hinge), (upper, bend))
+                point(middle, end)
+            if f"{side}toe" in self.there:
+                foot = rest[f"{side}toe"] - rest[f"{side}ankle"]
+                point(f"{side}ankle", f"{side}toe", foot if steep.isnan() else _sloping(foot, steep))
+        turns = torch.stack([carried(joint) for joint in range(body.joints)], -3)
+        above = turns[:, [max(parent, 0) for parent in parents]]
+        local = above.mT @ turns
+        local[:, root] = turns[:, root]
+        hips = (world[root] @ (rest["hips"] - joints[root])[:, None]).squeeze(-1)
+        return local, seen["hips"] - hips
+
+
+def _marks(places: Tensor, joints: Mapping[str, int]) -> dict[str, Tensor]:
+    """Places (..., 3) by part, and the middles of hips and shoulders, of places (..., J, 3)."""
+    marks = {part: places[..., joint, :] for part, joint in joints.items()}
+    return marks | {f"{part}s": (marks[f"l {part}"] + marks[f"r {part}"]) / 2 for part in ("hip", "shoulder")}
+
+
+def _turn(start: tuple[Tensor, Tensor], end: tuple[Tensor, Tensor]) -> Tensor:
+    """The rotation (..., 3, 3) of one vector onto another, and of two more as near to each other as that leaves."""
+    frames = []
+    for first, second in (start, end):
+        first = normalize(first, dim=-1)
+        third = normalize(first.cross(second.expand_as(first), dim=-1), dim=-1)
+        frames.append(torch.stack([first, third.cross(first, dim=-1), third], -1))
+    return frames[1] @ frames[0].mT
+
+
+def _down(bones: Tensor) -> Tensor:
+    """Angle of bones (..., 3) below the horizontal."""
+    return torch.atan2(-bones[..., 1], bones[..., [0, 2]].norm(dim=-1))
+
+
+def _sloping(bone: Tensor, angle: Tensor) -> Tensor:
+    """A bone (3,) whose direction is so far below the horizontal."""
+    ahead = normalize(bone * bone.new_tensor([1.0, 0, 1]), dim=-1)
+    return ahead * angle.cos() - bone.new_tensor([0.0, 1, 0]) * angle.sin()
+
+
+def _bodies(motion: MotionSet) -> list[list[int]]:
+    """The places of clips in which bones have the same lengths."""
+    groups: list[tuple[Tensor, list[int]]] = []
+    for n, clip in enumerate(motion):
+        lengths = motion.skeleton.bone_lengths(torch.from_numpy(clip.positions).double()).mean(0)
+        people = next((people for known, people in groups if (known - lengths).abs().max() < SAME), None)
+        if people is None:
+            groups.append((lengths, [n]))
+        else:
+            people.append(n)
+    return [people for _, people in groups]
+
+
+def _joints(body: Body, shapes: Tensor) -> Tensor:
+    """Places (N, J, 3) of bodies (N, S) at rest with the root at 0."""
+    unturned = torch.eye(3).to(shapes).expand(body.joints, 3, 3)
+    places, _ = forward(body.parents, unturned, body.offsets(shapes), shapes.new_zeros(len(shapes), 3))
+    return places
+
+
+def _standing(body: Body, shapes: Tensor) -> Tensor:
+    """Heights (N,) of the root above the soles of bodies (N, S) at rest."""
+    found = []
+    for some in shapes.to(body.template).split(256):
+        vertices, joints = body.at_rest(some)
+        found.append(joints[:, body.parents.index(-1), 1] - vertices[..., 1].amin(-1))
+    return torch.cat(found).double()
+
+
+def _shapes(shapes: Tensor, motion: MotionSet, body: Body) -> Tensor:
+    """(N, S), float64, of one for all or one each."""
+    size = body.parameters_of_shape
+    if shapes.shape not in ((size,), (len(motion), size)):
+        raise ValueError(
+            f"shapes are {tuple(shapes.shape)}, expected ({size},) or ({len(motion)}, {size}) of as many clips"
+        )
+    return shapes.detach().cpu().double().expand(len(motion), size)
+
+
+def _kept(motion: MotionSet, body: Body) -> Tensor:
+    """Parameters (N, S) of motion that has the body's turns: those that joints tell, or else of about these lengths."""
+    source, found = _Source.of(motion.skeleton, body), []
+    for clip in motion:
+        offsets = resting_offsets(clip, motion.skeleton)
+        shape = body.shape_of(offsets)
+        if (body.offsets(shape) - offsets).abs().max() > SAME:
+            unturned = torch.eye(3).to(offsets).expand(body.joints, 3, 3)
+            joints, _ = forward(body.parents, unturned, offsets, offsets.new_zeros(3))
+            shape = source.shape(body, source.lengths(source.seen(joints)))
+        found.append(shape)
+    return torch.stack(found)
+
+
+def _turns(clip: Clip, skeleton: Skeleton) -> tuple[Tensor, Tensor]:
+    """Local rotations (F, J, 3, 3) of a clip, and places of its root (F, 3)."""
+    assert clip.rotations is not None
+    local = to_matrix(torch.from_numpy(clip.rotations).double(), "quaternion")
+    return local, torch.from_numpy(clip.positions[:, skeleton.root]).double()
+
+
+def _turned_alike(motion: MotionSet, body: Body) -> bool:
+    """Whether turns are those of the body's joints, from about its rest pose."""
+    skeleton = motion.skeleton
+    if not skeleton.rest or any(clip.rotations is None for clip in motion):
+        return False
+    if (skeleton.names, skeleton.parents) != (body.names, body.parents):
+        return False
+    bones = body.offsets(torch.zeros(body.parameters_of_shape, dtype=torch.float64))
+    cosines = torch.cosine_similarity(bones, skeleton.offsets, dim=-1)
+    return bool((cosines > ALIKE)[[joint for _, joint in skeleton.edges]].all())
+
+
+def _check(motion: MotionSet, body: Body) -> None:
+    if not _turned_alike(motion, body):
+        raise ValueError(
+            f"{motion.name or 'this motion'} is not on the joints of the body, or not turned from its rest pose; "
+            "dvae.motion.bodies.fitted puts it there"
+        )
+
+
+def _y_up(motion: MotionSet) -> MotionSet:
+    """Motion with y up, turned about x; rest poses are as they are, in which nothing is said of the world."""
+    if motion.skeleton.up == "y":
+        return motion
+    turn = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+    clips = []
+    for clip in motion:
+        turns = clip.rotations
+        if turns is not None:
+            local, _ = _turns(clip, motion.skeleton)
+            local[:, motion.skeleton.root] = turn @ local[:, motion.skeleton.root]
+            turns = continuous(from_matrix(local, "quaternion")).numpy()
+        clips.append(replace(clip, positions=clip.positions @ turn.numpy().T, rotations=turns))
+    return replace(motion, clips=clips, skeleton=replace(motion.skeleton, up="y"))
+
+
+def _made(motion: MotionSet, body: Body, shapes: Tensor, turns: Iterable[tuple[Tensor, Tensor]]) -> MotionSet:
+    """Clips of bodies (N, S) with local rotations (F, J, 3, 3) and places of the root (F, 3)."""
+    offsets, clips = body.offsets(shapes), []
+    for clip, bones, (local, place) in zip(motion, offsets, turns, strict=True):
+        quaternions = continuous(from_matrix(local, "quaternion")).numpy()
+        positions, _ = forward(body.parents, local, bones, place)
+        clips.append(replace(clip, positions=positions.numpy(), rotations=quaternions))
+    own = motion.skeleton
+    rest = tuple(offsets.mean(0).flatten().tolist())
+    skeleton = Skeleton(body.names, body.parents, *sides(body.names), "y", own.fps, own.name, rest=rest)
+    return MotionSet(clips, skeleton, motion.name, copy=False, skipped=motion.skipped, said=motion.said)
