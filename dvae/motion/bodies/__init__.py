@@ -1,8 +1,12 @@
-"""Bodies with a surface: linear blend skinning, a low-polygon person made by code, and files in the layout of `smplx`.
+"""Bodies with a surface: linear blend skinning, a low-polygon person made by code, files in the layout of `smplx`, and
+motion put onto them.
 
 >>> person = dvae.motion.bodies.human()
 >>> unturned = torch.eye(3).expand(2, 5, person.joints, 3, 3)
 >>> vertices, joints = person(torch.zeros(2, person.parameters_of_shape), unturned, torch.zeros(2, 5, 3))
+>>> people = dvae.motion.bodies.fitted(dvae.motion.simulate(clips=2, frames=5), person)
+>>> dvae.motion.bodies.shapes_of(people, person).shape
+torch.Size([2, 8])
 """
 
 from .fitting import betas, fitted, retargeted, shapes_of

@@ -53,6 +53,9 @@ STRETCHED = 0.25
 STILL = 0.15
 """Metres a second, below which ankle and toes are those of a foot that stands flat."""
 
+APART = 0.03
+"""Metres between clavicles of which each begins at its side; others begin in the middle, and tell no girdle."""
+
 ALIKE = 0.5
 """Cosine between bones at rest from which turns against two rest poses mean the same; arms that hang are at 0."""
 
@@ -90,7 +93,7 @@ def fitted(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> Motio
     if _turned_alike(motion, body):
         each = _kept(motion, body) if shapes is None else _shapes(shapes, motion, body)
         return _made(motion, body, each, (_turns(clip, motion.skeleton) for clip in motion))
-    source = _Source.of(motion.skeleton, body)
+    source = _Source.of(motion, body)
     seen = [source.seen(torch.from_numpy(clip.positions).double()) for clip in motion]
     each = torch.zeros(len(motion), body.parameters_of_shape, dtype=torch.float64)
     steep = torch.zeros(len(motion), dtype=torch.float64)
@@ -175,9 +178,14 @@ class _Source(NamedTuple):
     girdle: str
 
     @classmethod
-    def of(cls, skeleton: Skeleton, body: Body) -> _Source:
+    def of(cls, motion: MotionSet, body: Body) -> _Source:
         """By what names mean."""
+        skeleton, pose = motion.skeleton, motion.clips[0].positions[0]
         there, own = parts(skeleton.names), parts(body.names)
+        if {"l clavicle", "r clavicle"} <= there.keys():
+            ends = [there.pop(f"{side} clavicle") for side in "lr"]
+            if np.linalg.norm(pose[ends[0]] - pose[ends[1]]) > APART:
+                there |= {"l clavicle": ends[0], "r clavicle": ends[1]}
         for part, higher in (("neck", "upperneck"), ("head", "headtop")):  # with two of them, the lower is in the chest
             there |= {part: there[higher]} if higher in there else {}
         for what, found, names, needed in (
@@ -372,7 +380,7 @@ def _shapes(shapes: Tensor, motion: MotionSet, body: Body) -> Tensor:
 
 def _kept(motion: MotionSet, body: Body) -> Tensor:
     """Parameters (N, S) of motion that has the body's turns: those that joints tell, or else of about these lengths."""
-    source, found = _Source.of(motion.skeleton, body), []
+    source, found = _Source.of(motion, body), []
     for clip in motion:
         offsets = resting_offsets(clip, motion.skeleton)
         shape = body.shape_of(offsets)
