@@ -218,17 +218,25 @@ class SVI:
         A run with self-feeding learns to run on its own output, which costs it bound on the true past. There
         the best is by the bound of the self-fed program, once the schedule has reached its last value.
 
-        A model without a likelihood has no bound; there, and where the objective says so, the best is by the objective.
+        A model without a likelihood has no bound; there, and where the objective says so, the best is by the objective,
+        among those that its own stages have.
         """
         state, row = self.state, self.evaluate(data)
         fed = "self_fed/" if self.final_feeding else ""
         score = -row[f"{fed}loss"] if "loss" in row else row[f"{fed}bound"]
         if not fed or self.rates(state.step - 1)["self_feeding"] == self.final_feeding:
             state.waited += 1
+            if "loss" in row and state.best_step is not None and not self._alike(state.best_step, state.step):
+                state.best_bound = None  # it is another objective's
             if score > (-math.inf if state.best_bound is None else state.best_bound):  # never true of NaN
                 state.best_step, state.best_bound, state.waited = state.step, score, 0
                 state.best = weights(self.model)
         return {f"validation/{name}": value for name, value in row.items()}
+
+    def _alike(self, first: int, second: int) -> bool:
+        """Whether losses at two steps are of one objective."""
+        before, now = (stage_at(self.plan, step)[1].objective for step in (first, second))
+        return before is now or before == now
 
     def rates(self, step: int) -> dict[str, float]:
         """The learning rate, the probability of self-feeding and the curriculum, if there is one, at a global step."""

@@ -12,6 +12,7 @@ from .graphconv import GraphConv
 from .graphs import FrameGraph, NodeGraph
 from .linear import Linear
 from .recurrent import Recurrent
+from .whole import WholeDecoder, WholeEncoder
 
 __all__ = [
     "Attention",
@@ -27,4 +28,6 @@ __all__ = [
     "NodeGraph",
     "Recurrent",
     "SelfAttention",
+    "WholeDecoder",
+    "WholeEncoder",
 ]

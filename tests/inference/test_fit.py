@@ -246,6 +246,16 @@ def test_momentum_is_that_of_sgd_and_goes_on_after_a_resume(tmp_path):
     assert same(*(load_file(tmp_path / name / "last.safetensors") for name in ("whole", "parts")))
 
 
+def test_the_best_weights_are_of_the_last_objective_that_tells_them():
+    """A loss in other units, however small, is no better and no worse."""
+    small, large = (Evidence(kl_weight=weight, select="loss") for weight in (1e-3, 1e3))
+    for first, second in ((small, large), (large, small)):
+        result = run(validation=HELD_OUT, stages=[Stage(40, first), Stage(40, second)])
+        assert result.best_step >= 40
+    result = run(validation=HELD_OUT, stages=[Stage(40, large), Stage(40, large, learning_rate=0.5)])
+    assert result.best_step == 40  # the one that came before, where it is the same
+
+
 def test_stages_follow_one_another_on_one_global_step():
     seen = []
 

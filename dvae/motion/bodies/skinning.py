@@ -127,6 +127,38 @@ class Body(nn.Module):
         Raises:
             ValueError: shapes that do not fit the body or each other.
         """
+        poses, joints = self._posed(shape, rotations, translation)
+        vertices = (poses @ self._hung(shape).mT).unflatten(-2, (-1, 3)).mT
+        # last, as rounding would grow with how far somebody walks
+        return vertices + translation[..., None, :], joints + translation[..., None, :]
+
+    def squared_error(self, shape: Tensor, first: Sequence[Tensor], second: Sequence[Tensor]) -> Tensor:
+        """The mean over vertices of the squared distance between two motions of the same bodies, (..., T) in m².
+
+        Vertices are linear in what joints do, so that this is a quadratic form of 4 J numbers, and no vertex is made:
+        with P and P' what two poses say and S the surface, |P S - P' S|² = tr (P - P') S S^T (P - P')^T.
+
+        Args:
+            shape: of each body, (..., S).
+            first, second: rotations (..., T, J, 3, 3) and translation (..., T, 3) of each, as `forward` takes them.
+        """
+        ours, theirs = (self._posed(shape, *motion)[0] for motion in (first, second))
+        apart = (ours - theirs).unflatten(-1, (-1, 4))
+        moved = (first[1] - second[1]).flatten(-2)[..., None]  # all joints alike, as weights have the sum 1
+        apart = torch.cat([apart[..., :3], apart[..., 3:] + moved[..., None, :]], -1).flatten(-2)
+        surface = self._hung(shape)
+        form = surface.mT @ surface / surface.shape[-2]
+        found: Tensor = ((apart @ form) * apart).sum(-1).unflatten(-1, (-1, 3)).sum(-1)
+        return found
+
+    def _hung(self, shape: Tensor) -> Tensor:
+        """Vertices at rest by the joints that they hang on, (..., V, 4 J)."""
+        resting = self.at_rest(shape)[0]
+        surface = torch.cat([resting, torch.ones_like(resting[..., :1])], -1)
+        return (self.weights[..., None] * surface[..., None, :]).flatten(-2)
+
+    def _posed(self, shape: Tensor, rotations: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+        """What joints do to what hangs on them (..., 3 T, 4 J), and where they are (..., T, J, 3), not translated."""
         frames = translation.shape[:-1]
         if rotations.shape != (*frames, self.joints, 3, 3) or shape.shape[:-1] != frames[:-1] or not frames:
             raise ValueError(
@@ -134,16 +166,10 @@ class Body(nn.Module):
                 f"translation (..., T, 3), got {tuple(shape.shape)}, {tuple(rotations.shape)} and "
                 f"{tuple(translation.shape)}"
             )
-        resting, pivots = self.at_rest(shape)
-        pivots = pivots[..., None, :, :]
+        pivots = self.at_rest(shape)[1][..., None, :, :]
         root = self.parents.index(-1)
         offsets = pivots - pivots[..., [max(parent, 0) for parent in self.parents], :]
         joints, turns = forward(self.parents, rotations, offsets, pivots[..., root, :].expand_as(translation))
         moved = joints - (turns @ pivots[..., None]).squeeze(-1)
         poses = torch.cat([turns, moved[..., None]], -1)  # (..., T, J, 3, 4)
-        poses = poses.movedim(-2, -3).flatten(-2).flatten(-3, -2)  # (..., 3 T, 4 J)
-        surface = torch.cat([resting, torch.ones_like(resting[..., :1])], -1)
-        surface = (self.weights[..., None] * surface[..., None, :]).flatten(-2)  # (..., V, 4 J)
-        vertices = (poses @ surface.mT).unflatten(-2, (-1, 3)).mT
-        # last, as rounding would grow with how far somebody walks
-        return vertices + translation[..., None, :], joints + translation[..., None, :]
+        return poses.movedim(-2, -3).flatten(-2).flatten(-3, -2), joints

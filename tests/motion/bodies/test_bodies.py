@@ -324,3 +324,11 @@ def test_no_file_is_no_body(tmp_path):
     (tmp_path / "text.npz").write_text("SMPL")
     with pytest.raises(ValueError, match="damaged"):
         read_body(tmp_path / "text.npz")
+
+
+def test_the_squared_error_is_that_of_vertices_though_none_is_made():
+    shape, *first = poses()
+    _, *second = poses()
+    away = PERSON(shape, *first)[0] - PERSON(shape, *second)[0]
+    torch.testing.assert_close(PERSON.squared_error(shape, first, second), away.square().sum(-1).mean(-1))
+    assert (PERSON.squared_error(shape, first, first) == 0).all()

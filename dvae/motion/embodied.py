@@ -1,0 +1,136 @@
+"""Segments of motion on a body with a surface: what a latent space of 4D motion learns from.
+
+Marsot, Wuhrer, Franco and Durocher (2021), arXiv 2106.04387: a segment is chi, time-stamped frames
+(`segments.TimedFrames`), beside beta, the shape of the body that moves.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from ..data import Batch, each
+from ..options import tuples
+from ..schema import Schema
+from ..views import WHOLE, Parts
+from .bodies import Body, human, shapes_of
+from .data import MotionSet
+from .gait import Reference
+from .segments import OFFSETS, ORIGIN, TimedFrames
+from .skeleton import Skeleton
+from .views import HEADING
+
+SHAPE = "beta"
+"""Name in batches of parameters of shape, (B, S)."""
+
+
+@dataclass(frozen=True)
+class SegmentSchema(Schema):
+    """The schema of segments on the body that ships, x (B, N, D) beside beta (B, S).
+
+    Args:
+        timed: how segments become frames and back.
+    """
+
+    kind: ClassVar[str] = "segments"
+
+    timed: TimedFrames = field(kw_only=True)
+
+    @classmethod
+    def under(cls, timed: TimedFrames, body: Body) -> Self:
+        """Of frames, and bodies with these parameters."""
+        sizes = {name: len(places) for name, places in timed.parts.items()}
+        return cls({**sizes, SHAPE: body.parameters_of_shape}, timed.frames, timed=timed)
+
+    @property
+    @override
+    def view(self) -> Parts:
+        return Parts(self.timed.parts)
+
+    @override
+    def config(self) -> dict[str, Any]:
+        own = asdict(replace(self.timed, references=()))
+        references = [{**vars(each), "hips": each.hips.tolist()} for each in self.timed.references]
+        return {"sizes": dict(self.sizes), "timed": {**own, "references": references}}
+
+    @classmethod
+    @override
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        timed = dict(config["timed"])
+        references = [
+            Reference(**{**each, "hips": np.array(each["hips"]), "source": tuple(each["source"])})
+            for each in timed.pop("references")
+        ]
+        skeleton = Skeleton(**tuples(timed.pop("skeleton")))
+        found = TimedFrames(skeleton, references=tuple(references), **tuples(timed))
+        return cls(dict(config["sizes"]), found.frames, timed=found)
+
+
+class Segments:
+    """Segments as a model sees them: training data that draws batches, or held-out ones.
+
+    Args:
+        motion: segments on the joints of the body, each a clip (see `bodies.fitted`, `gait_cycles`).
+        timed: how they become frames; that of the training data, for held-out ones.
+        body: whose joints these are; the person that ships by default.
+
+    Raises:
+        ValueError: motion on other joints.
+    """
+
+    def __init__(self, motion: MotionSet, timed: TimedFrames | None = None, body: Body | None = None):
+        self.motion, self.body = motion, body or human()
+        self.timed = timed or TimedFrames.of(motion)
+        seen = self.timed.to(motion)
+        self._batch = {WHOLE: seen[WHOLE], SHAPE: shapes_of(motion, self.body).float()}
+        self._start = {name: seen[name] for name in (HEADING, ORIGIN)}
+
+    def __len__(self) -> int:
+        return len(self.motion)
+
+    def all(self) -> Batch:
+        """All of them: x (B, N, D) and beta (B, S)."""
+        return self._batch
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
+        """So many different ones in random order; all of them if there are no more."""
+        chosen = torch.randperm(len(self), generator=generator)[:batch_size]
+        return each(self._batch, lambda value: value[chosen])
+
+    @property
+    def labels(self) -> Sequence[Mapping[str, str]]:
+        """Of each."""
+        return [clip.labels for clip in self.motion]
+
+    @property
+    def schema(self) -> SegmentSchema:
+        """What a model must know of them."""
+        return SegmentSchema.under(self.timed, self.body)
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of what models see."""
+        content = b"".join(self._batch[name].numpy().tobytes() for name in (WHOLE, SHAPE))
+        return hashlib.sha256(content).hexdigest()
+
+    def back(self, x: Tensor, shape: Tensor | None = None, fps: float | None = None) -> MotionSet:
+        """Motion of frames (B, N, D), from where these segments start; on bodies (B, S), theirs by default."""
+        offsets = self.body.offsets(self._batch[SHAPE] if shape is None else shape)
+        return self.timed.back({**self._start, OFFSETS: offsets, WHOLE: x}, fps)
+
+
+def surfaces_of(timed: TimedFrames, body: Body, x: Tensor, shape: Tensor) -> Tensor:
+    """Surfaces (..., N, V, 3) in metres of frames (..., N, D) on bodies (..., S), with gradients.
+
+    Everybody starts at the origin, facing heading zero.
+    """
+    rotations, place, _ = timed.unpack(x)
+    found: Tensor = body(shape, rotations, place)[0]
+    return found

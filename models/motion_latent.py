@@ -1,0 +1,165 @@
+"""A structured latent space of 4D motion: whole segments of moving bodies, with their timing, from one static latent.
+
+    p(z) p(turns_t | z, beta) p(place_t | z, beta) p(time_t | z, beta)
+    q(z | turns_{1:T}, place_{1:T}, time_{1:T})
+
+Chi = turns, place and time are T = 100 time-stamped frames of a segment (`dvae.motion.TimedFrames`), beta the shape of
+the body. Perceptrons read and make all of it at once. The published guide does not see beta, which the exact posterior
+does: with `shaped` ours does, q(z | turns_{1:T}, place_{1:T}, time_{1:T}, beta).
+
+Training has two phases. The first minimises squared errors of turns, place and time, and the second those of the
+surface's vertices and of time, each with weights that adapt (`dvae.GradNorm`), beside a KL with a weight of its own.
+
+Marsot, Wuhrer, Franco and Durocher, 2021, arXiv 2106.04387; there is no public code. Ours, where the paper is silent:
+widths of the layers, normal likelihoods whose scale stands for how squared errors are reduced beside the KL, one batch
+size for both phases, and the shared layer of adaptive weights, the decoder's last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from ..inference.gradnorm import GradNorm
+from ..inference.objectives import Evidence
+from ..inference.recipe import Recipe
+from ..inference.training import Stage
+from ..laws import FixedNormal, LawSpec
+from ..motion.bodies import Body, human
+from ..motion.embodied import SHAPE, SegmentSchema, surfaces_of
+from ..networks import NetworkSpec, WholeDecoder, WholeEncoder
+from ..networks.base import share_modules
+from ..notation import Factorization
+from ..options import Amount, Positive, Share, Size
+from ..program.model import DynamicalVAE
+from ..program.rollout import Rollout
+from ..schema import Schema
+from ..views import WHOLE
+from .method import Method
+
+TURNS, PLACE, TIME, SURFACE = "turns", "place", "time", "surface"
+PARTS = (TURNS, PLACE, TIME)
+
+
+@dataclass(frozen=True)
+class MotionLatent(Method):
+    """See the file.
+
+    Args:
+        latent: size of z.
+        widths: of the encoder's layers; the decoder has them the other way round.
+        shaped: the guide reads beta.
+        kl: weight of the KL.
+        scale: standard deviation of all numbers of chi.
+        deviation: metres, that of a vertex.
+        finish: share of training that is the second phase; 0 for the first alone.
+        finish_rate: its learning rate.
+        pace: how fast adaptive weights move; 0 to leave them 1.
+    """
+
+    name = "motion-latent"
+    source = "Marsot, Wuhrer, Franco and Durocher, 2021, arXiv 2106.04387"
+    generative = "p(z) p(turns_t | z, beta) p(place_t | z, beta) p(time_t | z, beta)"
+    inference = "q(z | turns_{1:T}, place_{1:T}, time_{1:T})"
+    exact: ClassVar[str] = "q(z | turns_{1:T}, place_{1:T}, time_{1:T}, beta)"
+
+    latent: Size = 64
+    widths: tuple[Size, ...] = (1024, 512, 256)
+    shaped: bool = False
+    kl: Amount = 0.01
+    scale: Positive = 0.1
+    deviation: Positive = 0.05
+    finish: Share = 0.2
+    finish_rate: Positive = 1e-4
+    pace: Share = 0.025
+
+    @override
+    def equations(self) -> tuple[Factorization, Factorization]:
+        inference = self.exact if self.shaped else self.inference
+        return Factorization.parse(self.generative), Factorization.parse(inference)
+
+    @override
+    def laws(self) -> Mapping[str, LawSpec]:
+        return {f"p({name})": FixedNormal(self.scale, project=False) for name in PARTS}
+
+    @override
+    def build(self, data: Any) -> DynamicalVAE:
+        """The model for segments (`dvae.motion.Segments`).
+
+        Of a schema with the sizes of turns, place, time and beta, and a length, it is one without a surface.
+        """
+        schema = Schema.of(data)
+        sizes, length = {name: schema.size(name) for name in (*PARTS, SHAPE)}, schema.length or 100
+        made = {name: sizes[name] for name in PARTS}
+        networks: dict[str, NetworkSpec] = {"q(z)": WholeEncoder(length, self.widths)}
+        for name in PARTS:
+            networks[f"p({name})"] = WholeDecoder(length, self.widths[::-1], sizes=made, name=name)
+        generative, inference = self.equations()
+        described: dict[str, Any] = {
+            "generative": generative,
+            "inference": inference,
+            "sizes": {**self.sizes(), **sizes},
+        }
+        described |= {"network": networks, "laws": self.laws()}
+        model = (
+            MotionLatentModel(self, schema, human(), **described)
+            if isinstance(schema, SegmentSchema)
+            else DynamicalVAE(**described, observed=PARTS)
+        )
+        share_modules([model.generator[name].network for name in PARTS], "trunk")
+        return model
+
+    @override
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
+        """Two stages of adaptive weights: errors of chi, then of the surface and of time."""
+        second = round(self.finish * steps) if isinstance(Schema.of(train), SegmentSchema) else 0
+        stages = [Stage(steps - second, self._weighing(PARTS, Evidence(kl_weight=self.kl, select="loss")))]
+        if second:
+            others = Evidence(kl_weight=self.kl, likelihood_weight=0.0, draws={"z": 1}, select="loss")
+            stages.append(Stage(second, self._weighing((SURFACE, TIME), others), self.finish_rate))
+        return Recipe(train, validation, stages)
+
+    def _weighing(self, tasks: tuple[str, ...], others: Evidence) -> GradNorm:
+        shared = f"generator.{TURNS}.network.trunk.out."
+        return GradNorm(tasks, shared, others, asymmetry=0.0, learning_rate=self.pace)
+
+
+class MotionLatentModel(DynamicalVAE):
+    """A model of segments on a body.
+
+    Args:
+        method: its options.
+        schema: of the segments.
+        body: whose surface they move.
+        **options: of `DynamicalVAE`.
+    """
+
+    def __init__(self, method: MotionLatent, schema: SegmentSchema, body: Body, **options: Any) -> None:
+        super().__init__(view=schema.view, **options)
+        self.method, self.timed, self.body = method, schema.timed, body
+
+    def vertices(self, x: Tensor, shape: Tensor) -> Tensor:
+        """Surfaces (..., N, V, 3) in metres of frames (..., N, D) on bodies (..., S), with gradients."""
+        return surfaces_of(self.timed, self.body, x, shape)
+
+    @override
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+        """The squared error of the surface, mean over vertices, in deviations; where an objective asks for draws."""
+        if not draws or not set(PARTS) <= data.keys():
+            return {}
+        made = self._moved({name: rollout.parameters(name, rollout.values[name])[0] for name in PARTS})
+        with torch.no_grad():
+            theirs = self._moved(data)
+        away = self.body.squared_error(data[SHAPE], made, theirs).sum(-1)
+        return {SURFACE: away / (2 * self.method.deviation**2)}
+
+    def _moved(self, parts: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Rotations (B, N, J, 3, 3) and translation (B, N, 3)."""
+        whole = self.view.inverse({name: parts[name] for name in PARTS})[WHOLE]
+        rotations, place, _ = self.timed.unpack(whole)
+        return rotations, place
