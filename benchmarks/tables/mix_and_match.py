@@ -108,14 +108,13 @@ WEIGHTS = {
 }
 """What the weight of the KL does, 2 scale^2 / D beside mean squared errors of D numbers."""
 SCHEDULES = {
-    "mix": NAMED["mix"],
     "mix, KL almost free": {"scale": 0.001},
     "mix, no annealing": {"annealing": 0.0},
     "mix, no curriculum": {"curriculum": 0.0},
     "mix, true poses": {"feeding": 0.0},
     "mix, no schedule": {"annealing": 0.0, "curriculum": 0.0, "feeding": 0.0},
 }
-"""Which schedule it is that moves the codes of "mix"."""
+"""What it is that moves the codes of "mix" in training: the KL, or one of three schedules."""
 
 
 @dataclass(frozen=True)
