@@ -87,6 +87,8 @@ class Trainable:
 
     name: ClassVar[str]
     source: ClassVar[str]
+    fitted_on: ClassVar[str] = "motion"
+    """The kind of its data, by the name that runs know it by (`dvae.runs.kinds.DATA`)."""
 
     def __post_init__(self) -> None:
         check(self)

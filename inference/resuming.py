@@ -172,7 +172,8 @@ def _take_up(objective: Adapting, run: Run, found: Any) -> None:
         held = reprlib.repr(list(found)) if isinstance(found, dict) and found else "none"
         raise CheckpointError(
             f"{run.path} was fitted with another objective: the state of this one is {', '.join(own)}, the run's "
-            f"{held}; resume with the objective and the stages that it was fitted with"
+            f"{held}; resume with the objective and the stages that it was fitted with, which begin elsewhere where "
+            "steps are others"
         )
     for name, value in own.items():
         given = found[name]

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
+from pyro import poutine
 from torch import Tensor
 from typing_extensions import override
 
@@ -33,7 +34,7 @@ from ..laws import FixedNormal, LawSpec
 from ..motion.bodies import Body, human
 from ..motion.embodied import SHAPE, SegmentSchema, surfaces_of
 from ..networks import NetworkSpec, WholeDecoder, WholeEncoder
-from ..networks.base import share_modules
+from ..networks.base import computing_once, share_modules
 from ..notation import Factorization
 from ..options import Amount, Positive, Share, Size
 from ..program.model import DynamicalVAE
@@ -66,6 +67,7 @@ class MotionLatent(Method):
     source = "Marsot, Wuhrer, Franco and Durocher, 2021, arXiv 2106.04387"
     generative = "p(z) p(turns_t | z, beta) p(place_t | z, beta) p(time_t | z, beta)"
     inference = "q(z | turns_{1:T}, place_{1:T}, time_{1:T})"
+    fitted_on = "segments"
     exact: ClassVar[str] = "q(z | turns_{1:T}, place_{1:T}, time_{1:T}, beta)"
 
     latent: Size = 64
@@ -142,6 +144,19 @@ class MotionLatentModel(DynamicalVAE):
     def __init__(self, method: MotionLatent, schema: SegmentSchema, body: Body, **options: Any) -> None:
         super().__init__(view=schema.view, **options)
         self.method, self.timed, self.body = method, schema.timed, body
+
+    def encode(self, batch: Mapping[str, Any]) -> Tensor:
+        """The mean (B, Z) of the guide's z, of x (B, N, D) on bodies beta (B, S), with gradients."""
+        law: Any = poutine.trace(self.guide).get_trace(batch).nodes["z"]["fn"]
+        return law.mean  # type: ignore[no-any-return]
+
+    def decode(self, latent: Tensor, shape: Tensor) -> Tensor:
+        """Frames x (..., N, D), the means of chi, of latents (..., Z) on bodies (..., S), with gradients."""
+        given = {"z": latent.flatten(0, -2), SHAPE: shape.flatten(0, -2)}
+        with computing_once():
+            made = {name: self.generator[name](given, len(given["z"]), self.timed.frames)[0] for name in PARTS}
+        x: Tensor = self.view.inverse(made)[WHOLE]
+        return x.unflatten(0, latent.shape[:-1])
 
     def vertices(self, x: Tensor, shape: Tensor) -> Tensor:
         """Surfaces (..., N, V, 3) in metres of frames (..., N, D) on bodies (..., S), with gradients."""

@@ -32,6 +32,7 @@ METHODS = {
     "trajevae": "dvae.models.trajevae:TrajeVAE",
     "cvae-rnn": "dvae.models.cvae_rnn:CVAERNN",
     "mix-and-match": "dvae.models.mix_and_match:MixAndMatchMotion",
+    "motion-latent": "dvae.models.motion_latent:MotionLatent",
     "equations": "dvae.models.equations:Equations",
 }
 JUDGES = {

@@ -27,7 +27,7 @@ LAYERS = {
 }
 # Motion is an application: beside itself, the methods and commands for it import it, and nothing else does.
 MOTION = re.compile(
-    r"dvae\.motion\b|dvae\.models\.(energies|gsps|hit_dvae|poses|trajectories|trajevae|cvae_rnn|mix_and_match)$"
+    r"dvae\.motion\b|dvae\.models\.(energies|gsps|hit_dvae|poses|trajectories|trajevae|cvae_rnn|mix_and_match|motion_latent)$"
     r"|dvae\.cli\.(data|fitting|futures|judging|report)$"
 )
 
@@ -97,13 +97,21 @@ def test_the_core_has_no_name_for_a_joint():
 
 def test_registries_alone_name_motion():
     """The one exception: what is known by name is imported when its name is given."""
-    naming = {module: {target for target in named(path) if "motion" in target} for module, path in sources().items()}
+    naming = {
+        module: {target for target in named(path) if target.startswith("dvae.motion.")}
+        for module, path in sources().items()
+    }
     assert {module: targets for module, targets in naming.items() if targets} == {
         "dvae.models.registry": {
             "dvae.motion.judges.pose_prior.PosePrior",
             "dvae.motion.judges.action_classifier.ActionClassifier",
         },
-        "dvae.runs.kinds": {"dvae.motion.protocols.Poses", "dvae.motion.dataset.MotionData"},
+        "dvae.runs.kinds": {
+            "dvae.motion.protocols.Poses",
+            "dvae.motion.dataset.MotionData",
+            "dvae.motion.embodied.SegmentSchema",
+            "dvae.motion.segmented.SegmentData",
+        },
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields, make_dataclass, replace
+from dataclasses import dataclass, fields, make_dataclass
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -24,8 +24,11 @@ from ..models import registry
 from ..models.method import LatentMethod
 from ..models.registry import judges, methods
 from ..models.trajectories import TrajectoryMethod
-from ..motion.dataset import SIMULATED, MotionData
+from ..motion.dataset import SIMULATED
+from ..motion.protocols import Representation
+from ..motion.segmented import Cut
 from ..runs import directory as runs
+from ..runs.kinds import DATA
 from ..runs.sweep import sweep as sweep_methods
 from .console import OUT, Missing, UsageError, arguments, at_least
 
@@ -81,22 +84,44 @@ class DataOptions:
 
     Args:
         data: a motion file or a folder of them, or "simulated".
+        skip_bad: leave out clips that cannot be used instead of refusing the file.
         protocol: how windows are cut, by default as suits the skeleton.
         representation: what the model sees: positions; or turns of joints in this form, and bones then keep their
             lengths.
-        skip_bad: leave out clips that cannot be used instead of refusing the file.
+        cut: of motion-latent: segments are gait cycles, or clips as they are, where they last 0.3 to 3 seconds.
+        scaling: of motion-latent: of turns, less no turn, or less their mean and by their deviation.
+        warped: of motion-latent: time goes along the most typical gait cycles, instead of evenly.
     """
 
     data: str = SIMULATED
-    protocol: ProtocolName | None = None
-    representation: Literal["positions", "6d", "quaternion", "vector"] = "positions"
     skip_bad: bool = False
+    protocol: ProtocolName | None = None
+    representation: Representation = "positions"
     missing: Missing = False
+    cut: Cut = "gait"
+    scaling: Literal["identity", "deviation"] = "identity"
+    warped: bool = False
 
-    def open(self) -> MotionData:
-        """The clips under their protocol."""
-        found = MotionData.open(self.data, self.protocol, self.skip_bad, self.missing)
-        return replace(found, protocol=replace(found.protocol, representation=self.representation))
+    def open(self, *methods: Trainable) -> Any:
+        """The data on which methods are fitted, of one kind.
+
+        Raises:
+            UsageError: they are of several, or an option is of another kind than that of the methods.
+        """
+        kinds = {method.fitted_on: method.name for method in methods}
+        if len(kinds) > 1:
+            said = " and ".join(f"{name} on {kind}" for kind, name in kinds.items())
+            raise UsageError(f"methods are fitted on data of their kind, {said}; give those of one kind")
+        ((kind, name),) = kinds.items()
+        given = {option: value for option, value in vars(self).items() if value != getattr(DataOptions, option)}
+        for other, options in OF_KINDS.items():
+            if other != kind and (strange := given.keys() & {*options}):
+                raise UsageError(f"--{min(strange)} is about {other}, and {name} is fitted on {kind}")
+        return DATA[kind].open(given.pop("data", SIMULATED), **given)
+
+
+OF_KINDS = {"motion": ("protocol", "representation", "missing"), "segments": ("cut", "scaling", "warped")}
+"""Options by the kind of data that has them."""
 
 
 def fit(
@@ -124,7 +149,7 @@ def fit(
     with arguments():
         method.check()  # wrong equations and options are found before the data are read
         how = Training(**vars(training))
-    opened = source.open()
+    opened = source.open(method)
     with _reported():
         _report(runs.fit_run(method, opened, out, how, trackers=[TensorBoard(out)] if tensorboard else []))
 
@@ -193,7 +218,7 @@ def sweep(
         for each in chosen:
             each.check()
         how = Training(**vars(training))
-    opened = source.open()
+    opened = source.open(*chosen)
     with nullcontext() if scheduler is None else _cluster(scheduler):
         results = sweep_methods(chosen, opened, out, seeds, how, jobs)
     if failed := [result for result in results if result.status == "failed"]:
@@ -239,6 +264,8 @@ def _use(name: str, run: Path) -> str:
         what = "the poses of forecasts" if name == "pose-prior" else "forecasts"
         option = "--pose-prior" if name == "pose-prior" else "--classifier"
         return f"score {what} with: dvae evaluate RUN {option} {run}"
+    if methods()[name].fitted_on == "segments":
+        return f"score it with: dvae evaluate {run}, look into it with: dvae interpolate {run}"
     if issubclass(methods()[name], TrajectoryMethod):
         joints = f"{run} --joints JOINT …"
         return f"score it with: dvae evaluate {joints}, move it with: dvae complete {joints}"

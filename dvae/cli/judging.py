@@ -14,7 +14,7 @@ import tyro
 
 from .. import files, motion
 from ..inference.calibration import calibrate
-from ..inference.checkpoints import Run
+from ..inference.checkpoints import CheckpointError, Run
 from ..inference.checks import predictive_checks
 from ..inference.compare import compare as compare_models
 from ..inference.evaluate import evaluate as evaluate_models
@@ -22,7 +22,7 @@ from ..models.trajectories import TrajectoryModel
 from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
 from . import opening
-from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, save_figure
+from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, note, save_figure
 from .futures import joint_names
 
 
@@ -77,6 +77,9 @@ def evaluate(
 ) -> None:
     """Score runs on the test windows of their protocol, beside zero velocity and nearest neighbours.
 
+    Runs of motion-latent: how near test segments come back, beside principal components of equal dimensions. Options
+    about forecasts are not for them.
+
     Prints the table, and writes it with all that it rests on to evaluation.json in each run, or to --out. With given
     joints or other data, the name of the file says which; nearest neighbours are those in the runs' own data alone.
 
@@ -92,33 +95,78 @@ def evaluate(
         seed: of the draws.
         batch_size: windows forecast at once.
         out: file to write instead of evaluation.json in each run.
-        figure: save the scores as dots with error bars.
+        figure: save the scores as dots with error bars, or as boxes of segments.
     """
     at_least(1, samples=samples, batch_size=batch_size)
     at_least(0, bound_particles=bound_particles, log_score_particles=log_score_particles)
     check_files(out, figure, ".json")
-    loaded, opened = opening.on_the_same_data(run, data, missing)
+    how = Judged(samples, log_score_particles, pose_prior, classifier, control, missing)
+    score = SCORERS.get(opening.kind_of(run, data), _forecasts)
+    result, record = score(run, data, how, bound_particles=bound_particles, seed=seed, batch_size=batch_size)
+    _keep(result, [each / f"{record}.json" for each in run] if out is None else [out], figure)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What only forecasts are judged by; see `evaluate`."""
+
+    samples: int = 50
+    log_score_particles: int = 0
+    pose_prior: Path | None = None
+    classifier: tuple[Path, ...] = ()
+    control: Control = Control()
+    missing: bool = False
+
+
+def _forecasts(paths: Sequence[Path], data: str | None, how: Judged, **settings: Any) -> tuple[Any, str]:
+    """Scores of forecasts of test windows, and what to call them."""
+    loaded, opened = opening.on_the_same_data(paths, data, how.missing)
     opening.note_unfinished(loaded)
     called, windows = dict(zip(opening.names(loaded), loaded, strict=True)), opened.windows("test")
-    given = control.windows(windows, loaded)
-    classifiers = _classifiers(classifier, data, loaded[0])
-    prior = None if pose_prior is None else _pose_prior(pose_prior, data, windows.skeleton)
-    own, temperature = opening.own(loaded[0], opened), control.temperature
+    given = how.control.windows(windows, loaded)
+    classifiers = _classifiers(how.classifier, data, loaded[0])
+    prior = None if how.pose_prior is None else _pose_prior(how.pose_prior, data, windows.skeleton)
+    own, temperature = opening.own(loaded[0], opened), how.control.temperature
     result = evaluate_models(
         {name: each.model for name, each in called.items()},
         given,
         scores=partial(motion.scores, pose_prior=prior, classifiers=classifiers),
-        samples=samples,
-        seed=seed,
-        batch_size=batch_size,
-        bound_particles=bound_particles,
-        log_score_particles=log_score_particles,
+        samples=how.samples,
+        log_score_particles=how.log_score_particles,
         training_windows=opened.windows("train+validation") if own else None,
         configs={name: Run(each.path).config for name, each in called.items()},
         options={} if temperature is None else {"temperature": temperature},
+        **settings,
     )
-    name = f"{opening.record('evaluation', loaded[0], opened)}{control}.json"
-    _keep(result, [each.path / name for each in loaded] if out is None else [out], figure)
+    return result, f"{opening.record('evaluation', loaded[0], opened)}{how.control}"
+
+
+def _segments(paths: Sequence[Path], data: str | None, how: Judged, **settings: Any) -> tuple[Any, str]:
+    """How near test segments come back, and what to call that."""
+    if odd := [name for name, value in vars(how).items() if value != getattr(Judged, name)]:
+        options = "--joints, --exchange and --temperature are" if odd[0] == "control" else f"--{odd[0]} is"
+        raise UsageError(f"{options.replace('_', '-')} about forecasts, and {paths[0]} makes whole segments")
+    loaded = opening.alike(paths, data, "segments")
+    opened = opening.data_of(data, *loaded)
+    opening.note_unfinished(loaded)
+    called = dict(zip(opening.names(loaded), loaded, strict=True))
+    try:
+        training = replace(loaded[0], where=data if opening.own(loaded[0], opened) else None).data.windows("train")
+    except CheckpointError as error:
+        note(f"no principal components, which are of training segments: {error}")
+        training = None
+    result = motion.reconstruct_segments(
+        {name: each.model for name, each in called.items()},
+        opened.windows("test"),
+        training,
+        configs={name: Run(each.path).config for name, each in called.items()},
+        **settings,
+    )
+    return result, opening.record("evaluation", loaded[0], opened)
+
+
+SCORERS = {"motion": _forecasts, "segments": _segments}
+"""What `evaluate` does with runs, by the kind of their data."""
 
 
 def _keep(result: Any, paths: Sequence[Path], figure: Path | None) -> None:

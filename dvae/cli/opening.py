@@ -16,15 +16,32 @@ from ..runs.sweep import ENDED
 from ..views import View
 from .console import UsageError, note
 
+USES = {
+    "motion": "forecasts and has no segments; use dvae forecast, animate or evaluate",
+    "segments": "makes whole segments and forecasts nothing; use dvae evaluate or interpolate",
+}
+"""What there is for runs, by the kind of their data."""
 
-def load_run(path: Path, data: str | None) -> runs.Loaded:
-    """A run of a method that forecasts."""
+
+def load_run(path: Path, data: str | None, kind: str = "motion") -> runs.Loaded:
+    """A run of a method that is fitted on data of a kind: if nothing is said, of one that forecasts."""
     loaded = runs.load(path, data)
+    if loaded.config.kind != kind and (use := USES.get(loaded.config.kind)):
+        raise ValueError(f"{path} is a fitted {loaded.method.name}, which {use}")
     if loaded.method.name in judges():
         raise ValueError(
             f"{path} is a fitted {loaded.method.name}, which forecasts nothing; its bounds are in {path / 'log.jsonl'}"
         )
     return loaded
+
+
+def kind_of(paths: Sequence[Path], data: str | None) -> str:
+    """The kind of data that runs were fitted on."""
+    kinds = {runs.read_config(path, data).kind: path for path in paths}
+    if len(kinds) > 1:
+        said = " and ".join(f"{path} on {kind}" for kind, path in kinds.items())
+        raise UsageError(f"these runs were fitted on data of several kinds, {said}; give runs of one kind")
+    return next(iter(kinds), "motion")
 
 
 def data_of(path: str | None, *shared: runs.Loaded, missing: bool = False) -> Any:
@@ -52,23 +69,28 @@ def on_the_same_data(paths: Sequence[Path], path: str | None, missing: bool = Fa
     return loaded, data_of(path, *loaded, missing=missing)
 
 
-def alike(paths: Sequence[Path], path: str | None) -> list[runs.Loaded]:
+def alike(paths: Sequence[Path], path: str | None, kind: str = "motion") -> list[runs.Loaded]:
     """Runs that share their test windows: those of the data that all were fitted on, or of other data."""
     if not paths:
         raise UsageError("give at least one run directory")
     twice, count = Counter(map(str, paths)).most_common(1)[0]
     if count > 1:
         raise UsageError(f"a run is named twice: {twice}")
-    loaded = [load_run(each, path) for each in paths]
+    loaded = [load_run(each, path, kind) for each in paths]
     first = loaded[0]
     for other in loaded[1:]:
         if not (other.alike(first) if path is None else other.schema.windows == first.schema.windows):
-            there, here = (f"{run.config.data.path}, {run.schema.protocol.name}" for run in (other, first))
+            there, here = (f"{run.config.data.path}, {_cut(run)}" for run in (other, first))
             raise ValueError(
                 f"{other.path} has other test windows ({there}) than {first.path} ({here}); give runs of the same data "
                 "and protocol"
             )
     return loaded
+
+
+def _cut(run: runs.Loaded) -> str:
+    """How the data of a run are cut, in a word."""
+    return str(run.config.data.cut if run.config.kind == "segments" else run.schema.protocol.name)
 
 
 def own(run: runs.Loaded, opened: Any) -> bool:

@@ -64,9 +64,9 @@ def report(
     at_least(0, windows=windows)
     at_least(1, samples=samples, bound_windows=bound_windows, particles=particles)
     check_files(out, None, ".html", ".htm")
+    loaded = opening.alike(run, data)
     if evaluate:
         evaluate_runs(run, Control(), data=data, missing=missing, seed=seed)
-    loaded = opening.alike(run, data)
     named = dict(zip(opening.names(loaded), loaded, strict=True))
     opening.note_unfinished(loaded)
 

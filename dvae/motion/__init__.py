@@ -11,13 +11,16 @@ from .angles import AngleLimits, estimate_angle_limits
 from .criticism import draw_traversal, statistics
 from .data import Clip, MotionSet
 from .dataset import MotionData
+from .embodied import Segments
 from .exchange import Exchanged
 from .files import read_motion, read_paths, save, write_motion
 from .forecasts import Forecasts, Imputed, is_forecasts
 from .gait import Cycles, gait_cycles, reference_cycles
 from .occlusion import occlude
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
+from .reconstruction import reconstruct_segments
 from .scoring import displacements, scores
+from .segmented import SegmentData
 from .segments import TimedFrames
 from .simulator import simulate
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
@@ -44,6 +47,8 @@ __all__ = [
     "Protocol",
     "PseudoTruths",
     "Rotations",
+    "SegmentData",
+    "Segments",
     "Skeleton",
     "TimedFrames",
     "Windows",
@@ -57,6 +62,7 @@ __all__ = [
     "occlude",
     "read_motion",
     "read_paths",
+    "reconstruct_segments",
     "reference_cycles",
     "rotate_about_up",
     "save",

@@ -11,7 +11,7 @@ from ..options import check, tuples
 from .data import MotionSet
 from .files import read_motion
 from .files.reading import chosen
-from .protocols import PROTOCOLS, Poses, Protocol, Windows, named_protocol, windows
+from .protocols import PROTOCOLS, Poses, Protocol, Representation, Windows, named_protocol, windows
 from .simulator import simulate
 
 SIMULATED = "simulated"
@@ -96,6 +96,7 @@ class MotionData:
         protocol: str | Protocol | None = None,
         skip_bad: bool = False,
         missing: bool = False,
+        representation: Representation | None = None,
     ) -> Self:
         """Reads a motion file, or simulates.
 
@@ -106,6 +107,7 @@ class MotionData:
                 are divided, see `MotionSet.divided`.
             skip_bad: leave out unusable clips instead of refusing the file.
             missing: keep clips that lack joints (NaN) in some frames.
+            representation: what models see, in place of what the protocol says.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -116,6 +118,7 @@ class MotionData:
         if isinstance(protocol, str):
             protocol = named_protocol(protocol)
         protocol = protocol or default_protocol(clips)
+        protocol = replace(protocol, representation=representation or protocol.representation)
         return cls(name, divided(clips, protocol), protocol, skip_bad)
 
     def windows(self, split: str) -> Windows:

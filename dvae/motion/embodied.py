@@ -24,7 +24,7 @@ from .bodies import Body, human, shapes_of
 from .data import MotionSet
 from .gait import Reference
 from .segments import OFFSETS, ORIGIN, TimedFrames
-from .skeleton import Skeleton
+from .skeleton import Skeleton, brief
 from .views import HEADING
 
 SHAPE = "beta"
@@ -54,6 +54,12 @@ class SegmentSchema(Schema):
     def view(self) -> Parts:
         return Parts(self.timed.parts)
 
+    @property
+    @override
+    def windows(self) -> Schema:
+        """Whatever frames models see of them, what they make are surfaces of the same bodies."""
+        return Schema({SHAPE: self.size(SHAPE)})
+
     @override
     def config(self) -> dict[str, Any]:
         own = asdict(replace(self.timed, references=()))
@@ -63,14 +69,23 @@ class SegmentSchema(Schema):
     @classmethod
     @override
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        timed = dict(config["timed"])
-        references = [
-            Reference(**{**each, "hips": np.array(each["hips"]), "source": tuple(each["source"])})
-            for each in timed.pop("references")
-        ]
+        timed, body = dict(config["timed"]), human()
+        references = tuple(map(_reference, timed.pop("references")))
         skeleton = Skeleton(**tuples(timed.pop("skeleton")))
-        found = TimedFrames(skeleton, references=tuple(references), **tuples(timed))
-        return cls(dict(config["sizes"]), found.frames, timed=found)
+        if (skeleton.names, skeleton.parents, skeleton.up) != (body.names, body.parents, "y"):
+            raise ValueError(f"timed.skeleton is not that of the body that ships, {', '.join(body.names)} with y up")
+        found = cls.under(TimedFrames(skeleton, references=references, **tuples(timed)), body)
+        if config["sizes"] != found.sizes:
+            raise ValueError(f"sizes are {brief(config['sizes'])}, and such segments have {found.sizes}")
+        return found
+
+
+def _reference(config: Mapping[str, Any]) -> Reference:
+    """One that a config says."""
+    hips = np.array(config["hips"], dtype=np.float64)
+    if hips.ndim != 3 or hips.shape[1:] != (2, 4) or len(hips) < 2 or not np.isfinite(hips).all():
+        raise ValueError(f"hips of a reference are {hips.shape}, expected finite quaternions (at least 2, 2, 4)")
+    return Reference(**{**config, "hips": hips, "source": tuple(config["source"])})
 
 
 class Segments:

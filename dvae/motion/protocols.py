@@ -38,6 +38,9 @@ from .rotations import continuous, from_matrix, to_matrix
 from .skeleton import Skeleton, rotate_about_up
 from .views import TURNS, Rotations
 
+Representation = Literal["positions", "6d", "quaternion", "vector"]
+"""What models see of motion: places of joints, or their turns in one of the forms of `dvae.motion.rotations`."""
+
 
 @dataclass(frozen=True)
 class Protocol:
@@ -82,7 +85,7 @@ class Protocol:
     sampling: Literal["clip", "length", "subject"] = "clip"
     heading: bool = False
     rotate: bool = False
-    representation: Literal["positions", "6d", "quaternion", "vector"] = "positions"
+    representation: Representation = "positions"
 
     def __post_init__(self) -> None:
         try:
@@ -263,15 +266,20 @@ def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
             f"protocol {protocol.name} wants {protocol.split_by} {'/'.join(protocol.train)} for training and "
             f"{'/'.join(protocol.test)} for test; {motion.name!r} has {found}"
         )
-    held_out = round(len(train) * protocol.validation)
-    if protocol.validation and len(train) > 1:
-        held_out = max(held_out, 1)
-    middle_of_each_block = {int((block + 0.5) * len(train) / held_out) for block in range(held_out)}
+    aside = held_out(len(train), protocol.validation)
     return {
-        "train": [clip for i, clip in enumerate(train) if i not in middle_of_each_block],
-        "validation": [clip for i, clip in enumerate(train) if i in middle_of_each_block],
+        "train": [clip for i, clip in enumerate(train) if i not in aside],
+        "validation": [clip for i, clip in enumerate(train) if i in aside],
         "test": test,
     }
+
+
+def held_out(count: int, part: float) -> set[int]:
+    """Which of so many clips are held out for validation: of as many blocks as that part of them are, the middles."""
+    blocks = round(count * part)
+    if part and count > 1:
+        blocks = max(blocks, 1)
+    return {int((block + 0.5) * count / blocks) for block in range(blocks)}
 
 
 class Windows:

@@ -94,6 +94,8 @@ class TimedFrames:
                 raise ValueError(
                     f"{name} has {numbers} numbers, expected 6 for each of {len(self.turning)} joints that turn"
                 )
+        if not np.isfinite([*self.mean, *self.deviation]).all():
+            raise ValueError("mean or deviation have NaN or infinite numbers")
         if any(value <= 0 for value in self.deviation):
             raise ValueError(f"a deviation is {min(self.deviation)}, by which nothing can be divided")
 

@@ -9,8 +9,17 @@ from ..inference.checkpoints import CheckpointError
 from ..models.registry import Registry
 from ..schema import Schema
 
-SCHEMAS = Registry({"sequences": "dvae.schema:Schema", "poses": "dvae.motion.protocols:Poses"}, "dvae.schemas")
-DATA = Registry({"motion": "dvae.motion.dataset:MotionData"}, "dvae.data")
+SCHEMAS = Registry(
+    {
+        "sequences": "dvae.schema:Schema",
+        "poses": "dvae.motion.protocols:Poses",
+        "segments": "dvae.motion.embodied:SegmentSchema",
+    },
+    "dvae.schemas",
+)
+DATA = Registry(
+    {"motion": "dvae.motion.dataset:MotionData", "segments": "dvae.motion.segmented:SegmentData"}, "dvae.data"
+)
 """Kinds of schemas and of data, by the name that a config gives them."""
 
 
@@ -22,6 +31,10 @@ class Dataset(Protocol):
     """The kind of their schema."""
     source: ClassVar[type[Any]]
     """What `recorded` is: a dataclass of JSON's types with at least a path and a fingerprint, which a run keeps."""
+
+    @classmethod
+    def open(cls, path: str, *, skip_bad: bool = False, **options: Any) -> Self:
+        """Reads a file, with options of this kind, which the command line gives."""
 
     @property
     def location(self) -> str:

@@ -1,0 +1,301 @@
+"""How near segments come back from a latent space: errors of surfaces and of time, beside principal components.
+
+As in Marsot et al. (2021), arXiv 2106.04387: the guide's mean is decoded on the segment's own body, and a segment's
+error is the mean distance over frames and vertices. Principal components of [chi, beta], as many as the latent and
+beta have numbers, are what any latent space should beat; they are decoded on the segment's own body too.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, Protocol, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from ..data import Batch, each
+from ..inference.bounds import SequenceELBO, importance_bound
+from ..inference.evaluation import ARROWS, Score
+from ..inference.held import clip_places, on_device_of, plain, reproducibly
+from ..inference.result import Result, Table, as_they_are, canvas, progress_bar
+from ..inference.scores import TEACHER_FORCED, Metric, clip_means
+from ..inference.uncertainty import clustered_variance, linearised
+from ..options import nearest
+from ..turns import alone
+from ..views import WHOLE
+from .bodies import vertex_error
+from .embodied import SHAPE, Segments, SegmentSchema, surfaces_of
+from .segments import TimedFrames
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ERROR, DURATION = "vertex error", "duration error"
+METRICS = {ERROR: Metric("mm"), DURATION: Metric("ms"), **TEACHER_FORCED}
+
+
+class LatentSpace(Protocol):
+    """A model that makes whole segments of a latent and a body, such as that of `motion-latent`."""
+
+    timed: TimedFrames
+
+    def encode(self, batch: Batch) -> Tensor:
+        """Latents (B, Z) of x (B, N, D) and beta (B, S)."""
+
+    def decode(self, latent: Tensor, shape: Tensor) -> Tensor:
+        """Frames (..., N, D) of latents (..., Z) on bodies (..., S)."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Reconstruction(Result):
+    """How near segments come back, each alone, in rows of models and references.
+
+    Indexing gives the scores of a row: `found["motion-latent"]["vertex error"].mean`.
+
+    Attributes:
+        rows: row to score to the values (N,) of segments.
+        segments: (split, segment, take) of each.
+        fingerprint: SHA-256 of the data.
+        notes: lines below the table.
+        configs: row to what was run.
+    """
+
+    rows: Mapping[str, Mapping[str, np.ndarray]]
+    segments: list[tuple[str, str, str]]
+    fingerprint: str
+    notes: list[str] = field(default_factory=list)
+    configs: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def __getitem__(self, row: str) -> dict[str, Score]:
+        return {name: self._score(values) for name, values in self._row(row).items()}
+
+    def difference(self, first: str, second: str, score: str = ERROR) -> Score:
+        """Paired difference of two rows, first minus second, with its standard error, clustered by take."""
+        ours, theirs = (self._row(row)[score] for row in (first, second))
+        return self._score(ours - theirs)
+
+    @override
+    def table(self) -> Table:
+        """Rows down, scores across: mean over segments and its 95 % interval; of vertices the median too."""
+        takes = len({take for _, _, take in self.segments})
+        title = f"{len(self.segments)} segments of {takes} takes · data {self.fingerprint[:12]}"
+        caption = "mean over segments, with its 95 % interval where there are several takes, by which it is clustered"
+        table = Table(title=title, caption="\n".join([caption, *self.notes]))
+        table.add_column("", no_wrap=True)
+        names = [name for name in METRICS if any(name in row for row in self.rows.values())]
+        for name in names:
+            metric = METRICS[name]
+            table.add_column(f"{name}{ARROWS[metric.better]}\n{metric.unit}", justify="right")
+        table.add_column("median\nmm", justify="right")
+        for row, values in self.rows.items():
+            scores = self[row]
+            cells = [_shown(scores[name], METRICS[name]) if name in scores else "–" for name in names]
+            table.add_row(row, *cells, f"{np.median(values[ERROR]):.1f}")
+        return table
+
+    def plot(self) -> Figure:
+        """Boxes of vertex errors by Tukey: quartiles, whiskers to 1.5 times their distance, and what is beyond."""
+        figure = canvas(1.6 + 1.2 * len(self.rows), 3.4)
+        axes = figure.subplots()
+        axes.boxplot([row[ERROR] for row in self.rows.values()], widths=0.6, flierprops={"markersize": 2})
+        axes.set_xticks(range(1, len(self.rows) + 1), list(self.rows), fontsize=8)
+        as_they_are(axes.get_xticklabels())
+        axes.set_ylim(bottom=0)
+        axes.set_ylabel("vertex error (mm)")
+        axes.set_title(f"{len(self.segments)} segments", fontsize=9)
+        axes.grid(axis="y", alpha=0.3)
+        return figure
+
+    @override
+    def to_json(self) -> str:
+        """Everything, with means and standard errors; numbers that are not finite become null."""
+        rows = {
+            row: {
+                name: {"mean": score.mean, "standard_error": score.standard_error, "values": self.rows[row][name]}
+                for name, score in self[row].items()
+            }
+            for row in self.rows
+        }
+        return json.dumps(plain({**vars(self), "rows": rows}), indent=1, allow_nan=False)
+
+    @classmethod
+    @override
+    def from_json(cls, text: str) -> Self:
+        try:
+            document = json.loads(text)
+            rows = {
+                row: {name: np.array(score["values"], dtype=np.float64) for name, score in scores.items()}
+                for row, scores in document.pop("rows").items()
+            }
+            segments = [tuple(key) for key in document.pop("segments")]
+            return cls(rows=rows, segments=segments, **document)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"this is no reconstruction written by Reconstruction.to_json: {error!r}") from error
+
+    def _row(self, row: str) -> Mapping[str, np.ndarray]:
+        if row not in self.rows:
+            raise KeyError(f"no row {row!r}{nearest(row, self.rows)}; there are {', '.join(self.rows)}")
+        return self.rows[row]
+
+    def _score(self, values: np.ndarray) -> Score:
+        places = clip_places([(split, take, 0) for split, _, take in self.segments])
+        mean, deviations = linearised(np.array(clip_means(torch.from_numpy(values), places)), places.bincount().numpy())
+        return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class PrincipalComponents:
+    """The linear latent space of [chi, beta].
+
+    Args:
+        mean: (N D + S,).
+        directions: (N D + S, C), orthonormal.
+    """
+
+    mean: Tensor
+    directions: Tensor
+
+    @classmethod
+    def of(cls, segments: Segments, components: int) -> Self:
+        """The first components of segments, or as many as these have."""
+        values = _joined(segments.all())
+        mean = values.mean(0)
+        away = values - mean  # (B, N D + S), where segments are fewer than numbers of one
+        _, shares = torch.linalg.eigh((away @ away.T).double())
+        most = max(min(components, len(values) - 1), 1)
+        directions, _ = torch.linalg.qr(away.T @ shares[:, -most:].flip(-1).to(away))
+        return cls(mean, directions)
+
+    def __call__(self, batch: Batch) -> Tensor:
+        """x (B, N, D) as the components have it."""
+        values = _joined(batch) - self.mean
+        near = self.mean + values @ self.directions @ self.directions.T
+        return near[:, : -batch[SHAPE].shape[-1]].view_as(batch[WHOLE])
+
+
+def _joined(batch: Batch) -> Tensor:
+    """[chi, beta], (B, N D + S)."""
+    return torch.cat([batch[WHOLE].flatten(1), batch[SHAPE]], -1)
+
+
+@alone
+def reconstruct_segments(
+    models: Mapping[str, Any],
+    segments: Segments,
+    training: Segments | None = None,
+    *,
+    bound_particles: int = 0,
+    seed: int = 0,
+    batch_size: int = 32,
+    configs: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: bool = True,
+) -> Reconstruction:
+    """Scores how near segments come back from models, and from principal components of equal dimensions.
+
+    Every model sees the segments as its own frames (`model.timed`), and is compared with them as such; vertices are in
+    metres, whatever frames are.
+
+    Args:
+        models: by name, such as of `motion-latent`; see `LatentSpace`.
+        segments: held-out ones, on one kind of body.
+        training: of which principal components are taken; without them there is no such row.
+        bound_particles: of the importance-weighted bound and its k-hat; 0 leaves both out.
+        seed: of the bounds' draws.
+        batch_size: segments at once.
+        configs: row to configuration, kept in JSON's types.
+        progress: whether to show a progress bar.
+
+    Raises:
+        ValueError: no model, or a batch or number of particles that makes no sense.
+        FloatingPointError: a segment comes back with what is no number.
+    """
+    if not models or batch_size < 1 or bound_particles < 0:
+        raise ValueError(
+            f"give at least one model, batch_size from 1 and bound_particles from 0, not {len(models)}, {batch_size} "
+            f"and {bound_particles}"
+        )
+    seen, remembered = _Seen(segments), None if training is None else _Seen(training)
+    rows: dict[str, dict[str, np.ndarray]] = {}
+    linear: dict[tuple[str, int], str] = {}
+    with progress_bar(progress) as bar:
+
+        def score(name: str, held: Segments, function: Callable[[Batch], Mapping[str, Tensor]]) -> None:
+            found = []
+            for part in bar.track(torch.arange(len(held)).split(batch_size), description=name):
+                found.append(function(each(held.all(), itemgetter(part))))
+            rows[name] = {key: torch.cat([one[key] for one in found]).double().cpu().numpy() for key in found[0]}
+            if wrong := np.flatnonzero(~np.isfinite(rows[name][ERROR])).tolist():
+                where = "/".join(held.motion.clips[wrong[0]].key)
+                raise FloatingPointError(f"what {name} makes of segment {where} is not finite")
+
+        for name, model in models.items():
+            held = seen.by(model.timed)
+            with reproducibly(model, seed):
+                score(name, held, partial(_scores, model, held, bound_particles))
+            size = model.sizes["z"] + held.schema.size(SHAPE)
+            if remembered is None or (key := (_key(model.timed), size)) in linear:
+                continue
+            linear[key] = f"PCA of {size}" if f"PCA of {size}" not in rows else f"PCA of {size}, frames of {name}"
+            known = PrincipalComponents.of(remembered.by(model.timed), size)
+            score(linear[key], held, partial(_linear, known, held))
+    keys = [(clip.split, clip.name, clip.labels.get("source", clip.name)) for clip in segments.motion]
+    notes = [] if training is None else [f"PCA: components of [chi, beta] of {len(training)} training segments"]
+    return Reconstruction(rows, keys, segments.motion.fingerprint(), notes, dict(configs or {}))
+
+
+class _Seen:
+    """The same segments as the frames of each model; made once for those who share them."""
+
+    def __init__(self, segments: Segments) -> None:
+        self.segments = segments
+        self.known = {_key(segments.timed): segments}
+
+    def by(self, timed: TimedFrames) -> Segments:
+        """As these frames."""
+        if (key := _key(timed)) not in self.known:
+            self.known[key] = Segments(self.segments.motion, timed, self.segments.body)
+        return self.known[key]
+
+
+def _key(timed: TimedFrames) -> str:
+    """What tells ways of seeing apart."""
+    return json.dumps(SegmentSchema({}, timed=timed).config())
+
+
+def _scores(model: Any, held: Segments, particles: int, batch: Batch) -> dict[str, Tensor]:
+    """Of a batch, (B,) each."""
+    batch = on_device_of(model, batch)
+    found = _errors(held, model.decode(model.encode(batch), batch[SHAPE]), batch)
+    terms = SequenceELBO().terms(model, batch)
+    found["ELBO"] = terms.per_frame
+    if particles:
+        weighted = importance_bound(model, batch, particles=particles)
+        found |= {"importance bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
+    return found
+
+
+def _linear(known: PrincipalComponents, held: Segments, batch: Batch) -> dict[str, Tensor]:
+    """Of components."""
+    return _errors(held, known(batch), batch)
+
+
+def _errors(held: Segments, x: Tensor, batch: Batch) -> dict[str, Tensor]:
+    """Of frames (B, N, D): of the surface in millimetres, and of how long it lasts in milliseconds, (B,)."""
+    shape, body = batch[SHAPE], held.body.to(x.device)
+    made, theirs = (surfaces_of(held.timed, body, frames, shape) for frames in (x, batch[WHOLE]))
+    lasts = (held.timed.lasts(x) - held.timed.lasts(batch[WHOLE])).abs()
+    return {ERROR: 1000 * vertex_error(made, theirs), DURATION: 1000 * lasts}
+
+
+def _shown(score: Score, metric: Metric) -> str:
+    decimals = 1 if metric.unit in ("mm", "ms") else 3
+    low, high = score.interval()
+    told = "" if math.isnan(low) or metric.unit == "" else f" [{low:.{decimals}f}, {high:.{decimals}f}]"
+    return f"{score.mean:.{decimals}f}{told}"

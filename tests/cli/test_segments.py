@@ -1,0 +1,136 @@
+"""The command line on segments: fit, resume and evaluate a latent space of 4D motion; what is not for it is refused."""
+
+import json
+import shutil
+
+import pytest
+
+import dvae
+from dvae import motion
+from dvae.cli import main
+from dvae.motion.reconstruction import Reconstruction
+
+SMALL = "motion-latent --latent 3 --widths 16 8 --batch-size 4 --validate-every 2 --cut clips".split()
+
+
+def failure(capsys, *arguments, code=1):
+    """The sentence with which a command fails."""
+    assert main([*map(str, arguments)]) == code
+    error = " ".join(capsys.readouterr().err.split())
+    assert "looks like a bug" not in error
+    return error
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two files of people, and a run fitted on the first; nobody writes to them."""
+    path = tmp_path_factory.mktemp("segments")
+    for seed, name in enumerate(("own", "other")):
+        motion.save(path / name / "people.npz", motion.simulate(clips=8, frames=50, seed=seed))
+    fit = ["fit", *SMALL, "--data", path / "own" / "people.npz", "--out", path / "run", "--steps", "5"]
+    assert main([*map(str, fit)]) == 0
+    return path
+
+
+@pytest.fixture
+def run(folder, tmp_path):
+    return shutil.copytree(folder / "run", tmp_path / "run")
+
+
+def test_a_fit_says_what_to_do_with_the_run_and_resumes(capsys, folder, tmp_path):
+    own, out = folder / "own" / "people.npz", tmp_path / "run"
+    assert main(["fit", *SMALL, "--data", str(own), "--out", str(out), "--steps", "4", "--scaling", "deviation"]) == 0
+    assert f"dvae evaluate {out}" in capsys.readouterr().out
+    config = json.loads((out / "config.json").read_text())
+    assert (config["data"]["kind"], config["data"]["cut"], config["schema"]["kind"]) == (
+        "segments",
+        "clips",
+        "segments",
+    )
+    assert len(config["schema"]["timed"]["deviation"]) == 102
+    assert main(["resume", str(out), "--steps", "5"]) == 0
+    assert len(dvae.load(out).data.windows("test")) == 2
+    motion.save(tmp_path / "people.npz", motion.simulate(clips=8, frames=50, seed=7))
+    assert "has changed since" in failure(capsys, "resume", out, "--data", tmp_path / "people.npz", "--steps", "6")
+
+
+def test_segments_are_scored_beside_components_on_other_data_too(capsys, folder, run, tmp_path):
+    second = shutil.copytree(run, tmp_path / "second")
+    config = json.loads((second / "config.json").read_text())
+    config["training"]["seed"] = 1
+    (second / "config.json").write_text(json.dumps(config))
+    figure = tmp_path / "boxes.png"
+    assert main(["evaluate", str(run), str(second), "--figure", str(figure), "--bound-particles", "2"]) == 0
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("vertex error", "duration error", "ELBO", "PCA of 11"))
+    found = Reconstruction.load(run / "evaluation.json")
+    assert list(found.rows) == ["run", "PCA of 11", "second"]
+    assert found.configs["run"]["data"]["path"] == str(folder / "own" / "people.npz")
+    assert figure.exists()
+
+    other = ["--data", str(folder / "other" / "people.npz")]
+    assert main(["evaluate", str(run), *other]) == 0
+    assert "people.npz is not the data that" in capsys.readouterr().err
+    assert "PCA of 11" in Reconstruction.load(run / "evaluation-people.json").rows
+    config["data"]["path"] = "gone.npz"
+    (second / "config.json").write_text(json.dumps(config))
+    assert main(["evaluate", str(second), *other]) == 0
+    assert "no principal components" in capsys.readouterr().err
+    assert list(Reconstruction.load(second / "evaluation-people.json").rows) == ["motion-latent"]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "forecast RUN --out f.npz",
+        "complete RUN --out f.npz",
+        "impute RUN --out f.npz",
+        "compare RUN",
+        "criticise RUN",
+        "animate RUN --out f.html",
+        "report RUN --out f.html --evaluate",
+    ],
+)
+def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    error = failure(capsys, *command.replace("RUN", str(folder / "run")).split())
+    assert "is a fitted motion-latent, which makes whole segments and forecasts nothing; use dvae evaluate" in error
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("fit motion-latent --protocol cmu8 --out new", "--protocol is about motion, and motion-latent is fitted on"),
+        ("fit vae --cut clips --out new", "--cut is about segments, and vae is fitted on motion"),
+        ("fit motion-latent --cut clip --out new", "did you mean 'clips'"),
+        ("evaluate RUN --samples 3", "--samples is about forecasts"),
+        ("evaluate RUN --joints left_wrist", "--joints, --exchange and --temperature are about forecasts"),
+        ("evaluate RUN FITTED", "on data of several kinds"),
+    ],
+)
+def test_wrong_arguments_exit_with_2(capsys, folder, fitted, tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    given = arguments.replace("RUN", str(folder / "run")).replace("FITTED", str(fitted)).split()
+    assert message in failure(capsys, *given, code=2)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "message"),
+    [
+        (("data", "cut"), "steps", "unknown cut 'steps'"),
+        (("data", "kind"), "motion", "data of the kind 'motion' are poses, not 'segments'"),
+        (("schema", "sizes", "turns"), 10**9, "and such segments have"),
+        (("schema", "timed", "frames"), 16384, "larger than|weights|sizes|shape"),
+        (("schema", "timed", "skeleton", "names"), ["a"], "skeleton|names|parents"),
+    ],
+)
+def test_a_config_out_of_range_is_refused(run, keys, value, message):
+    config = content = json.loads((run / "config.json").read_text())
+    for key in keys[:-1]:
+        content = content[key]
+    content[keys[-1]] = value
+    (run / "config.json").write_text(json.dumps(config))
+    with pytest.raises(dvae.inference.checkpoints.CheckpointError, match=message):
+        dvae.load(run)

@@ -1,0 +1,118 @@
+"""Segments of motion data as runs keep them: split by take, cut and seen alike when they are opened again."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+import dvae
+from dvae import motion
+from dvae.motion.embodied import SegmentSchema
+from dvae.motion.segmented import SegmentData, Takes
+
+PEOPLE = motion.simulate(clips=8, frames=80, seed=1)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return SegmentData("simulated", PEOPLE)
+
+
+@pytest.fixture(scope="module")
+def written(data):
+    """The schema of warped ones, as a run writes it."""
+    return json.dumps(replace(data, warped=True).schema.config())
+
+
+def test_splits_are_by_take_and_leave_nothing_out(data):
+    windows = {split: data.windows(split) for split in ("train", "validation", "test")}
+    found = {split: {clip.labels["source"] for clip in each.motion} for split, each in windows.items()}
+    assert all(found.values())
+    assert sum(map(len, found.values())) == len(set.union(*found.values()))
+    assert found["test"] == {clip.labels["source"] for clip in data.segments if clip.split == "test"}
+    assert sum(map(len, windows.values())) == len(data.segments)
+    with pytest.raises(ValueError, match="no split 'all': expected train, validation or test"):
+        data.windows("all")
+    alone = SegmentData("walks.npz", replace(PEOPLE, clips=[clip for clip in PEOPLE if clip.split == "train"]))
+    with pytest.raises(ValueError, match=r"no segments for test: .* are of takes in train"):
+        alone.windows("test")
+
+
+@pytest.mark.parametrize("options", [{}, {"scaling": "deviation", "warped": True}], ids=["plain", "warped"])
+def test_what_is_reopened_is_cut_and_seen_as_it_was(options, tmp_path):
+    motion.save(tmp_path / "people.npz", PEOPLE)
+    data = SegmentData.open(tmp_path / "people.npz", **options)
+    source, schema = data.recorded(), SegmentSchema.from_config(json.loads(json.dumps(data.schema.config())))
+    again = SegmentData.reopened(Takes(**vars(source)), schema)
+    assert again.fingerprint == source.fingerprint
+    assert (bool(schema.timed.mean), len(schema.timed.references)) == ((True, 2) if options else (False, 0))
+    assert torch.equal(again.windows("test").all()["x"], data.windows("test").all()["x"])
+    other = SegmentData.reopened(source, schema, "simulated")  # under the frames of the run, not frames of its own
+    assert other.timed is schema.timed
+    assert other.fingerprint != source.fingerprint
+
+
+def test_clips_are_segments_as_they_are_where_they_last_as_long_as_one():
+    clips = [replace(clip, positions=clip.positions[: 5 + 12 * n]) for n, clip in enumerate(PEOPLE)]
+    data = SegmentData("simulated", replace(PEOPLE, clips=clips), "clips")
+    assert [clip.frames for clip in data.segments] == [clip.frames for clip in clips if clip.frames > 9]
+    assert data.fingerprint != replace(data, cut="gait").fingerprint
+    with pytest.raises(ValueError, match=r"no clip that lasts 0\.3 to 3 s.*cut='gait' finds the gait cycles"):
+        assert SegmentData("simulated", replace(PEOPLE, clips=clips[:1]), "clips").segments
+
+
+@pytest.mark.parametrize("count", [1, 6])
+def test_takes_that_nobody_divided_are_whole_in_a_split(count, tmp_path):
+    clips = [replace(clip, split="all") for clip in PEOPLE.clips[:count]]
+    motion.save(tmp_path / "walks.npz", replace(PEOPLE, clips=clips))
+    found = SegmentData.open(tmp_path / "walks.npz").motion
+    assert {*found.splits} == {"train", "test"}
+    assert count == 1 or [clip.frames for clip in found] == [clip.frames for clip in clips]
+
+
+def test_a_segment_is_found_by_its_name_or_that_of_its_take(data):
+    first = data.segments.clips[0]
+    for name in (first.name, f"{first.split}/{first.name}", first.labels["source"]):
+        (clip,) = data.found(name).motion
+        assert clip.key == first.key
+    with pytest.raises(
+        ValueError, match=r"no segment or take 'person_00' .did you mean 'person_00.*the first is train"
+    ):
+        data.found("person_00")
+    both = replace(data.motion, clips=[*data.motion, replace(data.motion.clips[0], split="test")])
+    with pytest.raises(ValueError, match=r"is the name of several; say train/person_0000-.* or test/person_0000"):
+        SegmentData("simulated", both).found(first.name)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda config: config["sizes"].update(turns=10**6), "sizes are .*, and such segments have"),
+        (lambda config: config["timed"]["skeleton"].update(up="z"), "is not that of the body that ships"),
+        (lambda config: config["timed"].update(frames=10**9), "frames is 1000000000; it must be"),
+        (lambda config: config["timed"].update(mean=[float("nan")] * 102), "NaN or infinite numbers"),
+        (lambda config: config["timed"]["references"][0].update(hips=[[1, 0, 0, 0]]), "hips of a reference are"),
+    ],
+)
+def test_a_schema_that_no_run_writes_is_refused(written, change, message):
+    config = json.loads(written)
+    change(config)
+    with pytest.raises(ValueError, match=message):
+        SegmentSchema.from_config(config)
+
+
+def test_options_out_of_range_are_refused():
+    for options, message in (({"cut": "steps"}, "unknown cut 'steps'"), ({"scaling": "own"}, "unknown scaling")):
+        with pytest.raises(ValueError, match=message):
+            SegmentData.open(**options)
+    with pytest.raises(FileNotFoundError):
+        SegmentData.open("nowhere.npz")
+    with pytest.raises(TypeError, match="skip_bad"):
+        Takes("simulated", "", skip_bad="yes")
+
+
+def test_a_method_says_what_it_is_fitted_on():
+    kinds = {name: kind.fitted_on for name, kind in dvae.methods().items()}
+    assert kinds.pop("motion-latent") == "segments"
+    assert {*kinds.values()} == {"motion"}
