@@ -35,6 +35,7 @@ COMMANDS = {
     ),
     "forecast": ("futures:forecast", "Forecast the test windows, or those of one clip, many times each."),
     "complete": ("futures:complete", "Complete motion along paths of some joints, from a clip or from a file."),
+    "interpolate": ("segments:interpolate", "Go from one segment of motion to another in a run's latent space."),
     "impute": ("futures:impute", "Fill in the joints that windows or clips lack, several times each."),
     "animate": ("futures:animate", "Play forecasts beside what happened, or a clip, as moving skeletons."),
     "report": ("report:report", "Put what is known of runs on one page, with moving futures."),

@@ -16,6 +16,7 @@ from .exchange import Exchanged
 from .files import read_motion, read_paths, save, write_motion
 from .forecasts import Forecasts, Imputed, is_forecasts
 from .gait import Cycles, gait_cycles, reference_cycles
+from .interpolation import Interpolation, falls, interpolate, latent_map, transferred
 from .occlusion import occlude
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
 from .reconstruction import reconstruct_segments
@@ -41,6 +42,7 @@ __all__ = [
     "Forecasts",
     "Heading",
     "Imputed",
+    "Interpolation",
     "MotionData",
     "MotionSet",
     "Poses",
@@ -57,8 +59,11 @@ __all__ = [
     "displacements",
     "draw_traversal",
     "estimate_angle_limits",
+    "falls",
     "gait_cycles",
+    "interpolate",
     "is_forecasts",
+    "latent_map",
     "occlude",
     "read_motion",
     "read_paths",
@@ -69,6 +74,7 @@ __all__ = [
     "scores",
     "simulate",
     "statistics",
+    "transferred",
     "windows",
     "write_motion",
 ]

@@ -230,7 +230,7 @@ def reconstruct_segments(
             found = []
             for part in bar.track(torch.arange(len(held)).split(batch_size), description=name):
                 found.append(function(each(held.all(), itemgetter(part))))
-            rows[name] = {key: torch.cat([one[key] for one in found]).double().cpu().numpy() for key in found[0]}
+            rows[name] = {key: torch.cat([one[key].cpu() for one in found]).double().numpy() for key in found[0]}
             if wrong := np.flatnonzero(~np.isfinite(rows[name][ERROR])).tolist():
                 where = "/".join(held.motion.clips[wrong[0]].key)
                 raise FloatingPointError(f"what {name} makes of segment {where} is not finite")
@@ -271,12 +271,12 @@ def _key(timed: TimedFrames) -> str:
 
 def _scores(model: Any, held: Segments, particles: int, batch: Batch) -> dict[str, Tensor]:
     """Of a batch, (B,) each."""
-    batch = on_device_of(model, batch)
-    found = _errors(held, model.decode(model.encode(batch), batch[SHAPE]), batch)
-    terms = SequenceELBO().terms(model, batch)
+    seen = on_device_of(model, batch)
+    found = _errors(held, model.decode(model.encode(seen), seen[SHAPE]).cpu(), batch)
+    terms = SequenceELBO().terms(model, seen)
     found["ELBO"] = terms.per_frame
     if particles:
-        weighted = importance_bound(model, batch, particles=particles)
+        weighted = importance_bound(model, seen, particles=particles)
         found |= {"importance bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
     return found
 
@@ -288,8 +288,7 @@ def _linear(known: PrincipalComponents, held: Segments, batch: Batch) -> dict[st
 
 def _errors(held: Segments, x: Tensor, batch: Batch) -> dict[str, Tensor]:
     """Of frames (B, N, D): of the surface in millimetres, and of how long it lasts in milliseconds, (B,)."""
-    shape, body = batch[SHAPE], held.body.to(x.device)
-    made, theirs = (surfaces_of(held.timed, body, frames, shape) for frames in (x, batch[WHOLE]))
+    made, theirs = (surfaces_of(held.timed, held.body, frames, batch[SHAPE]) for frames in (x, batch[WHOLE]))
     lasts = (held.timed.lasts(x) - held.timed.lasts(batch[WHOLE])).abs()
     return {ERROR: 1000 * vertex_error(made, theirs), DURATION: 1000 * lasts}
 

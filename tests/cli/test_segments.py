@@ -10,7 +10,7 @@ from dvae import motion
 from dvae.cli import main
 from dvae.motion.reconstruction import Reconstruction
 
-SMALL = "motion-latent --latent 3 --widths 16 8 --batch-size 4 --validate-every 2 --cut clips".split()
+SMALL = ["motion-latent", "--latent", "3", "--widths", "16", "8", "--batch-size", "4", "--cut", "clips"]
 
 
 def failure(capsys, *arguments, code=1):
@@ -79,6 +79,25 @@ def test_segments_are_scored_beside_components_on_other_data_too(capsys, folder,
     assert list(Reconstruction.load(second / "evaluation-people.json").rows) == ["motion-latent"]
 
 
+def test_one_segment_becomes_another(capsys, folder, tmp_path):
+    command = ["interpolate", str(folder / "run"), "--from", "person_0001", "--to", "test/person_0007", "--steps", "3"]
+    assert main([*command, "--out", str(tmp_path / "a.npz"), "--fps", "50"]) == 0
+    assert "duration (s)" in capsys.readouterr().out
+    steps = motion.read_motion(tmp_path / "a.npz")
+    assert [clip.name for clip in steps] == ["step-00", "step-01", "step-02"]
+    assert steps.skeleton.fps == 50
+    for name in ("a.html", "middle.bvh", "folder"):
+        assert main([*command, "--out", str(tmp_path / name)]) == 0
+    assert "plotly" in (tmp_path / "a.html").read_text()
+    assert len(list((tmp_path / "folder").iterdir())) == 3
+    (middle,), (first, between, _) = (
+        [motion.read_motion(path) for path in paths]
+        for paths in ([tmp_path / "middle.bvh"], sorted((tmp_path / "folder").iterdir()))
+    )
+    assert middle.skeleton.rest == between.skeleton.rest != first.skeleton.rest
+    assert "no segment or take 'person_01'" in failure(capsys, *command[:3], "person_01", "--to", "person_0001")
+
+
 @pytest.mark.parametrize(
     "command",
     [
@@ -98,6 +117,11 @@ def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monk
     assert not list(tmp_path.iterdir())
 
 
+def test_a_run_that_forecasts_has_no_segments(capsys, fitted):
+    error = failure(capsys, "interpolate", fitted, "--from", "a", "--to", "b")
+    assert "is a fitted vae, which forecasts and has no segments; use dvae forecast" in error
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -107,6 +131,10 @@ def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monk
         ("evaluate RUN --samples 3", "--samples is about forecasts"),
         ("evaluate RUN --joints left_wrist", "--joints, --exchange and --temperature are about forecasts"),
         ("evaluate RUN FITTED", "on data of several kinds"),
+        ("interpolate RUN --from a --to b --steps 1", "--steps is 1; it must be at least 2"),
+        ("interpolate RUN --from a --to b --steps 1000", "--steps is 1000; it must be at most 100"),
+        ("interpolate RUN --from a --to b --fps 0", "--fps is 0; it must be between 1 and 1000"),
+        ("interpolate RUN --from a --to b --out a.mp4", "end its name in .npz or .html or"),
     ],
 )
 def test_wrong_arguments_exit_with_2(capsys, folder, fitted, tmp_path, monkeypatch, arguments, message):

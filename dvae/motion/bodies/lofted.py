@@ -12,6 +12,7 @@ looks human, and not fitted to people. With all of them between -3 and 3, no par
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from math import pi
 from typing import NamedTuple
 
@@ -212,10 +213,16 @@ def human() -> Body:
         >>> float(tall[:, 1].max() - tall[:, 1].min()) > 1.8
         True
     """
+    return Body(JOINTS, PARENTS, *(tensor.clone() for tensor in _made()))
+
+
+@cache
+def _made() -> tuple[Tensor, ...]:
+    """Template, shapes, regressor, weights and faces, once."""
     average = _vertices(torch.zeros(len(SHAPE), dtype=torch.float64))
     changes = [_vertices(unit) - average for unit in torch.eye(len(SHAPE), dtype=torch.float64)]
     faces, weights = [], []
-    regressor = torch.zeros(len(JOINTS), len(average))
+    regressor = torch.zeros(len(JOINTS), len(average), dtype=torch.float32)
     first = 0
     for name, side in _sided():
         around, _, _, rings = part = _PARTS[name]
@@ -229,7 +236,7 @@ def human() -> Body:
         weights.append(_weights(part, side, vertices))
         first += len(vertices)
     shapes, shares = torch.stack(changes, -1).float(), torch.cat(weights).float()
-    return Body(JOINTS, PARENTS, average.float(), shapes, regressor, shares, torch.cat(faces))
+    return average.float(), shapes, regressor, shares, torch.cat(faces)
 
 
 def _sided() -> list[tuple[str, str]]:

@@ -1,0 +1,208 @@
+"""Between segments of a latent space: interpolation, transfer to another body, and a map of the space.
+
+As in Marsot et al. (2021), arXiv 2106.04387, segments are interpolated on the straight line in z and beta together, and
+their motion is transferred by another beta. Along an interpolation from a walk to a run a segment should last less and
+less, as cycles of running are the shorter ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..data import Batch
+from ..inference.held import on_device_of, reproducibly
+from ..inference.result import Table, as_they_are, canvas
+from ..turns import alone
+from ..views import WHOLE
+from .bodies import Body
+from .data import MotionSet
+from .embodied import SHAPE
+from .segments import OFFSETS, TimedFrames
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Interpolation:
+    """Segments on the way from one to another, of B pairs in M steps; the first and the last are their own ends.
+
+    Attributes:
+        timed: how frames become motion.
+        body: which moves.
+        shares: (M,), how far a step has come, from 0 to 1.
+        latent: (B, M, Z).
+        shape: beta, (B, M, S).
+        x: frames (B, M, N, D).
+    """
+
+    timed: TimedFrames
+    body: Body
+    shares: Tensor
+    latent: Tensor
+    shape: Tensor
+    x: Tensor
+
+    @property
+    def durations(self) -> Tensor:
+        """How long each lasts, (B, M) in seconds."""
+        return self.timed.lasts(self.x)
+
+    @property
+    def displacements(self) -> Tensor:
+        """How far the root gets from its first frame to its last, (B, M) in metres."""
+        place: Tensor = self._unpacked[1]
+        found: Tensor = (place[..., -1, :] - place[..., 0, :]).norm(dim=-1)
+        return found
+
+    @property
+    def global_pose(self) -> Tensor:
+        """How far the root is turned from the first step's, (B, M) in degrees, the mean over frames."""
+        return self._away(self._unpacked[0][..., [self.timed.skeleton.root], :, :])
+
+    @property
+    def local_pose(self) -> Tensor:
+        """The same of all other joints that turn, against their parents, the mean over them too."""
+        others = [joint for joint in self.timed.turning if joint != self.timed.skeleton.root]
+        return self._away(self._unpacked[0][..., others, :, :])
+
+    @property
+    def measures(self) -> Mapping[str, Tensor]:
+        """All four by name and unit, (B, M) each."""
+        return {
+            "duration (s)": self.durations,
+            "displacement (m)": self.displacements,
+            "global pose (°)": self.global_pose,
+            "local pose (°)": self.local_pose,
+        }
+
+    def table(self, pair: int = 0) -> Table:
+        """The measures of a pair, step by step."""
+        table = Table(caption="poses: mean angle from those of the first step")
+        for column in ("step", *self.measures):
+            table.add_column(column, justify="right")
+        for share, *values in zip(self.shares, *(value[pair] for value in self.measures.values()), strict=True):
+            table.add_row(f"{float(share):.2f}", *(f"{float(value):.2f}" for value in values))
+        return table
+
+    def motion(self, pair: int = 0, fps: float | None = None) -> MotionSet:
+        """The steps of a pair as clips, each on its body, from the origin, facing heading zero.
+
+        Args:
+            pair: which.
+            fps: of the motion; that of the training data by default.
+        """
+        made = self.timed.back({WHOLE: self.x[pair], OFFSETS: self.body.offsets(self.shape[pair])}, fps)
+        names = [f"step-{n:02d}" for n in range(len(made))]
+        clips = [replace(clip, name=name) for clip, name in zip(made, names, strict=True)]
+        return replace(made, clips=clips, name="interpolation")
+
+    def vertices(self, pair: int = 0) -> Tensor:
+        """Surfaces (M, N, V, 3) of a pair in metres."""
+        rotations, place, _ = self.timed.unpack(self.x[pair])
+        found: Tensor = self.body(self.shape[pair], rotations, place)[0]
+        return found
+
+    @cached_property
+    def _unpacked(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.timed.unpack(self.x)
+
+    def _away(self, turns: Tensor) -> Tensor:
+        """Mean angle (B, M) in degrees of turns (B, M, N, K, 3, 3) from those of the first step."""
+        apart = (turns - turns[:, :1]).flatten(-2).norm(dim=-1)  # 2 sqrt(2) sin(angle / 2), exact where small
+        angle = 2 * torch.asin((apart / 8**0.5).clamp(max=1))
+        return angle.mean((-2, -1)).rad2deg()
+
+
+@alone
+@torch.no_grad()
+def interpolate(model: Any, first: Batch, second: Batch, steps: int = 9) -> Interpolation:
+    """Segments on the straight line in z and beta from some to others, all pairs and steps at once.
+
+    Args:
+        model: of segments, such as that of `motion-latent`.
+        first, second: batches with x (B, N, D) and beta (B, S) as the model sees them, B alike.
+        steps: M, ends included.
+
+    Raises:
+        ValueError: fewer than 2 steps, or batches of different sizes.
+    """
+    if steps < 2 or len(first[WHOLE]) != len(second[WHOLE]):
+        raise ValueError(
+            f"expected at least 2 steps between as many segments as others, got {steps} between {len(first[WHOLE])} "
+            f"and {len(second[WHOLE])}"
+        )
+    with reproducibly(model, 0):
+        ends = [on_device_of(model, batch) for batch in (first, second)]
+        latents = [model.encode(batch) for batch in ends]
+        shares = torch.linspace(0, 1, steps).to(latents[0])
+        latent, shape = (
+            torch.lerp(start[:, None], end[:, None], shares[:, None])
+            for start, end in (latents, [batch[SHAPE] for batch in ends])
+        )
+        return Interpolation(model.timed, model.body, shares, latent, shape, model.decode(latent, shape))
+
+
+@alone
+@torch.no_grad()
+def transferred(model: Any, batch: Batch, shape: Tensor) -> Tensor:
+    """The motion of segments on other bodies: their z, with another beta.
+
+    Args:
+        model: of segments.
+        batch: x (B, N, D) and beta (B, S).
+        shape: of the other bodies, (B, S).
+
+    Returns:
+        x (B, N, D).
+    """
+    with reproducibly(model, 0):
+        seen = on_device_of(model, batch)
+        found: Tensor = model.decode(model.encode(seen), shape.to(seen[SHAPE]))
+        return found
+
+
+def falls(values: Tensor) -> Tensor:
+    """Which of (..., M) fall from each step to the next, (...,): of durations, walks that become runs should."""
+    return (values.diff(dim=-1) < 0).all(-1)
+
+
+@torch.no_grad()
+def latent_map(model: Any, batch: Batch, labels: Sequence[str]) -> Figure:
+    """A map of the latent space: means of the guide on their first two principal axes, coloured by a label.
+
+    Args:
+        model: of segments.
+        batch: x (B, N, D) and beta (B, S), at least three.
+        labels: of each.
+
+    Raises:
+        ValueError: too few segments, or labels of others.
+    """
+    with reproducibly(model, 0):
+        means = model.encode(on_device_of(model, batch)).double().cpu()
+    if len(means) < 3 or len(labels) != len(means):
+        raise ValueError(f"expected at least 3 segments and a label of each, got {len(means)} and {len(labels)}")
+    away = means - means.mean(0)
+    _, spread, axes = torch.linalg.svd(away, full_matrices=False)
+    places, shares = (away @ axes.T).numpy(), (spread.square() / spread.square().sum()).numpy()
+    figure = canvas(6.0, 4.5)
+    panel = figure.subplots()
+    for n, label in enumerate(dict.fromkeys(labels)):
+        chosen = np.array([own == label for own in labels])
+        first, second = places[chosen, :2].T
+        panel.scatter(first, second, s=9, alpha=0.7, color=f"C{n % 10}", marker="osD^v<>"[n // 10 % 7])
+        panel.collections[-1].set_label(label)
+    panel.set_xlabel(f"first axis of z, {shares[0]:.0%} of variance")
+    panel.set_ylabel(f"second axis, {shares[1]:.0%}")
+    panel.set_aspect("equal", "datalim")
+    legend = panel.legend(fontsize=7)
+    as_they_are(legend.get_texts())
+    return figure
