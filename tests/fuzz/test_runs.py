@@ -21,9 +21,10 @@ from safetensors.torch import load, save
 
 import dvae
 from dvae import motion
-from dvae.cli import futures, judging
+from dvae.cli import futures, judging, segments
 from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE
 from dvae.motion.dataset import MotionData
+from dvae.motion.segmented import SegmentData
 from dvae.runs import directory as runs
 
 from .engine import Isolated, fuzz, limited
@@ -188,11 +189,11 @@ def clear(place: Path) -> None:
 
 def check(example: tuple, directory: Path) -> None:
     """Damage a copy of the run and use it; the files outside of it stay as they are."""
-    call, changes = example
+    call, fitted, changes = example
     place = directory / "inside"
     clear(place)
     run = place / "run"
-    shutil.copytree(directory / "fitted", run)
+    shutil.copytree(directory / fitted, run)
     canary = place / "mine.txt"
     canary.write_text("of value")
     os.mkfifo(place / "fifo")
@@ -203,21 +204,24 @@ def check(example: tuple, directory: Path) -> None:
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            use(call, run, directory / "people.npz")
+            use(call, fitted, run, directory / "people.npz")
     finally:
         assert canary.read_text() == "of value"
         assert sorted(each.name for each in place.iterdir()) == before
 
 
-def use(call: str, run: Path, data: Path) -> None:
+def use(call: str, fitted: str, run: Path, data: Path) -> None:
     if call == "load":
         assert dvae.load(run, data).data
     elif call == "resume":
         runs.resume(run, data, steps=6, progress=False)
+    elif call == "forecast" and fitted == "latent":
+        segments.interpolate(run, "person_0001", "person_0002", run / "steps.npz", steps=2, data=str(data))
     elif call == "forecast":
         futures.forecast(run, run / "futures.npz", samples=1, horizon=2, data=str(data))
     else:
-        judging.evaluate((run,), judging.Control(), samples=1, data=str(data))
+        few = {} if fitted == "latent" else {"samples": 1}
+        judging.evaluate((run,), judging.Control(), data=str(data), **few)
 
 
 @limited(SHARE)
@@ -226,6 +230,10 @@ def test_runs_go_on_or_are_refused(tmp_path):
     method = dvae.method("vrnn", latent=2, width=4, embed=(4,), embed_latent=(4,), warm_up=1)
     training = dvae.Training(steps=4, batch_size=2, validate_every=2, log_every=1, progress=False)
     runs.fit_run(method, MotionData.open(tmp_path / "people.npz"), tmp_path / "fitted", training)
-    examples = st.tuples(st.sampled_from(CALLS), st.lists(mutations(), min_size=1, max_size=2))
+    latent = dvae.method("motion-latent", latent=2, widths=(4,))
+    cut = SegmentData.open(tmp_path / "people.npz", cut="clips", scaling="deviation", warped=True)
+    runs.fit_run(latent, cut, tmp_path / "latent", training)
+    changes = st.lists(mutations(), min_size=1, max_size=2)
+    examples = st.tuples(st.sampled_from(CALLS), st.sampled_from(["fitted", "latent"]), changes)
     with Isolated(check, tmp_path) as isolated:
         fuzz(isolated, examples, seconds=SHARE)
