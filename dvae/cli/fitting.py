@@ -226,7 +226,9 @@ def sweep(
             f"{len(failed)} of {len(results)} runs failed, the same command tries them again\n"
             + "\n".join(map(str, failed))
         )
-    then = f"score their forecasts with: dvae evaluate {out}/*, and bounds, where all have one: dvae compare {out}/*"
+    then = f"score them with: dvae evaluate {out}/*"
+    if chosen[0].fitted_on == "motion":
+        then += f", and bounds, where all have one: dvae compare {out}/*"
     OUT.print(f"all {len(results)} runs have ended; {then}", soft_wrap=True)
 
 
@@ -265,7 +267,8 @@ def _use(name: str, run: Path) -> str:
         option = "--pose-prior" if name == "pose-prior" else "--classifier"
         return f"score {what} with: dvae evaluate RUN {option} {run}"
     if methods()[name].fitted_on == "segments":
-        return f"score it with: dvae evaluate {run}, look into it with: dvae interpolate {run}"
+        between = f"go from one segment to another with: dvae interpolate {run} --from CLIP --to CLIP"
+        return f"score it with: dvae evaluate {run}, {between}"
     if issubclass(methods()[name], TrajectoryMethod):
         joints = f"{run} --joints JOINT …"
         return f"score it with: dvae evaluate {joints}, move it with: dvae complete {joints}"

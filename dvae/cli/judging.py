@@ -151,7 +151,8 @@ def _segments(paths: Sequence[Path], data: str | None, how: Judged, **settings: 
     opening.note_unfinished(loaded)
     called = dict(zip(opening.names(loaded), loaded, strict=True))
     try:
-        training = replace(loaded[0], where=data if opening.own(loaded[0], opened) else None).data.windows("train")
+        own = opened if opening.own(loaded[0], opened) else replace(loaded[0], where=None).data
+        training = own.windows("train")
     except CheckpointError as error:
         note(f"no principal components, which are of training segments: {error}")
         training = None

@@ -29,6 +29,9 @@ from .segments import OFFSETS, TimedFrames
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+MARKERS = "osD^v<>"
+"""Of labels, ten colours each."""
+
 
 @dataclass(frozen=True, eq=False)
 class Interpolation:
@@ -184,25 +187,27 @@ def latent_map(model: Any, batch: Batch, labels: Sequence[str]) -> Figure:
         labels: of each.
 
     Raises:
-        ValueError: too few segments, or labels of others.
+        ValueError: too few segments, labels of others, or too many different ones.
     """
     with reproducibly(model, 0):
         means = model.encode(on_device_of(model, batch)).double().cpu()
     if len(means) < 3 or len(labels) != len(means):
         raise ValueError(f"expected at least 3 segments and a label of each, got {len(means)} and {len(labels)}")
+    names = list(dict.fromkeys(labels))
+    if len(names) > 10 * len(MARKERS):
+        raise ValueError(f"{len(names)} labels are more than anybody tells apart; give one of few values")
     away = means - means.mean(0)
     _, spread, axes = torch.linalg.svd(away, full_matrices=False)
     places, shares = (away @ axes.T).numpy(), (spread.square() / spread.square().sum()).numpy()
-    figure = canvas(6.0, 4.5)
+    columns = -(-len(names) // 20)
+    figure = canvas(5.0 + 1.3 * columns, 4.2)
     panel = figure.subplots()
-    for n, label in enumerate(dict.fromkeys(labels)):
-        chosen = np.array([own == label for own in labels])
-        first, second = places[chosen, :2].T
-        panel.scatter(first, second, s=9, alpha=0.7, color=f"C{n % 10}", marker="osD^v<>"[n // 10 % 7])
-        panel.collections[-1].set_label(label)
+    for n, name in enumerate(names):
+        first, second = places[np.array([label == name for label in labels]), :2].T
+        colour, marker = f"C{n % 10}", MARKERS[n // 10]
+        panel.scatter(first, second, s=9, alpha=0.7, label=name or "none", color=colour, marker=marker)
     panel.set_xlabel(f"first axis of z, {shares[0]:.0%} of variance")
     panel.set_ylabel(f"second axis, {shares[1]:.0%}")
     panel.set_aspect("equal", "datalim")
-    legend = panel.legend(fontsize=7)
-    as_they_are(legend.get_texts())
+    as_they_are(figure.legend(loc="outside right upper", fontsize=7, ncols=columns).get_texts())
     return figure

@@ -87,7 +87,7 @@ def test_a_map_says_labels_and_shares(held, model):
     labels = ["walk", "walk", "$run$", "walk"]
     figure = latent_map(model, held.all(), labels)
     (axes,) = figure.axes
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["walk", "$run$"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["walk", "$run$"]
     shares = [int(text.partition("%")[0].split()[-1]) for text in (axes.get_xlabel(), axes.get_ylabel())]
     assert 100 >= shares[0] >= shares[1] >= 0
     drawn = sum(len(points.get_offsets()) for points in axes.collections)
