@@ -12,7 +12,7 @@ import tyro
 from .. import motion
 from ..motion.interpolation import Interpolation
 from ..motion.interpolation import interpolate as interpolate_segments
-from ..motion.segments import offsets_of
+from ..motion.segments import resting_offsets
 from . import opening
 from .console import ERROR, OUT, UsageError, at_least, check_files
 
@@ -85,5 +85,5 @@ def _write(out: Path, found: Interpolation, fps: float | None) -> None:
 
 def _alone(steps: motion.MotionSet, clip: motion.Clip) -> motion.MotionSet:
     """One of the clips, with the rest pose of its own body."""
-    rest = tuple(offsets_of(clip, steps.skeleton).flatten().tolist())
+    rest = tuple(resting_offsets(clip, steps.skeleton).flatten().tolist())
     return replace(steps, clips=[clip], skeleton=replace(steps.skeleton, rest=rest))
