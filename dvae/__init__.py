@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from .inference.gradnorm import GradNorm
     from .inference.objectives import Evidence
     from .inference.particles import particle_bound
+    from .inference.posteriors import Descent, Posterior, posterior
     from .inference.svi import SVI
     from .inference.training import Stage, Training
     from .inference.traversal import traverse
@@ -54,6 +55,7 @@ __all__ = [
     "ArrayWindows",
     "Audit",
     "Comparison",
+    "Descent",
     "DynamicalVAE",
     "Evaluation",
     "Evidence",
@@ -61,6 +63,7 @@ __all__ = [
     "Fit",
     "GradNorm",
     "Oracle",
+    "Posterior",
     "SelfFeeding",
     "SequenceELBO",
     "Stage",
@@ -79,6 +82,7 @@ __all__ = [
     "motion",
     "networks",
     "particle_bound",
+    "posterior",
     "predictive_checks",
     "price",
     "schedules",
@@ -104,6 +108,7 @@ _PLACES = {
         "inference.gradnorm": "GradNorm",
         "inference.objectives": "Evidence",
         "inference.particles": "particle_bound",
+        "inference.posteriors": "Descent Posterior posterior",
         "inference.svi": "SVI",
         "inference.training": "Stage Training",
         "inference.traversal": "traverse",

@@ -233,16 +233,23 @@ class TimedFrames:
                 f"segments have shape {tuple(x.shape)}, expected (..., {self.frames}, {self.size}) for the skeleton "
                 f"{self.skeleton.name!r}"
             )
+        return *self.poses(x), self.times(x)
+
+    def poses(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """What any frames (..., D) say of poses, with gradients: rotations (..., J, 3, 3) and places (..., 3)."""
         rotations = torch.eye(3).to(x).repeat(*x.shape[:-1], self.skeleton.joints, 1, 1)
         rotations[..., self.turning, :, :] = to_matrix(self._turns(x), "6d")
+        return rotations, x[..., self.parts["place"]] * self.metres
+
+    def times(self, x: Tensor) -> Tensor:
+        """When frames (..., N, D) are, from the first on, (..., N) in seconds, with gradients."""
         even = self.seconds / (self.frames - 1)
         later = x[..., 1:, -1].clamp(BRIEFEST) * even
-        times = torch.nn.functional.pad(later.cumsum(-1), (1, 0))
-        return rotations, x[..., self.parts["place"]] * self.metres, times
+        return torch.nn.functional.pad(later.cumsum(-1), (1, 0))
 
     def lasts(self, x: Tensor) -> Tensor:
         """How long segments (..., N, D) last, (...,) in seconds: the sum of their increments."""
-        return self.unpack(x)[2][..., -1]
+        return self.times(x)[..., -1]
 
     def _seen(self, clip: Clip, fps: float, angle: Tensor) -> Tensor:
         """(N, D) of a clip turned by an angle."""

@@ -10,12 +10,13 @@ torch.Size([2, 8])
 """
 
 from .fitting import betas, fitted, retargeted, shapes_of
-from .lofted import SHAPE, human
+from .lofted import MARKERS, SHAPE, human
 from .measures import enclosed_volume, vertex_error
 from .skinning import Body
 from .smplx import read_body, write_body
 
 __all__ = [
+    "MARKERS",
     "SHAPE",
     "Body",
     "betas",

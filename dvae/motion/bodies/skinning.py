@@ -132,6 +132,37 @@ class Body(nn.Module):
         # last, as rounding would grow with how far somebody walks
         return vertices + translation[..., None, :], joints + translation[..., None, :]
 
+    def some(self, shape: Tensor, rotations: Tensor, translation: Tensor, vertices: Tensor) -> Tensor:
+        """Some vertices of moving bodies alone, differentiable as `forward` is.
+
+        Args:
+            shape, rotations, translation: see `forward`.
+            vertices: which they are in each frame, (..., T, M); or (M,), the same in all.
+
+        Returns:
+            (..., T, M, 3) in metres.
+        """
+        poses, _ = self._posed(shape, rotations, translation)
+        if vertices.dim() == 1:
+            found = (poses @ self._hung(shape, vertices).mT).unflatten(-2, (-1, 3)).mT
+            return found + translation[..., None, :]
+        frames = translation.shape[:-1]
+        resting = self.at_rest(shape)[0][..., None, :, :].expand(*frames, -1, 3)
+        resting = resting.gather(-2, vertices[..., None].expand(*vertices.shape, 3))
+        moves = poses.unflatten(-2, (-1, 3)).unflatten(-1, (-1, 4)).movedim(-2, -3).flatten(-2)  # (..., T, J, 12)
+        rows = torch.arange(frames.numel(), device=vertices.device).reshape(*frames, 1) * self.joints
+        weights, joints = self._carried
+        moved = torch.zeros_like(resting[..., None])
+        for share, joint in zip(weights.unbind(-1), joints.unbind(-1), strict=True):
+            going = moves.flatten(0, -2)[rows + joint[vertices]].unflatten(-1, (3, 4))
+            moved = moved + share[vertices][..., None, None] * going
+        return (moved[..., :3] @ resting[..., None]).squeeze(-1) + moved[..., 3] + translation[..., None, :]
+
+    @property
+    def _carried(self) -> tuple[Tensor, Tensor]:
+        """How much vertices go with the joints that they go with most (V, K), and which these are; others are 0."""
+        return self.weights.topk(int((self.weights > 0).sum(-1).max()), -1)
+
     def squared_error(self, shape: Tensor, first: Sequence[Tensor], second: Sequence[Tensor]) -> Tensor:
         """The mean over vertices of the squared distance between two motions of the same bodies, (..., T) in m².
 
@@ -151,11 +182,11 @@ class Body(nn.Module):
         found: Tensor = ((apart @ form) * apart).sum(-1).unflatten(-1, (-1, 3)).sum(-1)
         return found
 
-    def _hung(self, shape: Tensor) -> Tensor:
+    def _hung(self, shape: Tensor, vertices: Tensor | slice = slice(None)) -> Tensor:
         """Vertices at rest by the joints that they hang on, (..., V, 4 J)."""
-        resting = self.at_rest(shape)[0]
+        resting = self.at_rest(shape)[0][..., vertices, :]
         surface = torch.cat([resting, torch.ones_like(resting[..., :1])], -1)
-        return (self.weights[..., None] * surface[..., None, :]).flatten(-2)
+        return (self.weights[vertices][..., None] * surface[..., None, :]).flatten(-2)
 
     def _posed(self, shape: Tensor, rotations: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
         """What joints do to what hangs on them (..., 3 T, 4 J), and where they are (..., T, J, 3), not translated."""

@@ -1,0 +1,413 @@
+"""Prediction and completion: whole segments of motion from whatever was seen of them.
+
+    p(z) p(beta) p(seen | z, beta),    z, beta* = argmax log p(z, beta | seen)
+
+A decoder makes a segment of z, timing included, and a body of beta; both are looked for that agree best with what was
+seen (Marsot et al. 2021, arXiv 2106.04387, sections 5.4 and 5.5). What was seen of B segments is one batch, NaN where
+nothing was, any mix of
+
+    times     (B, K)        seconds from the first frame of the segment to the moments at which something was seen
+    frames    (B, K)        which frames of chi these are, from 0; between two of them, too
+    surfaces  (B, K, V, 3)  all vertices, as in the first quarter of a second that is to be continued
+    points    (B, K, M, 3)  points of the surface of which nobody knows the vertex, as a scanner sees them
+    markers   (B, K, L, 3)  some vertices
+    beta      (B, S)        the body, where it is known
+
+in metres, of somebody who starts at the origin, facing heading zero. Moments without a frame are met in the decoded
+time, on straight lines between chi's frames. Moments that have both are met at the frame, and its time counts.
+
+The paper adds squared errors, in weights that adapt. Here they are the negative log of normal likelihoods, whose
+deviations (`Noise`) are the weights: what is minimised is then a posterior's, and a completion knows how sure it is. Of
+points, what counts is how far each is from the nearest vertex, one way: a vertex far from all points is no error where
+points are few. A frame's surface counts as one vertex, the mean of all, for its vertices err together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import log, pi, sqrt
+from typing import Any, Protocol
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from ..data import Batch
+from ..inference.posteriors import Descent, Posterior, posterior
+from ..options import Positive, check
+from ..program.conditional import evaluating, like
+from ..turns import alone
+from .bodies import MARKERS, Body, vertex_error
+from .embodied import SHAPE
+from .segments import TimedFrames
+
+LATENT = "z"
+TIMES, FRAMES, SURFACES, POINTS, SPOTS = "times", "frames", "surfaces", "points", "markers"
+NEAREST = "nearest"
+"""Name of the vertices (B, K, M) that are taken for the nearest ones of points."""
+AT_ONCE = 256
+"""Frames of which all vertices are held to find the nearest ones."""
+THIN = 8
+"""Of so many vertices one stands for a surface of which all are known: they tell no less of 22 joints and a shape."""
+
+
+class Decoder(Protocol):
+    """A model of segments, such as `dvae.models.motion_latent.MotionLatentModel`."""
+
+    timed: TimedFrames
+    body: Body
+    sizes: Mapping[str, int]
+
+    def decode(self, latent: Tensor, shape: Tensor) -> Tensor:
+        """Frames (B, N, D) of z (B, Z) on bodies (B, S)."""
+        ...
+
+    def guide(self, batch: Any) -> Any:
+        """A Pyro program that draws z of segments."""
+        ...
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How far what was seen is from what a decoder makes: standard deviations of each coordinate.
+
+    What a decoder cannot make is part of it. Frames next to each other err alike, of which a likelihood with independent
+    errors knows nothing: see that intervals hold what they promise on segments that are known.
+
+    Args:
+        surface: metres, of a frame's surface as a whole.
+        point: metres, of a point from the nearest vertex; half the way between vertices is part of it.
+        marker: metres.
+        time: seconds, of a frame from when it was seen, and of a segment's end where it comes too early.
+    """
+
+    surface: Positive = 0.01
+    point: Positive = 0.02
+    marker: Positive = 0.01
+    time: Positive = 0.02
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True)
+class Completion:
+    """The Pyro program of what was seen, for `dvae.posterior` and for Pyro's own guides (`AutoDelta`, ...).
+
+    Args:
+        model: whose decoder makes segments.
+        noise: of what was seen.
+        markers: the vertices of markers (L,); `bodies.MARKERS` by default.
+        known: segments (x and beta), whose latents by the guide are where motion is: starts beside those of the prior.
+    """
+
+    model: Any
+    noise: Noise = Noise()
+    markers: Sequence[int] = tuple(MARKERS.values())
+    known: Batch | None = None
+
+    def __call__(self, seen: Batch) -> dict[str, Tensor]:
+        """z and beta from their priors N(0, I), and what was seen from what is made of them.
+
+        Args:
+            seen: see the module; what `read` gave. Where it says nothing of it, nearest vertices are looked for.
+
+        Returns:
+            z (B, Z), beta (B, S), and the frames x (B, N, D).
+        """
+        model, noise, kind = self.model, self.noise, like(self.model)
+        size, parameters = len(next(iter(seen.values()))), model.body.parameters_of_shape
+        with pyro.plate("sequences", size):
+            z = pyro.sample(LATENT, _standard(size, model.sizes[LATENT], kind))
+            shape = seen[SHAPE] if SHAPE in seen else pyro.sample(SHAPE, _standard(size, parameters, kind))
+            x = model.decode(z, shape)
+            met, times = _met(model.timed, x, seen)
+            rotations, places = model.timed.poses(met)
+            pose = (shape, rotations, places)
+            if TIMES in seen:
+                _observe(TIMES, times, seen[TIMES], noise.time)
+            if SURFACES in seen:
+                thin = torch.arange(0, len(model.body.template), THIN, device=x.device)
+                surface = model.body.some(*pose, thin)
+                _observe(SURFACES, surface, seen[SURFACES][..., thin, :], noise.surface * len(thin) ** 0.5)
+            if SPOTS in seen:
+                which = torch.tensor(self.markers, device=x.device)
+                _observe(SPOTS, model.body.some(*pose, which), seen[SPOTS], noise.marker)
+            if POINTS in seen:
+                which = seen[NEAREST] if NEAREST in seen else nearest(model.body, *pose, seen[POINTS])
+                _observe(POINTS, model.body.some(*pose, which), seen[POINTS], noise.point)
+        return {LATENT: z, SHAPE: shape, "x": x}
+
+    def guide(self, seen: Batch) -> Any:
+        """z of known segments, drawn at random."""
+        assert self.known is not None
+        chosen = torch.randint(len(self.known["x"]), (len(next(iter(seen.values()))),))
+        return self.model.guide({name: value[chosen] for name, value in self.known.items()})
+
+    def renewed(self, seen: Batch, values: Batch) -> dict[str, Any]:
+        """What was seen, with the vertices that are nearest to points where latents have these values."""
+        if POINTS not in seen:
+            return dict(seen)
+        shape = values.get(SHAPE, seen.get(SHAPE))
+        met, _ = _met(self.model.timed, self.model.decode(values[LATENT], shape), seen)
+        return {**seen, NEAREST: nearest(self.model.body, shape, *self.model.timed.poses(met), seen[POINTS])}
+
+    def read(self, seen: Batch) -> dict[str, Tensor]:
+        """What was seen, checked, in the model's precision and on its device.
+
+        Raises:
+            ValueError: an unknown name, another shape, nothing seen, or something seen when nobody knows.
+        """
+        found = {name: torch.as_tensor(value).to(like(self.model)) for name, value in seen.items()}
+        body, kinds = self.model.body, [name for name in (SURFACES, POINTS, SPOTS) if name in found]
+        moments = next((found[name] for name in (TIMES, FRAMES) if name in found), None)
+        if unknown := found.keys() - {TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE}:
+            raise ValueError(
+                f"there is nothing to be seen called {', '.join(sorted(unknown))}; what is read are {TIMES}, {FRAMES}, "
+                f"{SURFACES}, {POINTS}, {SPOTS} and {SHAPE}"
+            )
+        if moments is None or moments.dim() != 2 or not (kinds or {TIMES, FRAMES} <= found.keys()):
+            given = {name: tuple(value.shape) for name, value in found.items()}
+            raise ValueError(
+                f"what was seen is some of {SURFACES}, {POINTS} and {SPOTS}, at moments (B, K) that {TIMES} or {FRAMES} "
+                f"tell; got {given}"
+            )
+        b, k = moments.shape
+        rest: dict[str, tuple[Any, ...]] = {
+            **{TIMES: (k,), FRAMES: (k,), SHAPE: (body.parameters_of_shape,)},
+            **{SURFACES: (k, len(body.template), 3), SPOTS: (k, len(self.markers), 3)},
+            POINTS: (k, "M" if POINTS not in found else found[POINTS].shape[2:3].numel(), 3),
+        }
+        for name, value in found.items():
+            if value.shape != (b, *rest[name]):
+                raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {(b, *rest[name])}")
+        when = torch.stack([found[name].isfinite() for name in (TIMES, FRAMES) if name in found]).any(0)
+        for name in kinds:
+            lost = found[name].isfinite().flatten(2).any(-1) & ~when
+            if lost.any():
+                row, column = lost.nonzero()[0].tolist()
+                raise ValueError(f"segment {row} has {name} at moment {column}, but no time and no frame there")
+        frames, last = found.get(FRAMES), self.model.timed.frames - 1
+        if frames is not None and ((frames < 0) | (frames > last)).any():
+            raise ValueError(f"frames of chi are from 0 to {last}, got {frames.nan_to_num(0).aminmax()}")
+        if SHAPE in found and not found[SHAPE].isfinite().all():
+            raise ValueError(f"{SHAPE} is known of all segments, or left out and looked for; got NaN in some")
+        return found
+
+
+@dataclass(frozen=True)
+class Completed:
+    """Segments that were completed.
+
+    Args:
+        model: that made them.
+        seen: what was seen of them.
+        posterior: of z, and of beta where that was unknown.
+    """
+
+    model: Any
+    seen: Batch
+    posterior: Posterior
+
+    @property
+    def x(self) -> Tensor:
+        """The most probable frames (B, N, D)."""
+        return self._made(self.posterior.mode)[0]
+
+    @property
+    def shape(self) -> Tensor:
+        """The most probable bodies (B, S), or those that were known."""
+        return self._made(self.posterior.mode)[1]
+
+    def draw(self, n: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+        """Frames (n, B, N, D) and bodies (n, B, S) from the posterior."""
+        return self._made(self.posterior.draw(n, seed))
+
+    @torch.no_grad()
+    def _made(self, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        z = values[LATENT]
+        shape = values.get(SHAPE, self.seen.get(SHAPE)).expand(*z.shape[:-1], -1)  # type: ignore[union-attr]
+        return self.model.decode(z, shape), shape
+
+
+@alone
+def complete(
+    model: Any,
+    seen: Batch,
+    *,
+    noise: Noise | None = None,
+    markers: Sequence[int] | None = None,
+    known: Batch | None = None,
+    descent: Descent | None = None,
+    seed: int = 0,
+    chunk: int = 512,
+) -> Completed:
+    """The rest of segments of which something was seen; all at once.
+
+    Args:
+        model: of segments, see `Decoder`.
+        seen: see the module.
+        noise, markers, known: see `Completion`.
+        descent, seed, chunk: see `dvae.posterior`.
+
+    Raises:
+        ValueError: see `Completion.read`.
+    """
+    program = Completion(model, noise or Noise(), markers or tuple(MARKERS.values()), known)
+    data, guide = program.read(seen), None if known is None else program.guide
+    with evaluating(model):
+        found = posterior(program, data, guide=guide, descent=descent, renew=program.renewed, seed=seed, chunk=chunk)
+    return Completed(model, data, found)
+
+
+def glimpsed(
+    model: Any,
+    x: Tensor,
+    shape: Tensor,
+    kind: str,
+    *,
+    frames: Sequence[int] | None = None,
+    seconds: float | None = None,
+    timed: bool = True,
+    points: int = 50,
+    gaps: float = 0.0,
+    markers: Sequence[int] = tuple(MARKERS.values()),
+    seed: int = 0,
+) -> dict[str, Tensor]:
+    """What somebody would have seen of known segments, to see how well the rest is found.
+
+    Args:
+        model: of segments, see `Decoder`.
+        x, shape: frames (B, N, D) on bodies (B, S).
+        kind: "surfaces", "points" or "markers".
+        frames: of chi that are seen; all by default.
+        seconds: from the start that are seen; all by default.
+        timed: moments are known by their times, and else by their frames.
+        points: M, drawn evenly from the surface's triangles.
+        gaps: share of points or markers that are missing.
+        markers: vertices.
+        seed: of points and gaps.
+
+    Raises:
+        ValueError: another kind.
+    """
+    if kind not in (SURFACES, POINTS, SPOTS):
+        raise ValueError(f"kind is {kind!r}; expected {SURFACES!r}, {POINTS!r} or {SPOTS!r}")
+    generator, nan = torch.Generator().manual_seed(seed), torch.tensor(torch.nan)
+    chosen = torch.tensor(range(model.timed.frames) if frames is None else frames)
+    rotations, places, times = (part[:, chosen] for part in model.timed.unpack(x))
+    early = times <= (torch.inf if seconds is None else seconds)
+    kept = early.any(0)
+    early, times, rotations, places = (part[:, kept] for part in (early, times, rotations, places))
+    if kind == SPOTS:
+        found = model.body.some(shape, rotations, places, torch.tensor(markers))
+    else:
+        found = model.body(shape, rotations, places)[0]
+        if kind == POINTS:
+            found = scanned(found, model.body.faces, points, generator)
+    lost = torch.rand(found.shape[:-1], generator=generator) < (0.0 if kind == SURFACES else gaps)
+    moments = times if timed else chosen[kept].to(times).expand_as(times)
+    return {
+        (TIMES if timed else FRAMES): torch.where(early, moments, nan),
+        kind: torch.where(early[..., None, None] & ~lost[..., None], found, nan),
+    }
+
+
+def scanned(vertices: Tensor, faces: Tensor, points: int, generator: torch.Generator) -> Tensor:
+    """So many points of surfaces (..., V, 3), (..., M, 3): each anywhere on it as probable as anywhere else."""
+    first, second, third = (vertices[..., corner, :] for corner in faces.unbind(-1))
+    area = (second - first).cross(third - first, dim=-1).norm(dim=-1)
+    drawn = torch.multinomial(area.flatten(0, -2), points, replacement=True, generator=generator)
+    which = drawn.unflatten(0, area.shape[:-1])[..., None].expand(*area.shape[:-1], points, 3)
+    corners = [corner.gather(-2, which) for corner in (first, second, third)]
+    across, along = torch.rand(2, *which.shape[:-1], 1, generator=generator).to(vertices)
+    across = across.sqrt()  # of a triangle, more lies towards the side than towards the corner
+    shares = 1 - across, across * (1 - along), across * along
+    return torch.stack([share * corner for share, corner in zip(shares, corners, strict=True)]).sum(0)
+
+
+def chamfer(points: Tensor, vertices: Tensor) -> Tensor:
+    """Mean distance (...,) of points (..., M, 3) from the nearest of the vertices (..., V, 3), metres.
+
+    One way, as few points say nothing of the rest of a surface. Points that are NaN do not count.
+    """
+    away = torch.cdist(points.nan_to_num(0.0), vertices).amin(-1)
+    return torch.where(points.isfinite().all(-1), away, torch.nan).nanmean(-1)
+
+
+def surfaces_at(model: Any, x: Tensor, shape: Tensor, times: Tensor) -> Tensor:
+    """Surfaces (B, K, V, 3) of frames (B, N, D) on bodies (B, S) at times (B, K) in seconds; NaN behind the end."""
+    met, reached = _met(model.timed, x, {TIMES: times})
+    found: Tensor = model.body(shape, *model.timed.poses(met))[0]
+    return torch.where((times <= reached + 1e-4)[..., None, None], found, torch.nan)
+
+
+def error_by_time(
+    model: Any, made: tuple[Tensor, Tensor], truth: tuple[Tensor, Tensor], times: Sequence[float]
+) -> tuple[Tensor, Tensor]:
+    """How far predictions are from the truth at times, over all segments that are at least so long.
+
+    Where a prediction ends earlier it stays as it ends.
+
+    Args:
+        model: of segments.
+        made, truth: frames (B, N, D) and bodies (B, S) of each.
+        times: K, seconds.
+
+    Returns:
+        mean vertex error (K,) in metres, NaN where no segment is so long, and how many are (K,).
+    """
+    at = torch.tensor(times).to(truth[0]).expand(len(truth[0]), -1)
+    theirs = surfaces_at(model, *truth, at)
+    met, _ = _met(model.timed, made[0], {TIMES: at})
+    ours = model.body(made[1], *model.timed.poses(met))[0]
+    errors = vertex_error(ours[:, :, None], theirs[:, :, None])
+    return errors.nanmean(0), errors.isfinite().sum(0)
+
+
+def nearest(body: Body, shape: Tensor, rotations: Tensor, places: Tensor, points: Tensor) -> Tensor:
+    """Which vertices of moving bodies, see `Body.forward`, points (B, K, M, 3) are nearest to, (B, K, M)."""
+    found = []
+    with torch.no_grad():
+        at_once = max(1, AT_ONCE // points.shape[1])
+        parts = (part.split(at_once) for part in (shape, rotations, places, points.nan_to_num(0.0)))
+        for some in zip(*parts, strict=True):
+            vertices = body(*some[:3])[0]
+            # |p - v|^2 less |p|^2, which is the same for all of them
+            away = vertices.square().sum(-1)[..., None, :] - 2 * some[3] @ vertices.mT
+            found.append(away.argmin(-1))
+    return torch.cat(found)
+
+
+def _standard(size: int, dimensions: int, kind: Tensor) -> Any:
+    return dist.Normal(kind.new_zeros(size, dimensions), 1.0).to_event(1)
+
+
+def _observe(name: str, made: Tensor, seen: Tensor, deviation: float) -> None:
+    """The log-density of what was seen: as a factor, for a law has a scale for each number and takes its logarithm."""
+    known = seen.isfinite()
+    away = torch.where(known, seen.nan_to_num(0.0) - made, 0.0).flatten(1).square().sum(-1)
+    pyro.factor(name, -away / (2 * deviation**2) - known.flatten(1).sum(-1) * log(deviation * sqrt(2 * pi)))
+
+
+def _met(timed: TimedFrames, x: Tensor, seen: Batch) -> tuple[Tensor, Tensor]:
+    """Frames (B, K, D) at the moments that were seen, of frames (B, N, D), and when these are, (B, K) in seconds.
+
+    Moments behind the end are at the end, whose time says by how much too early it comes.
+    """
+    decoded = timed.times(x)
+    times = seen.get(TIMES, torch.full_like(seen[FRAMES], torch.nan) if FRAMES in seen else None)
+    at = times.nan_to_num(0.0)
+    before = torch.searchsorted(decoded.detach(), at.contiguous(), right=True).sub(1).clamp(0, timed.frames - 2)
+    start, end = decoded.gather(1, before), decoded.gather(1, before + 1)
+    share = ((at - start) / (end - start)).clamp(0, 1)
+    if FRAMES in seen:
+        frames = seen[FRAMES].nan_to_num(0.0)
+        located, floor = seen[FRAMES].isfinite(), frames.floor().clamp(max=timed.frames - 2)
+        before = torch.where(located, floor.long(), before)
+        share = torch.where(located, frames - floor, share)
+        start, end = decoded.gather(1, before), decoded.gather(1, before + 1)
+    low = before[..., None].expand(*before.shape, x.shape[-1])
+    return torch.lerp(x.gather(1, low), x.gather(1, low + 1), share[..., None]), torch.lerp(start, end, share)
