@@ -47,12 +47,12 @@ class Descent:
         newton: steps of Newton's at the end, each with a curvature of its own.
     """
 
-    steps: Count = 300
+    steps: Count = 200
     rate: Positive = 0.05
     starts: Size = 4
     candidates: Size = 16
     renewed: Count = 10
-    newton: Delay = 1
+    newton: Delay = 2
 
     def __post_init__(self) -> None:
         check(self)
@@ -175,7 +175,8 @@ def posterior(
     Example:
         >>> model = dvae.twin("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
         >>> seen = model.sample(5, 4)["x"]
-        >>> found = dvae.posterior(model.model, {"x": seen, "mask": torch.rand(seen.shape) < 0.5})
+        >>> batch = {"x": seen, "mask": torch.rand(seen.shape) < 0.5}
+        >>> found = dvae.posterior(model.model, batch, descent=dvae.Descent(steps=20))
         >>> found.mode["w"].shape, found.draw(10)["w"].shape
         (torch.Size([5, 2]), torch.Size([10, 5, 2]))
     """
@@ -329,7 +330,7 @@ def _energy(program: Program, batch: Any, values: Values, sites: Collection[str]
 
 
 def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Lower roots (B, P, P) of inverse curvature, which is at least the prior's; directions (B,) in which it was less."""
+    """Lower roots (B, P, P) of inverse curvature, at least the prior's, and in how many directions it was less."""
     kind, curvature, prior = curvature, curvature.double(), prior.double()
     root, failed = torch.linalg.cholesky_ex(prior)
     if failed.any():

@@ -34,7 +34,7 @@ from ..laws import FixedNormal, LawSpec
 from ..motion.bodies import Body, human
 from ..motion.embodied import SHAPE, SegmentSchema, surfaces_of
 from ..networks import NetworkSpec, WholeDecoder, WholeEncoder
-from ..networks.base import computing_once, share_modules
+from ..networks.base import share_modules
 from ..notation import Factorization
 from ..options import Amount, Positive, Share, Size
 from ..program.model import DynamicalVAE
@@ -152,11 +152,11 @@ class MotionLatentModel(DynamicalVAE):
 
     def decode(self, latent: Tensor, shape: Tensor) -> Tensor:
         """Frames x (..., N, D), the means of chi, of latents (..., Z) on bodies (..., S), with gradients."""
+        network = self.generator[TURNS].network
         given = {"z": latent.flatten(0, -2), SHAPE: shape.flatten(0, -2)}
-        with computing_once():
-            made = {name: self.generator[name](given, len(given["z"]), self.timed.frames)[0] for name in PARTS}
-        x: Tensor = self.view.inverse(made)[WHOLE]
-        return x.unflatten(0, latent.shape[:-1])
+        # of all parts at once, each of which has its features for means (`MotionLatent.laws`)
+        made: Tensor = network.trunk([given[parent.name] for parent in network.inputs])
+        return made.unflatten(0, latent.shape[:-1])
 
     def vertices(self, x: Tensor, shape: Tensor) -> Tensor:
         """Surfaces (..., N, V, 3) in metres of frames (..., N, D) on bodies (..., S), with gradients."""

@@ -47,10 +47,10 @@ LATENT = "z"
 TIMES, FRAMES, SURFACES, POINTS, SPOTS = "times", "frames", "surfaces", "points", "markers"
 NEAREST = "nearest"
 """Name of the vertices (B, K, M) that are taken for the nearest ones of points."""
-AT_ONCE = 256
+AT_ONCE = 32
 """Frames of which all vertices are held to find the nearest ones."""
-THIN = 8
-"""Of so many vertices one stands for a surface of which all are known: they tell no less of 22 joints and a shape."""
+THIN = 16
+"""Of so many vertices one stands for a surface of which all are known: that tells no less of joints and a shape."""
 
 
 class Decoder(Protocol):
@@ -73,8 +73,8 @@ class Decoder(Protocol):
 class Noise:
     """How far what was seen is from what a decoder makes: standard deviations of each coordinate.
 
-    What a decoder cannot make is part of it. Frames next to each other err alike, of which a likelihood with independent
-    errors knows nothing: see that intervals hold what they promise on segments that are known.
+    What a decoder cannot make is part of it. Frames next to each other err alike, of which a likelihood with
+    independent errors knows nothing: see that intervals hold what they promise on segments that are known.
 
     Args:
         surface: metres, of a frame's surface as a whole.
@@ -130,8 +130,7 @@ class Completion:
                 _observe(TIMES, times, seen[TIMES], noise.time)
             if SURFACES in seen:
                 thin = torch.arange(0, len(model.body.template), THIN, device=x.device)
-                surface = model.body.some(*pose, thin)
-                _observe(SURFACES, surface, seen[SURFACES][..., thin, :], noise.surface * len(thin) ** 0.5)
+                _observe(SURFACES, model.body.some(*pose, thin), seen[SURFACES], noise.surface * len(thin) ** 0.5)
             if SPOTS in seen:
                 which = torch.tensor(self.markers, device=x.device)
                 _observe(SPOTS, model.body.some(*pose, which), seen[SPOTS], noise.marker)
@@ -152,10 +151,11 @@ class Completion:
             return dict(seen)
         shape = values.get(SHAPE, seen.get(SHAPE))
         met, _ = _met(self.model.timed, self.model.decode(values[LATENT], shape), seen)
-        return {**seen, NEAREST: nearest(self.model.body, shape, *self.model.timed.poses(met), seen[POINTS])}
+        rotations, places = self.model.timed.poses(met)
+        return {**seen, NEAREST: nearest(self.model.body, shape, rotations, places, seen[POINTS])}
 
     def read(self, seen: Batch) -> dict[str, Tensor]:
-        """What was seen, checked, in the model's precision and on its device.
+        """What was seen, checked, in the model's precision and on its device; of surfaces one vertex in `THIN`.
 
         Raises:
             ValueError: an unknown name, another shape, nothing seen, or something seen when nobody knows.
@@ -171,8 +171,8 @@ class Completion:
         if moments is None or moments.dim() != 2 or not (kinds or {TIMES, FRAMES} <= found.keys()):
             given = {name: tuple(value.shape) for name, value in found.items()}
             raise ValueError(
-                f"what was seen is some of {SURFACES}, {POINTS} and {SPOTS}, at moments (B, K) that {TIMES} or {FRAMES} "
-                f"tell; got {given}"
+                f"what was seen is some of {SURFACES}, {POINTS} and {SPOTS}, at moments (B, K) that {TIMES} or "
+                f"{FRAMES} tell; got {given}"
             )
         b, k = moments.shape
         rest: dict[str, tuple[Any, ...]] = {
@@ -194,7 +194,7 @@ class Completion:
             raise ValueError(f"frames of chi are from 0 to {last}, got {frames.nan_to_num(0).aminmax()}")
         if SHAPE in found and not found[SHAPE].isfinite().all():
             raise ValueError(f"{SHAPE} is known of all segments, or left out and looked for; got NaN in some")
-        return found
+        return found | ({SURFACES: found[SURFACES][..., ::THIN, :]} if SURFACES in found else {})
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ def complete(
     known: Batch | None = None,
     descent: Descent | None = None,
     seed: int = 0,
-    chunk: int = 512,
+    chunk: int = 128,
 ) -> Completed:
     """The rest of segments of which something was seen; all at once.
 
@@ -268,9 +268,9 @@ def glimpsed(
     shape: Tensor,
     kind: str,
     *,
-    frames: Sequence[int] | None = None,
+    fps: float = 30.0,
     seconds: float | None = None,
-    timed: bool = True,
+    frames: Sequence[int] | None = None,
     points: int = 50,
     gaps: float = 0.0,
     markers: Sequence[int] = tuple(MARKERS.values()),
@@ -282,9 +282,9 @@ def glimpsed(
         model: of segments, see `Decoder`.
         x, shape: frames (B, N, D) on bodies (B, S).
         kind: "surfaces", "points" or "markers".
-        frames: of chi that are seen; all by default.
+        fps: moments a second, at known times.
         seconds: from the start that are seen; all by default.
-        timed: moments are known by their times, and else by their frames.
+        frames: of chi that are seen in place of such moments, at times that nobody knows.
         points: M, drawn evenly from the surface's triangles.
         gaps: share of points or markers that are missing.
         markers: vertices.
@@ -295,24 +295,23 @@ def glimpsed(
     """
     if kind not in (SURFACES, POINTS, SPOTS):
         raise ValueError(f"kind is {kind!r}; expected {SURFACES!r}, {POINTS!r} or {SPOTS!r}")
-    generator, nan = torch.Generator().manual_seed(seed), torch.tensor(torch.nan)
-    chosen = torch.tensor(range(model.timed.frames) if frames is None else frames)
-    rotations, places, times = (part[:, chosen] for part in model.timed.unpack(x))
-    early = times <= (torch.inf if seconds is None else seconds)
-    kept = early.any(0)
-    early, times, rotations, places = (part[:, kept] for part in (early, times, rotations, places))
+    generator, lasts = torch.Generator().manual_seed(seed), model.timed.lasts(x)
+    if frames is None:
+        end = lasts if seconds is None else lasts.clamp(max=seconds)
+        moments = (torch.arange(int(end.max() * fps + 1e-3) + 1).to(x) / fps).expand(len(x), -1)
+        seen = {TIMES: torch.where(moments <= end[:, None] + 1e-4, moments, torch.nan)}
+    else:
+        seen = {FRAMES: torch.tensor(frames).to(x).expand(len(x), -1)}
+    rotations, places = model.timed.poses(_met(model.timed, x, seen)[0])
     if kind == SPOTS:
         found = model.body.some(shape, rotations, places, torch.tensor(markers))
     else:
         found = model.body(shape, rotations, places)[0]
         if kind == POINTS:
             found = scanned(found, model.body.faces, points, generator)
-    lost = torch.rand(found.shape[:-1], generator=generator) < (0.0 if kind == SURFACES else gaps)
-    moments = times if timed else chosen[kept].to(times).expand_as(times)
-    return {
-        (TIMES if timed else FRAMES): torch.where(early, moments, nan),
-        kind: torch.where(early[..., None, None] & ~lost[..., None], found, nan),
-    }
+    kept = torch.rand(found.shape[:-1], generator=generator) >= (0.0 if kind == SURFACES else gaps)
+    kept &= next(iter(seen.values())).isfinite()[..., None]
+    return {**seen, kind: torch.where(kept[..., None], found, torch.nan)}
 
 
 def scanned(vertices: Tensor, faces: Tensor, points: int, generator: torch.Generator) -> Tensor:
@@ -375,9 +374,10 @@ def nearest(body: Body, shape: Tensor, rotations: Tensor, places: Tensor, points
         parts = (part.split(at_once) for part in (shape, rotations, places, points.nan_to_num(0.0)))
         for some in zip(*parts, strict=True):
             vertices = body(*some[:3])[0]
+            flat, near = vertices.flatten(0, 1), some[3].flatten(0, 1)
             # |p - v|^2 less |p|^2, which is the same for all of them
-            away = vertices.square().sum(-1)[..., None, :] - 2 * some[3] @ vertices.mT
-            found.append(away.argmin(-1))
+            away = torch.baddbmm(flat.square().sum(-1)[:, None], near, flat.mT, alpha=-2)
+            found.append(away.argmin(-1).unflatten(0, vertices.shape[:2]))
     return torch.cat(found)
 
 
@@ -409,5 +409,7 @@ def _met(timed: TimedFrames, x: Tensor, seen: Batch) -> tuple[Tensor, Tensor]:
         before = torch.where(located, floor.long(), before)
         share = torch.where(located, frames - floor, share)
         start, end = decoded.gather(1, before), decoded.gather(1, before + 1)
-    low = before[..., None].expand(*before.shape, x.shape[-1])
-    return torch.lerp(x.gather(1, low), x.gather(1, low + 1), share[..., None]), torch.lerp(start, end, share)
+    weights = torch.stack([1 - share, share], -1)
+    # by a product of matrices, whose gradient is one too: that of an index is as large as x, once for each
+    lines = torch.zeros(*before.shape, timed.frames).to(x).scatter(2, torch.stack([before, before + 1], -1), weights)
+    return lines @ x, torch.lerp(start, end, share)

@@ -244,7 +244,7 @@ class TimedFrames:
     def times(self, x: Tensor) -> Tensor:
         """When frames (..., N, D) are, from the first on, (..., N) in seconds, with gradients."""
         even = self.seconds / (self.frames - 1)
-        later = x[..., 1:, -1].clamp(BRIEFEST) * even
+        later = x[..., -1][..., 1:].clamp(BRIEFEST) * even
         return torch.nn.functional.pad(later.cumsum(-1), (1, 0))
 
     def lasts(self, x: Tensor) -> Tensor:

@@ -133,7 +133,7 @@ def test_what_becomes_of_a_sequence_does_not_depend_on_the_others():
 
 
 def test_nothing_is_less_sure_than_the_prior():
-    """Where the data say nothing of a latent it has its prior's width, and where they push it away from its mode, too."""
+    """Where the data say nothing of a latent it has its prior's width, and where they push it off its mode, too."""
 
     def pushed(batch):
         rows = len(batch["push"])

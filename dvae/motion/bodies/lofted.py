@@ -32,8 +32,8 @@ MARKERS = {
     **{"L_shoulder": 1057, "L_elbow": 1108, "L_wrist": 1153, "L_knee": 529, "L_heel": 918, "L_toes": 919},
     **{"R_shoulder": 1251, "R_elbow": 1302, "R_wrist": 1347, "R_knee": 713, "R_heel": 1028, "R_toes": 1029},
 }
-"""Vertices of `human()` where markers of motion capture would be, by name: on top of shoulders, behind elbows, on the back
-of wrists, in front of knees. Left is +x."""
+"""Vertices of `human()` where markers of motion capture would be: on top of shoulders, behind elbows, on the back of
+wrists, in front of knees."""
 
 _SIZE = 0.04
 _LENGTHS = {  # parameter: share, along which axes, of which bones, named by their ends

@@ -85,8 +85,7 @@ class Body(nn.Module):
         """Vertices (..., V, 3) and joints (..., J, 3) of bodies (..., S), nothing turned."""
         if shape.shape[-1:] != (self.parameters_of_shape,):
             raise ValueError(f"shape is {tuple(shape.shape)}, expected (..., {self.parameters_of_shape})")
-        vertices = self.template + (self.shapes.flatten(0, 1) @ shape[..., None]).unflatten(-2, (-1, 3)).squeeze(-1)
-        return vertices, self.regressor @ vertices
+        return _changed(self.template, self.shapes, shape), self._pivots(shape)
 
     def offsets(self, shape: Tensor) -> Tensor:
         """Where joints rest, from their parents: of bodies (..., S), (..., J, 3) in metres, the root's 0."""
@@ -144,11 +143,11 @@ class Body(nn.Module):
         """
         poses, _ = self._posed(shape, rotations, translation)
         if vertices.dim() == 1:
-            found = (poses @ self._hung(shape, vertices).mT).unflatten(-2, (-1, 3)).mT
+            found: Tensor = (poses @ self._hung(shape, vertices).mT).unflatten(-2, (-1, 3)).mT
             return found + translation[..., None, :]
         frames = translation.shape[:-1]
-        resting = self.at_rest(shape)[0][..., None, :, :].expand(*frames, -1, 3)
-        resting = resting.gather(-2, vertices[..., None].expand(*vertices.shape, 3))
+        which = vertices.flatten(-2)[..., None].expand(*frames[:-1], -1, 3)
+        resting = self.at_rest(shape)[0].gather(-2, which).unflatten(-2, vertices.shape[-2:])
         moves = poses.unflatten(-2, (-1, 3)).unflatten(-1, (-1, 4)).movedim(-2, -3).flatten(-2)  # (..., T, J, 12)
         rows = torch.arange(frames.numel(), device=vertices.device).reshape(*frames, 1) * self.joints
         weights, joints = self._carried
@@ -156,7 +155,8 @@ class Body(nn.Module):
         for share, joint in zip(weights.unbind(-1), joints.unbind(-1), strict=True):
             going = moves.flatten(0, -2)[rows + joint[vertices]].unflatten(-1, (3, 4))
             moved = moved + share[vertices][..., None, None] * going
-        return (moved[..., :3] @ resting[..., None]).squeeze(-1) + moved[..., 3] + translation[..., None, :]
+        found = (moved[..., :3] @ resting[..., None]).squeeze(-1) + moved[..., 3] + translation[..., None, :]
+        return found
 
     @property
     def _carried(self) -> tuple[Tensor, Tensor]:
@@ -184,9 +184,14 @@ class Body(nn.Module):
 
     def _hung(self, shape: Tensor, vertices: Tensor | slice = slice(None)) -> Tensor:
         """Vertices at rest by the joints that they hang on, (..., V, 4 J)."""
-        resting = self.at_rest(shape)[0][..., vertices, :]
+        resting = _changed(self.template[vertices], self.shapes[vertices], shape)
         surface = torch.cat([resting, torch.ones_like(resting[..., :1])], -1)
         return (self.weights[vertices][..., None] * surface[..., None, :]).flatten(-2)
+
+    def _pivots(self, shape: Tensor) -> Tensor:
+        """Joints at rest (..., J, 3): linear in the shape as vertices are, and fewer."""
+        changes = (self.regressor @ self.shapes.flatten(1)).unflatten(-1, (3, -1))
+        return _changed(self.regressor @ self.template, changes, shape)
 
     def _posed(self, shape: Tensor, rotations: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
         """What joints do to what hangs on them (..., 3 T, 4 J), and where they are (..., T, J, 3), not translated."""
@@ -197,10 +202,16 @@ class Body(nn.Module):
                 f"translation (..., T, 3), got {tuple(shape.shape)}, {tuple(rotations.shape)} and "
                 f"{tuple(translation.shape)}"
             )
-        pivots = self.at_rest(shape)[1][..., None, :, :]
+        pivots = self._pivots(shape)[..., None, :, :]
         root = self.parents.index(-1)
         offsets = pivots - pivots[..., [max(parent, 0) for parent in self.parents], :]
         joints, turns = forward(self.parents, rotations, offsets, pivots[..., root, :].expand_as(translation))
         moved = joints - (turns @ pivots[..., None]).squeeze(-1)
         poses = torch.cat([turns, moved[..., None]], -1)  # (..., T, J, 3, 4)
         return poses.movedim(-2, -3).flatten(-2).flatten(-3, -2), joints
+
+
+def _changed(average: Tensor, changes: Tensor, shape: Tensor) -> Tensor:
+    """Points (..., M, 3) that are on average there (M, 3), by what parameters (..., S) add to them (M, 3, S)."""
+    found: Tensor = average + (shape @ changes.flatten(0, 1).mT).unflatten(-1, (-1, 3))
+    return found

@@ -1,0 +1,257 @@
+"""Completion: what a decoder made is found again from part of it, at known and unknown times, and how surely."""
+
+import pytest
+import torch
+from pyro import poutine
+
+import dvae
+from dvae import motion
+from dvae.models.motion_latent import MotionLatent
+from dvae.motion import bodies
+from dvae.motion.completion import (
+    Completion,
+    Noise,
+    _met,
+    chamfer,
+    complete,
+    error_by_time,
+    glimpsed,
+    nearest,
+    scanned,
+    surfaces_at,
+)
+from dvae.motion.embodied import SHAPE, Segments
+
+BRIEF = dvae.Descent(steps=80, rate=0.1, starts=1, candidates=4)
+THOROUGH = dvae.Descent(steps=80, rate=0.1, starts=2, candidates=8, newton=3)
+
+
+@pytest.fixture(scope="module")
+def segments():
+    people = bodies.fitted(motion.simulate(clips=4, frames=90, seed=1), bodies.human())
+    return Segments(motion.gait_cycles(people))
+
+
+@pytest.fixture(scope="module")
+def model(segments):
+    """Nearly linear in z about a typical segment, with turns of some tenths: its hidden units are seldom off."""
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(0)
+        model = MotionLatent(latent=3, widths=(16,)).build(segments).eval().double()
+        trunk = model.generator["turns"].network.trunk
+        waves = torch.stack([torch.cos(torch.pi * n * torch.linspace(0, 1, 100)) for n in range(4)], 1).double()
+        drawn = torch.randn(4, 16, model.timed.size, dtype=torch.float64)
+        trunk.out.weight.copy_(0.05 * torch.einsum("tn,nhd->tdh", waves, drawn).flatten(0, 1))
+        trunk.hidden[0].bias.fill_(2.0)
+        trunk.out.bias.copy_(segments.all()["x"][0].flatten() - trunk.out.weight.sum(-1) * 2)
+    return model
+
+
+def made(model, many, seed=0):
+    """Segments that a model makes: z, beta and x."""
+    generator = torch.Generator().manual_seed(seed)
+    z = torch.randn(many, 3, generator=generator, dtype=torch.float64)
+    shape = torch.randn(many, 8, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        return z, shape, model.decode(z, shape)
+
+
+def test_decoding_is_the_mean_of_the_program(model):
+    z, shape, x = made(model, 3)
+    program = poutine.condition(model.model, data={"z": z})
+    parts = program({SHAPE: shape}, length=100, mean_emission=True)
+    torch.testing.assert_close(model.shown(parts)["x"], x)
+    torch.testing.assert_close(model.decode(z[:, None], shape[:, None]), x[:, None])
+
+
+def test_moments_are_met_in_decoded_time(model):
+    x = made(model, 2)[2].requires_grad_()
+    times = model.timed.times(x)
+    for frame in (0, 40, 99):
+        met, reached = _met(model.timed, x, {"times": times[:, [frame]].detach()})
+        torch.testing.assert_close(met, x[:, [frame]])
+        torch.testing.assert_close(reached, times[:, [frame]])
+    between = (times[:, [3]] + 2 * times[:, [4]]) / 3
+    torch.testing.assert_close(_met(model.timed, x, {"times": between.detach()})[0], (x[:, [3]] + 2 * x[:, [4]]) / 3)
+    located = _met(model.timed, x, {"frames": torch.full((2, 1), 3 + 2 / 3).double()})
+    torch.testing.assert_close(located[0], (x[:, [3]] + 2 * x[:, [4]]) / 3)
+    torch.testing.assert_close(located[1], between)
+    after, reached = _met(model.timed, x, {"times": times[:, [-1]].detach() + 0.5})
+    torch.testing.assert_close(after, x[:, [-1]])
+    torch.testing.assert_close(reached, times[:, [-1]])
+    # the later all frames are, the earlier is the one that is met
+    gradient = torch.autograd.grad(_met(model.timed, x, {"times": between.detach()})[0].sum(), x)[0]
+    assert gradient[..., 1:5, -1].abs().min() > 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("surfaces", {"fps": 20.0}),
+        ("markers", {"fps": 10.0, "gaps": 0.2}),
+        ("markers", {"frames": range(0, 100, 20)}),
+        ("points", {"frames": range(0, 100, 20)}),
+    ],
+)
+def test_what_the_decoder_made_is_found_again(model, kind, options):
+    """A mode is no less probable than the truth; of points, which do not tell how they belong, it is as near."""
+    z, shape, x = made(model, 3)
+    seen = glimpsed(model, x, shape, kind, **options)
+    found = complete(model, seen, descent=THOROUGH)
+    if kind == "points":
+        ours, theirs = (
+            model.vertices(*each)[:, seen["frames"][0].long()] for each in ((found.x, found.shape), (x, shape))
+        )
+        assert chamfer(seen["points"], ours).mean() < 1.5 * chamfer(seen["points"], theirs).mean()
+    else:
+        truth = poutine.condition(Completion(model), data={"z": z, SHAPE: shape})
+        trace = poutine.trace(truth).get_trace(found.seen)
+        assert found.posterior.energy.sum() <= -trace.log_prob_sum()
+        error = bodies.vertex_error(model.vertices(found.x, found.shape), model.vertices(x, shape))
+        assert error.max() < 0.02
+        assert found.posterior.left.max() < 0.01
+    known = complete(model, {**seen, SHAPE: shape}, descent=BRIEF)
+    assert torch.equal(known.shape, shape)
+    assert set(known.posterior.mode) == {"z"}
+    drawn = found.draw(5)
+    assert drawn[0].shape == (5, *x.shape)
+    assert drawn[1].shape == (5, *shape.shape)
+
+
+def test_intervals_of_completions_hold_what_they_promise(model):
+    """Of segments from the model and markers with its noise, within four binomial standard errors."""
+    z, shape, x = made(model, 120, seed=3)
+    noise = Noise(marker=0.05)
+    seen = glimpsed(model, x, shape, "markers", frames=[10, 60])
+    seen["markers"] = seen["markers"] + noise.marker * torch.randn_like(seen["markers"])
+    found = complete(model, {**seen, SHAPE: shape}, noise=noise, descent=BRIEF)
+    away = ((z - found.posterior.mode["z"]) / found.posterior.deviation["z"]).abs()
+    for level in (0.5, 0.8, 0.9):
+        reach = torch.distributions.Normal(0.0, 1.0).icdf(torch.tensor((1 + level) / 2))
+        error = (level * (1 - level) / z.numel()) ** 0.5
+        assert abs((away < reach).double().mean() - level) < 4 * error
+        assert abs((away < reach / 2).double().mean() - level) > 4 * error
+
+
+def test_what_is_missing_counts_for_nothing(model):
+    z, shape, x = made(model, 2)
+    program = Completion(model)
+    seen = glimpsed(model, x, shape, "markers", frames=[5, 50, 80])
+
+    def energy(seen):
+        conditioned = poutine.condition(program, data={"z": z + 0.1, SHAPE: shape})
+        return poutine.trace(conditioned).get_trace(program.read(seen)).log_prob_sum()
+
+    cut = {name: value[:, :2] for name, value in seen.items()}
+    lost = {name: value.clone() for name, value in seen.items()}
+    for value in lost.values():
+        value[:, 2] = torch.nan
+    torch.testing.assert_close(energy(lost), energy(cut))
+    assert energy(cut) != energy(seen)
+    timed = {**seen, "times": model.timed.times(x)[:, [5, 50, 80]]}
+    late = {**timed, "times": timed["times"] + 0.1}
+    assert energy(late) < energy(timed)
+
+
+def test_the_nearest_vertices_are_what_points_are_held_against(model):
+    _, shape, x = made(model, 2)
+    rotations, places = model.timed.poses(x[:, ::30])
+    vertices = model.body(shape, rotations, places)[0]
+    points = vertices[:, :, ::100] + 0.01 * torch.randn(2, 4, 15, 3, dtype=torch.float64)
+    which = nearest(model.body, shape, rotations, places, points)
+    assert torch.equal(which, torch.cdist(points, vertices).argmin(-1))
+    program, (z, shape, x) = Completion(model), made(model, 2)
+    seen = program.read(glimpsed(model, x, shape, "points", frames=[0, 50]))
+    values = {"z": z, SHAPE: shape}
+    runs = [poutine.trace(poutine.condition(program, values)) for _ in range(2)]
+    batches = seen, program.renewed(seen, values)
+    alone, told = (run.get_trace(batch).log_prob_sum() for run, batch in zip(runs, batches, strict=True))
+    torch.testing.assert_close(alone, told)
+
+
+def test_known_segments_are_starts_too(model, segments):
+    """Their latents by the guide, drawn at random."""
+    batch = {name: value.double() for name, value in segments.all().items()}
+    program = Completion(model, known=batch)
+    _, shape, x = made(model, 4)
+    seen = program.read(glimpsed(model, x, shape, "markers", frames=[0]))
+    nodes = poutine.trace(program.guide).get_trace(seen).nodes
+    assert nodes["z"]["value"].shape == (4, 3)
+    complete(model, seen, known=batch, descent=dvae.Descent(steps=2, candidates=4, newton=0))
+
+
+def test_scores_of_completions(model):
+    _, shape, x = made(model, 3)
+    vertices = model.vertices(x[:, :1].expand(-1, 100, -1), shape)[:, :2]
+    points = scanned(vertices, model.body.faces, 4000, torch.Generator().manual_seed(0))
+    apart = chamfer(vertices[..., ::7, :] + torch.tensor([0.0, 0, 1e-3]), vertices)
+    assert (apart > 0).all()
+    assert (apart <= 1e-3 + 1e-9).all()
+    assert chamfer(points, vertices).max() < 0.02
+    # shares of points are shares of area: above the pelvis and below
+    first, second, third = (vertices[0, 0][model.body.faces[:, n]] for n in range(3))
+    area = (second - first).cross(third - first, dim=-1).norm(dim=-1)
+    above = (first + second + third)[:, 1] / 3 > 0
+    share = float(area[above].sum() / area.sum())
+    error = (share * (1 - share) / 4000) ** 0.5
+    assert abs(float((points[0, 0, :, 1] > 0).double().mean()) - share) < 4 * error + 0.02  # of triangles across
+    lost = torch.where(torch.rand(*points.shape[:-1], 1) < 0.5, points, torch.nan)
+    assert chamfer(lost, vertices).isfinite().all()
+
+    longest = float(model.timed.lasts(x).max())
+    errors, many = error_by_time(model, (x, shape), (x, shape), [0.0, 0.1, longest, longest + 1])
+    assert many.tolist() == [3, 3, 1, 0]
+    assert errors[:3].max() < 1e-6
+    assert errors[3].isnan()
+    moved = x.clone()
+    moved[..., model.timed.parts["place"][1]] += 0.1 / model.timed.metres
+    errors, _ = error_by_time(model, (moved, shape), (x, shape), [0.0, 0.1])
+    torch.testing.assert_close(errors, torch.full((2,), 0.1, dtype=torch.float64))
+    at = surfaces_at(model, x, shape, model.timed.times(x)[:, [20]])
+    torch.testing.assert_close(at, model.vertices(x, shape)[:, [20]])
+
+
+def test_what_cannot_have_been_seen_is_refused(model):
+    _, shape, x = made(model, 2)
+    seen = glimpsed(model, x, shape, "markers", frames=[0, 50])
+    program = Completion(model)
+    for wrong, message in (
+        ({**seen, "marker": seen["markers"]}, "nothing to be seen called marker"),
+        ({"frames": seen["frames"]}, "some of surfaces, points and markers"),
+        ({"markers": seen["markers"]}, "at moments"),
+        ({**seen, "markers": seen["markers"][:, :, :5]}, r"markers has shape \(2, 2, 5, 3\), expected \(2, 2, 16, 3\)"),
+        ({**seen, "frames": seen["frames"] + 60}, "from 0 to 99"),
+        ({**seen, "frames": seen["frames"] * torch.nan}, "segment 0 has markers at moment 0"),
+        ({**seen, SHAPE: shape * torch.nan}, "beta is known of all segments"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            program.read(wrong)
+    with pytest.raises(ValueError, match="expected 'surfaces', 'points' or 'markers'"):
+        glimpsed(model, x, shape, "marker")
+    with pytest.raises(ValueError, match="marker"):
+        Noise(marker=0.0)
+
+
+def test_markers_are_where_their_names_say():
+    body = bodies.human()
+    vertices, joints = body.at_rest(torch.zeros(8))
+    for name, vertex in bodies.MARKERS.items():
+        side, _, part = name.rpartition("_")
+        if side == "L":
+            mirrored = vertices[bodies.MARKERS[f"R_{part}"]] * torch.tensor([-1.0, 1, 1])
+            torch.testing.assert_close(vertices[vertex], mirrored)
+        joint = {"heel": "Ankle", "toes": "Foot"}.get(part, part.title())
+        if side:
+            assert (vertices[vertex] - joints[body.names.index(f"{side}_{joint}")]).norm() < 0.1
+    assert len(set(bodies.MARKERS.values())) == 16
+
+
+def test_some_vertices_are_those_of_the_surface():
+    body = bodies.human().double()
+    shape, places = torch.randn(2, 8).double(), torch.randn(2, 5, 3).double()
+    turned = motion.rotations.to_matrix(torch.randn(2, 5, 22, 3).double(), "vector")
+    whole = body(shape, turned, places)[0]
+    which = torch.randint(len(body.template), (2, 5, 7))
+    expected = whole.gather(-2, which[..., None].expand(-1, -1, -1, 3))
+    torch.testing.assert_close(body.some(shape, turned, places, which), expected)
+    torch.testing.assert_close(body.some(shape, turned, places, which[0, 0]), whole[..., which[0, 0], :])
