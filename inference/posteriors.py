@@ -29,7 +29,7 @@ from ..program.batch import repeat, rows
 from ..turns import alone
 from .bounds import ImportanceBound, importance_mean
 
-Program = Callable[[Any], Any]
+_Program = Callable[[Any], Any]
 Values = Mapping[str, Tensor]
 
 
@@ -116,7 +116,7 @@ class Posterior:
 
     @alone
     @torch.no_grad()
-    def evidence(self, program: Program, batch: Any, particles: int = 200, *, seed: int = 0) -> ImportanceBound:
+    def evidence(self, program: _Program, batch: Any, particles: int = 200, *, seed: int = 0) -> ImportanceBound:
         """The log evidence of what was seen, by importance sampling from the normal, and k-hat of its weights.
 
         A k-hat above 0.7 says that the posterior is not like the normal: take its intervals as rough.
@@ -144,10 +144,10 @@ class Posterior:
 
 @alone
 def posterior(
-    program: Program,
+    program: _Program,
     batch: Mapping[str, Any],
     *,
-    guide: Program | None = None,
+    guide: _Program | None = None,
     descent: Descent | None = None,
     renew: Callable[[Mapping[str, Any], Values], Mapping[str, Any]] | None = None,
     seed: int = 0,
@@ -200,7 +200,7 @@ def _some(batch: Any) -> Tensor:
 class _Search:
     """Of one chunk of sequences."""
 
-    def __init__(self, program: Program, batch: Any, guide: Program | None, descent: Descent, renew: Any):
+    def __init__(self, program: _Program, batch: Any, guide: _Program | None, descent: Descent, renew: Any):
         self.program, self.batch, self.guide, self.descent = program, batch, guide, descent
         self.size = len(_some(batch))
         self.renew = renew or (lambda batch, values: batch)
@@ -261,7 +261,7 @@ class _Search:
         starts, each = self.descent.starts, torch.arange(self.size)
         return torch.stack([every[n::starts][energies[n::starts].argmin(0), each] for n in range(starts)])
 
-    def _drawn(self, program: Program) -> dict[str, Tensor]:
+    def _drawn(self, program: _Program) -> dict[str, Tensor]:
         """Latents that a program draws."""
         nodes: dict[str, Any] = poutine.trace(program).get_trace(self.batch).nodes
         return {name: nodes[name]["value"] for name in self.latents if name in nodes}
@@ -315,7 +315,7 @@ class _Search:
         return torch.stack(tried)[energies.argmin(0), torch.arange(self.size)]
 
 
-def _energy(program: Program, batch: Any, values: Values, sites: Collection[str] | None = None) -> Tensor:
+def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str] | None = None) -> Tensor:
     """-log p (B,) of a program's sites, or of some of them, at these values of its latents."""
     trace = poutine.trace(poutine.condition(program, data=dict(values))).get_trace(batch)
     trace.compute_log_prob(site_filter=lambda name, _: sites is None or name in sites)

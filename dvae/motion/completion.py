@@ -27,7 +27,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import log, pi, sqrt
-from typing import Any, Protocol
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
@@ -51,22 +51,6 @@ AT_ONCE = 32
 """Frames of which all vertices are held to find the nearest ones."""
 THIN = 16
 """Of so many vertices one stands for a surface of which all are known: that tells no less of joints and a shape."""
-
-
-class Decoder(Protocol):
-    """A model of segments, such as `dvae.models.motion_latent.MotionLatentModel`."""
-
-    timed: TimedFrames
-    body: Body
-    sizes: Mapping[str, int]
-
-    def decode(self, latent: Tensor, shape: Tensor) -> Tensor:
-        """Frames (B, N, D) of z (B, Z) on bodies (B, S)."""
-        ...
-
-    def guide(self, batch: Any) -> Any:
-        """A Pyro program that draws z of segments."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -93,11 +77,12 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Completion:
+class SegmentCompletion:
     """The Pyro program of what was seen, for `dvae.posterior` and for Pyro's own guides (`AutoDelta`, ...).
 
     Args:
-        model: whose decoder makes segments.
+        model: of segments, such as `dvae.models.motion_latent.MotionLatentModel`, of which `decode`, `guide`, `timed`
+            and `body` are used.
         noise: of what was seen.
         markers: the vertices of markers (L,); `bodies.MARKERS` by default.
         known: segments (x and beta), whose latents by the guide are where motion is: starts beside those of the prior.
@@ -135,7 +120,7 @@ class Completion:
                 which = torch.tensor(self.markers, device=x.device)
                 _observe(SPOTS, model.body.some(*pose, which), seen[SPOTS], noise.marker)
             if POINTS in seen:
-                which = seen[NEAREST] if NEAREST in seen else nearest(model.body, *pose, seen[POINTS])
+                which = seen[NEAREST] if NEAREST in seen else nearest_vertices(model.body, *pose, seen[POINTS])
                 _observe(POINTS, model.body.some(*pose, which), seen[POINTS], noise.point)
         return {LATENT: z, SHAPE: shape, "x": x}
 
@@ -152,7 +137,7 @@ class Completion:
         shape = values.get(SHAPE, seen.get(SHAPE))
         met, _ = _met(self.model.timed, self.model.decode(values[LATENT], shape), seen)
         rotations, places = self.model.timed.poses(met)
-        return {**seen, NEAREST: nearest(self.model.body, shape, rotations, places, seen[POINTS])}
+        return {**seen, NEAREST: nearest_vertices(self.model.body, shape, rotations, places, seen[POINTS])}
 
     def read(self, seen: Batch) -> dict[str, Tensor]:
         """What was seen, checked, in the model's precision and on its device; of surfaces one vertex in `THIN`.
@@ -247,15 +232,15 @@ def complete(
     """The rest of segments of which something was seen; all at once.
 
     Args:
-        model: of segments, see `Decoder`.
+        model: of segments, see `SegmentCompletion`.
         seen: see the module.
-        noise, markers, known: see `Completion`.
+        noise, markers, known: see `SegmentCompletion` too.
         descent, seed, chunk: see `dvae.posterior`.
 
     Raises:
-        ValueError: see `Completion.read`.
+        ValueError: see `SegmentCompletion.read`.
     """
-    program = Completion(model, noise or Noise(), markers or tuple(MARKERS.values()), known)
+    program = SegmentCompletion(model, noise or Noise(), markers or tuple(MARKERS.values()), known)
     data, guide = program.read(seen), None if known is None else program.guide
     with evaluating(model):
         found = posterior(program, data, guide=guide, descent=descent, renew=program.renewed, seed=seed, chunk=chunk)
@@ -279,7 +264,7 @@ def glimpsed(
     """What somebody would have seen of known segments, to see how well the rest is found.
 
     Args:
-        model: of segments, see `Decoder`.
+        model: of segments, see `SegmentCompletion`.
         x, shape: frames (B, N, D) on bodies (B, S).
         kind: "surfaces", "points" or "markers".
         fps: moments a second, at known times.
@@ -366,7 +351,7 @@ def error_by_time(
     return errors.nanmean(0), errors.isfinite().sum(0)
 
 
-def nearest(body: Body, shape: Tensor, rotations: Tensor, places: Tensor, points: Tensor) -> Tensor:
+def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tensor, points: Tensor) -> Tensor:
     """Which vertices of moving bodies, see `Body.forward`, points (B, K, M, 3) are nearest to, (B, K, M)."""
     found = []
     with torch.no_grad():

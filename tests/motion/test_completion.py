@@ -9,14 +9,14 @@ from dvae import motion
 from dvae.models.motion_latent import MotionLatent
 from dvae.motion import bodies
 from dvae.motion.completion import (
-    Completion,
     Noise,
+    SegmentCompletion,
     _met,
     chamfer,
     complete,
     error_by_time,
     glimpsed,
-    nearest,
+    nearest_vertices,
     scanned,
     surfaces_at,
 )
@@ -104,7 +104,7 @@ def test_what_the_decoder_made_is_found_again(model, kind, options):
         )
         assert chamfer(seen["points"], ours).mean() < 1.5 * chamfer(seen["points"], theirs).mean()
     else:
-        truth = poutine.condition(Completion(model), data={"z": z, SHAPE: shape})
+        truth = poutine.condition(SegmentCompletion(model), data={"z": z, SHAPE: shape})
         trace = poutine.trace(truth).get_trace(found.seen)
         assert found.posterior.energy.sum() <= -trace.log_prob_sum()
         error = bodies.vertex_error(model.vertices(found.x, found.shape), model.vertices(x, shape))
@@ -135,7 +135,7 @@ def test_intervals_of_completions_hold_what_they_promise(model):
 
 def test_what_is_missing_counts_for_nothing(model):
     z, shape, x = made(model, 2)
-    program = Completion(model)
+    program = SegmentCompletion(model)
     seen = glimpsed(model, x, shape, "markers", frames=[5, 50, 80])
 
     def energy(seen):
@@ -158,9 +158,9 @@ def test_the_nearest_vertices_are_what_points_are_held_against(model):
     rotations, places = model.timed.poses(x[:, ::30])
     vertices = model.body(shape, rotations, places)[0]
     points = vertices[:, :, ::100] + 0.01 * torch.randn(2, 4, 15, 3, dtype=torch.float64)
-    which = nearest(model.body, shape, rotations, places, points)
+    which = nearest_vertices(model.body, shape, rotations, places, points)
     assert torch.equal(which, torch.cdist(points, vertices).argmin(-1))
-    program, (z, shape, x) = Completion(model), made(model, 2)
+    program, (z, shape, x) = SegmentCompletion(model), made(model, 2)
     seen = program.read(glimpsed(model, x, shape, "points", frames=[0, 50]))
     values = {"z": z, SHAPE: shape}
     runs = [poutine.trace(poutine.condition(program, values)) for _ in range(2)]
@@ -172,7 +172,7 @@ def test_the_nearest_vertices_are_what_points_are_held_against(model):
 def test_known_segments_are_starts_too(model, segments):
     """Their latents by the guide, drawn at random."""
     batch = {name: value.double() for name, value in segments.all().items()}
-    program = Completion(model, known=batch)
+    program = SegmentCompletion(model, known=batch)
     _, shape, x = made(model, 4)
     seen = program.read(glimpsed(model, x, shape, "markers", frames=[0]))
     nodes = poutine.trace(program.guide).get_trace(seen).nodes
@@ -214,7 +214,7 @@ def test_scores_of_completions(model):
 def test_what_cannot_have_been_seen_is_refused(model):
     _, shape, x = made(model, 2)
     seen = glimpsed(model, x, shape, "markers", frames=[0, 50])
-    program = Completion(model)
+    program = SegmentCompletion(model)
     for wrong, message in (
         ({**seen, "marker": seen["markers"]}, "nothing to be seen called marker"),
         ({"frames": seen["frames"]}, "some of surfaces, points and markers"),

@@ -83,8 +83,6 @@ class Body(nn.Module):
 
     def at_rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
         """Vertices (..., V, 3) and joints (..., J, 3) of bodies (..., S), nothing turned."""
-        if shape.shape[-1:] != (self.parameters_of_shape,):
-            raise ValueError(f"shape is {tuple(shape.shape)}, expected (..., {self.parameters_of_shape})")
         return _changed(self.template, self.shapes, shape), self._pivots(shape)
 
     def offsets(self, shape: Tensor) -> Tensor:
@@ -213,5 +211,7 @@ class Body(nn.Module):
 
 def _changed(average: Tensor, changes: Tensor, shape: Tensor) -> Tensor:
     """Points (..., M, 3) that are on average there (M, 3), by what parameters (..., S) add to them (M, 3, S)."""
+    if shape.shape[-1:] != changes.shape[-1:]:
+        raise ValueError(f"shape is {tuple(shape.shape)}, expected (..., {changes.shape[-1]})")
     found: Tensor = average + (shape @ changes.flatten(0, 1).mT).unflatten(-1, (-1, 3))
     return found
