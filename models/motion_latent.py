@@ -150,12 +150,15 @@ class MotionLatentModel(DynamicalVAE):
         law: Any = poutine.trace(self.guide).get_trace(batch).nodes["z"]["fn"]
         return law.mean  # type: ignore[no-any-return]
 
-    def decode(self, latent: Tensor, shape: Tensor) -> Tensor:
-        """Frames x (..., N, D), the means of chi, of latents (..., Z) on bodies (..., S), with gradients."""
+    def decode(self, latent: Tensor, shape: Tensor, frames: Tensor | None = None) -> Tensor:
+        """Frames x (..., N, D), the means of chi, of latents (..., Z) on bodies (..., S), with gradients.
+
+        Where some frames (K,) are asked for, these alone are made, (..., K, D).
+        """
         network = self.generator[TURNS].network
         given = {"z": latent.flatten(0, -2), SHAPE: shape.flatten(0, -2)}
         # of all parts at once, each of which has its features for means (`MotionLatent.laws`)
-        made: Tensor = network.trunk([given[parent.name] for parent in network.inputs])
+        made: Tensor = network.trunk([given[parent.name] for parent in network.inputs], frames)
         return made.unflatten(0, latent.shape[:-1])
 
     def vertices(self, x: Tensor, shape: Tensor) -> Tensor:

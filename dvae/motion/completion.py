@@ -100,29 +100,28 @@ class SegmentCompletion:
             seen: see the module; what `read` gave. Where it says nothing of it, nearest vertices are looked for.
 
         Returns:
-            z (B, Z), beta (B, S), and the frames x (B, N, D).
+            z (B, Z) and beta (B, S).
         """
         model, noise, kind = self.model, self.noise, like(self.model)
         size, parameters = len(next(iter(seen.values()))), model.body.parameters_of_shape
         with pyro.plate("sequences", size):
             z = pyro.sample(LATENT, _standard(size, model.sizes[LATENT], kind))
             shape = seen[SHAPE] if SHAPE in seen else pyro.sample(SHAPE, _standard(size, parameters, kind))
-            x = model.decode(z, shape)
-            met, times = _met(model.timed, x, seen)
+            met, times = self._met(z, shape, seen)
             rotations, places = model.timed.poses(met)
             pose = (shape, rotations, places)
             if TIMES in seen:
                 _observe(TIMES, times, seen[TIMES], noise.time)
             if SURFACES in seen:
-                thin = torch.arange(0, len(model.body.template), THIN, device=x.device)
+                thin = torch.arange(0, len(model.body.template), THIN, device=z.device)
                 _observe(SURFACES, model.body.some(*pose, thin), seen[SURFACES], noise.surface * len(thin) ** 0.5)
             if SPOTS in seen:
-                which = torch.tensor(self.markers, device=x.device)
+                which = torch.tensor(self.markers, device=z.device)
                 _observe(SPOTS, model.body.some(*pose, which), seen[SPOTS], noise.marker)
             if POINTS in seen:
                 which = seen[NEAREST] if NEAREST in seen else nearest_vertices(model.body, *pose, seen[POINTS])
                 _observe(POINTS, model.body.some(*pose, which), seen[POINTS], noise.point)
-        return {LATENT: z, SHAPE: shape, "x": x}
+        return {LATENT: z, SHAPE: shape}
 
     def guide(self, seen: Batch) -> Any:
         """z of known segments, drawn at random."""
@@ -135,9 +134,16 @@ class SegmentCompletion:
         if POINTS not in seen:
             return dict(seen)
         shape = values.get(SHAPE, seen.get(SHAPE))
-        met, _ = _met(self.model.timed, self.model.decode(values[LATENT], shape), seen)
+        met, _ = self._met(values[LATENT], shape, seen)
         rotations, places = self.model.timed.poses(met)
         return {**seen, NEAREST: nearest_vertices(self.model.body, shape, rotations, places, seen[POINTS])}
+
+    def _met(self, z: Tensor, shape: Tensor, seen: Batch) -> tuple[Tensor, Tensor]:
+        """`_met` of what is decoded: of some frames alone, where these were seen of all and no time counts."""
+        frames = seen.get(FRAMES)
+        if TIMES not in seen and frames is not None and bool((frames == frames[:1].round()).all()):
+            return self.model.decode(z, shape, frames[0].long()), frames
+        return _met(self.model.timed, self.model.decode(z, shape), seen)
 
     def read(self, seen: Batch) -> dict[str, Tensor]:
         """What was seen, checked, in the model's precision and on its device; of surfaces one vertex in `THIN`.

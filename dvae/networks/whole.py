@@ -107,10 +107,14 @@ class Trunk(nn.Module):
         self.out = nn.Linear((size, *spec.widths)[-1], spec.length * numbers)
         self.length = spec.length
 
-    def forward(self, given: Sequence[Tensor]) -> Tensor:
-        """All steps of all variables."""
-        made: Tensor = self.out(self.hidden(torch.cat(list(given), -1))).unflatten(-1, (self.length, -1))
-        return made
+    def forward(self, given: Sequence[Tensor], steps: Tensor | None = None) -> Tensor:
+        """All steps of all variables; or these (K,) alone, of which no other is computed."""
+        hidden = self.hidden(torch.cat(list(given), -1))
+        if steps is None:
+            made: Tensor = self.out(hidden)
+            return made.unflatten(-1, (self.length, -1))
+        weight, bias = (part.unflatten(0, (self.length, -1))[steps] for part in (self.out.weight, self.out.bias))
+        return functional.linear(hidden, weight.flatten(0, 1), bias.flatten()).unflatten(-1, (len(steps), -1))
 
 
 class WholeDecoderNetwork(AtOnce):

@@ -62,6 +62,8 @@ def test_decoding_is_the_mean_of_the_program(model):
     parts = program({SHAPE: shape}, length=100, mean_emission=True)
     torch.testing.assert_close(model.shown(parts)["x"], x)
     torch.testing.assert_close(model.decode(z[:, None], shape[:, None]), x[:, None])
+    some = torch.tensor([0, 40, 99])
+    torch.testing.assert_close(model.decode(z, shape, some), x[:, some])
 
 
 def test_moments_are_met_in_decoded_time(model):
