@@ -110,11 +110,12 @@ class Trunk(nn.Module):
     def forward(self, given: Sequence[Tensor], steps: Tensor | None = None) -> Tensor:
         """All steps of all variables; or these (K,) alone, of which no other is computed."""
         hidden = self.hidden(torch.cat(list(given), -1))
-        if steps is None:
-            made: Tensor = self.out(hidden)
-            return made.unflatten(-1, (self.length, -1))
-        weight, bias = (part.unflatten(0, (self.length, -1))[steps] for part in (self.out.weight, self.out.bias))
-        return functional.linear(hidden, weight.flatten(0, 1), bias.flatten()).unflatten(-1, (len(steps), -1))
+        weight, bias = self.out.weight, self.out.bias
+        if steps is not None:
+            weight, bias = (part.unflatten(0, (self.length, -1))[steps].flatten(0, 1) for part in (weight, bias))
+        length = self.length if steps is None else len(steps)
+        made: Tensor = functional.linear(hidden, weight, bias).unflatten(-1, (length, -1))
+        return made
 
 
 class WholeDecoderNetwork(AtOnce):
