@@ -17,7 +17,7 @@ in metres, of somebody who starts at the origin, facing heading zero. Moments wi
 time, on straight lines between chi's frames. Moments that have both are met at the frame, and its time counts.
 
 The paper adds squared errors, in weights that adapt. Here they are the negative log of normal likelihoods, whose
-deviations (`Noise`) are the weights: what is minimised is then a posterior's, and a completion knows how sure it is. Of
+`Deviations` are the weights: what is minimised is then a posterior's, and a completion knows how sure it is. Of
 points, what counts is how far each is from the nearest vertex, one way: a vertex far from all points is no error where
 points are few. A frame's surface counts as one vertex, the mean of all, for its vertices err together.
 """
@@ -54,7 +54,7 @@ THIN = 16
 
 
 @dataclass(frozen=True)
-class Noise:
+class Deviations:
     """How far what was seen is from what a decoder makes: standard deviations of each coordinate.
 
     What a decoder cannot make is part of it. Frames next to each other err alike, of which a likelihood with
@@ -83,13 +83,13 @@ class SegmentCompletion:
     Args:
         model: of segments, such as `dvae.models.motion_latent.MotionLatentModel`, of which `decode`, `guide`, `timed`
             and `body` are used.
-        noise: of what was seen.
+        deviations: of what was seen.
         markers: the vertices of markers (L,); `bodies.MARKERS` by default.
         known: segments (x and beta), whose latents by the guide are where motion is: starts beside those of the prior.
     """
 
     model: Any
-    noise: Noise = Noise()
+    deviations: Deviations = Deviations()
     markers: Sequence[int] = tuple(MARKERS.values())
     known: Batch | None = None
 
@@ -102,7 +102,7 @@ class SegmentCompletion:
         Returns:
             z (B, Z) and beta (B, S).
         """
-        model, noise, kind = self.model, self.noise, like(self.model)
+        model, deviations, kind = self.model, self.deviations, like(self.model)
         size, parameters = len(next(iter(seen.values()))), model.body.parameters_of_shape
         with pyro.plate("sequences", size):
             z = pyro.sample(LATENT, _standard(size, model.sizes[LATENT], kind))
@@ -111,16 +111,16 @@ class SegmentCompletion:
             rotations, places = model.timed.poses(met)
             pose = (shape, rotations, places)
             if TIMES in seen:
-                _observe(TIMES, times, seen[TIMES], noise.time)
+                _observe(TIMES, times, seen[TIMES], deviations.time)
             if SURFACES in seen:
                 thin = torch.arange(0, len(model.body.template), THIN, device=z.device)
-                _observe(SURFACES, model.body.some(*pose, thin), seen[SURFACES], noise.surface * len(thin) ** 0.5)
+                _observe(SURFACES, model.body.some(*pose, thin), seen[SURFACES], deviations.surface * len(thin) ** 0.5)
             if SPOTS in seen:
                 which = torch.tensor(self.markers, device=z.device)
-                _observe(SPOTS, model.body.some(*pose, which), seen[SPOTS], noise.marker)
+                _observe(SPOTS, model.body.some(*pose, which), seen[SPOTS], deviations.marker)
             if POINTS in seen:
                 which = seen[NEAREST] if NEAREST in seen else nearest_vertices(model.body, *pose, seen[POINTS])
-                _observe(POINTS, model.body.some(*pose, which), seen[POINTS], noise.point)
+                _observe(POINTS, model.body.some(*pose, which), seen[POINTS], deviations.point)
         return {LATENT: z, SHAPE: shape}
 
     def guide(self, seen: Batch) -> Any:
@@ -228,7 +228,7 @@ def complete(
     model: Any,
     seen: Batch,
     *,
-    noise: Noise | None = None,
+    deviations: Deviations | None = None,
     markers: Sequence[int] | None = None,
     known: Batch | None = None,
     descent: Descent | None = None,
@@ -240,13 +240,13 @@ def complete(
     Args:
         model: of segments, see `SegmentCompletion`.
         seen: see the module.
-        noise, markers, known: see `SegmentCompletion` too.
+        deviations, markers, known: see `SegmentCompletion` too.
         descent, seed, chunk: see `dvae.posterior`.
 
     Raises:
         ValueError: see `SegmentCompletion.read`.
     """
-    program = SegmentCompletion(model, noise or Noise(), markers or tuple(MARKERS.values()), known)
+    program = SegmentCompletion(model, deviations or Deviations(), markers or tuple(MARKERS.values()), known)
     data, guide = program.read(seen), None if known is None else program.guide
     with evaluating(model):
         found = posterior(program, data, guide=guide, descent=descent, renew=program.renewed, seed=seed, chunk=chunk)

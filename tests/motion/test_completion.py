@@ -9,7 +9,7 @@ from dvae import motion
 from dvae.models.motion_latent import MotionLatent
 from dvae.motion import bodies
 from dvae.motion.completion import (
-    Noise,
+    Deviations,
     SegmentCompletion,
     _met,
     chamfer,
@@ -123,10 +123,10 @@ def test_what_the_decoder_made_is_found_again(model, kind, options):
 def test_intervals_of_completions_hold_what_they_promise(model):
     """Of segments from the model and markers with its noise, within four binomial standard errors."""
     z, shape, x = made(model, 120, seed=3)
-    noise = Noise(marker=0.05)
+    noise = Deviations(marker=0.05)
     seen = glimpsed(model, x, shape, "markers", frames=[10, 60])
     seen["markers"] = seen["markers"] + noise.marker * torch.randn_like(seen["markers"])
-    found = complete(model, {**seen, SHAPE: shape}, noise=noise, descent=BRIEF)
+    found = complete(model, {**seen, SHAPE: shape}, deviations=noise, descent=BRIEF)
     away = ((z - found.posterior.mode["z"]) / found.posterior.deviation["z"]).abs()
     for level in (0.5, 0.8, 0.9):
         reach = torch.distributions.Normal(0.0, 1.0).icdf(torch.tensor((1 + level) / 2))
@@ -231,7 +231,7 @@ def test_what_cannot_have_been_seen_is_refused(model):
     with pytest.raises(ValueError, match="expected 'surfaces', 'points' or 'markers'"):
         glimpsed(model, x, shape, "marker")
     with pytest.raises(ValueError, match="marker"):
-        Noise(marker=0.0)
+        Deviations(marker=0.0)
 
 
 def test_markers_are_where_their_names_say():
