@@ -96,10 +96,14 @@ def swept(alpha: float, curriculum: bool) -> str:
     return f"alpha {alpha:g}" if curriculum else f"alpha {alpha:g}, no curriculum"
 
 
-SWEEP = {
+SWEEP: dict[str, dict[str, Any]] = {
     swept(alpha, curriculum): {"alpha": alpha, **({} if curriculum else {"curriculum": 0.0})}
     for curriculum in (True, False)
     for alpha in ALPHAS
+}
+SWEEP |= {
+    f"{name}, scale 0.03": {**SWEEP[name], "scale": 0.03}
+    for name in (swept(ALPHAS[-1], True), swept(ALPHAS[-1], False))
 }
 WEIGHTS = {
     f"{way}, scale {scale:g}": {**NAMED[way], "scale": scale}
