@@ -422,7 +422,7 @@ def angles(cases: Mapping[str, Case]) -> str:
 def draw(cases: Mapping[str, Case], alphas: Mapping[str, Case], file: Path) -> None:
     """Codes over training, one panel for each way; and quality against diversity."""
     ways = {name: case for name, case in cases.items() if name in NAMED and case.runs[0]["codes"]["diversity"][-1] > 0}
-    figure = canvas(12, 3)
+    figure = canvas(14, 3)
     *panels, last = figure.subplots(1, len(ways) + 1)
     for panel, (name, case) in zip(panels, ways.items(), strict=True):
         for run in case.runs:
@@ -445,7 +445,7 @@ def draw(cases: Mapping[str, Case], alphas: Mapping[str, Case], file: Path) -> N
     last.set_ylim(0)
     last.set_xlabel("APD (m)")
     last.set_title("quality (%)", fontsize=9)
-    last.legend(fontsize=7)
+    figure.legend(*last.get_legend_handles_labels(), loc="outside right center", fontsize=7, frameon=False)
     figure.savefig(file, dpi=110)
 
 
