@@ -45,6 +45,9 @@ class Descent:
             prior's are dealt out to the starts, each of which is the most probable of its own.
         renewed: steps after which what the batch says of the values is renewed.
         newton: steps of Newton's at the end, each with a curvature of its own.
+
+    Example:
+        >>> quick = dvae.Descent(steps=50, starts=2)
     """
 
     steps: Count = 200
@@ -77,6 +80,12 @@ class Posterior:
             wide as the prior, for it would be wider, or have no width.
         factor: (B, P, P) lower triangle whose square is the covariance of all numbers of a sequence's latents, in the
             order of `mode`.
+
+    Example:
+        >>> model = dvae.twin("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
+        >>> found = dvae.posterior(model.model, {"x": model.sample(5, 4)["x"]}, descent=dvae.Descent(steps=20))
+        >>> bool((found.left < 1e-6).all())  # nats: it has converged
+        True
     """
 
     mode: Mapping[str, Tensor]

@@ -8,7 +8,7 @@ from dvae import motion
 
 
 @pytest.fixture(scope="session")
-def windows():
+def quaternions():
     """Windows of 5 + 7 frames, "train" and "test", whose representation is quaternions."""
     changes = {"observed": 5, "predicted": 7, "train_stride": 3, "test_stride": 6, "representation": "quaternion"}
     people = motion.simulate(clips=8, frames=40, test=0.3)

@@ -10,6 +10,11 @@ from dvae.models.codes import CodeDiversity, code_diversity, codes
 WAYS = ("mix", "concatenate", "add", "step")
 
 
+@pytest.fixture
+def windows(quaternions):
+    return quaternions
+
+
 def made(windows, **options):
     torch.manual_seed(0)
     return dvae.method("mix-and-match", **{"width": 24, **options}).build(windows["train"]).eval()

@@ -50,6 +50,11 @@ class TestALatentForEachStep(Contract):
     options: ClassVar = {"noise": "step", "latent": 3, "velocity": True}
 
 
+@pytest.fixture
+def windows(quaternions):
+    return quaternions
+
+
 def made(windows, **options):
     torch.manual_seed(0)
     return small(**options).build(windows["train"]).eval()

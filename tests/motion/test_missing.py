@@ -714,7 +714,10 @@ def test_every_command_that_reads_motion_takes_gaps_the_same_way():
         hints = get_type_hints(command([name]), include_extras=True)
         if "source" in hints and is_dataclass(hints["source"]):
             hints |= get_type_hints(hints["source"], include_extras=True)
-        reads = {"data", "files"} & hints.keys() and name != "resume"  # which reads what the run has
+        reads = {"data", "files"} & hints.keys() and name not in (
+            "resume",
+            "interpolate",
+        )  # what the run has, and whole bodies
         assert (hints.get("missing") == Missing) == bool(reads), name
 
 
