@@ -81,7 +81,7 @@ class MixAndMatchMotion(PoseMethod):
 
     name = "mix-and-match"
     source = "Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733"
-    generative, inference = EQUATIONS["mix"]
+    generative, inference = EQUATIONS["mix"]  # of the default; `equations` has those of each way
     representation: ClassVar[str] = "quaternion"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"human36m": {"width": 1024}, "": {"width": 128}}
 
