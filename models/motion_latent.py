@@ -12,7 +12,7 @@ surface's vertices and of time, each with weights that adapt (`dvae.GradNorm`), 
 
 Marsot, Wuhrer, Franco and Durocher, 2021, arXiv 2106.04387; there is no public code. Ours, where the paper is silent:
 widths of the layers, normal likelihoods whose scale stands for how squared errors are reduced beside the KL, one batch
-size for both phases, and the shared layer of adaptive weights, the decoder's last.
+size for both phases, and the layer by whose gradients weights adapt, the last that all tasks share.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class MotionLatent(Method):
         return Recipe(train, validation, stages)
 
     def _weighing(self, tasks: tuple[str, ...], others: Evidence) -> GradNorm:
-        shared = f"generator.{TURNS}.network.trunk.out."
+        shared = f"generator.{TURNS}.network.trunk.hidden.{2 * len(self.widths) - 2}."  # of the last, only rows are a task's
         return GradNorm(tasks, shared, others, asymmetry=0.0, learning_rate=self.pace)
 
 
