@@ -85,5 +85,6 @@ def _write(out: Path, found: Interpolation, fps: float | None) -> None:
 
 def _alone(steps: motion.MotionSet, clip: motion.Clip) -> motion.MotionSet:
     """One of the clips, with the rest pose of its own body."""
-    rest = tuple(resting_offsets(clip, steps.skeleton).flatten().tolist())
-    return replace(steps, clips=[clip], skeleton=replace(steps.skeleton, rest=rest))
+    alone = replace(steps, clips=[clip])
+    rest = tuple(resting_offsets(alone).flatten().tolist())
+    return replace(alone, skeleton=replace(steps.skeleton, rest=rest))

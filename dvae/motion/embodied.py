@@ -95,15 +95,23 @@ class Segments:
         motion: segments on the joints of the body, each a clip (see `bodies.fitted`, `gait_cycles`).
         timed: how they become frames; that of the training data, for held-out ones.
         body: whose joints these are; the person that ships by default.
+        seen: what `timed` makes of them, where that is known.
 
     Raises:
         ValueError: motion on other joints.
     """
 
-    def __init__(self, motion: MotionSet, timed: TimedFrames | None = None, body: Body | None = None):
+    def __init__(
+        self,
+        motion: MotionSet,
+        timed: TimedFrames | None = None,
+        body: Body | None = None,
+        seen: Batch | None = None,
+    ):
         self.motion, self.body = motion, body or human()
-        self.timed = timed or TimedFrames.of(motion)
-        seen = self.timed.to(motion)
+        if timed is None:
+            timed, seen = TimedFrames.seeing(motion)
+        self.timed, seen = timed, seen or timed.to(motion)
         self._batch = {WHOLE: seen[WHOLE], SHAPE: shapes_of(motion, self.body).float()}
         self._start = {name: seen[name] for name in (HEADING, ORIGIN)}
 

@@ -139,10 +139,7 @@ class SegmentData:
     @cached_property
     def timed(self) -> TimedFrames:
         """As which frames they are seen."""
-        if self.seen is not None:
-            return self.seen
-        references = reference_cycles(self._embodied) if self.warped else ()
-        return TimedFrames.of(self._of("train"), scaling=self.scaling, references=references)
+        return self.seen or self._training.timed
 
     def windows(self, split: str) -> Segments:
         """The segments of "train", "validation" or "test".
@@ -150,7 +147,7 @@ class SegmentData:
         Raises:
             ValueError: there is none, or no such split.
         """
-        return Segments(self._of(split), self.timed)
+        return self._training if split == "train" else Segments(self._of(split), self.timed)
 
     def found(self, name: str) -> Segments:
         """One segment, by its name; or the first one of a take.
@@ -195,6 +192,16 @@ class SegmentData:
             FileNotFoundError, ValueError: see `open`.
         """
         return cls.open(path or source.path, source.skip_bad, cut=source.cut, seen=schema.timed)
+
+    @cached_property
+    def _training(self) -> Segments:
+        """Those from which frames have their units, unless these are those of a run."""
+        motion = self._of("train")
+        if self.seen is not None:
+            return Segments(motion, self.seen)
+        references = reference_cycles(self._embodied) if self.warped else ()
+        timed, seen = TimedFrames.seeing(motion, scaling=self.scaling, references=references)
+        return Segments(motion, timed, seen=seen)
 
     @cached_property
     def _embodied(self) -> MotionSet:

@@ -16,14 +16,16 @@ turned, so that down stays down.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import BSpline
+from scipy.sparse.linalg import splu
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ..data import Batch
 from ..options import Positive, Size, check
@@ -31,7 +33,7 @@ from ..views import WHOLE
 from . import kinematics
 from .data import Clip, MotionSet
 from .gait import Reference, stamps
-from .rotations import continuous, from_matrix, to_matrix
+from .rotations import continuous, from_matrix, normalised, to_matrix
 from .skeleton import Skeleton, rotate_about_up
 from .views import HEADING
 
@@ -50,6 +52,9 @@ STEADY = 1e-3
 
 BRIEFEST = 0.01
 """Share of an even increment of the longest segment that an increment has at least, whatever a decoder makes of it."""
+
+AT_ONCE = 4096
+"""Frames of clips of one length that are read at once, for which there is room in a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -119,18 +124,29 @@ class TimedFrames:
         Raises:
             ValueError: another scaling; or see `to`.
         """
+        return cls.seeing(motion, frames, scaling, references)[0]
+
+    @classmethod
+    def seeing(
+        cls,
+        motion: MotionSet,
+        frames: int = 100,
+        scaling: Literal["identity", "deviation"] = "identity",
+        references: Sequence[Reference] = (),
+    ) -> tuple[Self, dict[str, Any]]:
+        """`of` segments, and these segments so (`to`), where both are needed: frames are made once."""
         if scaling not in ("identity", "deviation"):
             raise ValueError(f"scaling is {scaling!r}; expected 'identity' or 'deviation'")
         made = cls(motion.skeleton, frames, references=references)
-        x = made.to(motion)[WHOLE].double()
-        parts = made.parts
-        metres = max(float(x[..., parts["place"]].abs().max()), 1e-3)
-        made = replace(made, metres=metres, seconds=float(made.lasts(x).max()))
-        if scaling == "identity":
-            return made
-        turns = made._turns(x).flatten(-2).flatten(0, 1)
-        deviation = turns.std(0, correction=0).clamp(STEADY)
-        return replace(made, mean=tuple(turns.mean(0).tolist()), deviation=tuple(deviation.tolist()))
+        found = made._found(motion)
+        x = made._scaled(found)[WHOLE]  # of single precision, as units do not hang on a double's last digits
+        metres = max(float(x[..., made.parts["place"]].abs().max()), 1e-3)
+        made = replace(made, metres=metres, seconds=float(made.lasts(x[..., -1:].double()).max()))
+        if scaling == "deviation":
+            turns = made._turns(x.double()).flatten(-2).flatten(0, 1)
+            deviation = turns.std(0, correction=0).clamp(STEADY)
+            made = replace(made, mean=tuple(turns.mean(0).tolist()), deviation=tuple(deviation.tolist()))
+        return made, made._scaled(found)
 
     @property
     def turning(self) -> list[int]:
@@ -161,29 +177,7 @@ class TimedFrames:
         Raises:
             ValueError: clips without rotations, of one frame, or of another skeleton.
         """
-        skeleton = motion.skeleton
-        if (skeleton.names, skeleton.parents, skeleton.up) != tuple(
-            getattr(self.skeleton, name) for name in ("names", "parents", "up")
-        ):
-            raise ValueError(
-                f"{motion.name or 'these segments'} have the tree of joints {skeleton.name!r}, and frames here are of "
-                f"{self.skeleton.name!r}; dvae.motion.gait.alike brings two sources onto one tree"
-            )
-        for clip in motion:
-            where = f"segment {'/'.join(clip.key)}"
-            if clip.rotations is None:
-                raise ValueError(f"{where} has no turns of joints; MotionSet.with_rotations() finds them")
-            if clip.frames < 2:
-                raise ValueError(f"{where} has {clip.frames} frame, expected at least 2, between which time passes")
-        first = torch.from_numpy(np.stack([clip.positions[0] for clip in motion])).double()
-        heading = skeleton.heading(first)
-        found = {
-            WHOLE: torch.stack([self._seen(clip, skeleton.fps, -h) for clip, h in zip(motion, heading, strict=True)]),
-            HEADING: heading,
-            ORIGIN: first[:, skeleton.root],
-            OFFSETS: torch.stack([resting_offsets(clip, self.skeleton) for clip in motion]),
-        }
-        return {name: value.float() for name, value in found.items()}
+        return self._scaled(self._found(motion))
 
     def back(self, seen: Batch, fps: float | None = None) -> MotionSet:
         """Motion of time-stamped frames: what `to` made, or a decoder.
@@ -207,9 +201,13 @@ class TimedFrames:
         for b in range(len(x)):
             values = _joined(continuous(from_matrix(turns[b][:, self.turning], "quaternion")), places[b])
             at = np.arange(int(float(times[b, -1]) * skeleton.fps + 1e-3) + 1) / skeleton.fps
-            local, place = self._taken(_through(values, times[b].numpy(), at.clip(max=float(times[b, -1]))))
+            through = _cubic(times[b].numpy(), at.clip(max=float(times[b, -1])))
+            own, place = _parted(_normed(through @ values))
+            local = torch.eye(3).to(x).repeat(len(own), skeleton.joints, 1, 1)
+            local[:, self.turning] = to_matrix(own, "quaternion")
             if HEADING in seen:
-                local, place = self._faced(local, place, seen[HEADING][b].cpu().double())
+                turn, place = self._faced(local[:, skeleton.root], place, seen[HEADING][b].cpu().double())
+                local[:, skeleton.root] = turn
             if ORIGIN in seen:
                 place = place + seen[ORIGIN][b].cpu().double()
             offsets = seen[OFFSETS][b].cpu().double() if OFFSETS in seen else skeleton.offsets
@@ -245,46 +243,70 @@ class TimedFrames:
         """When frames (..., N, D) are, from the first on, (..., N) in seconds, with gradients."""
         even = self.seconds / (self.frames - 1)
         later = x[..., -1][..., 1:].clamp(BRIEFEST) * even
-        return torch.nn.functional.pad(later.cumsum(-1), (1, 0))
+        return pad(later.cumsum(-1), (1, 0))
 
     def lasts(self, x: Tensor) -> Tensor:
         """How long segments (..., N, D) last, (...,) in seconds: the sum of their increments."""
         return self.times(x)[..., -1]
 
-    def _seen(self, clip: Clip, fps: float, angle: Tensor) -> Tensor:
-        """(N, D) of a clip turned by an angle."""
-        assert clip.rotations is not None
-        local = to_matrix(torch.from_numpy(clip.rotations).double(), "quaternion")
-        place = torch.from_numpy(clip.positions[:, self.skeleton.root]).double()
-        local, place = self._faced(local, place - place[:1], angle)
-        given = _joined(continuous(from_matrix(local[:, self.turning], "quaternion")), place)
-        times = np.arange(clip.frames) / fps
-        at = times[-1] * np.linspace(0, 1, self.frames)
-        if self.references:
-            at = stamps(clip, self.skeleton, self.references, self.frames) / fps
-        values = _through(given, times, at)
+    def _found(self, motion: MotionSet) -> dict[str, Tensor]:
+        """What `to` gives, with x as it is: six numbers of each turn, metres, seconds."""
+        skeleton = motion.skeleton
+        if (skeleton.names, skeleton.parents, skeleton.up) != tuple(
+            getattr(self.skeleton, name) for name in ("names", "parents", "up")
+        ):
+            raise ValueError(
+                f"{motion.name or 'these segments'} have the tree of joints {skeleton.name!r}, and frames here are of "
+                f"{self.skeleton.name!r}; dvae.motion.gait.alike brings two sources onto one tree"
+            )
+        for clip in motion:
+            where = f"segment {'/'.join(clip.key)}"
+            if clip.rotations is None:
+                raise ValueError(f"{where} has no turns of joints; MotionSet.with_rotations() finds them")
+            if clip.frames < 2:
+                raise ValueError(f"{where} has {clip.frames} frame, expected at least 2, between which time passes")
+        first = torch.from_numpy(np.stack([clip.positions[0] for clip in motion])).double()
+        heading = skeleton.heading(first)
+        x = first.new_empty(len(motion), self.frames, self.size)
+        for places, turns, positions in _of_one_length(motion):
+            at = np.linspace(0, turns.shape[1] - 1, self.frames)[None]
+            if self.references:
+                some = (motion.clips[n] for n in places)
+                at = np.stack([stamps(clip, self.skeleton, self.references, self.frames) for clip in some])
+            x[places] = self._seen(turns, positions[:, :, skeleton.root], at, skeleton.fps, -heading[places, None])
+        origin, offsets = first[:, skeleton.root], resting_offsets(motion)
+        return {WHOLE: x, HEADING: heading, ORIGIN: origin, OFFSETS: offsets}
+
+    def _seen(self, turns: Tensor, place: Tensor, at: np.ndarray, fps: float, angle: Tensor) -> Tensor:
+        """x as it is (B, N, D) of quaternions (B, F, J, 4) and places (B, F, 3), turned by angles (B, 1).
+
+        Its frames are at frames (B, N) of the clips, or (1, N) of all of them.
+        """
+        root, times = self.skeleton.root, np.arange(turns.shape[1])
+        first, place = self._faced(to_matrix(turns[:, :, root], "quaternion"), place - place[:, :1], angle)
+        turns[:, :, root] = from_matrix(first, "quaternion")
+        given = _joined(continuous(normalised(turns[:, :, self.turning])), place)
+        there = torch.stack([_cubic(times, each) for each in at])
+        again = torch.stack([_cubic(each, times) for each in at])
+        values = _normed(there @ given)
         for _ in range(ROUNDS):  # what comes back less or more than it was, goes in more or less
-            values = _normed(values + _spline(given - _through(values, at, times), times, at))
-        local, place = self._taken(values)
-        turns = from_matrix(local[:, self.turning], "6d").flatten(-2)
-        increments = torch.from_numpy(np.diff(at, prepend=0.0)) * (self.frames - 1) / self.seconds
-        mean, deviation = self._scaling(turns)
-        return torch.cat([(turns - mean) / deviation, place / self.metres, increments[:, None]], -1)
+            values = _normed(values + there @ (given - _normed(again @ values)))
+        turns, place = _parted(values)
+        six = from_matrix(to_matrix(turns, "quaternion"), "6d").flatten(-2)
+        increments = torch.from_numpy(np.diff(at, prepend=0.0) / fps).expand(len(turns), -1)
+        return torch.cat([six, place, increments[..., None]], -1)
 
-    def _faced(self, local: Tensor, place: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotations (F, J, 3, 3) and places (F, 3) of whoever turns about the up axis by an angle."""
-        root, up = self.skeleton.root, self.skeleton.up
-        axes = rotate_about_up(torch.eye(3).to(local), angle.expand(3), up).mT
-        local = local.clone()
-        local[:, root] = axes @ local[:, root]
-        return local, rotate_about_up(place, angle.expand(len(place)), up)
+    def _scaled(self, found: Batch) -> dict[str, Any]:
+        """What was found in these units, single precision."""
+        mean, deviation = self._scaling(found[WHOLE])
+        others = mean.new_tensor([self.metres] * 3 + [self.seconds / (self.frames - 1)])
+        x = (found[WHOLE] - pad(mean, (0, 4))).div_(torch.cat([deviation, others]))
+        return {name: value.float() for name, value in {**found, WHOLE: x}.items()}
 
-    def _taken(self, values: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Rotations (F, J, 3, 3), of ends none, and places (F, 3) of joined ones."""
-        given = torch.from_numpy(values)
-        local = torch.eye(3).to(given).repeat(len(given), self.skeleton.joints, 1, 1)
-        local[:, self.turning] = to_matrix(given[:, :-3].unflatten(-1, (-1, 4)), "quaternion")
-        return local, given[:, -3:]
+    def _faced(self, turn: Tensor, place: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+        """The root's rotations (..., 3, 3) and places (..., 3), turned about the up axis by angles (...)."""
+        up = self.skeleton.up
+        return rotate_about_up(turn.mT, angle[..., None], up).mT, rotate_about_up(place, angle, up)
 
     def _turns(self, x: Tensor) -> Tensor:
         """Six numbers of each turning joint (..., K, 6)."""
@@ -297,36 +319,50 @@ class TimedFrames:
         return like.new_tensor(self.mean or unturned), like.new_tensor(self.deviation or [1.0] * len(unturned))
 
 
-def resting_offsets(clip: Clip, skeleton: Skeleton) -> Tensor:
-    """Where joints of a clip with rotations are, on average, from their parents as these turn, (J, 3) in metres."""
+def resting_offsets(motion: MotionSet) -> Tensor:
+    """Where joints of clips with rotations are, on average, from their parents as these turn, (B, J, 3) in metres."""
+    skeleton = motion.skeleton
     parents, children = (list(ends) for ends in zip(*skeleton.edges, strict=True))
-    places = torch.from_numpy(clip.positions).double()
-    local = to_matrix(torch.from_numpy(clip.rotations).double(), "quaternion")
-    _, world = kinematics.forward(skeleton.parents, local, skeleton.offsets, places[:, 0])
-    found = torch.zeros_like(places[0])
-    limbs = (places[:, children] - places[:, parents])[..., None]
-    found[children] = (world[:, parents].mT @ limbs).squeeze(-1).mean(0)
+    found = torch.zeros(len(motion), skeleton.joints, 3, dtype=torch.float64)
+    for some, turns, places in _of_one_length(motion):
+        local = to_matrix(turns, "quaternion")
+        _, world = kinematics.forward(skeleton.parents, local, places, places[..., 0, :])  # turns, whatever hangs there
+        limbs = (places[..., children, :] - places[..., parents, :])[..., None]
+        found[some[:, None], children] = (world[..., parents, :, :].mT @ limbs).squeeze(-1).mean(1)
     return found
 
 
-def _joined(quaternions: Tensor, place: Tensor) -> np.ndarray:
-    """(F, 4 K + 3) of (F, K, 4) and (F, 3)."""
-    found: np.ndarray = torch.cat([quaternions.flatten(-2), place], -1).numpy()
-    return found
+def _of_one_length(motion: MotionSet) -> Iterator[tuple[np.ndarray, Tensor, Tensor]]:
+    """Places of some clips in a set, and their quaternions (B, F, J, 4) and positions (B, F, J, 3)."""
+    lengths = np.array([clip.frames for clip in motion])
+    for frames in np.unique(lengths):
+        alike = np.flatnonzero(lengths == frames)
+        for some in np.array_split(alike, -(-len(alike) * frames // AT_ONCE)):
+            given = zip(*((motion.clips[n].rotations, motion.clips[n].positions) for n in some), strict=True)
+            turns, positions = (torch.from_numpy(np.stack(each)).double() for each in given)
+            yield some, turns, positions
 
 
-def _normed(values: np.ndarray) -> np.ndarray:
-    """Joined ones with quaternions of unit length."""
-    turns = values[:, :-3].reshape(len(values), -1, 4)
-    turns = turns / np.linalg.norm(turns, axis=-1, keepdims=True)
-    return np.concatenate([turns.reshape(len(values), -1), values[:, -3:]], axis=1)
+def _joined(quaternions: Tensor, place: Tensor) -> Tensor:
+    """(..., 4 K + 3) of (..., K, 4) and (..., 3)."""
+    return torch.cat([quaternions.flatten(-2), place], -1)
 
 
-def _spline(values: np.ndarray, times: np.ndarray, at: np.ndarray) -> np.ndarray:
-    found: np.ndarray = CubicSpline(times, values, axis=0)(at)
-    return found
+def _parted(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Quaternions (..., K, 4) and places (..., 3) of joined ones."""
+    return values[..., :-3].unflatten(-1, (-1, 4)), values[..., -3:]
 
 
-def _through(values: np.ndarray, times: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Joined ones at other times, on a cubic through those that are given, the nearer way round where they turn."""
-    return _normed(_spline(values, times, at))
+def _normed(values: Tensor) -> Tensor:
+    """Joined ones, whose quaternions are brought to unit length in place."""
+    turns, _ = _parted(values)
+    turns /= turns.norm(dim=-1, keepdim=True)
+    return values
+
+
+def _cubic(times: np.ndarray, at: np.ndarray) -> Tensor:
+    """What takes values at F times to those at N others on a cubic through them, the not-a-knot spline: (N, F)."""
+    degree = min(3, len(times) - 1)
+    knots = np.concatenate([times[:1].repeat(degree + 1), times[2:-2], times[-1:].repeat(degree + 1)])
+    given, asked = (BSpline.design_matrix(each, knots, degree, extrapolate=True) for each in (times, at))
+    return torch.from_numpy(splu(given.T.tocsc()).solve(asked.T.toarray()).T)

@@ -8,7 +8,7 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.motion.embodied import SegmentSchema
+from dvae.motion.embodied import Segments, SegmentSchema
 from dvae.motion.segmented import SegmentData, Takes
 
 PEOPLE = motion.simulate(clips=8, frames=80, seed=1)
@@ -37,6 +37,21 @@ def test_splits_are_by_take_and_leave_nothing_out(data):
     alone = SegmentData("walks.npz", replace(PEOPLE, clips=[clip for clip in PEOPLE if clip.split == "train"]))
     with pytest.raises(ValueError, match=r"no segments for test: .* are of takes in train"):
         alone.windows("test")
+
+
+@pytest.mark.parametrize("options", [{}, {"scaling": "deviation"}])
+def test_frames_of_a_segment_are_made_once(options, monkeypatch):
+    made, seen = [], motion.TimedFrames._seen
+    monkeypatch.setattr(motion.TimedFrames, "_seen", lambda *given: made.append(len(given[1])) or seen(*given))
+    data = SegmentData("simulated", PEOPLE, **options)
+    train, validation = data.windows("train"), data.windows("validation")
+    assert data.schema == train.schema
+    assert data.windows("train").all() is train.all()
+    assert sum(made) == len(train) + len(validation)
+    again = train.timed.to(train.motion)
+    assert torch.equal(again["x"], train.all()["x"])
+    if not options:
+        assert torch.equal(Segments(train.motion).all()["x"], again["x"])
 
 
 @pytest.mark.parametrize("options", [{}, {"scaling": "deviation", "warped": True}], ids=["plain", "warped"])

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.interpolate import CubicSpline
 
 from dvae.motion import MotionSet, TimedFrames, kinematics, reference_cycles, rotations, simulate
-from dvae.motion.segments import HEADING, OFFSETS
+from dvae.motion.segments import HEADING, OFFSETS, _cubic, resting_offsets
 from dvae.motion.skeleton import rotate_about_up
 
 
@@ -27,6 +28,27 @@ def test_motion_comes_back_within_two_millimetres(people, frames):
     some = replace(people, clips=[clip.between(0, frames) for clip in people])
     view = TimedFrames.of(some)
     assert largest(some, view.back(view.to(some))) < 2e-3
+
+
+@pytest.mark.parametrize("frames", [2, 3, 4, 5, 40])
+def test_the_way_from_times_to_others_is_that_of_a_cubic_spline(frames):
+    rng = np.random.default_rng(frames)
+    times, values = np.cumsum(rng.uniform(0.5, 2, frames)), rng.normal(size=(frames, 7))
+    at = np.sort(rng.uniform(times[0], times[-1], 100))
+    np.testing.assert_allclose(_cubic(times, at).numpy() @ values, CubicSpline(times, values)(at), atol=1e-10)
+    np.testing.assert_allclose(_cubic(times, times), np.eye(frames), atol=1e-12)
+
+
+@pytest.mark.parametrize("warped", [False, True])
+def test_segments_together_are_seen_as_each_alone(people, warped):
+    clips = [clip.between(0, frames) for clip, frames in zip(people, (40, 31, 40, 2, 31, 40), strict=True)]
+    some = replace(people, clips=clips[:3] + clips[4:] if warped else clips)
+    references = reference_cycles(simulate(clips=16, frames=150, seed=1).with_rotations()) if warped else ()
+    view = TimedFrames.of(some, references=references)
+    together, alone = view.to(some), [view.to(replace(some, clips=[clip])) for clip in some]
+    for name, value in together.items():
+        torch.testing.assert_close(value, torch.cat([each[name] for each in alone]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(resting_offsets(some).float(), together[OFFSETS], atol=0, rtol=0)
 
 
 @pytest.mark.parametrize("file", ["bandai/bandai2.npz", "cmu/cmu8.npz"])

@@ -115,7 +115,7 @@ def shapes_of(motion: MotionSet, body: Body) -> Tensor:
         ValueError: the clips are on other joints, or have no rotations.
     """
     _check(motion, body)
-    return torch.stack([body.shape_of(resting_offsets(clip, motion.skeleton)) for clip in motion])
+    return body.shape_of(resting_offsets(motion))
 
 
 def retargeted(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
@@ -381,8 +381,7 @@ def _shapes(shapes: Tensor, motion: MotionSet, body: Body) -> Tensor:
 def _kept(motion: MotionSet, body: Body) -> Tensor:
     """Parameters (N, S) of motion that has the body's turns: those that joints tell, or else of about these lengths."""
     source, found = _Source.of(motion, body), []
-    for clip in motion:
-        offsets = resting_offsets(clip, motion.skeleton)
+    for offsets in resting_offsets(motion):
         shape = body.shape_of(offsets)
         if (body.offsets(shape) - offsets).abs().max() > SAME:
             unturned = torch.eye(3).to(offsets).expand(body.joints, 3, 3)
