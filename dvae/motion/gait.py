@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache, reduce
 from itertools import pairwise
 from typing import Annotated, Literal, NamedTuple
 
@@ -161,17 +162,21 @@ def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference],
         ValueError: a clip without rotations, or references of another rate than that of `cycles`.
     """
     compared, ratio = _at_rate(clip, skeleton.fps, cycles.rate)
-    hips, bent = _hips(compared, skeleton), _bent(compared, skeleton)
-    longest = int(cycles.longest * cycles.rate + 1e-6) + 1
+    turned = _turned(compared, skeleton)
+    hips, bent = _hips(turned), _bent(turned, skeleton)
+    longest = min(int(cycles.longest * cycles.rate + 1e-6) + 1, len(hips))
     shortest = int(np.ceil(cycles.shortest * cycles.rate - 1e-6)) + 1
+    swings = _deviations(bent[:, 0] - bent[:, 1], longest) >= cycles.swing
+    possible = swings & (_open(hips, longest) <= cycles.threshold)
+    possible[:, : shortest - 1] = False
     found = []
     for reference in references:
         if reference.rate != cycles.rate:
             raise ValueError(f"a reference has {reference.rate:g} frames a second, and cycles {cycles.rate:g}")
-        costs = subsequence_costs(_apart(reference.hips, hips), min(longest, len(hips)))
-        costs[:, : shortest - 1] = np.inf
-        costs[_deviations(bent[:, 0] - bent[:, 1], costs.shape[1]) < cycles.swing] = np.inf
-        costs[_open(hips, costs.shape[1]) > cycles.threshold] = np.inf
+        if not possible.any():
+            continue  # as in most clips, and costs are what takes long
+        costs = subsequence_costs(_apart(reference.hips, hips), longest)
+        costs[~possible] = np.inf
         for first, frames in _cheapest(costs, cycles.threshold, cycles.overlap):
             start, end = (min(round(place * ratio), clip.frames - 1) for place in (first, first + frames))
             found.append(Found(reference.side, start, end, float(costs[first, frames])))
@@ -193,11 +198,12 @@ def reference_cycles(motion: MotionSet, cycles: Cycles | None = None) -> tuple[R
     best = -np.inf
     for clip in [clip for clip in motion if clip.split == "train"] or motion:
         compared, _ = _at_rate(clip, motion.skeleton.fps, cycles.rate)
-        bent = _bent(compared, motion.skeleton)
+        turned = _turned(compared, motion.skeleton)
+        bent = _bent(turned, motion.skeleton)
         regular, period = _regularity(bent[:, 0] - bent[:, 1], cycles)
         best = max(best, regular)
         if regular >= cycles.regular:
-            hips = _hips(compared, motion.skeleton)
+            hips = _hips(turned)
             for own, angle in zip(walked, bent.T, strict=True):
                 own += [(hips[first : last + 1], clip) for first, last in _between_peaks(angle, period)]
     if not all(walked):
@@ -228,7 +234,7 @@ def stamps(clip: Clip, skeleton: Skeleton, references: Sequence[Reference], fram
         found: np.ndarray = between / np.linalg.norm(between, axis=-1, keepdims=True)
         return found
 
-    own = even(_hips(clip, skeleton))
+    own = even(_hips(_turned(clip, skeleton)))
     warped = [alignment(_apart(even(reference.hips), own)) for reference in references]
     places, _ = min(warped, key=lambda each: each[1])
     return places * ((clip.frames - 1) / (frames - 1))
@@ -241,12 +247,19 @@ def _at_rate(clip: Clip, fps: float, rate: float) -> tuple[Clip, float]:
     return (clip, 1.0) if fps == rate else (clip.resampled(fps / rate), fps / rate)
 
 
+@lru_cache(maxsize=8)
+def _resting(skeleton: Skeleton) -> torch.Tensor:
+    """Joints (J, 3) with nothing turned, and the root at 0."""
+    unturned = torch.eye(3, dtype=torch.float64).expand(skeleton.joints, 3, 3)
+    places, _ = forward(skeleton.parents, unturned, skeleton.offsets, unturned.new_zeros(3))
+    return places
+
+
+@lru_cache(maxsize=8)
 def _legs(skeleton: Skeleton) -> list[list[int]]:
     """For either side the joints from below the root down to the hip, and to the knee: of those where left and right
     leave the trunk, the lowest at rest."""
-    unturned = torch.eye(3, dtype=torch.float64).expand(skeleton.joints, 3, 3)
-    rest, _ = forward(skeleton.parents, unturned, skeleton.offsets, torch.zeros(3, dtype=torch.float64))
-    legs = []
+    rest, legs = _resting(skeleton), []
     for leaving in skeleton.sides:
         hip = min(leaving, key=lambda joint: float(rest[joint, skeleton.vertical]))
         below = [child for parent, child in skeleton.edges if parent == hip]
@@ -265,31 +278,26 @@ def _legs(skeleton: Skeleton) -> list[list[int]]:
 
 def _turned(clip: Clip, skeleton: Skeleton) -> torch.Tensor:
     """Of both thighs against the pelvis, (F, 2, 3, 3)."""
-    local = to_matrix(torch.from_numpy(clip.rotations).double(), "quaternion")
     found = []
     for *hips, _ in _legs(skeleton):
-        turn = local[:, hips[0]]
-        for joint in hips[1:]:
-            turn = turn @ local[:, joint]
-        found.append(turn)
+        turns = to_matrix(torch.from_numpy(clip.rotations)[:, hips].double(), "quaternion")
+        found.append(reduce(torch.matmul, turns.unbind(1)))
     return torch.stack(found, 1)
 
 
-def _hips(clip: Clip, skeleton: Skeleton) -> np.ndarray:
+def _hips(turned: torch.Tensor) -> np.ndarray:
     """The same as quaternions (F, 2, 4)."""
-    found: np.ndarray = from_matrix(_turned(clip, skeleton), "quaternion").numpy()
+    found: np.ndarray = from_matrix(turned, "quaternion").numpy()
     return found
 
 
-def _bent(clip: Clip, skeleton: Skeleton) -> np.ndarray:
+def _bent(turned: torch.Tensor, skeleton: Skeleton) -> np.ndarray:
     """How far the left and the right thigh are bent forward in the pelvis, (F, 2) in radians."""
-    unturned = torch.eye(3, dtype=torch.float64).expand(skeleton.joints, 3, 3)
-    rest, _ = forward(skeleton.parents, unturned, skeleton.offsets, torch.zeros(3, dtype=torch.float64))
     up = torch.eye(3, dtype=torch.float64)[skeleton.vertical]
     ahead = torch.tensor([0.0, 0.0, 1.0] if skeleton.up == "y" else [0.0, -1.0, 0.0], dtype=torch.float64)
-    ahead = rotate_about_up(ahead, skeleton.heading(rest), skeleton.up)
+    ahead = rotate_about_up(ahead, skeleton.heading(_resting(skeleton)), skeleton.up)
     knees = skeleton.offsets[[leg[-1] for leg in _legs(skeleton)]]
-    thighs = (_turned(clip, skeleton) @ knees[..., None]).squeeze(-1)
+    thighs = (turned @ knees[..., None]).squeeze(-1)
     found: np.ndarray = torch.atan2(thighs @ ahead, -thighs @ up).numpy()
     return found
 
