@@ -18,9 +18,10 @@ The middle of the hips is where the source has it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from itertools import pairwise
+from itertools import groupby, pairwise
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +35,7 @@ from ..kinematics import forward, swing
 from ..matching import parts
 from ..naming import sides
 from ..rotations import continuous, from_matrix, to_matrix
-from ..segments import resting_offsets
+from ..segments import AT_ONCE, resting_offsets
 from ..skeleton import Skeleton
 from .skinning import Body
 
@@ -97,13 +98,25 @@ def fitted(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> Motio
     seen = [source.seen(torch.from_numpy(clip.positions).double()) for clip in motion]
     each = torch.zeros(len(motion), body.parameters_of_shape, dtype=torch.float64)
     steep = torch.zeros(len(motion), dtype=torch.float64)
-    for people in _bodies(motion):
+    whose = np.zeros(len(motion), int)
+    for person, people in enumerate(_bodies(motion)):
+        whose[people] = person
         lengths = torch.cat([source.lengths(seen[n]) for n in people])
         each[people] = source.shape(body, lengths.mean(0))
         steep[people] = source.steepness([seen[n] for n in people], motion.skeleton.fps)
     each = each if shapes is None else _shapes(shapes, motion, body)
-    of_each = zip(seen, _joints(body, each), steep, strict=True)
-    return _made(motion, body, each, (source.turns(body, *own) for own in of_each))
+    joints, frames = _joints(body, each), [clip.frames for clip in motion]
+    alike = zip(np.cumsum(frames) // AT_ONCE, whose, each.tolist(), strict=True)
+
+    def turns() -> Iterator[tuple[Tensor, Tensor]]:
+        """Of clips one after the other, found for several of one body at once."""
+        for _, together in groupby(enumerate(alike), key=itemgetter(1)):
+            some = [n for n, _ in together]
+            marks = {part: torch.cat([seen[n][part] for n in some]) for part in seen[0]}
+            found = source.turns(body, marks, joints[some[0]], steep[some[0]])
+            yield from zip(*(values.split([frames[n] for n in some]) for values in found), strict=True)
+
+    return _made(motion, body, each, turns())
 
 
 def shapes_of(motion: MotionSet, body: Body) -> Tensor:

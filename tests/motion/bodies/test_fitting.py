@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dvae.motion import Clip, MotionSet, Skeleton, TimedFrames, gait_cycles, read_motion, rotations, simulate
-from dvae.motion.bodies import SHAPE, Body, betas, fitted, human, retargeted, shapes_of
+from dvae.motion.bodies import SHAPE, Body, betas, fitted, fitting, human, retargeted, shapes_of
 from dvae.motion.matching import parts
 from dvae.motion.naming import sides
 from dvae.motion.segments import OFFSETS
@@ -108,6 +108,17 @@ def test_one_body_has_one_shape_and_others_have_others(walkers):
     torch.testing.assert_close(found[::2], found[1::2], atol=1e-4, rtol=0)
     assert torch.pdist(found[::2]).min() > 0.1
     assert found.abs().max() < 3 + 1e-4
+
+
+def test_clips_together_are_put_onto_the_body_as_each_alone(walkers, monkeypatch):
+    cut = [replace(part, name=f"{clip.name}-{n}") for clip in walkers for n, part in enumerate((clip, clip))]
+    shape = shapes(6).repeat_interleave(torch.tensor([1, 3, 2, 2, 3, 1]), dim=0)
+    monkeypatch.setattr(fitting, "AT_ONCE", 250)  # blocks that begin and end amid clips of one body
+    together = fitted(replace(walkers, clips=cut), PERSON, shape)
+    for clip, own, found in zip(cut, shape, together, strict=True):
+        (alone,) = fitted(replace(walkers, clips=[clip]), PERSON, own)
+        np.testing.assert_allclose(found.positions, alone.positions, atol=1e-6)
+        np.testing.assert_allclose(found.rotations, alone.rotations, atol=1e-6)
 
 
 def test_a_body_is_fitted_to_the_lengths_of_bones():
