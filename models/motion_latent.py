@@ -18,7 +18,7 @@ size for both phases, and the layer by whose gradients weights adapt, the last t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -58,7 +58,7 @@ class MotionLatent(Method):
         kl: weight of the KL.
         scale: standard deviation of all numbers of chi.
         deviation: metres, that of a vertex.
-        finish: share of training that is the second phase; 0 for the first alone.
+        finish: share of training that is the second phase; 0 for the first alone, 1 for the second.
         finish_rate: its learning rate.
         pace: how fast adaptive weights move; 0 to leave them 1.
     """
@@ -118,16 +118,18 @@ class MotionLatent(Method):
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """Two stages of adaptive weights: errors of chi, then of the surface and of time."""
+        """Two stages of adaptive weights: errors of chi, then of the surface and of time; those that have steps."""
         second = round(self.finish * steps) if isinstance(Schema.of(train), SegmentSchema) else 0
-        stages = [Stage(steps - second, self._weighing(PARTS, Evidence(kl_weight=self.kl, select="loss")))]
-        if second:
-            others = Evidence(kl_weight=self.kl, likelihood_weight=0.0, draws={"z": 1}, select="loss")
-            stages.append(Stage(second, self._weighing((SURFACE, TIME), others), self.finish_rate))
+        first = Evidence(kl_weight=self.kl, select="loss")
+        others = replace(first, likelihood_weight=0.0, draws={"z": 1})
+        phases = [(steps - second, PARTS, first, None), (second, (SURFACE, TIME), others, self.finish_rate)]
+        stages = [Stage(many, self._weighing(tasks, rest), rate) for many, tasks, rest, rate in phases if many]
         return Recipe(train, validation, stages)
 
     def _weighing(self, tasks: tuple[str, ...], others: Evidence) -> GradNorm:
-        shared = f"generator.{TURNS}.network.trunk.hidden.{2 * len(self.widths) - 2}."  # of the last, only rows are a task's
+        shared = (
+            f"generator.{TURNS}.network.trunk.hidden.{2 * len(self.widths) - 2}."  # of the last, only rows are a task's
+        )
         return GradNorm(tasks, shared, others, asymmetry=0.0, learning_rate=self.pace)
 
 

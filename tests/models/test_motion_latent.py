@@ -78,8 +78,17 @@ def test_training_has_two_phases_of_adaptive_weights(segments, tmp_path):
         assert not weights or sum(weights) == pytest.approx(len(weights))
     last = max((row for row in result.history if "weight/surface" in row), key=lambda row: row["step"])
     assert last["weight/surface"] != 1
-    alone = MotionLatent(latent=4, widths=(32, 16), finish=0.0).train(segments, None, 30)
-    assert [stage.steps for stage in alone.stages] == [30]
+
+
+@pytest.mark.parametrize(
+    ("finish", "steps", "phases"),
+    [(0.0, 30, {PARTS: 30}), (1.0, 2, {(SURFACE, "time"): 2}), (0.6, 1, {(SURFACE, "time"): 1}), (0.4, 1, {PARTS: 1})],
+)
+def test_a_phase_without_steps_is_left_out(finish, steps, phases, segments):
+    method = MotionLatent(latent=4, widths=(32, 16), finish=finish)
+    recipe = method.train(segments, None, steps)
+    assert {stage.objective.tasks: stage.steps for stage in recipe.stages} == phases
+    assert len(recipe.fit(made(segments, method), batch_size=4, log_every=1, progress=False).history) == steps
 
 
 def test_training_brings_surfaces_nearer(segments):
