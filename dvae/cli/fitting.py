@@ -27,6 +27,7 @@ from ..models.trajectories import TrajectoryMethod
 from ..motion.dataset import SIMULATED
 from ..motion.protocols import Representation
 from ..motion.segmented import Cut
+from ..options import Amount
 from ..runs import directory as runs
 from ..runs.kinds import DATA
 from ..runs.sweep import sweep as sweep_methods
@@ -91,6 +92,7 @@ class DataOptions:
         cut: of motion-latent: segments are gait cycles, or clips as they are, where they last 0.3 to 3 seconds.
         scaling: of motion-latent: of turns, less no turn, or less their mean and by their deviation.
         warped: of motion-latent: time goes along the most typical gait cycles, instead of evenly.
+        bodies: of motion-latent: deviation of shapes of bodies that are drawn for training segments; 0 for their own.
     """
 
     data: str = SIMULATED
@@ -101,6 +103,7 @@ class DataOptions:
     cut: Cut = "gait"
     scaling: Literal["identity", "deviation"] = "identity"
     warped: bool = False
+    bodies: Amount = 1.0
 
     def open(self, *methods: Trainable) -> Any:
         """The data on which methods are fitted, of one kind.
@@ -120,7 +123,7 @@ class DataOptions:
         return DATA[kind].open(given.pop("data", SIMULATED), **given)
 
 
-OF_KINDS = {"motion": ("protocol", "representation", "missing"), "segments": ("cut", "scaling", "warped")}
+OF_KINDS = {"motion": ("protocol", "representation", "missing"), "segments": ("cut", "scaling", "warped", "bodies")}
 """Options by the kind of data that has them."""
 
 

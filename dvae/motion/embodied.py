@@ -21,6 +21,7 @@ from ..options import tuples
 from ..schema import Schema
 from ..views import WHOLE, Parts
 from .bodies import Body, human, shapes_of
+from .bodies.fitting import MOST, standing
 from .data import MotionSet
 from .gait import Reference
 from .segments import OFFSETS, ORIGIN, TimedFrames
@@ -96,6 +97,8 @@ class Segments:
         timed: how they become frames; that of the training data, for held-out ones.
         body: whose joints these are; the person that ships by default.
         seen: what `timed` makes of them, where that is known.
+        bodies: deviation of the parameters of bodies that `sample` draws for segments in place of their own, places in
+            lengths of legs (see `bodies.retargeted`); 0 for their own. Who has learned from few bodies knows no others.
 
     Raises:
         ValueError: motion on other joints.
@@ -107,8 +110,9 @@ class Segments:
         timed: TimedFrames | None = None,
         body: Body | None = None,
         seen: Batch | None = None,
+        bodies: float = 0.0,
     ):
-        self.motion, self.body = motion, body or human()
+        self.motion, self.body, self.bodies = motion, body or human(), bodies
         if timed is None:
             timed, seen = TimedFrames.seeing(motion)
         self.timed, seen = timed, seen or timed.to(motion)
@@ -125,7 +129,18 @@ class Segments:
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """So many different ones in random order; all of them if there are no more."""
         chosen = torch.randperm(len(self), generator=generator)[:batch_size]
-        return each(self._batch, lambda value: value[chosen])
+        batch = each(self._batch, lambda value: value[chosen])
+        if not self.bodies:
+            return batch
+        drawn = self.bodies * torch.randn(batch[SHAPE].shape, generator=generator)
+        return self.on(batch, drawn.clamp(-MOST, MOST))
+
+    def on(self, batch: Batch, shape: Tensor) -> Batch:
+        """The same turns and times on bodies (B, S), places in lengths of legs."""
+        legs = [standing(self.body, shapes).to(shape) for shapes in (batch[SHAPE], shape)]
+        x = batch[WHOLE].clone()
+        x[..., self.timed.parts["place"]] *= (legs[1] / legs[0])[:, None, None]
+        return {WHOLE: x, SHAPE: shape}
 
     @property
     def labels(self) -> Sequence[Mapping[str, str]]:

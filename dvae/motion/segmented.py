@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Self
 
-from ..options import check, nearest
+from ..options import Amount, check, nearest
 from .bodies import fitted, human
 from .data import Clip, MotionSet
 from .dataset import SIMULATED
@@ -36,12 +36,14 @@ class Takes:
         fingerprint: SHA-256 of the clips, and of how they are cut.
         cut: how they are.
         skip_bad: whether unusable clips were left out.
+        bodies: those on which training segments were learned, see `Segments`.
     """
 
     path: str
     fingerprint: str
     cut: Cut = "gait"
     skip_bad: bool = False
+    bodies: Amount = 1.0
 
     def __post_init__(self) -> None:
         check(self)
@@ -61,6 +63,7 @@ class SegmentData:
         skip_bad: whether unusable clips were left out.
         scaling: of turns, see `TimedFrames.of`.
         warped: time goes along the gait cycles that are most typical of these data, see `TimedFrames`.
+        bodies: deviation of the shapes on which training segments are drawn, see `Segments`; 0 for their own.
         seen: as which frames, those of a run; else those that training segments give.
     """
 
@@ -76,6 +79,7 @@ class SegmentData:
     skip_bad: bool = False
     scaling: Literal["identity", "deviation"] = "identity"
     warped: bool = False
+    bodies: Amount = 1.0
     seen: TimedFrames | None = None
 
     def __post_init__(self) -> None:
@@ -89,7 +93,7 @@ class SegmentData:
             path: of a file or folder that `read_motion` reads, or "simulated" for `simulate()`. Takes that are in
                 neither split "train" nor "test" are divided, the last fifth of them for test; of one alone, its end.
             skip_bad: leave out unusable clips instead of refusing the file.
-            **options: cut, scaling, warped and seen, see the class.
+            **options: cut, scaling, warped, bodies and seen, see the class.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -177,7 +181,7 @@ class SegmentData:
 
     def recorded(self) -> Takes:
         """Where the clips are; `reopened` reads it."""
-        return Takes(self.path, self.fingerprint, self.cut, self.skip_bad)
+        return Takes(self.path, self.fingerprint, self.cut, self.skip_bad, self.bodies)
 
     @classmethod
     def reopened(cls, source: Takes, schema: SegmentSchema, path: str | os.PathLike[str] | None = None) -> Self:
@@ -191,17 +195,18 @@ class SegmentData:
         Raises:
             FileNotFoundError, ValueError: see `open`.
         """
-        return cls.open(path or source.path, source.skip_bad, cut=source.cut, seen=schema.timed)
+        kept = {"cut": source.cut, "bodies": source.bodies}
+        return cls.open(path or source.path, source.skip_bad, **kept, seen=schema.timed)
 
     @cached_property
     def _training(self) -> Segments:
         """Those from which frames have their units, unless these are those of a run."""
         motion = self._of("train")
         if self.seen is not None:
-            return Segments(motion, self.seen)
+            return Segments(motion, self.seen, bodies=self.bodies)
         references = reference_cycles(self._embodied) if self.warped else ()
         timed, seen = TimedFrames.seeing(motion, scaling=self.scaling, references=references)
-        return Segments(motion, timed, seen=seen)
+        return Segments(motion, timed, seen=seen, bodies=self.bodies)
 
     @cached_property
     def _embodied(self) -> MotionSet:

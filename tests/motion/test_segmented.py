@@ -68,6 +68,27 @@ def test_what_is_reopened_is_cut_and_seen_as_it_was(options, tmp_path):
     assert other.fingerprint != source.fingerprint
 
 
+def test_training_segments_are_drawn_on_other_bodies_with_places_in_lengths_of_legs(data):
+    train, held, own = data.windows("train"), data.windows("validation"), replace(data, bodies=0.0).windows("train")
+    drawn, again, kept = (each.sample(len(train), torch.Generator().manual_seed(3)) for each in (train, train, own))
+    assert torch.equal(drawn["x"], again["x"])
+    for known in (held.sample(1, torch.Generator())["beta"], kept["beta"][:1]):
+        assert any(torch.equal(known[0], beta) for each in (held, own) for beta in each.all()["beta"])
+    assert 0.8 < drawn["beta"].std() < 1.2
+    turns = train.timed.parts["turns"]
+    order = torch.cdist(drawn["x"][..., turns].flatten(1), train.all()["x"][..., turns].flatten(1)).argmin(1)
+    assert order.sort().values.equal(torch.arange(len(train)))
+    chosen = replace(train.motion, clips=[train.motion.clips[n] for n in order])
+    moved = motion.bodies.retargeted(chosen, motion.bodies.human(), drawn["beta"].double())
+    for ours, theirs in zip(*map(_whatever_the_heading, (drawn["x"], train.timed.to(moved)["x"])), strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=0)
+
+
+def _whatever_the_heading(x):
+    """Of frames: turns of joints but the root, how far it is gone, and time; its heading is seen in joints' places."""
+    return x[..., 6:-4], x[..., -4:-1:2].norm(dim=-1), x[..., -3], x[..., -1]
+
+
 def test_clips_are_segments_as_they_are_where_they_last_as_long_as_one():
     clips = [replace(clip, positions=clip.positions[: 5 + 12 * n]) for n, clip in enumerate(PEOPLE)]
     data = SegmentData("simulated", replace(PEOPLE, clips=clips), "clips")

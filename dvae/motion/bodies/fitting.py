@@ -147,7 +147,7 @@ def retargeted(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
     """
     _check(motion, body)
     each = _shapes(shapes, motion, body)
-    scales = _standing(body, each) / _standing(body, shapes_of(motion, body))
+    scales = standing(body, each) / standing(body, shapes_of(motion, body))
     turns = (_turns(clip, motion.skeleton) for clip in motion)
     return _made(
         motion, body, each, ((local, scale * place) for scale, (local, place) in zip(scales, turns, strict=True))
@@ -372,8 +372,8 @@ def _joints(body: Body, shapes: Tensor) -> Tensor:
     return places
 
 
-def _standing(body: Body, shapes: Tensor) -> Tensor:
-    """Heights (N,) of the root above the soles of bodies (N, S) at rest."""
+def standing(body: Body, shapes: Tensor) -> Tensor:
+    """Heights (N,) of the root above the soles of bodies (N, S) at rest, in metres, float64."""
     found = []
     for some in shapes.to(body.template).split(256):
         vertices, joints = body.at_rest(some)
