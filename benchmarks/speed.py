@@ -4,6 +4,7 @@
     chain     an SRNN training step with a plain loop over z_{t-1} against the fused one
     cache     generation with caches against recomputing the prefix at every step, Attention
     linear    seconds of a training step over T, Recurrent: the exponent of a power law
+    segments  segments seen as time-stamped frames against forward kinematics of as many poses, on one core
     the family, by name: a whole training step (forward, backward, Adam) at the layer sizes of the public
               implementation, in units of one 2048 x 2048 x 2048 float32 product timed beside it
 
@@ -21,6 +22,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -28,6 +30,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 import dvae
+from dvae import motion
 from dvae.laws.chain import gaussian_chain
 from dvae.networks.base import shift
 
@@ -37,6 +40,7 @@ TARGETS = {
     "chain": ("at least", 1.0),
     "cache": ("at least", 8.0),
     "linear": ("at most", 1.1),  # 1 is linear; what is timed is exact to a few percent
+    "segments": ("at most", 3.0),
     "vrnn": ("at most", 0.98),
     "srnn": ("at most", 0.45),
     "dkf": ("at most", 0.45),
@@ -177,6 +181,20 @@ def linear() -> float:
     return math.log(times[-1] / times[0]) / math.log(lengths[-1] / lengths[0])
 
 
+def segments() -> float:
+    """Frames of segments of .7 to 1.6 seconds over the forward kinematics of so many poses, on one core."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    people = motion.simulate(clips=200, frames=50, seed=1).with_rotations()
+    some = replace(people, clips=[clip.between(0, 20 + 3 * (n % 10)) for n, clip in enumerate(people)])
+    view = motion.TimedFrames.of(some)
+    turns, places = view.poses(view.to(some)["x"].double())
+    parents, offsets = people.skeleton.parents, people.skeleton.offsets
+    a, b = seconds(lambda: view.to(some), lambda: motion.kinematics.forward(parents, turns, offsets, places), repeat=5)
+    torch.set_num_threads(threads)
+    return a / b
+
+
 def member(name: str, x: Tensor) -> float:
     """Training step of a member of the family over one matrix product."""
     model = dvae.method(name, **FAMILY[name]).build({"x": SIZE})
@@ -201,7 +219,7 @@ def start(description: str | None, *options: str) -> argparse.Namespace:
 def main() -> None:
     options = start(__doc__, "--out")
     x = torch.randn(BATCH, STEPS, SIZE)
-    ratios = {"program": program(x), "chain": chain(x), "cache": cache(), "linear": linear()}
+    ratios = {"program": program(x), "chain": chain(x), "cache": cache(), "linear": linear(), "segments": segments()}
     ratios |= {name: member(name, x) for name in FAMILY}
     if options.out:
         options.out.write_text(json.dumps(ratios, indent=1))
