@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from math import ceil
 from typing import Any
 
@@ -28,6 +29,7 @@ from ..options import Count, Delay, Positive, Size, check
 from ..program.batch import repeat, rows
 from ..turns import alone
 from .bounds import ImportanceBound, importance_mean
+from .result import progress_bar
 
 _Program = Callable[[Any], Any]
 Values = Mapping[str, Tensor]
@@ -125,7 +127,9 @@ class Posterior:
 
     @alone
     @torch.no_grad()
-    def evidence(self, program: _Program, batch: Any, particles: int = 200, *, seed: int = 0) -> ImportanceBound:
+    def evidence(
+        self, program: _Program, batch: Any, particles: int = 200, *, seed: int = 0, chunk: int = 4096
+    ) -> ImportanceBound:
         """The log evidence of what was seen, by importance sampling from the normal, and k-hat of its weights.
 
         A k-hat above 0.7 says that the posterior is not like the normal: take its intervals as rough.
@@ -134,6 +138,7 @@ class Posterior:
             program, batch: of which this is the posterior.
             particles: K.
             seed: of the draws.
+            chunk: sequences times particles to hold at once.
         """
         generator = torch.Generator().manual_seed(seed)
         law = dist.MultivariateNormal(torch.zeros_like(self.factor[..., 0]), scale_tril=self.factor)
@@ -143,7 +148,7 @@ class Posterior:
             drawn = _split((_joined(self.mode) + away).flatten(0, 1), self.mode)
             return -_energy(program, repeat(batch, count), drawn) - law.log_prob(away).flatten()
 
-        return importance_mean(log_weights, len(self.factor), particles)
+        return importance_mean(log_weights, len(self.factor), particles, chunk)
 
     def _away(self, n: int, generator: torch.Generator) -> Tensor:
         """(n, B, P) draws from the normal, less its mean."""
@@ -161,6 +166,7 @@ def posterior(
     renew: Callable[[Mapping[str, Any], Values], Mapping[str, Any]] | None = None,
     seed: int = 0,
     chunk: int = 2048,
+    progress: bool = False,
 ) -> Posterior:
     """The posterior of a program's latents given a batch.
 
@@ -175,6 +181,7 @@ def posterior(
             batch and the latents every `descent.renewed` steps, without gradients.
         seed: of the candidates.
         chunk: sequences times starts to hold at once.
+        progress: whether to show a progress bar.
 
     Raises:
         ValueError: a program without latents, with sites of which sequences have no log-density of their own, or with
@@ -192,12 +199,12 @@ def posterior(
     descent = descent or Descent()
     size, at_once = len(_some(batch)), max(1, chunk // descent.starts)
     device = _some(batch).device
-    with torch.random.fork_rng([device] if device.type == "cuda" else []), pyro.validation_enabled(False):
+    forked = torch.random.fork_rng([device] if device.type == "cuda" else [])
+    with forked, pyro.validation_enabled(False), progress_bar(progress) as bar:
         torch.manual_seed(seed)
-        parts = [
-            _Search(program, rows(batch, slice(first, first + at_once)), guide, descent, renew).run()
-            for first in range(0, size, at_once)
-        ]
+        chunks = [rows(batch, slice(first, first + at_once)) for first in range(0, size, at_once)]
+        task = bar.add_task("looking for modes", total=len(chunks) * (descent.steps + descent.newton + 1))
+        parts = [_Search(program, chunk, guide, descent, renew, partial(bar.advance, task)).run() for chunk in chunks]
     return parts[0] if len(parts) == 1 else _together(parts)
 
 
@@ -209,8 +216,16 @@ def _some(batch: Any) -> Tensor:
 class _Search:
     """Of one chunk of sequences."""
 
-    def __init__(self, program: _Program, batch: Any, guide: _Program | None, descent: Descent, renew: Any):
-        self.program, self.batch, self.guide, self.descent = program, batch, guide, descent
+    def __init__(
+        self,
+        program: _Program,
+        batch: Any,
+        guide: _Program | None,
+        descent: Descent,
+        renew: Any,
+        went: Callable[[], object],
+    ):
+        self.program, self.batch, self.guide, self.descent, self.went = program, batch, guide, descent, went
         self.size = len(_some(batch))
         self.renew = renew or (lambda batch, values: batch)
         self.latents: dict[str, Tensor] = {}  # of which shapes are read
@@ -237,6 +252,7 @@ class _Search:
             step = -(factor @ factor.mT @ gradient[..., None]).squeeze(-1)
             if round < self.descent.newton:
                 values = self._lower(batch, values, step)
+            self.went()
         left = -(gradient * step).sum(-1) / 2
         return Posterior(
             _split(values, self.latents),
@@ -291,6 +307,7 @@ class _Search:
             adam.step()
             falling.step()
             course.append(energy.detach())
+            self.went()
         return values.detach().unflatten(0, starts.shape[:2]), torch.stack(course).unflatten(1, starts.shape[:2])
 
     def _energy(self, batch: Any, values: Tensor, sites: Collection[str] | None = None) -> Tensor:

@@ -11,6 +11,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import is_dataclass
 from importlib import import_module
 from itertools import pairwise
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -36,6 +37,7 @@ COMMANDS = {
     "forecast": ("futures:forecast", "Forecast the test windows, or those of one clip, many times each."),
     "complete": ("futures:complete", "Complete motion along paths of some joints, from a clip or from a file."),
     "interpolate": ("segments:interpolate", "Go from one segment of motion to another in a run's latent space."),
+    "recover": ("segments:recover", "Recover whole segments of motion from what was seen of them, and how surely."),
     "impute": ("futures:impute", "Fill in the joints that windows or clips lack, several times each."),
     "animate": ("futures:animate", "Play forecasts beside what happened, or a clip, as moving skeletons."),
     "report": ("report:report", "Put what is known of runs on one page, with moving futures."),
@@ -115,9 +117,9 @@ def _meant(given: Sequence[str]) -> Iterator[str]:
 
     name, *rest = given
     hints = get_type_hints(called)
-    if name in ("fit", "sweep"):
-        for kind in (hints["training"], hints["source"], *methods().values()):
-            hints = get_type_hints(kind) | hints
+    kinds = [*filter(is_dataclass, hints.values()), *(methods().values() if name in ("fit", "sweep") else ())]
+    for kind in kinds:
+        hints = get_type_hints(kind) | hints
     choices = {option: _choices(hint) for option, hint in hints.items()}
     names = {"fit": [*methods(), *judges()], "sweep": choices.get("method"), "data": choices.get("action")}.get(name)
     for before, word in pairwise(["", *rest]):

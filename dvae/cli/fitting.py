@@ -271,7 +271,10 @@ def _use(name: str, run: Path) -> str:
         return f"score {what} with: dvae evaluate RUN {option} {run}"
     if methods()[name].fitted_on == "segments":
         between = f"go from one segment to another with: dvae interpolate {run} --from CLIP --to CLIP"
-        return f"score it with: dvae evaluate {run}, {between}"
+        return (
+            f"score it with: dvae evaluate {run}, {between}, recover one from a part of it with: dvae recover {run} "
+            "--from CLIP --seen markers"
+        )
     if issubclass(methods()[name], TrajectoryMethod):
         joints = f"{run} --joints JOINT …"
         return f"score it with: dvae evaluate {joints}, move it with: dvae complete {joints}"

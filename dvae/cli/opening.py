@@ -17,8 +17,8 @@ from ..views import View
 from .console import UsageError, note
 
 USES = {
-    "motion": "forecasts and has no segments; use dvae forecast, animate or evaluate",
-    "segments": "makes whole segments and forecasts nothing; use dvae evaluate or interpolate",
+    "motion": "forecasts and has no segments; use dvae forecast, complete, animate or evaluate",
+    "segments": "makes whole segments and forecasts nothing; use dvae evaluate, interpolate or recover",
 }
 """What there is for runs, by the kind of their data."""
 

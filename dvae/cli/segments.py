@@ -1,22 +1,36 @@
-"""Commands on latent spaces of segments: interpolate."""
+"""Commands on latent spaces of segments: interpolate, recover."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import pi
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import torch
 import tyro
 
 from .. import motion
+from ..data import Batch
+from ..inference.posteriors import Descent
+from ..motion.completion import Deviations, glimpsed
+from ..motion.embodied import SHAPE
 from ..motion.interpolation import Interpolation
 from ..motion.interpolation import interpolate as interpolate_segments
+from ..motion.recovery import Recovered, read_seen
+from ..motion.recovery import recover as recover_segments
 from ..motion.segments import resting_offsets
+from ..options import Positive, Range, check
+from ..views import WHOLE
 from . import opening
-from .console import ERROR, OUT, UsageError, at_least, check_files
+from .console import ERROR, OUT, UsageError, at_least, check_files, note
 
-MOST_STEPS = 100
+MOST_STEPS = MOST_DRAWS = 100
+
+APART = 3.0
+"""Nats by which a search may still fall, and deviations that segments may be from what was seen, without a note."""
 
 
 def interpolate(
@@ -69,22 +83,184 @@ def _write(out: Path, found: Interpolation, fps: float | None) -> None:
     if suffix == ".npz":
         motion.write_motion(out, steps)
     elif suffix in (".html", ".htm"):
-        from ..motion.plot import animate, save_html
-
-        frames = max(clip.frames for clip in steps)
-        still = [np.pad(c.positions, ((0, frames - c.frames), (0, 0), (0, 0)), mode="edge") for c in steps]
         told = zip(found.shares.tolist(), found.durations[0].tolist(), strict=True)
-        names = [f"{share:.2f}: {seconds:.2f} s" for share, seconds in told]
-        save_html(animate(steps.skeleton, still[0][:1], np.stack(still)[:, 1:], names=names), out)
+        _save_page(out, steps, [f"{share:.2f}: {seconds:.2f} s" for share, seconds in told])
     elif suffix:
         motion.write_motion(out, _alone(steps, steps.clips[len(steps) // 2]))
     else:
-        for clip in steps:
-            motion.write_motion(out / f"{clip.name}.bvh", _alone(steps, clip))
+        _save_folder(out, steps)
 
 
-def _alone(steps: motion.MotionSet, clip: motion.Clip) -> motion.MotionSet:
+def _save_page(out: Path, made: motion.MotionSet, names: Sequence[str], truth: motion.MotionSet | None = None) -> None:
+    """Clips that move side by side; who is done stays as it ends."""
+    from ..motion.plot import animate, save_html
+
+    clips = [*made, *(truth or ())]
+    frames = max(clip.frames for clip in clips)
+    still = np.stack([np.pad(c.positions, ((0, frames - c.frames), (0, 0), (0, 0)), mode="edge") for c in clips])
+    samples, real = still[: len(made), 1:], None if truth is None else still[-1, 1:]
+    save_html(animate(made.skeleton, still[0, :1], samples, real, names=names), out)
+
+
+def _save_folder(out: Path, made: motion.MotionSet) -> None:
+    """A BVH file for each clip."""
+    for clip in made:
+        motion.write_motion(out / f"{clip.name}.bvh", _alone(made, clip))
+
+
+def _alone(made: motion.MotionSet, clip: motion.Clip) -> motion.MotionSet:
     """One of the clips, with the rest pose of its own body."""
-    alone = replace(steps, clips=[clip])
+    alone = replace(made, clips=[clip])
     rest = tuple(resting_offsets(alone).flatten().tolist())
-    return replace(alone, skeleton=replace(steps.skeleton, rest=rest))
+    return replace(alone, skeleton=replace(made.skeleton, rest=rest))
+
+
+@dataclass(frozen=True)
+class Glimpse:
+    """What is seen of known segments.
+
+    Args:
+        seen: of the segments that --from names.
+        seconds: that are seen, from the start on; all by default.
+        fps: moments a second that are seen; 30 by default.
+        frames: that are seen in place of these, so many of the 100 of a segment, evenly, at times that nobody knows.
+        points: seen of the surface at each moment.
+        gaps: share of points or markers that are missing.
+        known_body: the shape of the body is known, and not looked for.
+    """
+
+    seen: Literal["surfaces", "points", "markers"] | None = None
+    seconds: Positive | None = None
+    fps: Annotated[float, Range(1, 1000)] | None = None
+    frames: Annotated[int, Range(1, 1000)] | None = None
+    points: Annotated[int, Range(1, 10_000)] = 50
+    gaps: Annotated[float, Range(0, 1, below=True)] = 0.0
+    known_body: bool = False
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.frames is not None and (self.seconds, self.fps) != (None, None):
+            raise ValueError("--frames are seen at unknown times, --seconds and --fps at known ones; give either")
+
+    def of(self, model: Any, truth: Batch, seed: int) -> dict[str, torch.Tensor]:
+        """What is seen of x (B, N, D) and beta (B, S)."""
+        if self.seen is None:
+            raise UsageError("--from names what is looked at, and --seen what of it: surfaces, points or markers")
+        x, shape = truth[WHOLE], truth[SHAPE]
+        chosen = None
+        if self.frames is not None:
+            if self.frames > model.timed.frames:
+                raise UsageError(f"--frames is {self.frames}; segments of this run have {model.timed.frames}")
+            chosen = np.linspace(0, model.timed.frames - 1, self.frames).round().tolist()
+        how: dict[str, Any] = {"seconds": self.seconds, "frames": chosen, "points": self.points, "gaps": self.gaps}
+        found = glimpsed(model, x, shape, self.seen, fps=self.fps or 30.0, seed=seed, **how)
+        return found | ({SHAPE: shape} if self.known_body else {})
+
+
+def recover(
+    run: Annotated[Path, tyro.conf.Positional],
+    glimpse: Glimpse,
+    deviations: Deviations,
+    descent: Descent,
+    source: Annotated[tuple[str, ...], tyro.conf.arg(name="from")] = (),
+    file: Path | None = None,
+    draws: int = 5,
+    out: Path | None = None,
+    seed: int = 0,
+    data: str | None = None,
+) -> None:
+    """Recover whole segments, with their timing and bodies, from what was seen of them.
+
+    What was seen is a glimpse of known segments (--from NAME --seen KIND), to see how well the rest is found: their
+    first quarter of a second (--seen surfaces --seconds .25), a few points of the surface, markers, or some frames at
+    unknown times. Or it is a --file of somebody's own: an npz of arrays `times` (K,) in seconds or `frames` (K,) of
+    100, and some of `surfaces` (K, vertices, 3), `points` (K, any, 3) and `markers` (K, 16, 3) in metres, NaN where
+    nothing was seen; `beta` (S,) where the body is known; or of several segments, (B, K, ...). Somebody starts at the
+    origin, facing heading zero.
+
+    Prints what was found: how long it lasts and how far it gets, with intervals, how far it is from what was seen and,
+    where that is known, from the truth, and how surely it is the most probable one.
+
+    A name that ends in .npz gets the most probable segments and draws from the posterior as clips of a motion file. Of
+    one segment, .html gets a page on which truth, the most probable and draws move side by side, .bvh the most
+    probable. A name without an ending is a new folder, with a BVH file for each clip.
+
+    Args:
+        run: the run directory of a motion-latent.
+        glimpse: what is seen of known segments.
+        deviations: how far what was seen is from what the model makes, standard deviations.
+        descent: how the most probable segments are looked for.
+        source: names of segments; or of takes, of which it is the first one; or split/name.
+        file: what somebody has seen, instead.
+        draws: from the posterior, to write.
+        out: the file to write.
+        seed: of starts, draws and glimpses.
+        data: where the data lie now, if the path in the run no longer leads there; or other data.
+    """
+    at_least(0, draws=draws)
+    if draws > MOST_DRAWS:
+        raise UsageError(f"--draws is {draws}; it must be at most {MOST_DRAWS}")
+    check_files(out, None, ".npz", ".html", ".htm", ".bvh", "")
+    if bool(source) == (file is not None):
+        raise UsageError("give what was seen, either of the run's segments (--from NAME --seen KIND) or as a --file")
+    if file is not None and (glimpse != Glimpse() or data is not None):
+        raise UsageError("a --file says all that was seen; --data, and what is seen of segments, go with --from")
+    loaded = opening.load_run(run, data, "segments")
+    opening.note_unfinished([loaded])
+    truth, model = None, loaded.model
+    if file is None:
+        opened = opening.data_of(data, loaded)
+        chosen = [opened.found(name) for name in source]
+        keys = [each.motion.clips[0].key for each in chosen]
+        if len({name for _, name in keys}) < len(keys):
+            raise UsageError(f"--from {' '.join(source)} names a segment twice, or two that are called the same")
+        truth = {name: torch.cat([each.all()[name] for each in chosen]) for name in (WHOLE, SHAPE)}
+        seen = glimpse.of(model, truth, seed)
+    else:
+        seen = read_seen(file, model)
+        keys = [("seen", f"{file.stem}-{n:02d}") for n in range(len(next(iter(seen.values()))))]
+    if out is not None and out.suffix.lower() not in (".npz", "") and len(keys) > 1:
+        raise UsageError(f"--out {out} shows one segment, of {len(keys)}; end its name in .npz, or in nothing")
+    how: dict[str, Any] = {"truth": truth, "deviations": deviations, "descent": descent, "seed": seed}
+    found = recover_segments(model, seen, keys, **how, progress=True)
+    OUT.print(found.table())
+    for doubt in _doubts(found, deviations):
+        note(doubt)
+    if out is not None:
+        drawn = 0 if out.suffix.lower() == ".bvh" else draws
+        _write_recovered(out, found, drawn)
+        names = ", ".join(map("/".join, keys))
+        ERROR.print(f"wrote {out}: the most probable of {names}" + f", and {drawn} draws of each" * (drawn > 0))
+
+
+def _doubts(found: Recovered, deviations: Deviations) -> Iterator[str]:
+    """What whoever reads the table should know of it."""
+    left = found.found.posterior.left
+    if many := int((left > APART).sum()):
+        yield (
+            f"{many} of {len(left)} segments not converged, with up to {float(left.max()):,.0f} nats left; give more "
+            "--steps or --starts, or allow for larger deviations"
+        )
+    for name, away in found.away.items():
+        option, allowed = name.removesuffix("s"), deviations.of(name)
+        apart = float(away.max()) / (8 / pi) ** 0.5  # the mean length of three normal coordinates
+        if apart > APART * allowed:
+            yield (
+                f"the {name} are up to {1000 * float(away.max()):.0f} mm from what this run makes, and --{option} "
+                f"{allowed:g} allows for {1000 * allowed:g} mm in each coordinate: intervals are too narrow; try "
+                f"--{option} {apart:.2g}"
+            )
+
+
+def _write_recovered(out: Path, found: Recovered, draws: int) -> None:
+    """The most probable segments and draws as a motion file, a page of one, its BVH, or a folder of these."""
+    made, suffix = found.motion(draws), out.suffix.lower()
+    if suffix == ".npz":
+        motion.write_motion(out, made)
+    elif suffix in (".html", ".htm"):
+        names = ["most probable", *(f"draw {n}" for n in range(1, draws + 1))]
+        _save_page(out, made, names, found.true_motion())
+    elif suffix:
+        motion.write_motion(out, _alone(made, made.clips[0]))
+    else:
+        _save_folder(out, made)

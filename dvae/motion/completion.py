@@ -75,6 +75,10 @@ class Deviations:
     def __post_init__(self) -> None:
         check(self)
 
+    def of(self, name: str) -> float:
+        """That of "surfaces", "points" or "markers", in metres."""
+        return {SURFACES: self.surface, POINTS: self.point, SPOTS: self.marker}[name]
+
 
 @dataclass(frozen=True)
 class SegmentCompletion:
@@ -107,21 +111,26 @@ class SegmentCompletion:
         with pyro.plate("sequences", size):
             z = pyro.sample(LATENT, _standard(size, model.sizes[LATENT], kind))
             shape = seen[SHAPE] if SHAPE in seen else pyro.sample(SHAPE, _standard(size, parameters, kind))
-            met, times = self._met(z, shape, seen)
-            rotations, places = model.timed.poses(met)
-            pose = (shape, rotations, places)
+            times, made = self._made(z, shape, seen)
             if TIMES in seen:
                 _observe(TIMES, times, seen[TIMES], deviations.time)
-            if SURFACES in seen:
-                thin = torch.arange(0, len(model.body.template), THIN, device=z.device)
-                _observe(SURFACES, model.body.some(*pose, thin), seen[SURFACES], deviations.surface * len(thin) ** 0.5)
-            if SPOTS in seen:
-                which = torch.tensor(self.markers, device=z.device)
-                _observe(SPOTS, model.body.some(*pose, which), seen[SPOTS], deviations.marker)
-            if POINTS in seen:
-                which = seen[NEAREST] if NEAREST in seen else nearest_vertices(model.body, *pose, seen[POINTS])
-                _observe(POINTS, model.body.some(*pose, which), seen[POINTS], deviations.point)
+            for name, each in made.items():
+                counts = each.shape[-2] if name == SURFACES else 1  # as one vertex
+                _observe(name, each, seen[name], deviations.of(name) * counts**0.5)
         return {LATENT: z, SHAPE: shape}
+
+    @torch.no_grad()
+    def away(self, seen: Batch, z: Tensor, shape: Tensor) -> dict[str, Tensor]:
+        """How far what was seen is from what is made of z (B, Z) and beta (B, S): mean distances (B,) in metres.
+
+        Args:
+            seen: what `read` gave.
+
+        Returns:
+            "surfaces", "points" or "markers" to the distances; of points from the nearest vertex.
+        """
+        made = self._made(z, shape, seen)[1]
+        return {name: (each - seen[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, each in made.items()}
 
     def guide(self, seen: Batch) -> Any:
         """z of known segments, drawn at random."""
@@ -137,6 +146,21 @@ class SegmentCompletion:
         met, _ = self._met(values[LATENT], shape, seen)
         rotations, places = self.model.timed.poses(met)
         return {**seen, NEAREST: nearest_vertices(self.model.body, shape, rotations, places, seen[POINTS])}
+
+    def _made(self, z: Tensor, shape: Tensor, seen: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """When moments (B, K) are, and where all that was seen at them is made, by name."""
+        body = self.model.body
+        met, times = self._met(z, shape, seen)
+        rotations, places = self.model.timed.poses(met)
+        pose, made = (shape, rotations, places), {}
+        if SURFACES in seen:
+            made[SURFACES] = body.some(*pose, torch.arange(0, len(body.template), THIN, device=z.device))
+        if SPOTS in seen:
+            made[SPOTS] = body.some(*pose, torch.tensor(self.markers, device=z.device))
+        if POINTS in seen:
+            which = seen[NEAREST] if NEAREST in seen else nearest_vertices(body, *pose, seen[POINTS])
+            made[POINTS] = body.some(*pose, which)
+        return times, made
 
     def _met(self, z: Tensor, shape: Tensor, seen: Batch) -> tuple[Tensor, Tensor]:
         """`_met` of what is decoded: of some frames alone, where these were seen of all and no time counts."""
@@ -234,6 +258,7 @@ def complete(
     descent: Descent | None = None,
     seed: int = 0,
     chunk: int = 128,
+    progress: bool = False,
 ) -> Completed:
     """The rest of segments of which something was seen; all at once.
 
@@ -241,15 +266,16 @@ def complete(
         model: of segments, see `SegmentCompletion`.
         seen: see the module.
         deviations, markers, known: see `SegmentCompletion` too.
-        descent, seed, chunk: see `dvae.posterior`.
+        descent, seed, chunk, progress: see `dvae.posterior`.
 
     Raises:
         ValueError: see `SegmentCompletion.read`.
     """
     program = SegmentCompletion(model, deviations or Deviations(), markers or tuple(MARKERS.values()), known)
     data, guide = program.read(seen), None if known is None else program.guide
+    how: dict[str, Any] = {"descent": descent, "seed": seed, "chunk": chunk, "progress": progress}
     with evaluating(model):
-        found = posterior(program, data, guide=guide, descent=descent, renew=program.renewed, seed=seed, chunk=chunk)
+        found = posterior(program, data, guide=guide, renew=program.renewed, **how)
     return Completed(model, data, found)
 
 

@@ -61,9 +61,7 @@ class Interpolation:
     @property
     def displacements(self) -> Tensor:
         """How far the root gets from its first frame to its last, (B, M) in metres."""
-        place: Tensor = self._unpacked[1]
-        found: Tensor = (place[..., -1, :] - place[..., 0, :]).norm(dim=-1)
-        return found
+        return self.timed.travels(self.x)
 
     @property
     def global_pose(self) -> Tensor:

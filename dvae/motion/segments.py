@@ -249,6 +249,12 @@ class TimedFrames:
         """How long segments (..., N, D) last, (...,) in seconds: the sum of their increments."""
         return self.times(x)[..., -1]
 
+    def travels(self, x: Tensor) -> Tensor:
+        """How far roots get from the first of frames (..., N, D) to the last, (...,) in metres."""
+        first, last = self.poses(x[..., [0, -1], :])[1].unbind(-2)
+        found: Tensor = (last - first).norm(dim=-1)
+        return found
+
     def _found(self, motion: MotionSet) -> dict[str, Tensor]:
         """What `to` gives, with x as it is: six numbers of each turn, metres, seconds."""
         skeleton = motion.skeleton

@@ -3,12 +3,15 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 
 import dvae
 from dvae import motion
 from dvae.cli import main
+from dvae.motion.completion import glimpsed
 from dvae.motion.reconstruction import Reconstruction
+from dvae.motion.recovery import read_seen
 
 SMALL = ["motion-latent", "--latent", "3", "--widths", "16", "8", "--batch-size", "4", "--cut", "clips"]
 
@@ -98,6 +101,98 @@ def test_one_segment_becomes_another(capsys, folder, tmp_path):
     assert "no segment or take 'person_01'" in failure(capsys, *command[:3], "person_01", "--to", "person_0001")
 
 
+BRIEF = ["--steps", "3", "--starts", "2", "--candidates", "2", "--newton", "0"]
+
+
+def recovered(capsys, folder, *arguments):
+    """What `dvae recover` prints of the run, the notes and what was written."""
+    assert main(["recover", str(folder / "run"), *map(str, arguments), *BRIEF]) == 0
+    printed = capsys.readouterr()
+    return " ".join(printed.out.split()), " ".join(printed.err.split())
+
+
+def test_segments_are_recovered_from_a_glimpse(capsys, folder, tmp_path):
+    one = ["--from", "person_0001", "--seen", "markers", "--seconds", "0.25", "--gaps", "0.2", "--draws", "2"]
+    table, said = recovered(capsys, folder, *one, "--out", tmp_path / "a.npz")
+    for word in ("duration", "from markers", "vertex error", "left", "behind", "k-hat", "train/person_0001"):
+        assert word in table
+    assert "1 of 1 segments not converged" in said
+    assert "; try --marker 0." in said
+    assert "the most probable of train/person_0001, and 2 draws of each" in said
+    clips = motion.read_motion(tmp_path / "a.npz")
+    assert [clip.name for clip in clips] == [f"person_0001-{end}" for end in ("found", "draw-01", "draw-02")]
+    for name in ("a.html", "a.bvh", "folder"):
+        again, _ = recovered(capsys, folder, *one, "--out", tmp_path / name)
+        assert again == table  # of the same seed
+    page = (tmp_path / "a.html").read_text()
+    assert all(name in page for name in ("truth", "most probable", "draw 2"))
+    assert len(list((tmp_path / "folder").iterdir())) == 3
+    (probable,) = motion.read_motion(tmp_path / "a.bvh")
+    assert abs(probable.frames - clips.clips[0].frames) <= 1
+    several = ["--from", "person_0001", "test/person_0007", "--seen", "points", "--frames", "3", "--points", "5"]
+    table, said = recovered(capsys, folder, *several, "--known-body", "--draws", "0", "--out", tmp_path / "b.npz")
+    assert "train/person_0001" in table
+    assert "test/person_0007" in table
+    assert said.endswith("the most probable of train/person_0001, test/person_0007")
+    assert len(motion.read_motion(tmp_path / "b.npz")) == 2
+
+
+def observations(folder, **options):
+    """What is seen of the body's markers in two segments of the run, for a file."""
+    run = dvae.load(folder / "run")
+    truth = run.data.windows("test").all()
+    return {name: value.numpy() for name, value in glimpsed(run.model, *truth.values(), "markers", **options).items()}
+
+
+def test_what_somebody_has_seen_is_read_without_the_data(capsys, folder, tmp_path):
+    """One segment or several; the same numbers are the same segments, whatever way they came."""
+    moved = shutil.copytree(folder, tmp_path / "moved")
+    config = json.loads((moved / "run" / "config.json").read_text())
+    config["data"]["path"] = "gone.npz"
+    (moved / "run" / "config.json").write_text(json.dumps(config))
+    seen = observations(folder, fps=10.0)
+    np.savez(tmp_path / "both.npz", **seen)
+    np.savez(tmp_path / "one.npz", **{name: value[0] for name, value in seen.items()})
+    table, _ = recovered(capsys, moved, "--file", tmp_path / "both.npz")
+    assert "seen/both-00" in table
+    assert "seen/both-01" in table
+    assert "vertex error" not in table
+    table, said = recovered(capsys, moved, "--file", tmp_path / "one.npz", "--out", tmp_path / "one.html")
+    assert "seen/one-00" in table
+    assert "truth" not in (tmp_path / "one.html").read_text()
+    names = [clip.name for clip in dvae.load(folder / "run").data.windows("test").motion]
+    theirs, _ = recovered(capsys, folder, "--from", f"test/{names[0]}", "--seen", "markers", "--fps", "10")
+    duration = table.split("seen/one-00 │ ")[1].split(" │ ")[0]
+    assert duration in theirs
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda seen: {**seen, "marker": seen["markers"]}, "'marker' is nothing that is seen .did you mean 'markers'"),
+        (lambda seen: {**seen, "markers": seen["markers"][:, :, :5]}, r"expected \(2, \d+, 16, 3\)"),
+        (lambda seen: {**seen, "markers": np.nan * seen["markers"]}, "nothing was seen of segment 0 of 2"),
+        (lambda seen: {**seen, "markers": 1000 * seen["markers"]}, "markers has a coordinate of .* expected metres"),
+        (lambda seen: {**seen, "markers": seen["markers"] + np.inf}, "markers has a coordinate of inf"),
+        (lambda seen: {**seen, "markers": seen["markers"].astype("U8")}, "markers is <U8 .* expected numbers"),
+        (lambda seen: {**seen, "markers": seen["markers"].astype(object)}, "pickled objects"),
+        (lambda seen: {**seen, "times": 1000 * seen["times"]}, "times go from 0 to .* expected seconds"),
+        (lambda seen: {name: value[:, :0] for name, value in seen.items()}, "expected numbers"),
+        (lambda seen: {**seen, "times": 0.0}, "some of surfaces, points and markers, at moments"),
+        (lambda seen: {"markers": seen["markers"]}, "at moments"),
+        (lambda seen: {}, "some of surfaces, points and markers|npz"),
+        (lambda seen: {**seen, "times": np.zeros((2, 1001)), "markers": np.zeros((2, 1001, 16, 3))}, "at most 1000"),
+        (lambda seen: {**seen, "points": np.zeros((2, 1, 2**17 + 1, 3))}, "at most 131,072 of a segment"),
+        (lambda seen: {**seen, "points": np.zeros((2, 1, 2**20, 3))}, "at most 33,554,432 are read"),
+    ],
+)
+def test_files_of_what_nobody_can_have_seen_are_refused(folder, tmp_path, change, message):
+    path = tmp_path / "seen.npz"
+    np.savez_compressed(path, **change(observations(folder, fps=5.0)))
+    with pytest.raises(ValueError, match=f"seen.npz: (.*{message})"):
+        read_seen(path, dvae.load(folder / "run").model)
+
+
 @pytest.mark.parametrize(
     "command",
     [
@@ -114,12 +209,14 @@ def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monk
     monkeypatch.chdir(tmp_path)
     error = failure(capsys, *command.replace("RUN", str(folder / "run")).split())
     assert "is a fitted motion-latent, which makes whole segments and forecasts nothing; use dvae evaluate" in error
+    assert "recover" in error
     assert not list(tmp_path.iterdir())
 
 
 def test_a_run_that_forecasts_has_no_segments(capsys, fitted):
-    error = failure(capsys, "interpolate", fitted, "--from", "a", "--to", "b")
-    assert "is a fitted vae, which forecasts and has no segments; use dvae forecast" in error
+    for command in (["interpolate", fitted, "--from", "a", "--to", "b"], ["recover", fitted, "--from", "a"]):
+        error = failure(capsys, *command)
+        assert "is a fitted vae, which forecasts and has no segments; use dvae forecast, complete" in error
 
 
 @pytest.mark.parametrize(
@@ -136,6 +233,19 @@ def test_a_run_that_forecasts_has_no_segments(capsys, fitted):
         ("interpolate RUN --from a --to b --steps 1000", "--steps is 1000; it must be at most 100"),
         ("interpolate RUN --from a --to b --fps 0", "--fps is 0; it must be between 1 and 1000"),
         ("interpolate RUN --from a --to b --out a.mp4", "end its name in .npz or .html or"),
+        ("recover RUN", "either of the run's segments (--from NAME --seen KIND) or as a --file"),
+        ("recover RUN --from a --file b.npz", "either of the run's segments"),
+        ("recover RUN --from person_0001", "--seen what of it: surfaces, points or markers"),
+        ("recover RUN --from person_0001 --seen marker", "did you mean 'markers'"),
+        ("recover RUN --file b.npz --seen points", "a --file says all that was seen"),
+        ("recover RUN --from a --seen markers --frames 3 --fps 10", "--frames are seen at unknown times"),
+        ("recover RUN --from person_0001 --seen markers --frames 101", "segments of this run have 100"),
+        ("recover RUN --from a --seen markers --gaps 1", "gaps is 1.0; it must be at least 0 and below 1"),
+        ("recover RUN --from a --seen markers --marker 0", "marker is 0.0; it must be"),
+        ("recover RUN --from a --seen markers --draws 101", "--draws is 101; it must be at most 100"),
+        ("recover RUN --from person_0001 person_0001 --seen markers", "names a segment twice"),
+        ("recover RUN --from person_0001 person_0002 --seen markers --out a.html", "shows one segment, of 2"),
+        ("recover RUN --from a --seen markers --out a.gif", "end its name in .npz or .html or"),
     ],
 )
 def test_wrong_arguments_exit_with_2(capsys, folder, fitted, tmp_path, monkeypatch, arguments, message):

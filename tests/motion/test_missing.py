@@ -717,6 +717,7 @@ def test_every_command_that_reads_motion_takes_gaps_the_same_way():
         reads = {"data", "files"} & hints.keys() and name not in (
             "resume",
             "interpolate",
+            "recover",
         )  # what the run has, and whole bodies
         assert (hints.get("missing") == Missing) == bool(reads), name
 

@@ -1,0 +1,250 @@
+"""Segments recovered from what was seen of them: what was found, how far from that, how surely; and files of it.
+
+`completion.complete` looks for the segments; here is what there is to say of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..data import Batch
+from ..inference.posteriors import Descent
+from ..inference.result import Table
+from ..options import nearest
+from ..program.conditional import evaluating
+from ..turns import alone
+from ..views import WHOLE
+from .bodies import vertex_error
+from .completion import (
+    FRAMES,
+    LATENT,
+    POINTS,
+    SPOTS,
+    SURFACES,
+    TIMES,
+    Completed,
+    Deviations,
+    SegmentCompletion,
+    complete,
+)
+from .data import MotionSet
+from .embodied import SHAPE
+from .files.archive import Refused, archive
+from .segments import OFFSETS
+
+LARGEST = 2**25
+"""Bytes of all arrays of a file of what was seen: nearly two thousand surfaces, or two million points."""
+
+MOST, MOST_POINTS = 1000, 2**17
+"""Segments of a file and moments of a segment; and points of a segment."""
+
+FARTHEST, LATEST = 30.0, 60.0
+"""Metres from the origin and seconds from the first frame, beyond which numbers are in other units."""
+
+DRAWS, LEVEL = 200, 0.95
+"""By which intervals are, and what they hold."""
+
+AT_ONCE = 512
+"""Draws to hold at once."""
+
+UNRELIABLE = 0.7
+"""k-hat above which intervals are rough."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recovered:
+    """Segments that were recovered.
+
+    Args:
+        found: the most probable ones.
+        keys: (split, name) of each.
+        drawn: frames (n, B, N, D) and bodies (n, B, S) from the posterior.
+        khat: (B,), see `Posterior.evidence`.
+        away: how far they are from what was seen, (B,) in metres by name, see `SegmentCompletion.away`.
+        truth: x (B, N, D) and beta (B, S), where they are known.
+    """
+
+    found: Completed
+    keys: Sequence[tuple[str, str]]
+    drawn: tuple[Tensor, Tensor]
+    khat: Tensor
+    away: Mapping[str, Tensor]
+    truth: Batch | None = None
+
+    @property
+    def errors(self) -> dict[str, Tensor]:
+        """Of known truths, (B,) each: of vertices in metres, frame of chi by frame; and of durations in seconds."""
+        if self.truth is None:
+            return {}
+        model, (x, shape), truth = self.found.model, (self.found.x, self.found.shape), self.truth
+        rows = [slice(row, row + 1) for row in range(len(x))]  # surfaces are large
+        vertices = [
+            vertex_error(model.vertices(x[row], shape[row]), model.vertices(truth[WHOLE][row], truth[SHAPE][row]))
+            for row in rows
+        ]
+        lasts = model.timed.lasts(x) - model.timed.lasts(truth[WHOLE])
+        return {"vertex error": torch.cat(vertices), "duration error": lasts.abs()}
+
+    def table(self) -> Table:
+        """A row for each segment."""
+        draws = f"{100 * LEVEL:g} % of {len(self.drawn[0])} draws from the posterior"
+        table = Table(
+            caption=f"[ ]: {draws}, rough where k-hat is above {UNRELIABLE}\n"
+            "left: by which the energy would still fall, about 0 where the search has converged\n"
+            "behind: by which other starts arrived above the best\n"
+            "bent: directions of which nothing seen tells, or not as a normal would"
+        )
+        timed, posterior = self.found.model.timed, self.found.posterior
+        ways = {"duration\ns": timed.lasts, "displacement\nm": timed.travels}
+        errors = {f"from {name}\nmm": value for name, value in self.away.items()}
+        errors |= {f"{name}\n{'mm' if 'vertex' in name else 'ms'}": value for name, value in self.errors.items()}
+        table.add_column("segment", no_wrap=True)
+        for name in (*ways, *errors, "left\nnats", "behind\nnats", "bent", "k-hat"):
+            table.add_column(name, justify="right")
+        measured = [(measure(self.found.x), measure(self.drawn[0])) for measure in ways.values()]
+        for row, key in enumerate(self.keys):
+            others = posterior.behind[1:, row].tolist()
+            table.add_row(
+                "/".join(key),
+                *(_with_interval(value[row], drawn[:, row]) for value, drawn in measured),
+                *(f"{1000 * float(value[row]):.1f}" for value in errors.values()),
+                _brief(float(posterior.left[row])),
+                " to ".join(dict.fromkeys(map(_brief, others[:1] + others[-1:]))),
+                str(int(posterior.bent[row])),
+                f"{float(self.khat[row]):.2f}",
+            )
+        return table
+
+    def motion(self, draws: int = 0) -> MotionSet:
+        """The most probable segments, and after each some of its draws: clips, from the origin, facing heading zero."""
+        pairs = zip((self.found.x, self.found.shape), self.drawn, strict=True)
+        x, shape = (torch.cat([mode[None], drawn[:draws]]).transpose(0, 1).flatten(0, 1) for mode, drawn in pairs)
+        ends = ["found", *(f"draw-{n:02d}" for n in range(1, draws + 1))]
+        return self._moved(x, shape, [(split, f"{name}-{end}") for split, name in self.keys for end in ends])
+
+    def true_motion(self) -> MotionSet | None:
+        """The truths, where they are known, in the same way."""
+        return None if self.truth is None else self._moved(self.truth[WHOLE], self.truth[SHAPE], self.keys)
+
+    def _moved(self, x: Tensor, shape: Tensor, keys: Sequence[tuple[str, str]]) -> MotionSet:
+        model = self.found.model
+        made: MotionSet = model.timed.back({WHOLE: x, OFFSETS: model.body.offsets(shape)})
+        named = zip(made, keys, strict=True)
+        return replace(made, clips=[replace(clip, split=split, name=name) for clip, (split, name) in named])
+
+
+@alone
+def recover(
+    model: Any,
+    seen: Batch,
+    keys: Sequence[tuple[str, str]],
+    *,
+    truth: Batch | None = None,
+    deviations: Deviations | None = None,
+    descent: Descent | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Recovered:
+    """Completes segments, and says how well.
+
+    Args:
+        model, seen, deviations, descent, seed, progress: see `complete`.
+        keys: (split, name) of each.
+        truth: x (B, N, D) and beta (B, S), where they are known.
+
+    Raises:
+        ValueError: see `complete`; or nothing was seen of a segment.
+    """
+    program = SegmentCompletion(model, deviations or Deviations())
+    _check_something(program.read(seen))
+    found = complete(model, seen, deviations=deviations, descent=descent, seed=seed, progress=progress)
+    with evaluating(model):
+        bound = found.posterior.evidence(program, found.seen, DRAWS, seed=seed, chunk=AT_ONCE)
+    away = program.away(found.seen, found.posterior.mode[LATENT], found.shape)
+    return Recovered(found, keys, found.draw(DRAWS, seed), bound.khat, away, truth)
+
+
+def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
+    """What somebody has seen of segments, of a file.
+
+    Args:
+        path: an npz of arrays by the names of `dvae.motion.completion`: times or frames, some of surfaces, points and
+            markers, and beta where it is known; without the first axis, of one segment.
+        model: of segments.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, too large, or not as described; or nothing was seen.
+    """
+    arrays = _read(Path(path))
+    try:
+        for name, array in arrays.items():
+            if array.dtype.kind not in "fiu" or not array.size:
+                raise ValueError(f"{name} is {array.dtype} {array.shape}, expected numbers")
+        found = {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
+        if all(found[name].dim() == 1 for name in (TIMES, FRAMES) if name in found):
+            found = {name: value[None] for name, value in found.items()}
+        for name, value in found.items():
+            _check_numbers(name, value)
+        _check_something(SegmentCompletion(model).read(found))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return found
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of numbers, of known names and bounded sizes."""
+    known = (TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE)
+    with archive(path) as members:
+        if unknown := [name for name in members if name not in known]:
+            meant = nearest(unknown[0], known)
+            raise Refused(f"{unknown[0]!r} is nothing that is seen{meant}; expected some of {', '.join(known)}")
+        if (size := sum(member.size for member in members.values())) > LARGEST:
+            raise Refused(f"it unpacks to {size:,} bytes, at most {LARGEST:,} are read; give fewer moments or segments")
+        return {name: member.array() for name, member in members.items()}
+
+
+def _check_numbers(name: str, value: Tensor) -> None:
+    """Refuse more than can be looked for, and what is in other units."""
+    if value.dim() > 1 and name != SHAPE and (len(value) > MOST or value.shape[1] > MOST):
+        raise ValueError(
+            f"{name} has shape {tuple(value.shape)}; at most {MOST} segments and moments of each are taken"
+        )
+    if name == POINTS and value.shape[1:3].numel() > MOST_POINTS:
+        raise ValueError(f"{name} has shape {tuple(value.shape)}; at most {MOST_POINTS:,} of a segment are taken")
+    far = float(value.abs().nan_to_num(0.0, torch.inf).max())
+    if name in (SURFACES, POINTS, SPOTS) and far > FARTHEST:
+        raise ValueError(
+            f"{name} has a coordinate of {far:g}; expected metres, from where the root is in the segment's first frame"
+        )
+    if name == TIMES and (far > LATEST or (value < 0).any()):
+        low, high = value.nan_to_num(0.0).aminmax()
+        raise ValueError(f"times go from {low:g} to {high:g}; expected seconds from the first frame of the segment")
+    if name == SHAPE and far > FARTHEST:
+        raise ValueError(f"{name} has {far:g}; expected parameters of shape, which are about as wide as N(0, 1)")
+
+
+def _check_something(seen: Batch) -> None:
+    """Refuse segments of which nothing was seen."""
+    kinds = [seen[name].isfinite().flatten(2).any(-1) for name in (SURFACES, POINTS, SPOTS) if name in seen]
+    timed = [seen[name].isfinite() for name in (TIMES, FRAMES) if name in seen]
+    some = torch.stack(kinds).any(0) if kinds else torch.stack(timed).all(0)
+    if not (known := some.any(-1)).all():
+        row = int(known.logical_not().nonzero()[0])
+        raise ValueError(f"nothing was seen of segment {row} of {len(known)}: all of it is NaN")
+
+
+def _with_interval(value: Tensor, drawn: Tensor) -> str:
+    low, high = drawn.quantile(drawn.new_tensor([(1 - LEVEL) / 2, (1 + LEVEL) / 2])).tolist()
+    return f"{float(value):.2f} [{low:.2f}, {high:.2f}]"
+
+
+def _brief(nats: float) -> str:
+    return f"{nats:.1f}" if nats < 10 else f"{nats:,.0f}"
