@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import pi
 from pathlib import Path
@@ -14,6 +14,7 @@ import tyro
 
 from .. import motion
 from ..data import Batch
+from ..inference.checkpoints import CheckpointError
 from ..inference.posteriors import Descent
 from ..motion.completion import Deviations, glimpsed
 from ..motion.embodied import SHAPE
@@ -23,11 +24,15 @@ from ..motion.recovery import Recovered, read_seen
 from ..motion.recovery import recover as recover_segments
 from ..motion.segments import resting_offsets
 from ..options import Positive, Range, check
+from ..runs import directory as runs
 from ..views import WHOLE
 from . import opening
 from .console import ERROR, OUT, UsageError, at_least, check_files, note
 
 MOST_STEPS = MOST_DRAWS = 100
+
+MOST_KNOWN = 200
+"""Segments for training of which the latents are where a search may start."""
 
 APART = 3.0
 """Nats by which a search may still fall, and deviations that segments may be from what was seen, without a note."""
@@ -88,7 +93,8 @@ def _write(out: Path, found: Interpolation, fps: float | None) -> None:
     elif suffix:
         motion.write_motion(out, _alone(steps, steps.clips[len(steps) // 2]))
     else:
-        _save_folder(out, steps)
+        for clip in steps:
+            motion.write_motion(out / f"{clip.name}.bvh", _alone(steps, clip))
 
 
 def _save_page(out: Path, made: motion.MotionSet, names: Sequence[str], truth: motion.MotionSet | None = None) -> None:
@@ -100,12 +106,6 @@ def _save_page(out: Path, made: motion.MotionSet, names: Sequence[str], truth: m
     still = np.stack([np.pad(c.positions, ((0, frames - c.frames), (0, 0), (0, 0)), mode="edge") for c in clips])
     samples, real = still[: len(made), 1:], None if truth is None else still[-1, 1:]
     save_html(animate(made.skeleton, still[0, :1], samples, real, names=names), out)
-
-
-def _save_folder(out: Path, made: motion.MotionSet) -> None:
-    """A BVH file for each clip."""
-    for clip in made:
-        motion.write_motion(out / f"{clip.name}.bvh", _alone(made, clip))
 
 
 def _alone(made: motion.MotionSet, clip: motion.Clip) -> motion.MotionSet:
@@ -195,7 +195,8 @@ def recover(
         draws: from the posterior, to write.
         out: the file to write.
         seed: of starts, draws and glimpses.
-        data: where the data lie now, if the path in the run no longer leads there; or other data.
+        data: where the data lie now, if the path in the run no longer leads there; or other data. Latents of known
+            segments, of other takes, are starts of the search.
     """
     at_least(0, draws=draws)
     if draws > MOST_DRAWS:
@@ -203,26 +204,28 @@ def recover(
     check_files(out, None, ".npz", ".html", ".htm", ".bvh", "")
     if bool(source) == (file is not None):
         raise UsageError("give what was seen, either of the run's segments (--from NAME --seen KIND) or as a --file")
-    if file is not None and (glimpse != Glimpse() or data is not None):
-        raise UsageError("a --file says all that was seen; --data, and what is seen of segments, go with --from")
+    if file is not None and glimpse != Glimpse():
+        raise UsageError("a --file says all that was seen; --seen and what goes with it are about segments of --from")
     loaded = opening.load_run(run, data, "segments")
     opening.note_unfinished([loaded])
-    truth, model = None, loaded.model
+    model, truth, takes = loaded.model, None, set()
     if file is None:
         opened = opening.data_of(data, loaded)
         chosen = [opened.found(name) for name in source]
-        keys = [each.motion.clips[0].key for each in chosen]
-        if len({name for _, name in keys}) < len(keys):
-            raise UsageError(f"--from {' '.join(source)} names a segment twice, or two that are called the same")
+        clips = [clip for each in chosen for clip in each.motion]
+        keys, takes = [clip.key for clip in clips], {clip.labels["source"] for clip in clips}
+        if len({*keys}) < len(keys):
+            raise UsageError(f"--from {' '.join(source)} names a segment twice")
         truth = {name: torch.cat([each.all()[name] for each in chosen]) for name in (WHOLE, SHAPE)}
         seen = glimpse.of(model, truth, seed)
     else:
-        seen = read_seen(file, model)
-        keys = [("seen", f"{file.stem}-{n:02d}") for n in range(len(next(iter(seen.values()))))]
+        seen, opened = read_seen(file, model), _known_data(loaded, data)
+        keys = [("seen", f"segment-{n:02d}") for n in range(len(next(iter(seen.values()))))]
     if out is not None and out.suffix.lower() not in (".npz", "") and len(keys) > 1:
         raise UsageError(f"--out {out} shows one segment, of {len(keys)}; end its name in .npz, or in nothing")
-    how: dict[str, Any] = {"truth": truth, "deviations": deviations, "descent": descent, "seed": seed}
-    found = recover_segments(model, seen, keys, **how, progress=True)
+    known = None if opened is None else _known(opened, takes)
+    how: dict[str, Any] = {"truth": truth, "deviations": deviations, "known": known, "descent": descent}
+    found = recover_segments(model, seen, keys, **how, seed=seed, progress=True)
     OUT.print(found.table())
     for doubt in _doubts(found, deviations):
         note(doubt)
@@ -230,7 +233,23 @@ def recover(
         drawn = 0 if out.suffix.lower() == ".bvh" else draws
         _write_recovered(out, found, drawn)
         names = ", ".join(map("/".join, keys))
-        ERROR.print(f"wrote {out}: the most probable of {names}" + f", and {drawn} draws of each" * (drawn > 0))
+        ERROR.print(f"wrote {out}: {names}, the most probable" + f" and {drawn} draws of each" * (drawn > 0))
+
+
+def _known_data(loaded: runs.Loaded, data: str | None) -> Any:
+    """The data of a run, or other data; None where its own are gone."""
+    try:
+        return opening.data_of(data, loaded)
+    except CheckpointError as error:
+        note(f"no segments are known, so that the search starts from the prior alone: {error}")
+        return None
+
+
+def _known(opened: Any, takes: Collection[str]) -> Batch | None:
+    """Some segments for training, of other takes than these."""
+    others = [clip for clip in opened.segments if clip.split == "train" and clip.labels["source"] not in takes]
+    clips = others[:: -(-len(others) // MOST_KNOWN) or 1]
+    return motion.Segments(replace(opened.segments, clips=clips), opened.timed).all() if clips else None
 
 
 def _doubts(found: Recovered, deviations: Deviations) -> Iterator[str]:
@@ -263,4 +282,5 @@ def _write_recovered(out: Path, found: Recovered, draws: int) -> None:
     elif suffix:
         motion.write_motion(out, _alone(made, made.clips[0]))
     else:
-        _save_folder(out, made)
+        for clip in made:
+            motion.write_motion(out, _alone(made, clip), "bvh")

@@ -148,6 +148,7 @@ def recover(
     *,
     truth: Batch | None = None,
     deviations: Deviations | None = None,
+    known: Batch | None = None,
     descent: Descent | None = None,
     seed: int = 0,
     progress: bool = False,
@@ -155,7 +156,7 @@ def recover(
     """Completes segments, and says how well.
 
     Args:
-        model, seen, deviations, descent, seed, progress: see `complete`.
+        model, seen, deviations, known, descent, seed, progress: see `complete`.
         keys: (split, name) of each.
         truth: x (B, N, D) and beta (B, S), where they are known.
 
@@ -164,7 +165,8 @@ def recover(
     """
     program = SegmentCompletion(model, deviations or Deviations())
     _check_something(program.read(seen))
-    found = complete(model, seen, deviations=deviations, descent=descent, seed=seed, progress=progress)
+    how: dict[str, Any] = {"deviations": deviations, "known": known, "descent": descent}
+    found = complete(model, seen, **how, seed=seed, progress=progress)
     with evaluating(model):
         bound = found.posterior.evidence(program, found.seen, DRAWS, seed=seed, chunk=AT_ONCE)
     away = program.away(found.seen, found.posterior.mode[LATENT], found.shape)

@@ -118,7 +118,7 @@ def test_segments_are_recovered_from_a_glimpse(capsys, folder, tmp_path):
         assert word in table
     assert "1 of 1 segments not converged" in said
     assert "; try --marker 0." in said
-    assert "the most probable of train/person_0001, and 2 draws of each" in said
+    assert "train/person_0001, the most probable and 2 draws of each" in said
     clips = motion.read_motion(tmp_path / "a.npz")
     assert [clip.name for clip in clips] == [f"person_0001-{end}" for end in ("found", "draw-01", "draw-02")]
     for name in ("a.html", "a.bvh", "folder"):
@@ -126,14 +126,14 @@ def test_segments_are_recovered_from_a_glimpse(capsys, folder, tmp_path):
         assert again == table  # of the same seed
     page = (tmp_path / "a.html").read_text()
     assert all(name in page for name in ("truth", "most probable", "draw 2"))
-    assert len(list((tmp_path / "folder").iterdir())) == 3
+    assert len(list((tmp_path / "folder" / "train").iterdir())) == 3
     (probable,) = motion.read_motion(tmp_path / "a.bvh")
     assert abs(probable.frames - clips.clips[0].frames) <= 1
     several = ["--from", "person_0001", "test/person_0007", "--seen", "points", "--frames", "3", "--points", "5"]
     table, said = recovered(capsys, folder, *several, "--known-body", "--draws", "0", "--out", tmp_path / "b.npz")
     assert "train/person_0001" in table
     assert "test/person_0007" in table
-    assert said.endswith("the most probable of train/person_0001, test/person_0007")
+    assert said.endswith("train/person_0001, test/person_0007, the most probable")
     assert len(motion.read_motion(tmp_path / "b.npz")) == 2
 
 
@@ -153,17 +153,17 @@ def test_what_somebody_has_seen_is_read_without_the_data(capsys, folder, tmp_pat
     seen = observations(folder, fps=10.0)
     np.savez(tmp_path / "both.npz", **seen)
     np.savez(tmp_path / "one.npz", **{name: value[0] for name, value in seen.items()})
-    table, _ = recovered(capsys, moved, "--file", tmp_path / "both.npz")
-    assert "seen/both-00" in table
-    assert "seen/both-01" in table
+    table, said = recovered(capsys, moved, "--file", tmp_path / "both.npz")
+    assert "the search starts from the prior alone" in said
+    assert "seen/segment-00" in table
+    assert "seen/segment-01" in table
     assert "vertex error" not in table
-    table, said = recovered(capsys, moved, "--file", tmp_path / "one.npz", "--out", tmp_path / "one.html")
-    assert "seen/one-00" in table
+    table, said = recovered(capsys, folder, "--file", tmp_path / "one.npz", "--out", tmp_path / "one.html")
+    assert "prior alone" not in said
     assert "truth" not in (tmp_path / "one.html").read_text()
     names = [clip.name for clip in dvae.load(folder / "run").data.windows("test").motion]
     theirs, _ = recovered(capsys, folder, "--from", f"test/{names[0]}", "--seen", "markers", "--fps", "10")
-    duration = table.split("seen/one-00 │ ")[1].split(" │ ")[0]
-    assert duration in theirs
+    assert table.split("seen/segment-00 │ ")[1].split(" │ ")[0] in theirs
 
 
 @pytest.mark.parametrize(
