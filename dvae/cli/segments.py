@@ -146,6 +146,10 @@ class Glimpse:
         """What is seen of x (B, N, D) and beta (B, S)."""
         if self.seen is None:
             raise UsageError("--from names what is looked at, and --seen what of it: surfaces, points or markers")
+        if self.seen != "points" and self.points != Glimpse.points:
+            raise UsageError(f"--points says how many are seen of a surface; --seen is {self.seen}")
+        if self.seen == "surfaces" and self.gaps:
+            raise UsageError("--gaps are of points or markers; surfaces are seen as a whole")
         x, shape = truth[WHOLE], truth[SHAPE]
         chosen = None
         if self.frames is not None:

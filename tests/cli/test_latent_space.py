@@ -241,6 +241,8 @@ def test_a_run_that_forecasts_has_no_segments(capsys, fitted):
         ("recover RUN --from a --seen markers --frames 3 --fps 10", "--frames are seen at unknown times"),
         ("recover RUN --from person_0001 --seen markers --frames 101", "segments of this run have 100"),
         ("recover RUN --from a --seen markers --gaps 1", "gaps is 1.0; it must be at least 0 and below 1"),
+        ("recover RUN --from person_0001 --seen markers --points 9", "--points says how many are seen of a surface"),
+        ("recover RUN --from person_0001 --seen surfaces --gaps .1", "surfaces are seen as a whole"),
         ("recover RUN --from a --seen markers --marker 0", "marker is 0.0; it must be"),
         ("recover RUN --from a --seen markers --draws 101", "--draws is 101; it must be at most 100"),
         ("recover RUN --from person_0001 person_0001 --seen markers", "names a segment twice"),

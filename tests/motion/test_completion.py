@@ -21,6 +21,7 @@ from dvae.motion.completion import (
     surfaces_at,
 )
 from dvae.motion.embodied import SHAPE, Segments
+from dvae.motion.recovery import recover
 
 BRIEF = dvae.Descent(steps=80, rate=0.1, starts=1, candidates=4)
 THOROUGH = dvae.Descent(steps=80, rate=0.1, starts=2, candidates=8, newton=3)
@@ -211,6 +212,54 @@ def test_scores_of_completions(model):
     torch.testing.assert_close(errors, torch.full((2,), 0.1, dtype=torch.float64))
     at = surfaces_at(model, x, shape, model.timed.times(x)[:, [20]])
     torch.testing.assert_close(at, model.vertices(x, shape)[:, [20]])
+
+
+@pytest.mark.parametrize("kind", ["surfaces", "points", "markers"])
+def test_how_far_something_is_from_what_was_seen(model, kind):
+    """Of surfaces and markers as far as they are moved; of points at most so far, as others may be nearer."""
+    z, shape, x = made(model, 2)
+    frames = [0, 40, 99]
+    seen = glimpsed(model, x, shape, kind, frames=frames, points=49, gaps=0.3)
+    vertices = model.vertices(x, shape)[:, frames]
+    if kind == "points":
+        seen[kind] = torch.where(seen[kind].isnan(), torch.nan, vertices[:, :, :1470:30])
+    program = SegmentCompletion(model)
+    assert program.away(program.read(seen), z, shape)[kind].max() < 1e-9
+    moved = {**seen, kind: seen[kind] + torch.tensor([0.0, 0.03, 0.04])}
+    away = program.away(program.read(moved), z, shape)[kind]
+    expected = torch.full((2,), 0.05, dtype=torch.float64)
+    if kind == "points":
+        assert (away < expected).all()
+        assert (away > expected / 10).all()
+    else:
+        torch.testing.assert_close(away, expected)
+
+
+def test_what_is_said_of_recovered_segments(model):
+    _, shape, x = made(model, 2)
+    seen = glimpsed(model, x, shape, "markers", frames=range(0, 100, 10))
+    keys, truth = [("a", "first"), ("b", "second")], {"x": x, SHAPE: shape}
+    found = recover(model, {**seen, SHAPE: shape}, keys, truth=truth, descent=THOROUGH)
+    assert found.away["markers"].max() < 1e-3
+    assert found.errors["vertex error"].max() < 2e-3
+    lasts = model.timed.lasts(found.found.x)
+    torch.testing.assert_close(found.errors["duration error"], (lasts - model.timed.lasts(x)).abs())
+    moving, true = found.motion(draws=2), found.true_motion()
+    assert [clip.key for clip in moving][::3] == [("a", "first-found"), ("b", "second-found")]
+    assert [clip.key for clip in true] == keys
+    fps = moving.skeleton.fps
+    for clip, seconds in zip(moving.clips[::3], lasts.tolist(), strict=True):
+        assert 0 <= seconds - (clip.frames - 1) / fps < 1 / fps + 1e-3
+    for clip, theirs in zip(moving.clips[::3], true, strict=True):
+        shorter = min(clip.frames, theirs.frames)
+        assert abs(clip.positions[:shorter] - theirs.positions[:shorter]).max() < 0.02
+    drawn = model.timed.lasts(found.drawn[0])
+    assert (drawn.amin(0) < lasts).all()
+    assert (lasts < drawn.amax(0)).all()
+    texts = [str(cell) for cell in found.table().columns[0].cells]
+    assert texts == ["a/first", "b/second"]
+    with pytest.raises(ValueError, match="nothing was seen of segment 1 of 2"):
+        recover(model, {**seen, "markers": seen["markers"] * torch.tensor([1.0, torch.nan])[:, None, None, None]}, keys)
 
 
 def test_what_cannot_have_been_seen_is_refused(model):
