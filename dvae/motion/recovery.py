@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Group
 from torch import Tensor
 
 from ..data import Batch
@@ -92,35 +93,38 @@ class Recovered:
         lasts = model.timed.lasts(x) - model.timed.lasts(truth[WHOLE])
         return {"vertex error": torch.cat(vertices), "duration error": lasts.abs()}
 
-    def table(self) -> Table:
-        """A row for each segment."""
-        draws = f"{100 * LEVEL:g} % of {len(self.drawn[0])} draws from the posterior"
-        table = Table(
-            caption=f"[ ]: {draws}, rough where k-hat is above {UNRELIABLE}\n"
+    def table(self) -> Group:
+        """What was found, and below how surely; a row for each segment in both."""
+        timed, draws = self.found.model.timed, len(self.drawn[0])
+        ways = {"duration\ns": timed.lasts, "displacement\nm": timed.travels}
+        errors = {f"from\n{name}\nmm": value for name, value in self.away.items()}
+        apart = {"vertex error": "vertex\nerror\nmm", "duration error": "duration\nerror\nms"}
+        errors |= {apart[name]: value for name, value in self.errors.items()}
+        what = _table((*ways, *errors), f"[ ]: {100 * LEVEL:g} % of {draws} draws from the posterior")
+        how = _table(
+            ("left\nnats", "behind\nnats", "bent", "k-hat"),
             "left: by which the energy would still fall, about 0 where the search has converged\n"
             "behind: by which other starts arrived above the best\n"
-            "bent: directions of which nothing seen tells, or not as a normal would"
+            "bent: directions of which nothing seen tells, or not as a normal would\n"
+            f"k-hat: above {UNRELIABLE} the draws, and so intervals, are rough",
         )
-        timed, posterior = self.found.model.timed, self.found.posterior
-        ways = {"duration\ns": timed.lasts, "displacement\nm": timed.travels}
-        errors = {f"from {name}\nmm": value for name, value in self.away.items()}
-        errors |= {f"{name}\n{'mm' if 'vertex' in name else 'ms'}": value for name, value in self.errors.items()}
-        table.add_column("segment", no_wrap=True)
-        for name in (*ways, *errors, "left\nnats", "behind\nnats", "bent", "k-hat"):
-            table.add_column(name, justify="right")
+        posterior = self.found.posterior
         measured = [(measure(self.found.x), measure(self.drawn[0])) for measure in ways.values()]
         for row, key in enumerate(self.keys):
             others = posterior.behind[1:, row].tolist()
-            table.add_row(
+            what.add_row(
                 "/".join(key),
                 *(_with_interval(value[row], drawn[:, row]) for value, drawn in measured),
                 *(f"{1000 * float(value[row]):.1f}" for value in errors.values()),
+            )
+            how.add_row(
+                "/".join(key),
                 _brief(float(posterior.left[row])),
                 " to ".join(dict.fromkeys(map(_brief, others[:1] + others[-1:]))),
                 str(int(posterior.bent[row])),
                 f"{float(self.khat[row]):.2f}",
             )
-        return table
+        return Group(what, how)
 
     def motion(self, draws: int = 0) -> MotionSet:
         """The most probable segments, and after each some of its draws: clips, from the origin, facing heading zero."""
@@ -241,6 +245,15 @@ def _check_something(seen: Batch) -> None:
     if not (known := some.any(-1)).all():
         row = int(known.logical_not().nonzero()[0])
         raise ValueError(f"nothing was seen of segment {row} of {len(known)}: all of it is NaN")
+
+
+def _table(columns: Sequence[str], caption: str) -> Table:
+    """With a column for segments; on a narrow terminal cells are folded, and nothing of a number is cut away."""
+    table = Table(caption=caption)
+    table.add_column("segment", overflow="fold")
+    for column in columns:
+        table.add_column(column, justify="right", overflow="fold")
+    return table
 
 
 def _with_interval(value: Tensor, drawn: Tensor) -> str:

@@ -114,7 +114,7 @@ def recovered(capsys, folder, *arguments):
 def test_segments_are_recovered_from_a_glimpse(capsys, folder, tmp_path):
     one = ["--from", "person_0001", "--seen", "markers", "--seconds", "0.25", "--gaps", "0.2", "--draws", "2"]
     table, said = recovered(capsys, folder, *one, "--out", tmp_path / "a.npz")
-    for word in ("duration", "from markers", "vertex error", "left", "behind", "k-hat", "train/person_0001"):
+    for word in ("duration", "markers", "vertex", "left", "behind", "k-hat", "train/person_0001"):
         assert word in table
     assert "1 of 1 segments not converged" in said
     assert "; try --marker 0." in said
@@ -157,7 +157,7 @@ def test_what_somebody_has_seen_is_read_without_the_data(capsys, folder, tmp_pat
     assert "the search starts from the prior alone" in said
     assert "seen/segment-00" in table
     assert "seen/segment-01" in table
-    assert "vertex error" not in table
+    assert "vertex" not in table
     table, said = recovered(capsys, folder, "--file", tmp_path / "one.npz", "--out", tmp_path / "one.html")
     assert "prior alone" not in said
     assert "truth" not in (tmp_path / "one.html").read_text()
