@@ -206,7 +206,8 @@ class SegmentCompletion:
                 raise ValueError(f"segment {row} has {name} at moment {column}, but no time and no frame there")
         frames, last = found.get(FRAMES), self.model.timed.frames - 1
         if frames is not None and ((frames < 0) | (frames > last)).any():
-            raise ValueError(f"frames of chi are from 0 to {last}, got {frames.nan_to_num(0).aminmax()}")
+            low, high = frames.nan_to_num(0.0).aminmax()
+            raise ValueError(f"frames of chi are from 0 to {last}, got {low:g} to {high:g}")
         if SHAPE in found and not found[SHAPE].isfinite().all():
             raise ValueError(f"{SHAPE} is known of all segments, or left out and looked for; got NaN in some")
         return found | ({SURFACES: found[SURFACES][..., ::THIN, :]} if SURFACES in found else {})

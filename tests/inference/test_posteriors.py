@@ -9,6 +9,8 @@ from pyro.infer.autoguide import AutoLaplaceApproximation
 from pyro.infer.autoguide.initialization import init_to_value
 
 import dvae
+from dvae.inference import posteriors
+from dvae.inference.result import progress_bar
 
 QUICK = dvae.Descent(steps=60, newton=3)
 BRIEF = dvae.Descent(steps=10, starts=2, candidates=2)
@@ -32,7 +34,9 @@ def test_it_is_the_oracles_where_everything_is_normal():
     mean, spread = oracle.posterior(x)
     torch.testing.assert_close(joined(whole.mode), mean, rtol=0, atol=1e-9)
     torch.testing.assert_close(covariance(whole), spread.expand(5, -1, -1), rtol=0, atol=1e-9)
-    torch.testing.assert_close(whole.evidence(model.model, {"x": x}, 20).bound, oracle.evidence(x), rtol=0, atol=1e-8)
+    for chunk in (4096, 15):
+        evidence = whole.evidence(model.model, {"x": x}, 20, chunk=chunk).bound
+        torch.testing.assert_close(evidence, oracle.evidence(x), rtol=0, atol=1e-8)
     assert whole.left.max() < 1e-9
     assert not whole.bent.any()
 
@@ -47,6 +51,19 @@ def test_it_is_the_oracles_where_everything_is_normal():
         torch.testing.assert_close(joined(part.mode)[row], expected, rtol=0, atol=1e-9)
         left = everything[:latents, :latents] - gain @ everything[known][:, :latents]
         torch.testing.assert_close(covariance(part)[row], left, rtol=0, atol=1e-9)
+
+
+def test_a_bar_is_full_when_the_work_is_done(monkeypatch):
+    bars = []
+    monkeypatch.setattr(
+        posteriors, "progress_bar", lambda shown: bars.append((progress_bar(False), shown)) or bars[-1][0]
+    )
+    x = torch.randn(5, 5, dtype=torch.float64)
+    for progress in (False, True):
+        dvae.posterior(bowed, {"x": x}, descent=BRIEF, chunk=4, progress=progress)
+    assert [shown for _, shown in bars] == [False, True]
+    for bar, _ in bars:
+        assert bar.tasks[0].completed == bar.tasks[0].total > 30  # of three chunks, ten steps each
 
 
 def bowed(batch):

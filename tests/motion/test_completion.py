@@ -271,7 +271,7 @@ def test_what_cannot_have_been_seen_is_refused(model):
         ({"frames": seen["frames"]}, "some of surfaces, points and markers"),
         ({"markers": seen["markers"]}, "at moments"),
         ({**seen, "markers": seen["markers"][:, :, :5]}, r"markers has shape \(2, 2, 5, 3\), expected \(2, 2, 16, 3\)"),
-        ({**seen, "frames": seen["frames"] + 60}, "from 0 to 99"),
+        ({**seen, "frames": seen["frames"] + 60}, "from 0 to 99, got 60 to 110"),
         ({**seen, "frames": seen["frames"] * torch.nan}, "segment 0 has markers at moment 0"),
         ({**seen, SHAPE: shape * torch.nan}, "beta is known of all segments"),
     ):
