@@ -127,9 +127,8 @@ class MotionLatent(Method):
         return Recipe(train, validation, stages)
 
     def _weighing(self, tasks: tuple[str, ...], others: Evidence) -> GradNorm:
-        shared = (
-            f"generator.{TURNS}.network.trunk.hidden.{2 * len(self.widths) - 2}."  # of the last, only rows are a task's
-        )
+        last = 2 * len(self.widths) - 2  # of the layer behind it every row is of one task
+        shared = f"generator.{TURNS}.network.trunk.hidden.{last}."
         return GradNorm(tasks, shared, others, asymmetry=0.0, learning_rate=self.pace)
 
 
