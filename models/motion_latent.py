@@ -71,7 +71,7 @@ class MotionLatent(Method):
     exact: ClassVar[str] = "q(z | turns_{1:T}, place_{1:T}, time_{1:T}, beta)"
 
     latent: Size = 64
-    widths: tuple[Size, ...] = (1024, 512, 256)
+    widths: tuple[Size, ...] = (256,)
     shaped: bool = False
     kl: Amount = 0.01
     scale: Positive = 0.1

@@ -66,6 +66,8 @@ WAYS = {
     "turns scaled": Case(data={"scaling": "deviation"}),
     "time warped": Case(data={"warped": True}),
     "own bodies": Case(data={"bodies": 0.0}),
+    "two layers": Case({"widths": (512, 256)}),
+    "three layers": Case({"widths": (1024, 512, 256)}),
 }
 SIZES = {f"z of {size}": Case({"latent": size}) for size in (16, 32, 128)}
 WEIGHTS = {f"KL {weight:g}": Case({"kl": weight}) for weight in (0.001, 0.1, 1.0)}
