@@ -24,10 +24,11 @@ def code(text: str) -> str:
     return "`" + text.replace("|", "\\|") + "`"
 
 
-def write(page: Path, *tables: str) -> None:
-    """Puts tables between the marks of a page."""
-    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    page.write_text(before + BEGIN + "\n" + "\n".join(tables) + "\n" + END + rest.split(END)[1], encoding="utf-8")
+def write(page: Path, *tables: str, name: str = "tables") -> None:
+    """Puts tables between the marks of a page, or between those that have another name."""
+    begin, end = (mark.replace("tables", name) for mark in (BEGIN, END))
+    before, rest = page.read_text(encoding="utf-8").split(begin)
+    page.write_text(before + begin + "\n" + "\n".join(tables) + "\n" + end + rest.split(end)[1], encoding="utf-8")
 
 
 def joined(files: Sequence[Path]) -> tuple[dvae.Evaluation, str]:

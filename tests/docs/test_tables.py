@@ -11,6 +11,7 @@ from benchmarks.tables import (
     audits,
     bones,
     bounds,
+    completion,
     demo,
     family,
     gsps,
@@ -23,8 +24,10 @@ from benchmarks.tables import (
     rotations,
     trajevae,
 )
-from dvae import Evaluation, motion
+from dvae import Descent, Evaluation, Training, method, motion
 from dvae.cli import main as command
+from dvae.motion import segmented
+from dvae.runs.directory import fit_run
 
 SMALL = ["--steps", "2", "--batch-size", "4", "--validate-every", "2"]
 
@@ -172,6 +175,97 @@ def test_mix_and_match(tmp_path, page, monkeypatch):
     assert [row[:2] for row in angles[1:]] == [["zero velocity", "1"], ["mix", "1"], *counts]
     assert [row[0] for row in swept[1:]] == ["alpha 0.1", "alpha 0.3"]
     assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Completion of simulated people, from little and for half a second."""
+    few = motion.simulate(clips=10, frames=90, seed=1)
+    monkeypatch.setattr(segmented, "simulate", lambda: few)
+    monkeypatch.setattr(completion.Source, "grouped", property(lambda source: source.data.segments))
+    for name, value in {"HORIZON": 0.5, "DESCENT": Descent(2, starts=2, candidates=2, newton=0), "DRAWS": 30}.items():
+        monkeypatch.setattr(completion, name, value)
+    for name, value in {
+        "POINTS": (5, 10),
+        "FRAMES": (4, 100),
+        "FEW": 5,
+        "RESIDUAL": completion.RESIDUAL | {"width": 4},
+    }.items():
+        monkeypatch.setattr(completion, name, value)
+    sights = {(5, 4): False, (5, 100): False, (10, 100): True, (0, 4): True}
+    found = [completion.Sight(*sight, markers) for sight, markers in sights.items()]
+    monkeypatch.setattr(completion, "SIGHTS", {"few": found})
+    monkeypatch.setattr(completion, "GRID", [completion.Sight(n, k) for n in (5, 10) for k in (4, 100)])
+    return completion.Budget(some=2, known=2, steps=2, dense=20)
+
+
+def test_completion(tmp_path, page, short, monkeypatch):
+    """Measured once, whatever is asked again; what is seen is not predicted, and nothing is nearer than the floor."""
+    small = method("motion-latent", latent=3, widths=(8,), finish=0.0)
+    fit_run(small, segmented.SegmentData.open(), tmp_path / "a", Training(steps=2, batch_size=4, progress=False))
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    for name in ("BEGIN", "END"):
+        page.write_text(
+            page.read_text().replace(getattr(pages, name), getattr(pages, name).replace("tables", "completion"))
+        )
+    options = {"out": tmp_path / "out", "picture": tmp_path / "a.png", "budget": short, "page": page}
+    runs = tmp_path / "a", tmp_path / "b"
+    completion.main("simulated", runs, parts=("prediction",), **options)
+    completion.main("simulated", runs[:1], parts=("completion", "grid", "uncertainty"), **options)
+    text, files = page.read_text(), sorted((tmp_path / "out").rglob("*.json"))
+    times = [file.stat().st_mtime_ns for file in files]
+    completion.main(None, runs, parts=("prediction",), **options)
+    completion.main(None, runs[:1], **options)
+    assert page.read_text() == text
+    assert [file.stat().st_mtime_ns for file in files] == times
+    page.write_text(text.replace("completion -->", "tables -->").replace("end of completion", "end of tables"))
+    curves, seen, *_, sure = tables(page)
+    assert [row[0] for row in curves[1:4]] == ["ours", "ours, body unknown", "reconstruction"]
+    assert curves[-1][0] == "segments"
+    assert [row[0] for row in seen[1:]][-2:] == ["10 points, 100 frames, markers", "0 points, 4 frames, markers"]
+    for row in seen[1:]:
+        assert float(row[4].split()[0]) < float(row[1].split()[0])
+    assert [row[0] for row in sure[1:]] == [str(sight) for sight in completion.SURE]
+    errors = completion.found_in(tmp_path / "out", "references")[0]["errors"]
+    observed = completion.moments(30.0)[1]
+    for row in errors.values():
+        assert max(each[observed - 1] for each in row) == 0 < min(each[observed] for each in row)
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+    monkeypatch.setattr(completion, "TRIED", {"surface": (0.01, 0.1), "marker": (), "point": ()})
+    monkeypatch.setattr(completion, "DESCENTS", [])
+    completion.main("simulated", (), tmp_path / "a", parts=("tuning",), **{**options, "page": None})
+    assert len([*(tmp_path / "out" / completion.TUNING).glob("*.json")]) == 2
+    with pytest.raises(SystemExit, match="no part guesses"):
+        completion.main(parts=("guesses",), **options)
+
+
+def test_recurrent_poses_are_put_where_segments_start(short):
+    """What knows the future makes the true surfaces, whatever segments face and wherever they are."""
+    data = segmented.SegmentData.open()
+    held = completion.Held(MotionSpace(data), data.windows("test"), {})
+    people, cut = held.segments.motion, completion.protocol(30.0)
+    windows = motion.windows(people, cut, "test")
+    assert len(windows) == len(people)
+
+    class Oracle:
+        turns = windows.schema.view
+
+        def read(self, batch):
+            return batch
+
+        def model(self, batch, length, mean_emission):
+            return {"x": self.turns(windows.all())["x"][:, cut.observed :]}
+
+    errors = completion.references(held, Oracle())["errors"]
+    assert max(max(row) for row in errors[completion.SUP]) < 5  # mm, of which frames of chi lose 2
+    assert min(row[-1] for row in errors[completion.STILL]) > 50
+
+
+class MotionSpace:
+    """Frames and a body, of which surfaces are made."""
+
+    def __init__(self, data):
+        self.timed, self.body = data.timed, motion.bodies.human()
 
 
 def test_rotations(folder, page):
