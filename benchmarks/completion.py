@@ -1,10 +1,12 @@
 """Speed of completion at the sizes of the paper's latent: `python benchmarks/completion.py`, or `make bench`.
 
-    descent    steps of Adam for 100 segments, of which 16 markers are seen in 5 frames: one by one over in one batch
-    curvature  the same of what comes once, above all the posterior's curvature
+    whole      100 segments from one start each, of which 16 markers are seen in 5 frames: one by one over in one batch
+    descent    the same of steps of Adam alone
+    curvature  of what comes once, above all the posterior's curvature
 
 Of one segment most time goes into starting operations, of many into the operations themselves. The decoder is not
-fitted, which changes no time; a segment stands for all of those that are completed one by one.
+fitted, which changes no time; a segment stands for all of those that are completed one by one. Times are the
+processor's.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from dvae.motion.completion import complete, glimpsed
 from dvae.motion.embodied import Segments
 
 MANY, STEPS = 100, 101
-TARGETS = {"descent": ("at least", 20.0)}
+TARGETS = {"whole": ("at least", 20.0), "descent": ("at least", 20.0)}
 
 
 def main() -> None:
@@ -34,15 +36,24 @@ def main() -> None:
     x, shape = batch["x"][rows], batch["beta"][rows]
     seen = glimpsed(model, x, shape, "markers", frames=range(0, 100, 20))
 
-    def seconds(steps: int, end: int) -> float:
-        begun = time.perf_counter()
-        descent = dvae.Descent(steps=steps, starts=1, candidates=1, newton=0)
+    def seconds(descent: dvae.Descent, end: int) -> float:
+        begun = time.process_time()
         complete(model, {name: value[:end] for name, value in seen.items()}, descent=descent)
-        return time.perf_counter() - begun
+        return time.process_time() - begun
 
-    times = {end: [min(seconds(steps, end) for _ in range(3)) for steps in (1, STEPS)] for end in (1, MANY)}
-    descents = {end: after - before for end, (before, after) in times.items()}
-    found = {"descent": MANY * descents[1] / descents[MANY], "curvature": MANY * times[1][0] / times[MANY][0]}
+    descents = {steps: dvae.Descent(steps=steps, starts=1, candidates=1, newton=0) for steps in (1, STEPS)}
+    descents["whole"] = dvae.Descent(starts=1)
+    # the two sides in turns, so that what else the machine does counts for both
+    rounds = [
+        {(name, end): seconds(each, end) for name, each in descents.items() for end in (1, MANY)} for _ in range(3)
+    ]
+    least = {key: min(times[key] for times in rounds) for key in rounds[0]}
+    steps = {end: least[STEPS, end] - least[1, end] for end in (1, MANY)}
+    found = {
+        "whole": MANY * least["whole", 1] / least["whole", MANY],
+        "descent": MANY * steps[1] / steps[MANY],
+        "curvature": MANY * least[1, 1] / least[1, MANY],
+    }
     report(found, TARGETS)
 
 

@@ -17,7 +17,7 @@ size for both phases, and the layer by whose gradients weights adapt, the last t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -156,11 +156,24 @@ class MotionLatentModel(DynamicalVAE):
 
         Where some frames (K,) are asked for, these alone are made, (..., K, D).
         """
+        return self.decoder(latent, shape)(frames)
+
+    def decoder(self, latent: Tensor, shape: Tensor) -> Callable[..., Tensor]:
+        """What makes frames of latents (..., Z) on bodies (..., S), of which what frames share is computed once.
+
+        Returns:
+            A function of frames (K,), or None for all, and a slice of coordinates, all by default: see `decode`.
+        """
         network = self.generator[TURNS].network
         given = {"z": latent.flatten(0, -2), SHAPE: shape.flatten(0, -2)}
         # of all parts at once, each of which has its features for means (`MotionLatent.laws`)
-        made: Tensor = network.trunk([given[parent.name] for parent in network.inputs], frames)
-        return made.unflatten(0, latent.shape[:-1])
+        features = network.trunk.features([given[parent.name] for parent in network.inputs])
+
+        def made(frames: Tensor | None = None, coordinates: slice = slice(None)) -> Tensor:
+            found: Tensor = network.trunk.made(features, frames, coordinates)
+            return found.unflatten(0, latent.shape[:-1])
+
+        return made
 
     def vertices(self, x: Tensor, shape: Tensor) -> Tensor:
         """Surfaces (..., N, V, 3) in metres of frames (..., N, D) on bodies (..., S), with gradients."""

@@ -24,7 +24,7 @@ points are few. A frame's surface counts as one vertex, the mean of all, for its
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import log, pi, sqrt
 from typing import Any
@@ -45,6 +45,8 @@ from .segments import TimedFrames
 
 LATENT = "z"
 TIMES, FRAMES, SURFACES, POINTS, SPOTS = "times", "frames", "surfaces", "points", "markers"
+TIME = slice(-1, None)
+"""Coordinates of a frame that say when it is."""
 NEAREST = "nearest"
 """Name of the vertices (B, K, M) that are taken for the nearest ones of points."""
 AT_ONCE = 32
@@ -85,8 +87,8 @@ class SegmentCompletion:
     """The Pyro program of what was seen, for `dvae.posterior` and for Pyro's own guides (`AutoDelta`, ...).
 
     Args:
-        model: of segments, such as `dvae.models.motion_latent.MotionLatentModel`, of which `decode`, `guide`, `timed`
-            and `body` are used.
+        model: of segments, such as `dvae.models.motion_latent.MotionLatentModel`, of which `decode`, `decoder`,
+            `guide`, `timed` and `body` are used.
         deviations: of what was seen.
         markers: the vertices of markers (L,); `bodies.MARKERS` by default.
         known: segments (x and beta), whose latents by the guide are where motion is: starts beside those of the prior.
@@ -163,11 +165,11 @@ class SegmentCompletion:
         return times, made
 
     def _met(self, z: Tensor, shape: Tensor, seen: Batch) -> tuple[Tensor, Tensor]:
-        """`_met` of what is decoded: of some frames alone, where these were seen of all and no time counts."""
-        frames = seen.get(FRAMES)
+        """`_met` of what is decoded, of which no more is made than is met."""
+        frames, made = seen.get(FRAMES), self.model.decoder(z, shape)
         if TIMES not in seen and frames is not None and bool((frames == frames[:1].round()).all()):
-            return self.model.decode(z, shape, frames[0].long()), frames
-        return _met(self.model.timed, self.model.decode(z, shape), seen)
+            return made(frames[0].long()), frames
+        return _along(self.model.timed.times(made(None, TIME)), made, seen)
 
     def read(self, seen: Batch) -> dict[str, Tensor]:
         """What was seen, checked, in the model's precision and on its device; of surfaces one vertex in `THIN`.
@@ -415,19 +417,29 @@ def _met(timed: TimedFrames, x: Tensor, seen: Batch) -> tuple[Tensor, Tensor]:
 
     Moments behind the end are at the end, whose time says by how much too early it comes.
     """
-    decoded = timed.times(x)
+    return _along(timed.times(x), lambda frames: x if frames is None else x[:, frames], seen)
+
+
+def _along(decoded: Tensor, made: Callable[[Tensor | None], Tensor], seen: Batch) -> tuple[Tensor, Tensor]:
+    """`_met` of frames at these times (B, N), of which those that lie at moments are made, or all (None)."""
+    many = decoded.shape[1]
     times = seen.get(TIMES, torch.full_like(seen[FRAMES], torch.nan) if FRAMES in seen else None)
     at = times.nan_to_num(0.0)
-    before = torch.searchsorted(decoded.detach(), at.contiguous(), right=True).sub(1).clamp(0, timed.frames - 2)
-    start, end = decoded.gather(1, before), decoded.gather(1, before + 1)
+    before = torch.searchsorted(decoded.detach(), at.contiguous(), right=True).sub(1).clamp(0, many - 2)
+    ends = torch.stack([before, before + 1], -1)
+    start, end = (decoded.gather(1, each) for each in ends.unbind(-1))
     share = ((at - start) / (end - start)).clamp(0, 1)
     if FRAMES in seen:
         frames = seen[FRAMES].nan_to_num(0.0)
-        located, floor = seen[FRAMES].isfinite(), frames.floor().clamp(max=timed.frames - 2)
-        before = torch.where(located, floor.long(), before)
-        share = torch.where(located, frames - floor, share)
-        start, end = decoded.gather(1, before), decoded.gather(1, before + 1)
+        located, around = seen[FRAMES].isfinite(), torch.stack([frames.floor(), frames.ceil()], -1)
+        ends = torch.where(located[..., None], around.long(), ends)
+        share = torch.where(located, frames - around[..., 0], share)
+        start, end = (decoded.gather(1, each) for each in ends.unbind(-1))
+    needed = torch.zeros(many, dtype=torch.bool, device=ends.device).index_fill(0, ends.flatten(), True)
+    if few := 2 * int(needed.sum()) <= many:  # of more, choosing takes longer than making all
+        ends = (needed.cumsum(0) - 1)[ends]
+    x = made(needed.nonzero().squeeze(1) if few else None)
     weights = torch.stack([1 - share, share], -1)
     # by a product of matrices, whose gradient is one too: that of an index is as large as x, once for each
-    lines = torch.zeros(*before.shape, timed.frames).to(x).scatter(2, torch.stack([before, before + 1], -1), weights)
+    lines = torch.zeros(*share.shape, x.shape[1]).to(x).scatter_add(2, ends, weights)
     return lines @ x, torch.lerp(start, end, share)

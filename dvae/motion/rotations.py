@@ -64,11 +64,16 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
     if form == "6d":
         shortest = torch.finfo(values.dtype).eps
         first, second = values.unflatten(-1, (2, 3)).unbind(-2)
-        first = torch.where(first.norm(dim=-1, keepdim=True) < shortest, values.new_tensor([1.0, 0, 0]), first)
-        axis = torch.nn.functional.normalize(first, dim=-1)
-        apart = second - (axis * second).sum(-1, keepdim=True) * axis
-        along = apart.norm(dim=-1, keepdim=True) <= (shortest**0.5 * second.norm(dim=-1, keepdim=True)).clamp(shortest)
-        return roma.special_gramschmidt(torch.stack([first, torch.where(along, across(axis), second)], -1))
+        # asked first, for gradients of what is not chosen cost as much as those of what is
+        if (short := first.norm(dim=-1, keepdim=True) < shortest).any():
+            first = torch.where(short, values.new_tensor([1.0, 0, 0]), first)
+        with torch.no_grad():
+            axis = torch.nn.functional.normalize(first, dim=-1)
+            apart = (second - (axis * second).sum(-1, keepdim=True) * axis).norm(dim=-1, keepdim=True)
+            along = apart <= (shortest**0.5 * second.norm(dim=-1, keepdim=True)).clamp(shortest)
+        if along.any():
+            second = torch.where(along, across(torch.nn.functional.normalize(first, dim=-1)), second)
+        return roma.special_gramschmidt(torch.stack([first, second], -1))
     return roma.euler_to_rotmat(form.removeprefix("euler-").upper(), values)
 
 

@@ -235,9 +235,12 @@ class TimedFrames:
 
     def poses(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """What any frames (..., D) say of poses, with gradients: rotations (..., J, 3, 3) and places (..., 3)."""
-        rotations = torch.eye(3).to(x).repeat(*x.shape[:-1], self.skeleton.joints, 1, 1)
-        rotations[..., self.turning, :, :] = to_matrix(self._turns(x), "6d")
-        return rotations, x[..., self.parts["place"]] * self.metres
+        turning = self.turning
+        ends = [joint for joint in range(self.skeleton.joints) if joint not in turning]
+        unturned = torch.eye(3).to(x).expand(*x.shape[:-1], len(ends), 3, 3)
+        places = torch.tensor([*turning, *ends], device=x.device).argsort()
+        rotations = torch.cat([to_matrix(self._turns(x), "6d"), unturned], -3).index_select(-3, places)
+        return rotations, x[..., -4:-1] * self.metres
 
     def times(self, x: Tensor) -> Tensor:
         """When frames (..., N, D) are, from the first on, (..., N) in seconds, with gradients."""

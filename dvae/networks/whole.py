@@ -107,14 +107,21 @@ class Trunk(nn.Module):
         self.out = nn.Linear((size, *spec.widths)[-1], spec.length * numbers)
         self.length = spec.length
 
-    def forward(self, given: Sequence[Tensor], steps: Tensor | None = None) -> Tensor:
-        """All steps of all variables; or these (K,) alone, of which no other is computed."""
-        hidden = self.hidden(torch.cat(list(given), -1))
-        weight, bias = self.out.weight, self.out.bias
+    def forward(self, given: Sequence[Tensor]) -> Tensor:
+        """All steps of all variables."""
+        return self.made(self.features(given))
+
+    def features(self, given: Sequence[Tensor]) -> Tensor:
+        """What all steps are made of, (B, H)."""
+        found: Tensor = self.hidden(torch.cat(list(given), -1))
+        return found
+
+    def made(self, features: Tensor, steps: Tensor | None = None, coordinates: slice = slice(None)) -> Tensor:
+        """Steps of features: all, or these (K,) and these coordinates alone, of which no other is computed."""
+        weight, bias = (part.unflatten(0, (self.length, -1))[:, coordinates] for part in self.out.parameters())
         if steps is not None:
-            weight, bias = (part.unflatten(0, (self.length, -1))[steps].flatten(0, 1) for part in (weight, bias))
-        length = self.length if steps is None else len(steps)
-        made: Tensor = functional.linear(hidden, weight, bias).unflatten(-1, (length, -1))
+            weight, bias = weight[steps], bias[steps]
+        made: Tensor = functional.linear(features, weight.flatten(0, 1), bias.flatten()).unflatten(-1, bias.shape)
         return made
 
 

@@ -124,8 +124,8 @@ class Body(nn.Module):
         Raises:
             ValueError: shapes that do not fit the body or each other.
         """
-        poses, joints = self._posed(shape, rotations, translation)
-        vertices = (poses @ self._hung(shape).mT).unflatten(-2, (-1, 3)).mT
+        moves, joints = self._posed(shape, rotations, translation)
+        vertices = (_flat(moves) @ self._hung(shape).mT).unflatten(-2, (-1, 3)).mT
         # last, as rounding would grow with how far somebody walks
         return vertices + translation[..., None, :], joints + translation[..., None, :]
 
@@ -139,21 +139,23 @@ class Body(nn.Module):
         Returns:
             (..., T, M, 3) in metres.
         """
-        poses, _ = self._posed(shape, rotations, translation)
+        moves, _ = self._posed(shape, rotations, translation)
         if vertices.dim() == 1:
-            found: Tensor = (poses @ self._hung(shape, vertices).mT).unflatten(-2, (-1, 3)).mT
-            return found + translation[..., None, :]
+            resting = _changed(self.template[vertices], self.shapes[vertices], shape).mT[..., None, None, :, :]
+            # first by the weights, which all bodies share: second derivatives of the other order take twice as long
+            moved = moves.movedim(-3, -1).contiguous() @ self.weights[vertices].mT  # (..., T, 3, 4, M)
+            placed = (moved[..., :3, :] * resting).sum(-2) + moved[..., 3, :]
+            return placed.mT + translation[..., None, :]
         frames = translation.shape[:-1]
         which = vertices.flatten(-2)[..., None].expand(*frames[:-1], -1, 3)
         resting = self.at_rest(shape)[0].gather(-2, which).unflatten(-2, vertices.shape[-2:])
-        moves = poses.unflatten(-2, (-1, 3)).unflatten(-1, (-1, 4)).movedim(-2, -3).flatten(-2)  # (..., T, J, 12)
         rows = torch.arange(frames.numel(), device=vertices.device).reshape(*frames, 1) * self.joints
         weights, joints = self._carried
         moved = torch.zeros_like(resting[..., None])
         for share, joint in zip(weights.unbind(-1), joints.unbind(-1), strict=True):
-            going = moves.flatten(0, -2)[rows + joint[vertices]].unflatten(-1, (3, 4))
+            going = moves.flatten(-2).flatten(0, -2)[rows + joint[vertices]].unflatten(-1, (3, 4))
             moved = moved + share[vertices][..., None, None] * going
-        found = (moved[..., :3] @ resting[..., None]).squeeze(-1) + moved[..., 3] + translation[..., None, :]
+        found: Tensor = (moved[..., :3] @ resting[..., None]).squeeze(-1) + moved[..., 3] + translation[..., None, :]
         return found
 
     @property
@@ -171,7 +173,7 @@ class Body(nn.Module):
             shape: of each body, (..., S).
             first, second: rotations (..., T, J, 3, 3) and translation (..., T, 3) of each, as `forward` takes them.
         """
-        ours, theirs = (self._posed(shape, *motion)[0] for motion in (first, second))
+        ours, theirs = (_flat(self._posed(shape, *motion)[0]) for motion in (first, second))
         apart = (ours - theirs).unflatten(-1, (-1, 4))
         moved = (first[1] - second[1]).flatten(-2)[..., None]  # all joints alike, as weights have the sum 1
         apart = torch.cat([apart[..., :3], apart[..., 3:] + moved[..., None, :]], -1).flatten(-2)
@@ -180,11 +182,11 @@ class Body(nn.Module):
         found: Tensor = ((apart @ form) * apart).sum(-1).unflatten(-1, (-1, 3)).sum(-1)
         return found
 
-    def _hung(self, shape: Tensor, vertices: Tensor | slice = slice(None)) -> Tensor:
+    def _hung(self, shape: Tensor) -> Tensor:
         """Vertices at rest by the joints that they hang on, (..., V, 4 J)."""
-        resting = _changed(self.template[vertices], self.shapes[vertices], shape)
+        resting = _changed(self.template, self.shapes, shape)
         surface = torch.cat([resting, torch.ones_like(resting[..., :1])], -1)
-        return (self.weights[vertices][..., None] * surface[..., None, :]).flatten(-2)
+        return (self.weights[..., None] * surface[..., None, :]).flatten(-2)
 
     def _pivots(self, shape: Tensor) -> Tensor:
         """Joints at rest (..., J, 3): linear in the shape as vertices are, and fewer."""
@@ -192,7 +194,7 @@ class Body(nn.Module):
         return _changed(self.regressor @ self.template, changes, shape)
 
     def _posed(self, shape: Tensor, rotations: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-        """What joints do to what hangs on them (..., 3 T, 4 J), and where they are (..., T, J, 3), not translated."""
+        """What joints do to what hangs on them (..., T, J, 3, 4), and where they are (..., T, J, 3), not translated."""
         frames = translation.shape[:-1]
         if rotations.shape != (*frames, self.joints, 3, 3) or shape.shape[:-1] != frames[:-1] or not frames:
             raise ValueError(
@@ -205,8 +207,12 @@ class Body(nn.Module):
         offsets = pivots - pivots[..., [max(parent, 0) for parent in self.parents], :]
         joints, turns = forward(self.parents, rotations, offsets, pivots[..., root, :].expand_as(translation))
         moved = joints - (turns @ pivots[..., None]).squeeze(-1)
-        poses = torch.cat([turns, moved[..., None]], -1)  # (..., T, J, 3, 4)
-        return poses.movedim(-2, -3).flatten(-2).flatten(-3, -2), joints
+        return torch.cat([turns, moved[..., None]], -1), joints
+
+
+def _flat(moves: Tensor) -> Tensor:
+    """(..., 3 T, 4 J) of what joints do (..., T, J, 3, 4)."""
+    return moves.movedim(-2, -3).flatten(-2).flatten(-3, -2)
 
 
 def _changed(average: Tensor, changes: Tensor, shape: Tensor) -> Tensor:
