@@ -76,8 +76,8 @@ class MotionLatent(Method):
     kl: Amount = 0.01
     scale: Positive = 0.1
     deviation: Positive = 0.05
-    finish: Share = 0.2
-    finish_rate: Positive = 1e-4
+    finish: Share = 0.4
+    finish_rate: Positive = 3e-4
     pace: Share = 0.025
 
     @override
