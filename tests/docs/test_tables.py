@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 
 import networkx as nx
 import pytest
@@ -18,6 +19,7 @@ from benchmarks.tables import (
     hit_dvae,
     house,
     mix_and_match,
+    motion_latent,
     occlusion,
     overview,
     pages,
@@ -52,6 +54,12 @@ def fitted(folder, name, method, *options):
 def evaluated(folder, name, *options, runs):
     dvae("evaluate", *runs, "--samples", 3, "--out", folder / f"{name}.json", *options)
     return folder / f"{name}.json"
+
+
+@pytest.fixture(autouse=True)
+def _as_many_threads(monkeypatch):
+    """As there were: scripts take one."""
+    monkeypatch.setattr(torch, "set_num_threads", lambda number: None)
 
 
 @pytest.fixture
@@ -197,6 +205,40 @@ def short(monkeypatch):
     monkeypatch.setattr(completion, "SIGHTS", {"few": found})
     monkeypatch.setattr(completion, "GRID", [completion.Sight(n, k) for n in (5, 10) for k in (4, 100)])
     return completion.Budget(some=2, known=2, steps=2, dense=20)
+
+
+def test_motion_latent(tmp_path, page, monkeypatch):
+    """Fitted and scored once, whatever is asked again; an interrupted run goes on; seeds have errors."""
+    people = motion.simulate(clips=24, frames=90, seed=1)
+    told = [
+        {**clip.labels, "file_group": "ABC"[n % 3], "content": ("walk", "run")[n % 2]} for n, clip in enumerate(people)
+    ]
+    clips = [replace(clip, labels=labels) for clip, labels in zip(people, told, strict=True)]
+    motion.save(tmp_path / "people.npz", replace(people, clips=clips))
+    monkeypatch.setattr(motion_latent, "PAIRS", 4)
+    for cases in motion_latent.SECTIONS.values():
+        for name, case in cases.items():
+            small = replace(case, method={"widths": (8,), **case.method, "latent": case.method.get("latent", 64) // 16})
+            monkeypatch.setitem(cases, name, small)
+    options = {"runs": tmp_path / "runs", "page": page, "picture": tmp_path / "a.png", "steps": 3}
+    data = {"data": tmp_path / "people.npz", "other": tmp_path / "people.npz"}
+    main, tuning = motion_latent.main, ("both phases", "turns scaled", "z of 16")
+    main(**data, sections=("held out",), cases=("both phases", "first phase alone"), seeds=(0, 1), **options)
+    main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
+    text, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
+    times = [file.stat().st_mtime_ns for file in files]
+    main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
+    assert page.read_text() == text
+    assert [file.stat().st_mtime_ns for file in files] == times
+    (tmp_path / "runs" / "tuning" / "z-of-16-0" / motion_latent.MEASURED).unlink()
+    main(**data, sections=("tuning",), cases=("z of 16",), seeds=(0,), **options)
+    assert page.read_text().count("| z of 16 |") == 1
+    varied, _, same, against, other, _ = tables(page)
+    assert [row[0] for row in varied[1:]] == [*tuning, "PCA of 12", "PCA of 9"]
+    assert [row[0] for row in same[1:]] == ["both phases", "first phase alone", "PCA of 12"]
+    assert [row[0] for row in against[1:]][1] == "both phases minus PCA of 12"
+    assert other[1][1] != same[1][1]
+    assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_completion(tmp_path, page, short, monkeypatch):
