@@ -141,16 +141,16 @@ def run(section: str, case: str, seed: int, out: Path, file: Path, other: Path |
     config = Config(method, data.schema, data.kind, data.recorded(), training).written()
     torch.manual_seed(seed)
     model = method.build(data.schema)
-    start = time.process_time()
+    start, resumed = time.process_time(), Run(out).exists
     recipe = method.train(data.windows("train"), data.windows("validation"), steps)
-    recipe.fit(model, out=out, resume=Run(out).exists, config=config, **vars(training))
-    seconds = time.process_time() - start
+    recipe.fit(model, out=out, resume=resumed, config=config, **vars(training))
+    seconds = None if resumed else time.process_time() - start  # of a run that was not stopped
     tests = {"same source": data.windows("test")}
     if other is not None and section == HELD:
         tests["other source"] = elsewhere(other, data.timed)
     found = measured(model.eval(), tests, data.windows("train"), seed)
     (out / MEASURED).write_text(json.dumps(plain({"seconds": seconds, "steps": steps, **found})))
-    print(f"{out}: fitted in {seconds:.0f} s of processor time", flush=True)
+    print(f"{out}: measured", flush=True)
 
 
 @dataclass(frozen=True)
@@ -290,11 +290,11 @@ def main(
     parts = []
     for name, read in ((name, read) for name, read in there.items() if read):
         first = next(iter(read.values())).runs[0]
-        seconds = [run["seconds"] for case in read.values() for run in case.runs]
+        seconds = [run["seconds"] or np.nan for case in read.values() for run in case.runs]
         for test, found in first["scores"].items():
             count, takes = sum(found["takes"]), len(found["takes"])
-            said = f"{count} segments of {takes} takes. {first['steps']} steps of training, {min(seconds):.0f} to "
-            said += f"{max(seconds):.0f} s of processor time."
+            said = f"{count} segments of {takes} takes. {first['steps']} steps of training, {np.nanmin(seconds):.0f} "
+            said += f"to {np.nanmax(seconds):.0f} s of processor time."
             parts += [f"## {name.capitalize()}, {test}\n", f"{said}\n", scored(read, test), against(read, test)]
     write(page, *parts)
     draw(there[HELD], there[TUNING], picture)
