@@ -20,8 +20,8 @@ import dvae
 from dvae import motion
 from dvae.models.motion_latent import MotionLatent
 from dvae.motion import bodies
-from dvae.motion.completion import complete, glimpsed
-from dvae.motion.embodied import Segments
+from dvae.motion.segments.completion import complete, glimpsed
+from dvae.motion.segments.embodied import Segments
 
 MANY, STEPS = 100, 101
 TARGETS = {"whole": ("at least", 20.0), "descent": ("at least", 20.0)}

@@ -32,7 +32,7 @@ from ..inference.recipe import Recipe
 from ..inference.training import Stage
 from ..laws import FixedNormal, LawSpec
 from ..motion.bodies import Body, human
-from ..motion.embodied import SHAPE, SegmentSchema, surfaces_of
+from ..motion.segments.embodied import SHAPE, SegmentSchema, surfaces_of
 from ..networks import NetworkSpec, WholeDecoder, WholeEncoder
 from ..networks.base import share_modules
 from ..notation import Factorization

@@ -109,8 +109,8 @@ def test_registries_alone_name_motion():
         "dvae.runs.kinds": {
             "dvae.motion.protocols.Poses",
             "dvae.motion.dataset.MotionData",
-            "dvae.motion.embodied.SegmentSchema",
-            "dvae.motion.segmented.SegmentData",
+            "dvae.motion.segments.embodied.SegmentSchema",
+            "dvae.motion.segments.dataset.SegmentData",
         },
     }
 

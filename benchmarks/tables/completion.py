@@ -36,7 +36,8 @@ from dvae.inference.comparison import Crossed, Estimate
 from dvae.inference.held import plain
 from dvae.inference.result import canvas
 from dvae.motion import bodies
-from dvae.motion.completion import (
+from dvae.motion.rotations import to_matrix
+from dvae.motion.segments.completion import (
     Completed,
     Deviations,
     SegmentCompletion,
@@ -47,9 +48,8 @@ from dvae.motion.completion import (
     scanned,
     surfaces_at,
 )
-from dvae.motion.embodied import SHAPE, Segments
-from dvae.motion.rotations import to_matrix
-from dvae.motion.segmented import SegmentData
+from dvae.motion.segments.dataset import SegmentData
+from dvae.motion.segments.embodied import SHAPE, Segments
 from dvae.motion.skeleton import rotate_about_up
 from dvae.views import WHOLE
 

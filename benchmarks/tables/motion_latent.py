@@ -27,10 +27,10 @@ from dvae.inference.comparison import Crossed, Estimate
 from dvae.inference.held import clip_places, plain
 from dvae.inference.result import canvas
 from dvae.inference.scores import clip_means
-from dvae.motion.embodied import Segments
-from dvae.motion.interpolation import falls, interpolate
-from dvae.motion.reconstruction import reconstruct_segments
-from dvae.motion.segmented import SegmentData
+from dvae.motion.segments.dataset import SegmentData
+from dvae.motion.segments.embodied import Segments
+from dvae.motion.segments.interpolation import falls, interpolate
+from dvae.motion.segments.reconstruction import reconstruct_segments
 from dvae.runs.directory import Config
 
 from .pages import DOCS, table, write
@@ -41,6 +41,7 @@ GROUPS = {"A": "train", "B": "test"}
 TRAINING: dict[str, Any] = {"batch_size": 64, "validate_every": 250}
 PAIRS, STEPS = 200, 9
 """Of walks and runs that are interpolated, and the steps of each, both ends included."""
+FALLS = ("falls", "falls where the run is shorter")
 OURS, MEASURED = "ours", "measured.json"
 ERROR, DURATION = "vertex error", "duration error"
 
@@ -122,10 +123,12 @@ def interpolated(model: Any, test: Segments, seed: int) -> dict[str, Any]:
         ends.append(np.stack([generator.choice(those, PAIRS // 2) for those in own]))
     first, second = (each(test.all(), lambda value, some=some: value[some]) for some in np.concatenate(ends, 1))
     found = interpolate(model, first, second, STEPS)
+    lasts = [test.timed.lasts(batch["x"]) for batch in (first, second)]
+    falling, shorter = falls(found.durations), (lasts[1] < lasts[0]).to(found.durations.device)
     kept = {"durations": found.durations, "displacements": found.displacements, "local": found.local_pose}
     return {
-        "falls": falls(found.durations).double().mean().item(),
-        "pairs": PAIRS,
+        **dict(zip(FALLS, (falling.double().mean().item(), falling[shorter].double().mean().item()), strict=True)),
+        "shorter": shorter.double().mean().item(),
         **{name: values.double().mean(0).tolist() for name, values in kept.items()},
     }
 
@@ -197,14 +200,14 @@ class Read:
         """Vertex errors of all segments and seeds, in millimetres."""
         return np.concatenate([run["scores"][test]["errors"][self.row] for run in self.runs])
 
-    def falling(self) -> str:
+    def falling(self, name: str) -> str:
         """Share of pairs whose durations fall at each step, of each seed."""
-        return ", ".join(f"{run['interpolation']['falls']:.2f}" for run in self.runs) if self.row == OURS else "–"
+        return ", ".join(f"{run['interpolation'][name]:.2f}" for run in self.runs) if self.row == OURS else "–"
 
 
 def scored(cases: Mapping[str, Read], test: str) -> str:
     """Cases down, scores across."""
-    header = ["", "vertex error (mm)", "95 %", "median (mm)", "duration error (ms)", "ELBO (nats/frame)", "falls"]
+    header = ["", "vertex error (mm)", "95 %", "median (mm)", "duration error (ms)", "ELBO (nats/frame)", *FALLS]
     lines = []
     for name, case in cases.items():
         found = case.estimate(test, ERROR)
@@ -212,7 +215,7 @@ def scored(cases: Mapping[str, Read], test: str) -> str:
         interval = "–" if np.isnan(low) else f"{low:.1f} to {high:.1f}"
         median = f"{np.median(case.errors(test)):.1f}"
         lines.append([name, case.said(test, ERROR), interval, median, case.said(test, DURATION)])
-        lines[-1] += [case.said(test, "ELBO"), case.falling()]
+        lines[-1] += [case.said(test, "ELBO"), *map(case.falling, FALLS)]
     return table(header, lines)
 
 

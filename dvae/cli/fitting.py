@@ -26,7 +26,7 @@ from ..models.registry import judges, methods
 from ..models.trajectories import TrajectoryMethod
 from ..motion.dataset import SIMULATED
 from ..motion.protocols import Representation
-from ..motion.segmented import Cut
+from ..motion.segments.dataset import Cut
 from ..options import Amount
 from ..runs import directory as runs
 from ..runs.kinds import DATA

@@ -16,13 +16,13 @@ from .. import motion
 from ..data import Batch
 from ..inference.checkpoints import CheckpointError
 from ..inference.posteriors import Descent
-from ..motion.completion import Deviations, glimpsed
-from ..motion.embodied import SHAPE
-from ..motion.interpolation import Interpolation
-from ..motion.interpolation import interpolate as interpolate_segments
-from ..motion.recovery import Recovered, read_seen
-from ..motion.recovery import recover as recover_segments
-from ..motion.segments import resting_offsets
+from ..motion.segments.completion import Deviations, glimpsed
+from ..motion.segments.embodied import SHAPE
+from ..motion.segments.frames import resting_offsets
+from ..motion.segments.interpolation import Interpolation
+from ..motion.segments.interpolation import interpolate as interpolate_segments
+from ..motion.segments.recovery import Recovered, read_seen
+from ..motion.segments.recovery import recover as recover_segments
 from ..options import Positive, Range, check
 from ..runs import directory as runs
 from ..views import WHOLE

@@ -11,18 +11,18 @@ from .angles import AngleLimits, estimate_angle_limits
 from .criticism import draw_traversal, statistics
 from .data import Clip, MotionSet
 from .dataset import MotionData
-from .embodied import Segments
 from .exchange import Exchanged
 from .files import read_motion, read_paths, save, write_motion
 from .forecasts import Forecasts, Imputed, is_forecasts
-from .gait import Cycles, gait_cycles, reference_cycles
-from .interpolation import Interpolation, falls, interpolate, latent_map, transferred
 from .occlusion import occlude
 from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
-from .reconstruction import reconstruct_segments
 from .scoring import displacements, scores
-from .segmented import SegmentData
-from .segments import TimedFrames
+from .segments.dataset import SegmentData
+from .segments.embodied import Segments
+from .segments.frames import TimedFrames
+from .segments.gait import Cycles, gait_cycles, reference_cycles
+from .segments.interpolation import Interpolation, falls, interpolate, latent_map, transferred
+from .segments.reconstruction import reconstruct_segments
 from .simulator import simulate
 from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
 from .truths import PseudoTruths, WithPseudoTruths

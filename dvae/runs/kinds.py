@@ -13,12 +13,12 @@ SCHEMAS = Registry(
     {
         "sequences": "dvae.schema:Schema",
         "poses": "dvae.motion.protocols:Poses",
-        "segments": "dvae.motion.embodied:SegmentSchema",
+        "segments": "dvae.motion.segments.embodied:SegmentSchema",
     },
     "dvae.schemas",
 )
 DATA = Registry(
-    {"motion": "dvae.motion.dataset:MotionData", "segments": "dvae.motion.segmented:SegmentData"}, "dvae.data"
+    {"motion": "dvae.motion.dataset:MotionData", "segments": "dvae.motion.segments.dataset:SegmentData"}, "dvae.data"
 )
 """Kinds of schemas and of data, by the name that a config gives them."""
 

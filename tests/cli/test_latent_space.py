@@ -9,9 +9,9 @@ import pytest
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.motion.completion import glimpsed
-from dvae.motion.reconstruction import Reconstruction
-from dvae.motion.recovery import read_seen
+from dvae.motion.segments.completion import glimpsed
+from dvae.motion.segments.reconstruction import Reconstruction
+from dvae.motion.segments.recovery import read_seen
 
 SMALL = ["motion-latent", "--latent", "3", "--widths", "16", "8", "--batch-size", "4", "--cut", "clips"]
 

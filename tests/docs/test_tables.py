@@ -28,7 +28,7 @@ from benchmarks.tables import (
 )
 from dvae import Descent, Evaluation, Training, method, motion
 from dvae.cli import main as command
-from dvae.motion import segmented
+from dvae.motion.segments import dataset
 from dvae.runs.directory import fit_run
 
 SMALL = ["--steps", "2", "--batch-size", "4", "--validate-every", "2"]
@@ -189,7 +189,7 @@ def test_mix_and_match(tmp_path, page, monkeypatch):
 def short(monkeypatch):
     """Completion of simulated people, from little and for half a second."""
     few = motion.simulate(clips=10, frames=90, seed=1)
-    monkeypatch.setattr(segmented, "simulate", lambda: few)
+    monkeypatch.setattr(dataset, "simulate", lambda: few)
     monkeypatch.setattr(completion.Source, "grouped", property(lambda source: source.data.segments))
     for name, value in {"HORIZON": 0.5, "DESCENT": Descent(2, starts=2, candidates=2, newton=0), "DRAWS": 30}.items():
         monkeypatch.setattr(completion, name, value)
@@ -244,7 +244,7 @@ def test_motion_latent(tmp_path, page, monkeypatch):
 def test_completion(tmp_path, page, short, monkeypatch):
     """Measured once, whatever is asked again; what is seen is not predicted, and nothing is nearer than the floor."""
     small = method("motion-latent", latent=3, widths=(8,), finish=0.0)
-    fit_run(small, segmented.SegmentData.open(), tmp_path / "a", Training(steps=2, batch_size=4, progress=False))
+    fit_run(small, dataset.SegmentData.open(), tmp_path / "a", Training(steps=2, batch_size=4, progress=False))
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     for name in ("BEGIN", "END"):
         page.write_text(
@@ -283,7 +283,7 @@ def test_completion(tmp_path, page, short, monkeypatch):
 
 def test_recurrent_poses_are_put_where_segments_start(short):
     """What knows the future makes the true surfaces, whatever segments face and wherever they are."""
-    data = segmented.SegmentData.open()
+    data = dataset.SegmentData.open()
     held = completion.Held(MotionSpace(data), data.windows("test"), {})
     people, cut = held.segments.motion, completion.protocol(30.0)
     windows = motion.windows(people, cut, "test")

@@ -24,7 +24,7 @@ from dvae import motion
 from dvae.cli import futures, judging, segments
 from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE
 from dvae.motion.dataset import MotionData
-from dvae.motion.segmented import SegmentData
+from dvae.motion.segments.dataset import SegmentData
 from dvae.runs import directory as runs
 
 from .engine import Isolated, fuzz, limited

@@ -11,7 +11,7 @@ from dvae import motion
 from dvae.inference.gradnorm import GradNorm
 from dvae.models.motion_latent import PARTS, SURFACE, MotionLatent
 from dvae.motion import bodies
-from dvae.motion.embodied import SHAPE, Segments, SegmentSchema
+from dvae.motion.segments.embodied import SHAPE, Segments, SegmentSchema
 from dvae.schema import Schema, SchemaError
 
 SMALL = MotionLatent(latent=4, widths=(32, 16))

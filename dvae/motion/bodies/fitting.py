@@ -35,7 +35,7 @@ from ..kinematics import forward, swing
 from ..matching import parts
 from ..naming import sides
 from ..rotations import continuous, from_matrix, to_matrix
-from ..segments import AT_ONCE, resting_offsets
+from ..segments.frames import AT_ONCE, resting_offsets
 from ..skeleton import Skeleton
 from .skinning import Body
 

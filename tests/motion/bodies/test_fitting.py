@@ -11,7 +11,7 @@ from dvae.motion import Clip, MotionSet, Skeleton, TimedFrames, gait_cycles, rea
 from dvae.motion.bodies import SHAPE, Body, betas, fitted, fitting, human, retargeted, shapes_of
 from dvae.motion.matching import parts
 from dvae.motion.naming import sides
-from dvae.motion.segments import OFFSETS
+from dvae.motion.segments.frames import OFFSETS
 
 PERSON = human()
 OWN = parts(PERSON.names)

@@ -8,7 +8,7 @@ import torch
 from scipy.interpolate import CubicSpline
 
 from dvae.motion import MotionSet, TimedFrames, kinematics, reference_cycles, rotations, simulate
-from dvae.motion.segments import HEADING, OFFSETS, _cubic, resting_offsets
+from dvae.motion.segments.frames import HEADING, OFFSETS, _cubic, resting_offsets
 from dvae.motion.skeleton import rotate_about_up
 
 

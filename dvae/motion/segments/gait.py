@@ -26,11 +26,11 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import torch
 
-from ..options import Amount, Positive, Range, Share, check
-from .data import Clip, MotionSet
-from .kinematics import forward
-from .rotations import continuous, from_matrix, to_matrix
-from .skeleton import Skeleton, rotate_about_up
+from ...options import Amount, Positive, Range, Share, check
+from ..data import Clip, MotionSet
+from ..kinematics import forward
+from ..rotations import continuous, from_matrix, to_matrix
+from ..skeleton import Skeleton, rotate_about_up
 from .warping import alignment, subsequence_costs
 
 MOST_CYCLES = 400
@@ -138,7 +138,7 @@ def alike(first: MotionSet, second: MotionSet) -> tuple[MotionSet, MotionSet]:
     Raises:
         ValueError: what they share is no tree.
     """
-    from .files.reading import chosen
+    from ..files.reading import chosen
 
     shared = [name for name in first.skeleton.names if name in second.skeleton.names]
     kept = chosen(first, shared)

@@ -8,7 +8,7 @@ import dvae
 from dvae import motion
 from dvae.models.motion_latent import MotionLatent
 from dvae.motion import bodies
-from dvae.motion.completion import (
+from dvae.motion.segments.completion import (
     Deviations,
     SegmentCompletion,
     _met,
@@ -20,8 +20,8 @@ from dvae.motion.completion import (
     scanned,
     surfaces_at,
 )
-from dvae.motion.embodied import SHAPE, Segments
-from dvae.motion.recovery import recover
+from dvae.motion.segments.embodied import SHAPE, Segments
+from dvae.motion.segments.recovery import recover
 
 BRIEF = dvae.Descent(steps=80, rate=0.1, starts=1, candidates=4)
 THOROUGH = dvae.Descent(steps=80, rate=0.1, starts=2, candidates=8, newton=3)

@@ -34,14 +34,14 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from ..data import Batch
-from ..inference.posteriors import Descent, Posterior, posterior
-from ..options import Positive, check
-from ..program.conditional import evaluating, like
-from ..turns import alone
-from .bodies import MARKERS, Body, vertex_error
+from ...data import Batch
+from ...inference.posteriors import Descent, Posterior, posterior
+from ...options import Positive, check
+from ...program.conditional import evaluating, like
+from ...turns import alone
+from ..bodies import MARKERS, Body, vertex_error
 from .embodied import SHAPE
-from .segments import TimedFrames
+from .frames import TimedFrames
 
 LATENT = "z"
 TIMES, FRAMES, SURFACES, POINTS, SPOTS = "times", "frames", "surfaces", "points", "markers"

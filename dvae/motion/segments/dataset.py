@@ -9,16 +9,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Self
 
-from ..options import Amount, check, nearest
-from .bodies import fitted, human
-from .data import Clip, MotionSet
-from .dataset import SIMULATED
+from ...options import Amount, check, nearest
+from ..bodies import fitted, human
+from ..data import Clip, MotionSet
+from ..dataset import SIMULATED
+from ..files import read_motion
+from ..protocols import held_out
+from ..simulator import simulate
 from .embodied import Segments, SegmentSchema
-from .files import read_motion
+from .frames import TimedFrames
 from .gait import Cycles, gait_cycles, reference_cycles
-from .protocols import held_out
-from .segments import TimedFrames
-from .simulator import simulate
 
 Cut = Literal["gait", "clips"]
 """How motion becomes segments: gait cycles, or clips as they are, where they last as long as a cycle may."""

@@ -15,14 +15,16 @@ import torch
 from rich.console import Group
 from torch import Tensor
 
-from ..data import Batch
-from ..inference.posteriors import Descent
-from ..inference.result import Table
-from ..options import nearest
-from ..program.conditional import evaluating
-from ..turns import alone
-from ..views import WHOLE
-from .bodies import vertex_error
+from ...data import Batch
+from ...inference.posteriors import Descent
+from ...inference.result import Table
+from ...options import nearest
+from ...program.conditional import evaluating
+from ...turns import alone
+from ...views import WHOLE
+from ..bodies import vertex_error
+from ..data import MotionSet
+from ..files.archive import Refused, archive
 from .completion import (
     FRAMES,
     LATENT,
@@ -35,10 +37,8 @@ from .completion import (
     SegmentCompletion,
     complete,
 )
-from .data import MotionSet
 from .embodied import SHAPE
-from .files.archive import Refused, archive
-from .segments import OFFSETS
+from .frames import OFFSETS
 
 LARGEST = 2**25
 """Bytes of all arrays of a file of what was seen: nearly two thousand surfaces, or two million points."""
@@ -181,8 +181,8 @@ def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
     """What somebody has seen of segments, of a file.
 
     Args:
-        path: an npz of arrays by the names of `dvae.motion.completion`: times or frames, some of surfaces, points and
-            markers, and beta where it is known; without the first axis, of one segment.
+        path: an npz of arrays by the names of `completion`: times or frames, some of surfaces, points and markers, and
+            beta where it is known; without the first axis, of one segment.
         model: of segments.
 
     Raises:

@@ -16,17 +16,17 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ..data import Batch, each
-from ..options import tuples
-from ..schema import Schema
-from ..views import WHOLE, Parts
-from .bodies import Body, human, shapes_of
-from .bodies.fitting import MOST, standing
-from .data import MotionSet
+from ...data import Batch, each
+from ...options import tuples
+from ...schema import Schema
+from ...views import WHOLE, Parts
+from ..bodies import Body, human, shapes_of
+from ..bodies.fitting import MOST, standing
+from ..data import MotionSet
+from ..skeleton import Skeleton, brief
+from ..views import HEADING
+from .frames import OFFSETS, ORIGIN, TimedFrames
 from .gait import Reference
-from .segments import OFFSETS, ORIGIN, TimedFrames
-from .skeleton import Skeleton, brief
-from .views import HEADING
 
 SHAPE = "beta"
 """Name in batches of parameters of shape, (B, S)."""

@@ -6,9 +6,15 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.motion.embodied import SHAPE, Segments
-from dvae.motion.reconstruction import DURATION, ERROR, PrincipalComponents, Reconstruction, reconstruct_segments
-from dvae.motion.segmented import SegmentData
+from dvae.motion.segments.dataset import SegmentData
+from dvae.motion.segments.embodied import SHAPE, Segments
+from dvae.motion.segments.reconstruction import (
+    DURATION,
+    ERROR,
+    PrincipalComponents,
+    Reconstruction,
+    reconstruct_segments,
+)
 
 
 @pytest.fixture(scope="module")

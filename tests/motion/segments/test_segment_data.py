@@ -8,8 +8,8 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.motion.embodied import Segments, SegmentSchema
-from dvae.motion.segmented import SegmentData, Takes
+from dvae.motion.segments.dataset import SegmentData, Takes
+from dvae.motion.segments.embodied import Segments, SegmentSchema
 
 PEOPLE = motion.simulate(clips=8, frames=80, seed=1)
 

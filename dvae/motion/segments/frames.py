@@ -27,15 +27,15 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ..data import Batch
-from ..options import Positive, Size, check
-from ..views import WHOLE
-from . import kinematics
-from .data import Clip, MotionSet
+from ...data import Batch
+from ...options import Positive, Size, check
+from ...views import WHOLE
+from .. import kinematics
+from ..data import Clip, MotionSet
+from ..rotations import continuous, from_matrix, normalised, to_matrix
+from ..skeleton import Skeleton, rotate_about_up
+from ..views import HEADING
 from .gait import Reference, stamps
-from .rotations import continuous, from_matrix, normalised, to_matrix
-from .skeleton import Skeleton, rotate_about_up
-from .views import HEADING
 
 OFFSETS = "offsets"
 """Name in batches of rest poses (B, J, 3) in metres: where joints are, on average, from their parents as these turn."""
@@ -266,7 +266,7 @@ class TimedFrames:
         ):
             raise ValueError(
                 f"{motion.name or 'these segments'} have the tree of joints {skeleton.name!r}, and frames here are of "
-                f"{self.skeleton.name!r}; dvae.motion.gait.alike brings two sources onto one tree"
+                f"{self.skeleton.name!r}; dvae.motion.segments.gait.alike brings two sources onto one tree"
             )
         for clip in motion:
             where = f"segment {'/'.join(clip.key)}"

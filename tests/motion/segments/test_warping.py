@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dvae.motion.warping import alignment, subsequence_costs
+from dvae.motion.segments.warping import alignment, subsequence_costs
 
 
 def slow(local):

@@ -17,7 +17,7 @@ from dvae.motion import (
     rotations,
     simulate,
 )
-from dvae.motion.gait import alike, find_cycles
+from dvae.motion.segments.gait import alike, find_cycles
 
 SKELETON = simulate(clips=4, frames=60).with_rotations().skeleton
 

@@ -20,19 +20,19 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ..data import Batch, each
-from ..inference.bounds import SequenceELBO, importance_bound
-from ..inference.evaluation import ARROWS, Score
-from ..inference.held import clip_places, on_device_of, plain, reproducibly
-from ..inference.result import Result, Table, as_they_are, canvas, progress_bar
-from ..inference.scores import TEACHER_FORCED, Metric, clip_means
-from ..inference.uncertainty import clustered_variance, linearised
-from ..options import nearest
-from ..turns import alone
-from ..views import WHOLE
-from .bodies import vertex_error
+from ...data import Batch, each
+from ...inference.bounds import SequenceELBO, importance_bound
+from ...inference.evaluation import ARROWS, Score
+from ...inference.held import clip_places, on_device_of, plain, reproducibly
+from ...inference.result import Result, Table, as_they_are, canvas, progress_bar
+from ...inference.scores import TEACHER_FORCED, Metric, clip_means
+from ...inference.uncertainty import clustered_variance, linearised
+from ...options import nearest
+from ...turns import alone
+from ...views import WHOLE
+from ..bodies import vertex_error
 from .embodied import SHAPE, Segments, SegmentSchema, surfaces_of
-from .segments import TimedFrames
+from .frames import TimedFrames
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

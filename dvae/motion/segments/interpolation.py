@@ -16,15 +16,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..data import Batch
-from ..inference.held import on_device_of, reproducibly
-from ..inference.result import Table, as_they_are, canvas
-from ..turns import alone
-from ..views import WHOLE
-from .bodies import Body
-from .data import MotionSet
+from ...data import Batch
+from ...inference.held import on_device_of, reproducibly
+from ...inference.result import Table, as_they_are, canvas
+from ...turns import alone
+from ...views import WHOLE
+from ..bodies import Body
+from ..data import MotionSet
 from .embodied import SHAPE
-from .segments import OFFSETS, TimedFrames
+from .frames import OFFSETS, TimedFrames
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
