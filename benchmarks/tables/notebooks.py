@@ -1,7 +1,7 @@
 """Runs notebooks and stores them with what they show; `make notebooks` does so for all.
 
-What is stored depends on the run alone: no times, no versions, no progress. An animation is stored as a still of its
-last frame, as figures that move are large and hosts that show notebooks do not play them.
+What is stored depends on the run alone: no times, no versions, no progress. A figure of plotly is stored as a still, of
+an animation its last frame, as these are large and hosts that show notebooks do not play or turn them.
 """
 
 import base64
@@ -15,6 +15,8 @@ from typing import Any
 import nbformat
 import numpy as np
 import tyro
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from nbclient import NotebookClient
 from PIL import Image
@@ -22,6 +24,7 @@ from PIL import Image
 ROOT = Path(__file__).parents[2]
 PLOTLY = "application/vnd.plotly.v1+json"
 SHARED = re.compile(r"(\b(?:steps|particles|warm_up)=|\bStage\(|\"warm_up\": )(\d{3,})")  # sequences have fewer steps
+LIGHT = np.array([-0.5, -0.6, 0.63])  # towards it, from the left, above and in front
 TEXTS = ("text/plain", "text/html", "text/latex")
 
 
@@ -50,7 +53,8 @@ def execute(path: Path, share: float = 1.0) -> nbformat.NotebookNode:
             if "text/plain" in data:
                 data["text/plain"] = re.sub(r" at 0x[0-9a-f]+", "", data["text/plain"])
             if PLOTLY in data:
-                output["data"] = {"image/png": _still(data[PLOTLY]), "text/plain": "a still; run the cell to play it"}
+                still, what = _still(data[PLOTLY]), "play" if data[PLOTLY].get("frames") else "turn"
+                output["data"] = {"image/png": still, "text/plain": f"a still; run the cell to {what} it"}
             if "image/png" in output.get("data", {}):
                 output["data"]["image/png"] = _small(output["data"]["image/png"])
     return notebook
@@ -80,20 +84,40 @@ def _kept(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
 
 
 def _still(figure: Any) -> str:
-    """The last frame of an animation by `dvae.motion.plot.animate`, seen from the front, as a PNG in base64."""
+    """A figure of `dvae.motion.plot`, seen from the front, of an animation the last frame, as a PNG in base64."""
     scene = figure["layout"]["scene"]
     width, height = (np.ptp(scene[axis]["range"]) for axis in ("xaxis", "zaxis"))
     still = Figure(figsize=(9, min(9 * height / width, 6)), dpi=72, layout="constrained")
     ax = still.subplots()
-    for trace in figure["frames"][-1]["data"]:
-        ax.plot(_numbers(trace["x"]), _numbers(trace["z"]), color=trace["line"]["color"], linewidth=1.8)
+    for trace in figure["frames"][-1]["data"] if figure.get("frames") else figure["data"]:
+        places = [_numbers(trace[axis]) for axis in "xyz"]
+        if trace["type"] == "mesh3d":
+            ax.add_collection(_shaded(trace, np.stack(places, -1)))
+        elif trace.get("name") != "floor":
+            ax.plot(places[0], places[2], color=trace["line"]["color"], linewidth=1.8)
     for label in scene["annotations"]:
         ax.text(label["x"], label["z"], html.unescape(label["text"]), ha="center", parse_math=False)
+    ax.autoscale_view()
     ax.set_aspect("equal")
     ax.axis("off")
     file = io.BytesIO()
     still.savefig(file, format="png")
     return base64.encodebytes(file.getvalue()).decode()
+
+
+def _shaded(mesh: Any, places: np.ndarray) -> PolyCollection:
+    """The triangles of a mesh (V, 3) that face the viewer, the nearest last, by how the light falls on them."""
+    faces = np.stack([_numbers(mesh[corner]) for corner in "ijk"], -1).astype(int)
+    first, second, third = places[faces].swapaxes(0, 1)
+    normals = np.cross(second - first, third - first)
+    smooth = np.zeros_like(places)
+    np.add.at(smooth, faces, normals[:, None])
+    smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
+    seen = np.flatnonzero(normals[:, 1] < 0)  # y goes away from the viewer
+    seen = seen[np.argsort(-places[faces[seen], 1].mean(-1))]
+    bright = 0.6 + 0.4 * (smooth[faces[seen]].mean(1) @ LIGHT).clip(0)
+    colours = bright.round(2)[:, None] * to_rgb(mesh["color"])
+    return PolyCollection(places[faces[seen]][..., [0, 2]], facecolors=colours, edgecolors=colours, linewidths=0.4)
 
 
 def _numbers(values: Any) -> np.ndarray:
@@ -107,7 +131,7 @@ def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
     """What a cell shows, as any run of it must: kinds of output, and their texts without what arithmetic decides.
 
     Figures are there or not. Texts have their words and whole numbers, but for shares; of a table, which may order its
-    rows by their numbers, the words alone.
+    rows by their numbers, the words alone, among which no fingerprint is.
     """
     found = []
     for output in cell.get("outputs", []):
@@ -123,7 +147,7 @@ def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
 
 def _stable(text: str) -> str:
     if "<pre" in text or "━" in text:
-        return " ".join(sorted(re.findall(r"[^\W\d_]{2,}", re.sub("<[^>]*>", "", text))))
+        return " ".join(sorted(re.findall(r"\b[^\W\d_]{2,}\b", re.sub("<[^>]*>", "", text))))
     return " ".join(re.sub(r"[-+]?(\d*\.\d+|\d+(?=e[-+]\d|%))(e[-+]?\d+)?", "#", text).split())
 
 
