@@ -209,7 +209,7 @@ def short(monkeypatch):
 
 def test_motion_latent(tmp_path, page, monkeypatch):
     """Fitted and scored once, whatever is asked again; an interrupted run goes on; seeds have errors."""
-    people = motion.simulate(clips=24, frames=90, seed=1)
+    people = motion.simulate(clips=12, frames=90, seed=1)
     told = [
         {**clip.labels, "file_group": "ABC"[n % 3], "content": ("walk", "run")[n % 2]} for n, clip in enumerate(people)
     ]
