@@ -1,4 +1,4 @@
-"""Speed of completion at the sizes of the paper's latent: `python benchmarks/completion.py`, or `make bench`.
+"""Speed of completion by a latent of the paper's size: `python benchmarks/completion.py`, or `make bench`.
 
     whole      100 segments from one start each, of which 16 markers are seen in 5 frames: one by one over in one batch
     descent    the same of steps of Adam alone
