@@ -147,10 +147,13 @@ class MotionLatentModel(DynamicalVAE):
         super().__init__(view=schema.view, **options)
         self.method, self.timed, self.body = method, schema.timed, body
 
+    def posterior(self, batch: Mapping[str, Any]) -> Any:
+        """The guide's law of z (B, Z), of x (B, N, D) on bodies beta (B, S), with gradients."""
+        return poutine.trace(self.guide).get_trace(batch).nodes["z"]["fn"]
+
     def encode(self, batch: Mapping[str, Any]) -> Tensor:
-        """The mean (B, Z) of the guide's z, of x (B, N, D) on bodies beta (B, S), with gradients."""
-        law: Any = poutine.trace(self.guide).get_trace(batch).nodes["z"]["fn"]
-        return law.mean  # type: ignore[no-any-return]
+        """Its mean."""
+        return self.posterior(batch).mean  # type: ignore[no-any-return]
 
     def decode(self, latent: Tensor, shape: Tensor, frames: Tensor | None = None) -> Tensor:
         """Frames x (..., N, D), the means of chi, of latents (..., Z) on bodies (..., S), with gradients.

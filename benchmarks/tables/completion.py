@@ -15,6 +15,7 @@ to poses, on quaternions and places, fitted to the takes of the same training se
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 import time
@@ -40,7 +41,6 @@ from dvae.motion.rotations import to_matrix
 from dvae.motion.segments.completion import (
     Completed,
     Deviations,
-    SegmentCompletion,
     chamfer,
     complete,
     error_by_time,
@@ -71,6 +71,8 @@ DRAWS = 200
 ENDS = ("left", "behind", "bent")
 THIN = 16
 """Of so many vertices one has intervals, in one frame of so many; neighbours err alike."""
+AT_ONCE = 512
+"""Draws to hold at once."""
 CONVERGED = 0.1
 """Nats that a step of Newton's would still gain, and within which two starts are taken for arrived at one place."""
 
@@ -82,14 +84,14 @@ class Budget:
     Args:
         every: test segments that are predicted, each so many-th.
         some: test segments that are completed from each kind of what was seen.
-        known: training segments of which descents start as well as of the prior.
+        known: training segments, which are starts of descents, and of which the prior is.
         steps: of training residual-sup.
         dense: points of the true surface in each frame from which completed ones are measured.
     """
 
     every: int = 1
     some: int = 40
-    known: int = 200
+    known: int = 500
     steps: int = 3000
     dense: int = 500
 
@@ -153,6 +155,7 @@ SURE = [Beginning(), Sight(0, 10, True), Sight(FEW, 20)]
 TRIED = {"surface": (0.005, 0.01, 0.02, 0.05, 0.1), "marker": (0.005, 0.01, 0.02, 0.05, 0.1)}
 TRIED |= {"point": (0.02, 0.05, 0.1, 0.2, 0.5)}
 KINDS = dict(zip(map(str, SURE), ("surface", "marker", "point"), strict=True))
+PRIORS = {"aggregate": True, "standard": False}
 DESCENTS = [
     dvae.Descent(steps, rate, starts)
     for steps, rate, starts in (
@@ -207,9 +210,12 @@ class Held:
         fewer = replace(self.segments.motion, clips=thinned(self.segments.motion.clips, many))
         return replace(self, segments=Segments(fewer, self.model.timed))
 
-    def complete(self, seen: Mapping[str, Tensor], deviations: Deviations, descent: dvae.Descent) -> Completed:
+    def complete(
+        self, seen: Mapping[str, Tensor], deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
+    ) -> Completed:
         """From what was seen."""
-        return complete(self.model, seen, deviations=deviations, descent=descent, known=self.known)
+        how: dict[str, Any] = {"deviations": deviations, "descent": descent, "aggregate": aggregate}
+        return complete(self.model, seen, **how, known=self.known)
 
 
 class Source:
@@ -273,9 +279,9 @@ class Run:
         """See `completed`."""
         return completed(self.some, sight, self.budget.dense)
 
-    def certain(self, sight: Any, deviations: Deviations, descent: dvae.Descent) -> dict[str, Any]:
+    def certain(self, sight: Any, *how: Any) -> dict[str, Any]:
         """See `certain`."""
-        return certain(self.some, sight, deviations, descent)
+        return certain(self.some, sight, *how)
 
 
 def thinned(clips: Sequence[Any], many: int) -> list[Any]:
@@ -434,16 +440,17 @@ def ended(done: Completed) -> dict[str, Any]:
     return dict(zip(ENDS, (each.tolist() for each in (posterior.left, behind, posterior.bent)), strict=True))
 
 
-def certain(held: Held, sight: Any, deviations: Deviations, descent: dvae.Descent) -> dict[str, Any]:
+def certain(
+    held: Held, sight: Any, deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
+) -> dict[str, Any]:
     """What intervals hold, by segment: shares of vertices' coordinates, and of durations, by level; and what is off.
 
     Intervals are those of normals with the mean and variance of draws: of the surface alone, and with the deviation of
     what was seen beside, of what would be seen.
     """
     model, batch = held.model, held.batch
-    done = held.complete(sight.of(model, batch), deviations, descent)
-    program = SegmentCompletion(model, deviations)
-    khat = done.posterior.evidence(program, program.renewed(done.seen, done.posterior.mode), DRAWS).khat
+    done = held.complete(sight.of(model, batch), deviations, descent, aggregate)
+    khat = done.evidence(DRAWS, chunk=AT_ONCE).khat
     x, shapes = done.draw(DRAWS)
     which, noise = torch.arange(0, len(model.body.template), THIN), getattr(deviations, KINDS[str(sight)])
     reach = torch.distributions.Normal(0.0, 1.0).icdf((1 + torch.tensor(LEVELS)) / 2)[:, None]
@@ -694,16 +701,17 @@ def draw(out: Path, file: Path) -> None:
     figure.savefig(file, dpi=110)
 
 
-def tried() -> dict[str, tuple[Any, Deviations, dvae.Descent]]:
-    """Of tuning: name to what is seen, deviations and descent."""
-    found: dict[str, tuple[Any, Deviations, dvae.Descent]] = {}
+def tried() -> dict[str, tuple[Any, Deviations, dvae.Descent, bool]]:
+    """Of tuning: name to what is seen, deviations, descent, and whether the prior is of known segments."""
+    found: dict[str, tuple[Any, Deviations, dvae.Descent, bool]] = {}
     for sight in SURE:
         kind = KINDS[str(sight)]
-        for value in TRIED[kind]:
-            found[f"{sight}, {kind} {value:g}"] = sight, replace(DEVIATIONS, **{kind: value}), DESCENT
+        for value, (prior, aggregate) in itertools.product(TRIED[kind], PRIORS.items()):
+            how = replace(DEVIATIONS, **{kind: value}), DESCENT, aggregate
+            found[f"{sight}, {prior} prior, {kind} {value:g}"] = sight, *how
         for descent in DESCENTS:
             told = f"{descent.steps} steps, rate {descent.rate:g}, {descent.starts} starts"
-            found[f"{sight}, {told}"] = sight, DEVIATIONS, descent
+            found[f"{sight}, {told}"] = sight, DEVIATIONS, descent, True
     return found
 
 

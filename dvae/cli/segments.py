@@ -31,7 +31,7 @@ from .console import ERROR, OUT, UsageError, at_least, check_files, note
 
 MOST_STEPS = MOST_DRAWS = 100
 
-MOST_KNOWN = 200
+MOST_KNOWN = 500
 """Segments for training of which the latents are where a search may start."""
 
 APART = 3.0
@@ -168,6 +168,7 @@ def recover(
     descent: Descent,
     source: Annotated[tuple[str, ...], tyro.conf.arg(name="from")] = (),
     file: Path | None = None,
+    aggregate: bool = True,
     draws: int = 5,
     out: Path | None = None,
     seed: int = 0,
@@ -196,11 +197,12 @@ def recover(
         descent: how the most probable segments are looked for.
         source: names of segments; or of takes, of which it is the first one; or split/name.
         file: what somebody has seen, instead.
+        aggregate: z has for its prior a normal of all latents of known segments, in place of N(0, I).
         draws: from the posterior, to write.
         out: the file to write.
         seed: of starts, draws and glimpses.
         data: where the data lie now, if the path in the run no longer leads there; or other data. Latents of known
-            segments, of other takes, are starts of the search.
+            segments, of other takes, are starts of the search, and make the prior.
     """
     at_least(0, draws=draws)
     if draws > MOST_DRAWS:
@@ -229,6 +231,7 @@ def recover(
         raise UsageError(f"--out {out} shows one segment, of {len(keys)}; end its name in .npz, or in nothing")
     known = None if opened is None else _known(opened, takes)
     how: dict[str, Any] = {"truth": truth, "deviations": deviations, "known": known, "descent": descent}
+    how["aggregate"] = aggregate
     found = recover_segments(model, seen, keys, **how, seed=seed, progress=True)
     OUT.print(found.table())
     for doubt in _doubts(found, deviations):
@@ -245,7 +248,7 @@ def _known_data(loaded: runs.Loaded, data: str | None) -> Any:
     try:
         return opening.data_of(data, loaded)
     except CheckpointError as error:
-        note(f"no segments are known, so that the search starts from the prior alone: {error}")
+        note(f"no segments are known, so that N(0, I) is the prior, and the search starts from it alone: {error}")
         return None
 
 

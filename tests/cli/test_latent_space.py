@@ -154,7 +154,7 @@ def test_what_somebody_has_seen_is_read_without_the_data(capsys, folder, tmp_pat
     np.savez(tmp_path / "both.npz", **seen)
     np.savez(tmp_path / "one.npz", **{name: value[0] for name, value in seen.items()})
     table, said = recovered(capsys, moved, "--file", tmp_path / "both.npz")
-    assert "the search starts from the prior alone" in said
+    assert "the search starts from it alone" in said
     assert "seen/segment-00" in table
     assert "seen/segment-01" in table
     assert "vertex" not in table

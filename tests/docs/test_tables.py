@@ -273,7 +273,7 @@ def test_completion(tmp_path, page, short, monkeypatch):
     for row in errors.values():
         assert max(each[observed - 1] for each in row) == 0 < min(each[observed] for each in row)
     assert (tmp_path / "a.png").stat().st_size > 10_000
-    monkeypatch.setattr(completion, "TRIED", {"surface": (0.01, 0.1), "marker": (), "point": ()})
+    monkeypatch.setattr(completion, "TRIED", {"surface": (0.01,), "marker": (), "point": ()})
     monkeypatch.setattr(completion, "DESCENTS", [])
     completion.main("simulated", (), tmp_path / "a", parts=("tuning",), **{**options, "page": None})
     assert len([*(tmp_path / "out" / completion.TUNING).glob("*.json")]) == 2

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import log, pi, sqrt
 from typing import Any
 
@@ -35,6 +36,7 @@ import torch
 from torch import Tensor
 
 from ...data import Batch
+from ...inference.bounds import ImportanceBound
 from ...inference.posteriors import Descent, Posterior, posterior
 from ...options import Positive, check
 from ...program.conditional import evaluating, like
@@ -92,15 +94,18 @@ class SegmentCompletion:
         deviations: of what was seen.
         markers: the vertices of markers (L,); `bodies.MARKERS` by default.
         known: segments (x and beta), whose latents by the guide are where motion is: starts beside those of the prior.
+        aggregate: where segments are known, the prior of z is a normal of what the guide says of them all, its mean and
+            its covariance, in place of N(0, I), from which a small weight of the KL lets them stray.
     """
 
     model: Any
     deviations: Deviations = Deviations()
     markers: Sequence[int] = tuple(MARKERS.values())
     known: Batch | None = None
+    aggregate: bool = True
 
     def __call__(self, seen: Batch) -> dict[str, Tensor]:
-        """z and beta from their priors N(0, I), and what was seen from what is made of them.
+        """z from `prior` and beta from N(0, I), and what was seen from what is made of them.
 
         Args:
             seen: see the module; what `read` gave. Where it says nothing of it, nearest vertices are looked for.
@@ -109,10 +114,10 @@ class SegmentCompletion:
             z (B, Z) and beta (B, S).
         """
         model, deviations, kind = self.model, self.deviations, like(self.model)
-        size, parameters = len(next(iter(seen.values()))), model.body.parameters_of_shape
+        size, parameters, prior = len(next(iter(seen.values()))), model.body.parameters_of_shape, self.prior
         with pyro.plate("sequences", size):
-            z = pyro.sample(LATENT, _standard(size, model.sizes[LATENT], kind))
-            shape = seen[SHAPE] if SHAPE in seen else pyro.sample(SHAPE, _standard(size, parameters, kind))
+            z = pyro.sample(LATENT, prior.expand([size]))
+            shape = seen[SHAPE] if SHAPE in seen else pyro.sample(SHAPE, _standard(parameters, kind).expand([size]))
             times, made = self._made(z, shape, seen)
             if TIMES in seen:
                 _observe(TIMES, times, seen[TIMES], deviations.time)
@@ -120,6 +125,15 @@ class SegmentCompletion:
                 counts = each.shape[-2] if name == SURFACES else 1  # as one vertex
                 _observe(name, each, seen[name], deviations.of(name) * counts**0.5)
         return {LATENT: z, SHAPE: shape}
+
+    @cached_property
+    def prior(self) -> Any:
+        """The law of z, of one event (Z,)."""
+        if self.known is None or not self.aggregate:
+            return _standard(self.model.sizes[LATENT], like(self.model))
+        with torch.no_grad(), pyro.poutine.block():  # a program inside another
+            law = self.model.posterior(self.known)
+        return dist.MultivariateNormal(law.mean.mean(0), _shrunk(law.mean, law.variance.mean(0)))
 
     @torch.no_grad()
     def away(self, seen: Batch, z: Tensor, shape: Tensor) -> dict[str, Tensor]:
@@ -220,14 +234,24 @@ class Completed:
     """Segments that were completed.
 
     Args:
-        model: that made them.
-        seen: what was seen of them.
+        program: of what was seen.
+        seen: what was seen of them, as it was read.
         posterior: of z, and of beta where that was unknown.
     """
 
-    model: Any
+    program: SegmentCompletion
     seen: Batch
     posterior: Posterior
+
+    @property
+    def model(self) -> Any:
+        """That made them."""
+        return self.program.model
+
+    def evidence(self, particles: int = 200, *, seed: int = 0, chunk: int = 4096) -> ImportanceBound:
+        """The log evidence of what was seen, and k-hat: see `Posterior.evidence`."""
+        with evaluating(self.model):
+            return self.posterior.evidence(self.program, self.seen, particles, seed=seed, chunk=chunk)
 
     @property
     def x(self) -> Tensor:
@@ -258,6 +282,7 @@ def complete(
     deviations: Deviations | None = None,
     markers: Sequence[int] | None = None,
     known: Batch | None = None,
+    aggregate: bool = True,
     descent: Descent | None = None,
     seed: int = 0,
     chunk: int = 128,
@@ -268,18 +293,19 @@ def complete(
     Args:
         model: of segments, see `SegmentCompletion`.
         seen: see the module.
-        deviations, markers, known: see `SegmentCompletion` too.
+        deviations, markers, known, aggregate: see `SegmentCompletion` too.
         descent, seed, chunk, progress: see `dvae.posterior`.
 
     Raises:
         ValueError: see `SegmentCompletion.read`.
     """
-    program = SegmentCompletion(model, deviations or Deviations(), markers or tuple(MARKERS.values()), known)
+    spots = markers or tuple(MARKERS.values())
+    program = SegmentCompletion(model, deviations or Deviations(), spots, known, aggregate)
     data, guide = program.read(seen), None if known is None else program.guide
     how: dict[str, Any] = {"descent": descent, "seed": seed, "chunk": chunk, "progress": progress}
     with evaluating(model):
         found = posterior(program, data, guide=guide, renew=program.renewed, **how)
-    return Completed(model, data, found)
+    return Completed(program, data, found)
 
 
 def glimpsed(
@@ -401,8 +427,22 @@ def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tenso
     return torch.cat(found)
 
 
-def _standard(size: int, dimensions: int, kind: Tensor) -> Any:
-    return dist.Normal(kind.new_zeros(size, dimensions), 1.0).to_event(1)
+def _shrunk(means: Tensor, variance: Tensor) -> Tensor:
+    """Covariance (Z, Z) of a mixture of N normals with these means (N, Z) and, on average, these variances (Z,).
+
+    Shrunk towards its mean variance in all directions by the oracle's approximation (Chen, Wiesel, Eldar and Hero 2010,
+    IEEE Transactions on Signal Processing 58:10), so that a few segments do not forbid all that differs from them.
+    """
+    (n, p), away = means.shape, means - means.mean(0)
+    found = (away.mT @ away) / n + variance.diag()
+    trace, square = found.trace(), found.square().sum()
+    spread = (n + 1 - 2 / p) * (square - trace**2 / p)
+    share = (((1 - 2 / p) * square + trace**2) / spread).nan_to_num(1.0).clamp(max=1.0)
+    return (1 - share) * found + share * trace / p * torch.eye(p).to(found)
+
+
+def _standard(dimensions: int, kind: Tensor) -> Any:
+    return dist.Normal(kind.new_zeros(dimensions), 1.0).to_event(1)
 
 
 def _observe(name: str, made: Tensor, seen: Tensor, deviation: float) -> None:

@@ -19,7 +19,6 @@ from ...data import Batch
 from ...inference.posteriors import Descent
 from ...inference.result import Table
 from ...options import nearest
-from ...program.conditional import evaluating
 from ...turns import alone
 from ...views import WHOLE
 from ..bodies import vertex_error
@@ -153,6 +152,7 @@ def recover(
     truth: Batch | None = None,
     deviations: Deviations | None = None,
     known: Batch | None = None,
+    aggregate: bool = True,
     descent: Descent | None = None,
     seed: int = 0,
     progress: bool = False,
@@ -160,20 +160,18 @@ def recover(
     """Completes segments, and says how well.
 
     Args:
-        model, seen, deviations, known, descent, seed, progress: see `complete`.
+        model, seen, deviations, known, aggregate, descent, seed, progress: see `complete`.
         keys: (split, name) of each.
         truth: x (B, N, D) and beta (B, S), where they are known.
 
     Raises:
         ValueError: see `complete`; or nothing was seen of a segment.
     """
-    program = SegmentCompletion(model, deviations or Deviations())
-    _check_something(program.read(seen))
-    how: dict[str, Any] = {"deviations": deviations, "known": known, "descent": descent}
+    _check_something(SegmentCompletion(model).read(seen))
+    how: dict[str, Any] = {"deviations": deviations, "known": known, "aggregate": aggregate, "descent": descent}
     found = complete(model, seen, **how, seed=seed, progress=progress)
-    with evaluating(model):
-        bound = found.posterior.evidence(program, found.seen, DRAWS, seed=seed, chunk=AT_ONCE)
-    away = program.away(found.seen, found.posterior.mode[LATENT], found.shape)
+    bound = found.evidence(DRAWS, seed=seed, chunk=AT_ONCE)
+    away = found.program.away(found.seen, found.posterior.mode[LATENT], found.shape)
     return Recovered(found, keys, found.draw(DRAWS, seed), bound.khat, away, truth)
 
 

@@ -12,6 +12,7 @@ from dvae.motion.segments.completion import (
     Deviations,
     SegmentCompletion,
     _met,
+    _shrunk,
     chamfer,
     complete,
     error_by_time,
@@ -181,6 +182,42 @@ def test_known_segments_are_starts_too(model, segments):
     nodes = poutine.trace(program.guide).get_trace(seen).nodes
     assert nodes["z"]["value"].shape == (4, 3)
     complete(model, seen, known=batch, descent=dvae.Descent(steps=2, candidates=4, newton=0))
+
+
+def test_known_segments_make_the_prior(model, segments):
+    """Where nothing is told of z, it is found in their middle, as wide as they are; without them, in the model's."""
+    batch = {name: value.double() for name, value in segments.all().items()}
+    law = model.posterior(batch)
+    z, shape, x = made(model, 2)
+    seen = {**glimpsed(model, x, shape, "markers", frames=[0]), SHAPE: shape}
+    how = {"deviations": Deviations(marker=1e6, time=1e6), "descent": BRIEF}
+    ours, theirs = (complete(model, seen, known=batch, aggregate=each, **how).posterior for each in (True, False))
+    wide = _shrunk(law.mean, law.variance.mean(0)).diagonal()
+    torch.testing.assert_close(ours.mode["z"], law.mean.mean(0).expand(2, -1))
+    torch.testing.assert_close(ours.deviation["z"], wide.sqrt().expand(2, -1))
+    torch.testing.assert_close(theirs.mode["z"], torch.zeros_like(z))
+    torch.testing.assert_close(theirs.deviation["z"], torch.ones_like(z))
+
+
+def test_covariances_of_few_are_shrunk():
+    """On average nearer than what was counted; positive in all directions; of many next to nothing is shrunk."""
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(6, 6, generator=generator).double() * torch.tensor([2.0, 1, 1, 0.5, 0.5, 0.1])
+    truth, none = root @ root.mT, torch.zeros(6).double()
+    ours, counted = [], []
+    for _ in range(50):
+        few = torch.randn(5, 6, generator=generator).double() @ root.mT
+        found = _shrunk(few, none)
+        assert torch.linalg.eigvalsh(found)[0] > 1e-3
+        away = few - few.mean(0)
+        torch.testing.assert_close(found.trace(), away.square().sum() / 5)
+        ours.append((found - truth).square().sum())
+        counted.append((away.mT @ away / 5 - truth).square().sum())
+    assert sum(ours) < 0.9 * sum(counted)
+    many = torch.randn(200_000, 6, generator=generator).double() @ root.mT
+    torch.testing.assert_close(_shrunk(many, none), truth, rtol=0, atol=0.02 * float(truth.trace()))
+    torch.testing.assert_close(_shrunk(many[:1], none + 3), 3 * torch.eye(6).double())
+    torch.testing.assert_close(_shrunk(many[:, :1], none[:1]), many[:, :1].var(0, correction=0)[:, None])
 
 
 def test_scores_of_completions(model):
