@@ -52,7 +52,7 @@ class Descent:
         >>> quick = dvae.Descent(steps=50, starts=2)
     """
 
-    steps: Count = 200
+    steps: Count = 400
     rate: Positive = 0.05
     starts: Size = 4
     candidates: Size = 16

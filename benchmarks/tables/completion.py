@@ -63,7 +63,7 @@ SECONDS, HORIZON = 0.25, 1.2
 RESIDUAL: dict[str, Any] = {"alpha": 0.0, "velocity": True, "width": 256}
 TRAINING: dict[str, Any] = {"batch_size": 32, "learning_rate": 2e-3, "decay": 0.5}
 OURS, UNTOLD, SUP, STILL, NEAR = "ours", "ours, body unknown", "residual-sup", "last frame held", "reconstruction"
-POINTS, FRAMES = (10, 50, 100, 500), (5, 10, 20, 50, 100)
+POINTS, FRAMES = (10, 50, 100), (5, 10, 20, 50, 100)
 FEW, ALL = 50, FRAMES[-1]
 """Points a frame where the number of frames changes, and frames where that of points does."""
 LEVELS = (0.5, 0.8, 0.95)
@@ -153,7 +153,7 @@ GRID = [Sight(points, frames, markers) for markers in (False, True) for points i
 SURE = [Beginning(), Sight(0, 10, True), Sight(FEW, 20)]
 """Of which intervals are judged, and deviations chosen, each one of a kind."""
 TRIED = {"surface": (0.005, 0.01, 0.02, 0.05, 0.1), "marker": (0.005, 0.01, 0.02, 0.05, 0.1)}
-TRIED |= {"point": (0.02, 0.05, 0.1, 0.2, 0.5)}
+TRIED |= {"point": (0.05, 0.1, 0.2)}
 KINDS = dict(zip(map(str, SURE), ("surface", "marker", "point"), strict=True))
 PRIORS = {"aggregate": True, "standard": False}
 DESCENTS = [
@@ -166,6 +166,7 @@ DESCENTS = [
         (200, 0.1, 4),
         (400, 0.05, 4),
         (200, 0.05, 8),
+        (400, 0.1, 4),
     )
 ]
 

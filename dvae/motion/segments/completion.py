@@ -51,8 +51,8 @@ TIME = slice(-1, None)
 """Coordinates of a frame that say when it is."""
 NEAREST = "nearest"
 """Name of the vertices (B, K, M) that are taken for the nearest ones of points."""
-AT_ONCE = 32
-"""Frames of which all vertices are held to find the nearest ones."""
+AT_ONCE, PAIRS = 32, 2**20
+"""Frames of which all vertices are held to find the nearest ones; and pairs of points and vertices a cache holds."""
 THIN = 16
 """Of so many vertices one stands for a surface of which all are known: that tells no less of joints and a shape."""
 
@@ -421,11 +421,11 @@ def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tenso
         parts = (part.split(at_once) for part in (shape, rotations, places, points.nan_to_num(0.0)))
         for some in zip(*parts, strict=True):
             vertices = body(*some[:3])[0]
-            flat, near = vertices.flatten(0, 1), some[3].flatten(0, 1)
-            # |p - v|^2 less |p|^2, which is the same for all of them
-            away = torch.baddbmm(flat.square().sum(-1)[:, None], near, flat.mT, alpha=-2)
-            found.append(away.argmin(-1).unflatten(0, vertices.shape[:2]))
-    return torch.cat(found)
+            pairs = max(1, PAIRS // (points.shape[2] * vertices.shape[2]))
+            each = zip(vertices.flatten(0, 1).split(pairs), some[3].flatten(0, 1).split(pairs), strict=True)
+            for flat, near in each:  # |p - v|^2 less |p|^2, which is the same for all of them
+                found.append(torch.baddbmm(flat.square().sum(-1)[:, None], near, flat.mT, alpha=-2).argmin(-1))
+    return torch.cat(found).unflatten(0, points.shape[:2])
 
 
 def _shrunk(means: Tensor, variance: Tensor) -> Tensor:
