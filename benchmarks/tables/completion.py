@@ -606,9 +606,9 @@ def grid(found: Mapping[Sight, Sequence[Mapping[str, Any]]], markers: bool, name
     return table(["points", *(f"{frames} frames" for frames in FRAMES)], lines)
 
 
-def sureness(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+def sureness(found: Mapping[str, Sequence[Mapping[str, Any]]], levels: Sequence[float] = LEVELS) -> str:
     """What was seen, or tried, down; what intervals hold and how descents end across."""
-    held = [f"{what}, {100 * level:.0f} % (%)" for what in ("surface", "seen", "duration") for level in LEVELS]
+    held = [f"{what}, {100 * level:.0f} % (%)" for what in ("surface", "seen", "duration") for level in levels]
     header = ["", "vertices (mm)", "off (mm)", "sure to (mm)", *held, "k-hat above 0.7 (%)", "converged (%)"]
     header += ["starts agree (%)", "bent", "seconds"]
     lines = []
@@ -616,7 +616,7 @@ def sureness(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
         cells = [
             over(rows, [[100 * segment[n] for segment in row[what]] for row in rows])
             for what in ("surface", "seen", "duration")
-            for n in range(len(LEVELS))
+            for n in map(LEVELS.index, levels)
         ]
         both = {key: np.concatenate([np.array(row[key], float) for row in rows]) for key in ("khat", *ENDS)}
         shares = [both["khat"] > 0.7, np.abs(both["left"]) < CONVERGED, np.abs(both["behind"]) < CONVERGED]
@@ -649,6 +649,8 @@ def sections(out: Path) -> list[str]:
                 found += [f"### All points and frames, {told}: {name} (mm)\n", grid(everything, markers, name)]
     if sure := {str(sight): rows for sight in SURE if (rows := found_in(out, f"sure of {sight}"))}:
         found += ["### Uncertainty\n", sureness(sure)]
+    if chosen := {name: rows for name in tried() if (rows := found_in(out, name))}:
+        found += ["### Tuning\n", sureness(chosen, levels=LEVELS[1:2])]
     return found
 
 
@@ -753,11 +755,9 @@ def main(
         for sight in SURE if "uncertainty" in parts else []:
             kept(here / f"{folder(f'sure of {sight}')}.json", partial(run.certain, sight, DEVIATIONS, DESCENT))
     if tuned is not None:
-        run, choices = Run(tuned, source, budget, grouped=True), tried()
-        if "tuning" in parts:
-            for name, choice in choices.items():
-                kept(out / TUNING / f"{folder(name)}.json", partial(run.certain, *choice))
-        print(sureness({name: found for name in choices if (found := found_in(out, name))}))
+        run = Run(tuned, source, budget, grouped=True)
+        for name, choice in tried().items() if "tuning" in parts else ():
+            kept(out / TUNING / f"{folder(name)}.json", partial(run.certain, *choice))
     found = sections(out)
     if page is None:
         print(*found, sep="\n")
