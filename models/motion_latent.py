@@ -12,7 +12,8 @@ surface's vertices and of time, each with weights that adapt (`dvae.GradNorm`), 
 
 Marsot, Wuhrer, Franco and Durocher, 2021, arXiv 2106.04387; there is no public code. Ours, where the paper is silent:
 widths of the layers, normal likelihoods whose scale stands for how squared errors are reduced beside the KL, one batch
-size for both phases, and the layer by whose gradients weights adapt, the last that all tasks share. The second phase's
+size for both phases, the layer by whose gradients weights adapt, the last that all tasks share, and that all of these
+become equal (asymmetry 0), as log-likelihoods have no zero against which their fall could be held. The second phase's
 rate and share of the steps are chosen for short runs (docs/decisions.md): the paper has 1e-4, and 200 of 5200 epochs.
 """
 

@@ -447,7 +447,7 @@ def certain(
     """What intervals hold, by segment: shares of vertices' coordinates, and of durations, by level; and what is off.
 
     Intervals are those of normals with the mean and variance of draws: of the surface alone, and with the deviation of
-    what was seen beside, of what would be seen.
+    what was seen beside, of what would be seen; of durations, where nobody saw the end, with that of times.
     """
     model, batch = held.model, held.batch
     done = held.complete(sight.of(model, batch), deviations, descent, aggregate)
@@ -467,14 +467,16 @@ def certain(
         spread = (drawn.var(0) + noise**2).sqrt()
         return ((truth - drawn.mean(0)).abs() <= reach * spread).float().mean(-1)
 
-    found: dict[str, list[Any]] = {"surface": [], "seen": [], "duration": [], "spread": [], "error": []}
+    found: dict[str, list[Any]] = {"surface": [], "seen": [], "spread": [], "error": []}
+    found |= {} if isinstance(sight, Sight) else {"duration": []}
     for n in range(len(x[0])):
         drawn, truth = places(x[:, n], shapes[:, n]), places(batch[WHOLE][n], batch[SHAPE][n])
-        lasts, last = (model.timed.lasts(frames)[..., None] for frames in (x[:, n], batch[WHOLE][n]))
+        if "duration" in found:
+            lasts, last = (model.timed.lasts(frames)[..., None] for frames in (x[:, n], batch[WHOLE][n]))
+            found["duration"].append(within(lasts, last, deviations.time).tolist())
         found["surface"].append(within(drawn, truth).tolist())
         found["seen"].append(within(drawn, truth, noise).tolist())
-        found["duration"].append(within(lasts, last, deviations.time).tolist())
-        found["spread"].append(1000 * float((drawn.var(0) + noise**2).mean().sqrt()))
+        found["spread"].append(1000 * float(drawn.var(0).mean().sqrt()))
         found["error"].append(1000 * float((drawn.mean(0) - truth).square().mean().sqrt()))
     made, theirs = (model.vertices(*each) for each in ((done.x, done.shape), (batch[WHOLE], batch[SHAPE])))
     vertices = millimetres(bodies.vertex_error(made, theirs))
@@ -614,7 +616,7 @@ def sureness(found: Mapping[str, Sequence[Mapping[str, Any]]], levels: Sequence[
     lines = []
     for name, rows in found.items():
         cells = [
-            over(rows, [[100 * segment[n] for segment in row[what]] for row in rows])
+            over(rows, [[100 * segment[n] for segment in row[what]] for row in rows]) if what in rows[0] else None
             for what in ("surface", "seen", "duration")
             for n in map(LEVELS.index, levels)
         ]

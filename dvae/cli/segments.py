@@ -32,9 +32,9 @@ from .console import ERROR, OUT, UsageError, at_least, check_files, note
 MOST_STEPS = MOST_DRAWS = 100
 
 MOST_KNOWN = 500
-"""Segments for training of which the latents are where a search may start."""
+"""Segments for training, of whose latents the prior is, and where a search may start."""
 
-APART = 3.0
+APART, FARTHER = 3.0, 1.3
 """Nats by which a search may still fall, and deviations that segments may be from what was seen, without a note."""
 
 
@@ -255,7 +255,7 @@ def _known_data(loaded: runs.Loaded, data: str | None) -> Any:
 def _known(opened: Any, takes: Collection[str]) -> Batch | None:
     """Some segments for training, of other takes than these."""
     others = [clip for clip in opened.segments if clip.split == "train" and clip.labels["source"] not in takes]
-    clips = others[:: -(-len(others) // MOST_KNOWN) or 1]
+    clips = [others[n] for n in np.linspace(0, len(others) - 1, min(MOST_KNOWN, len(others))).round().astype(int)]
     return motion.Segments(replace(opened.segments, clips=clips), opened.timed).all() if clips else None
 
 
@@ -270,7 +270,7 @@ def _doubts(found: Recovered, deviations: Deviations) -> Iterator[str]:
     for name, away in found.away.items():
         option, allowed = name.removesuffix("s"), deviations.of(name)
         apart = float(away.max()) / (8 / pi) ** 0.5  # the mean length of three normal coordinates
-        if apart > APART * allowed:
+        if apart > FARTHER * allowed:
             yield (
                 f"the {name} are up to {1000 * float(away.max()):.0f} mm from what this run makes, and --{option} "
                 f"{allowed:g} allows for {1000 * allowed:g} mm in each coordinate: intervals are too narrow; try "

@@ -19,7 +19,9 @@ time, on straight lines between chi's frames. Moments that have both are met at 
 The paper adds squared errors, in weights that adapt. Here they are the negative log of normal likelihoods, whose
 `Deviations` are the weights: what is minimised is then a posterior's, and a completion knows how sure it is. Of
 points, what counts is how far each is from the nearest vertex, one way: a vertex far from all points is no error where
-points are few. A frame's surface counts as one vertex, the mean of all, for its vertices err together.
+points are few. That is no density of points, so that evidence does not compare bodies by points; and the curvature of
+the posterior is that of nearest vertices held fixed, which points tell of more surely than they do: k-hat says so. A
+frame's surface counts as one vertex, the mean of all, for its vertices err together.
 """
 
 from __future__ import annotations
@@ -425,14 +427,15 @@ def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tenso
             each = zip(vertices.flatten(0, 1).split(pairs), some[3].flatten(0, 1).split(pairs), strict=True)
             for flat, near in each:  # |p - v|^2 less |p|^2, which is the same for all of them
                 found.append(torch.baddbmm(flat.square().sum(-1)[:, None], near, flat.mT, alpha=-2).argmin(-1))
-    return torch.cat(found).unflatten(0, points.shape[:2])
+    return torch.cat(found).unflatten(0, points.shape[:2])  # type: ignore[no-any-return]
 
 
 def _shrunk(means: Tensor, variance: Tensor) -> Tensor:
     """Covariance (Z, Z) of a mixture of N normals with these means (N, Z) and, on average, these variances (Z,).
 
     Shrunk towards its mean variance in all directions by the oracle's approximation (Chen, Wiesel, Eldar and Hero 2010,
-    IEEE Transactions on Signal Processing 58:10), so that a few segments do not forbid all that differs from them.
+    IEEE Transactions on Signal Processing 58:10), so that a few segments do not forbid all that differs from them. It
+    takes means for independent, so that many segments of one take are shrunk less than they should be.
     """
     (n, p), away = means.shape, means - means.mean(0)
     found = (away.mT @ away) / n + variance.diag()

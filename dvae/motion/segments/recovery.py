@@ -99,12 +99,15 @@ class Recovered:
         errors = {f"from\n{name}\nmm": value for name, value in self.away.items()}
         apart = {"vertex error": "vertex\nerror\nmm", "duration error": "duration\nerror\nms"}
         errors |= {apart[name]: value for name, value in self.errors.items()}
-        what = _table((*ways, *errors), f"[ ]: {100 * LEVEL:g} % of {draws} draws from the posterior")
+        told = (
+            f"[ ]: {100 * LEVEL:g} % of {draws} draws, too narrow where errors are alike or larger than deviations say"
+        )
+        what = _table((*ways, *errors), told)
         how = _table(
             ("left\nnats", "behind\nnats", "bent", "k-hat"),
             "left: by which the energy would still fall, about 0 where the search has converged\n"
             "behind: by which other starts arrived above the best\n"
-            "bent: directions of which nothing seen tells, or not as a normal would\n"
+            "bent: directions in which it is less sure than the prior: no normal\n"
             f"k-hat: above {UNRELIABLE} the draws, and so intervals, are rough",
         )
         posterior = self.found.posterior
@@ -242,7 +245,9 @@ def _check_something(seen: Batch) -> None:
     some = torch.stack(kinds).any(0) if kinds else torch.stack(timed).all(0)
     if not (known := some.any(-1)).all():
         row = int(known.logical_not().nonzero()[0])
-        raise ValueError(f"nothing was seen of segment {row} of {len(known)}: all of it is NaN")
+        raise ValueError(
+            f"nothing was seen of segment {row} of {len(known)}, the first being 0: all is NaN; leave it out"
+        )
 
 
 def _table(columns: Sequence[str], caption: str) -> Table:

@@ -98,5 +98,5 @@ def test_a_reconstruction_is_a_table_boxes_and_a_file(held, model, tmp_path):
 def test_what_is_not_finite_is_refused_by_its_segment(held, model):
     with torch.no_grad():
         next(iter(model.parameters())).fill_(torch.nan)
-    with pytest.raises((FloatingPointError, ValueError), match=r"segment .*is not finite|nan"):
+    with pytest.raises(FloatingPointError, match=r"segment test/\S+ is not finite"):
         reconstruct_segments({"m": model}, held[1], progress=False)
