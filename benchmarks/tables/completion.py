@@ -663,14 +663,16 @@ def draw(out: Path, file: Path) -> None:
         return
     figure = canvas(14, 3.4)
     first, *panels = figure.subplots(1, 3)
+    highest = 0.0  # of all but the last frame held, which leaves the picture
     for place, (name, (rows, key)) in enumerate(drawn.items()):
         points = [(time, cell.estimate()) for n, time in enumerate(times_of(drawn)) if (cell := at(rows, key, n))]
         means = [estimate.mean for _, estimate in points]
+        highest = max(highest, *means) if name != STILL else highest
         first.plot([time for time, _ in points], means, color=f"C{place}", label=name)
         lows, highs = zip(*(estimate.interval(error="sequences") for _, estimate in points), strict=True)
         first.fill_between([time for time, _ in points], lows, highs, color=f"C{place}", alpha=0.15, lw=0)
     first.axvline(SECONDS, color="grey", lw=0.8, ls="--")
-    first.set(xlabel="time (s)", title="vertex error (mm)", ylim=(0, None))
+    first.set(xlabel="time (s)", title="vertex error (mm)", ylim=(0, 1.2 * highest or None))
     first.legend(fontsize=7, frameon=False)
     ways = [("points", False), ("points and markers", True)]
     for panel, axis, across in ((panels[0], "points", POINTS), (panels[1], "frames", FRAMES)):
