@@ -6,6 +6,7 @@ over time is a schedule of the global step, and random numbers are the run's own
 changes nothing, nor the reverse.
 """
 
+import atexit
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -127,6 +128,9 @@ class SVI:
             accelerator=training.accelerator, devices=training.devices, precision=training.precision
         )
         self.fabric.launch()
+        if self.fabric.world_size > 1:
+            atexit.unregister(_leave)
+            atexit.register(_leave)
         with _forked(self.fabric.device):
             own: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
             optimizer = OPTIMISERS[training.optimizer](
@@ -330,6 +334,12 @@ class _Bound(nn.Module):
             with torch.autocast(terms.frames.device.type, enabled=False):
                 measure(terms)
         return dict(vars(terms))
+
+
+def _leave() -> None:
+    """Leave the group of processes: threads of it that outlive the interpreter abort it. For NCCL Fabric does so."""
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
 
 
 def _forked(device: torch.device) -> AbstractContextManager[None]:

@@ -481,8 +481,10 @@ def test_another_objective_is_refused_where_it_would_go_on(tmp_path):
 # Several processes --------------------
 
 SCRIPT = """
+import atexit
 import sys
 import torch
+atexit.register(lambda: print("left" if not torch.distributed.is_initialized() else "aborted"))  # what is first is last
 sys.path[:0] = sys.argv[2:]
 import dvae
 from dvae.inference.checkpoints import Run
@@ -525,6 +527,7 @@ def test_two_processes_have_the_weights_of_one_that_has_both_their_batches(tmp_p
     command = [sys.executable, str(script), str(tmp_path), *map(str, Path(__file__).parents[:2])]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+    assert done.stdout.split().count("left") == 2, done.stdout
     (first, model), (second, other) = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
     assert first == second
     assert all(torch.equal(model[name], other[name]) for name in model)
