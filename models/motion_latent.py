@@ -153,7 +153,7 @@ class MotionLatentModel(DynamicalVAE):
         return poutine.trace(self.guide).get_trace(batch).nodes["z"]["fn"]
 
     def encode(self, batch: Mapping[str, Any]) -> Tensor:
-        """Its mean."""
+        """The mean (B, Z) of that law, with gradients."""
         return self.posterior(batch).mean  # type: ignore[no-any-return]
 
     def decode(self, latent: Tensor, shape: Tensor, frames: Tensor | None = None) -> Tensor:

@@ -48,7 +48,7 @@ from dvae.motion.segments.completion import (
     scanned,
     surfaces_at,
 )
-from dvae.motion.segments.dataset import SegmentData
+from dvae.motion.segments.dataset import SegmentData, thinned
 from dvae.motion.segments.embodied import SHAPE, Segments
 from dvae.motion.skeleton import rotate_about_up
 from dvae.views import WHOLE
@@ -156,6 +156,7 @@ TRIED = {"surface": (0.005, 0.01, 0.02, 0.05, 0.1), "marker": (0.005, 0.01, 0.02
 TRIED |= {"point": (0.05, 0.1, 0.2)}
 KINDS = dict(zip(map(str, SURE), ("surface", "marker", "point"), strict=True))
 PRIORS = {"aggregate": True, "standard": False}
+"""That of known segments, and N(0, I)."""
 DESCENTS = [
     dvae.Descent(steps, rate, starts)
     for steps, rate, starts in (
@@ -283,11 +284,6 @@ class Run:
     def certain(self, sight: Any, *how: Any) -> dict[str, Any]:
         """See `certain`."""
         return certain(self.some, sight, *how)
-
-
-def thinned(clips: Sequence[Any], many: int) -> list[Any]:
-    """So many of them, evenly."""
-    return [clips[n] for n in np.linspace(0, len(clips) - 1, min(many, len(clips))).round().astype(int)]
 
 
 def kept(file: Path, measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from ..data import Batch
 from ..inference.checkpoints import CheckpointError
 from ..inference.posteriors import Descent
 from ..motion.segments.completion import Deviations, glimpsed
+from ..motion.segments.dataset import thinned
 from ..motion.segments.embodied import SHAPE
 from ..motion.segments.frames import resting_offsets
 from ..motion.segments.interpolation import Interpolation
@@ -255,7 +256,7 @@ def _known_data(loaded: runs.Loaded, data: str | None) -> Any:
 def _known(opened: Any, takes: Collection[str]) -> Batch | None:
     """Some segments for training, of other takes than these."""
     others = [clip for clip in opened.segments if clip.split == "train" and clip.labels["source"] not in takes]
-    clips = [others[n] for n in np.linspace(0, len(others) - 1, min(MOST_KNOWN, len(others))).round().astype(int)]
+    clips = thinned(others, MOST_KNOWN)
     return motion.Segments(replace(opened.segments, clips=clips), opened.timed).all() if clips else None
 
 

@@ -77,7 +77,7 @@ def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
             seen = positions[..., below, :] - positions[..., joint, None, :]
             seen = seen * inverse_lengths(seen)[..., None]
             if len(below) == 1:
-                world[joint] = swing(above @ rest[0], seen[..., 0, :]) @ above
+                world[joint] = orthogonal(swing(above @ rest[0], seen[..., 0, :]) @ above)
             else:
                 world[joint] = procrustes(seen.transpose(-1, -2) @ rest + TIE * above)
         local[joint] = above.transpose(-1, -2) @ world[joint]
@@ -94,6 +94,14 @@ def swing(start: Tensor, end: Tensor) -> Tensor:
     opposite = middle.norm(dim=-1, keepdim=True) < torch.finfo(middle.dtype).eps ** 0.5  # below, rounding rules
     middle = torch.nn.functional.normalize(torch.where(opposite, across(start), middle), dim=-1)
     return _half_turn(middle) @ _half_turn(start)
+
+
+def orthogonal(turn: Tensor) -> Tensor:
+    """A rotation (..., 3, 3) without the rounding of the products that it came from, or it would grow along a chain.
+
+    One step of Newton's iteration for the polar factor (Higham 1986).
+    """
+    return turn @ (1.5 * torch.eye(3, dtype=turn.dtype, device=turn.device) - 0.5 * turn.transpose(-1, -2) @ turn)
 
 
 def _half_turn(axis: Tensor) -> Tensor:

@@ -230,7 +230,8 @@ def test_rounding_does_not_grow_along_a_chain():
     body = Skeleton(tuple(map(str, range(30))), tuple(range(-1, 29)))
     offsets = torch.randn(30, 3)
     found = kinematics.inverse(body, torch.randn(50, 30, 3), offsets)
-    torch.testing.assert_close(found @ found.mT, torch.eye(3).expand_as(found), atol=1e-5, rtol=0)
+    errors = (found @ found.mT - torch.eye(3)).abs().amax((0, -2, -1))
+    assert errors.max() < 16 * torch.finfo(errors.dtype).eps, errors
 
 
 def test_inverse_kinematics_rounds_as_its_numbers_do():

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
 
 from ...options import Amount, check, nearest
 from ..bodies import fitted, human
@@ -25,6 +27,11 @@ Cut = Literal["gait", "clips"]
 
 VALIDATION = 0.1
 """Part of the takes for training that is held out."""
+
+
+def thinned(clips: Sequence[Clip], many: int) -> list[Clip]:
+    """So many of them, evenly, or all where there are no more."""
+    return [clips[n] for n in np.linspace(0, len(clips) - 1, min(many, len(clips))).round().astype(int)]
 
 
 @dataclass(frozen=True)
