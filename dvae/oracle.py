@@ -172,6 +172,8 @@ class Oracle:
 
     def bound(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
         """The exact evidence lower bound of the model's guide, (B,): no draws are taken."""
+        if not self.model.latents:
+            return self.evidence(x)
         gain, offset, root = self._guide()
         mean, _ = self.posterior(x)
         data = self._stack(self.model.read(x), self.model.observed)
@@ -204,6 +206,8 @@ class Oracle:
 
     def fit_guide(self, iterations: int = 2000) -> float:
         """Fits the guide to the model's exact gap by L-BFGS and returns what is left of it, in nats a sequence."""
+        if not self.model.latents:
+            return 0.0
         parameters = list(self.model.encoder.parameters())
         optimiser = torch.optim.LBFGS(
             parameters,

@@ -193,7 +193,7 @@ def site_log_prob(fn: Any, value: Tensor) -> Tensor:
     """(B, T) of a local variable, (B,) of a static one."""
     if not isinstance(fn, Sequence):
         return fn.log_prob(value)
-    return _over_entries(fn.steps(value).log_prob(value), fn)
+    return _over_entries(fn.steps(value).log_prob(fn.scored(value)), fn)
 
 
 def log_densities(trace: Any) -> dict[str, Tensor]:
@@ -316,7 +316,8 @@ def importance_bound(
     """The importance-weighted bound: log of the mean over particles of p(x, z) / q(z | x), per sequence.
 
     Its mean rises with the number of particles, from the evidence lower bound at 1 to the log evidence. With fewer than
-    25 particles the tail shape is not estimated (nan).
+    25 particles the tail shape is not estimated (nan). Of a model without latents it is the log-likelihood,
+    with k-hat 0, and evaluated once.
 
     Args:
         model: the model with its guide.
@@ -339,6 +340,9 @@ def importance_bound(
     data = model.read(batch)
     size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
     with model._evaluating():
+        if not model.latents:
+            evidence = _log_weights(model, data, options)
+            return ImportanceBound(evidence, torch.zeros_like(evidence), particles)
         return importance_mean(lambda count: _log_weights(model, repeat(data, count), options), size, particles, chunk)
 
 

@@ -292,6 +292,10 @@ def calibrate(
             f"length, simulations, draws and chunk are at least 1, got {length}, {simulations}, {draws} and {chunk}"
         )
     require_likelihood(model)
+    if not model.latents:
+        raise ValueError(
+            f"{model.generative} has no latents, so that its likelihood is exact and no guide to calibrate"
+        )
     kept = list(range(1, length + 1)) if steps is None else list(steps)
     if not kept or len(set(kept)) < len(kept) or not set(kept) <= set(range(1, length + 1)):
         raise ValueError(f"steps are different numbers from 1 to {length}, got {kept}")

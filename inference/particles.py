@@ -203,7 +203,7 @@ class Filter:
             total = total + _log_prob(law.conditional, parameters, value, _at(counted[name], t))
             if name in self.hidden:  # the model reads its own mean there
                 seen = self.known.observed[name][:, t].index_select(0, self.sequence)
-                self.paths[name][t] = torch.where(seen, value, parameters[0])
+                self.paths[name][t] = torch.where(seen, value, law.conditional.law.mean(parameters))
         return total
 
     def _draw_statics(self, late: bool) -> Tensor:
@@ -312,7 +312,7 @@ def _log_mean(log_weights: Tensor) -> Tensor:
 
 def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, counted: Tensor | None = None) -> Tensor:
     """(N,) of values (N, D); entries that are not `counted` are left out."""
-    entries = conditional.law.distribution(parameters).log_prob(value)
+    entries = conditional.law.distribution(parameters).log_prob(conditional.scored(value, counted))
     if counted is not None and counted.dim() != entries.dim():  # one of guide and model has whole events
         counted = counted.all(-1) if conditional.whole else counted[:, None]
     # where, not a product: an entry that does not count may be infinite

@@ -22,7 +22,7 @@ class Equations(LatentMethod):
 
     Args:
         generative: the model's factorization.
-        inference: the guide's.
+        inference: the guide's; "" of a model without latents.
         network: "recurrent", "attention", "dense" or "linear", for every factor.
         width: of the networks.
         latents: sizes of the latents, where they differ from `latent`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -43,8 +43,9 @@ class Method(Trainable):
     latent: Size | None = 16
 
     def equations(self) -> tuple[Factorization, Factorization]:
-        """The generative model and the guide."""
-        return Factorization.parse(self.generative), Factorization.parse(self.inference)
+        """The generative model and the guide, which has no factor where there are no latents."""
+        guide = Factorization.parse(self.inference) if self.inference.strip() else Factorization("q", ())
+        return Factorization.parse(self.generative), guide
 
     def sizes(self) -> dict[str, int]:
         """Sizes of the latents."""
@@ -69,7 +70,7 @@ class Method(Trainable):
 
 
 @dataclass(frozen=True)
-class LatentMethod(Method):
+class LikelihoodMethod(Method):
     """A method with a likelihood whose model follows from its networks and laws, and is trained on the evidence.
 
     A subclass gives `networks`, and `sizes` and `laws` where these are other ones.
@@ -79,6 +80,57 @@ class LatentMethod(Method):
             "normal" (scale read from the parents) or "student" (Student t).
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1, an offset, one step
             ahead is sharp, but a free run can drift without bound; somewhat less forgets where it was.
+        self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over a
+            third of training, after the first tenth, and carries no gradient. Nothing is fed to a model that reads no
+            x.
+    """
+
+    emission: Literal["fixed", "unit", "normal", "student"] = "fixed"
+    residual: Share = 0.0
+    self_feeding: Share = 0.0
+
+    @override
+    def laws(self) -> Mapping[str, LawSpec]:
+        """Laws by factor: that of x."""
+        emissions: dict[str, LawSpec] = {
+            "normal": Normal(residual=self.residual),
+            "fixed": FixedNormal(scale=0.1, learned=True, residual=self.residual),
+            "unit": FixedNormal(residual=self.residual),
+            "student": StudentT(residual=self.residual),
+        }
+        return {"p(x)": emissions[self.emission]}
+
+    @override
+    def build(self, data: Any) -> DynamicalVAE:
+        """The model of these equations."""
+        schema = Schema.of(data)
+        model = DynamicalVAE(**self.described(schema.sizes), view=schema.view)
+        model.feeding = SelfFeeding(0.0, gradient=False)
+        return model
+
+    @override
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
+        """One stage that minimises the negative evidence, with self-feeding as the options say."""
+        return Recipe(train, validation, [Stage(steps, self.objective())], self._feeding(steps))
+
+    def objective(self) -> Objective:
+        """What training minimises."""
+        return Evidence()
+
+    def _feeding(self, steps: int) -> Schedule | float:
+        """Probability of self-feeding over a run of `steps`; 0 for a model that reads no data, where nothing is fed."""
+        p, q = self.equations()
+        reads = {parent.name for factor in p.factors for parent in factor.parents}
+        if not self.self_feeding or not reads & (set(p.variables) - set(q.variables)):
+            return 0.0
+        return Ramp(0.0, self.self_feeding, steps=max(steps // 3, 1), delay=steps // 10)
+
+
+@dataclass(frozen=True)
+class LatentMethod(LikelihoodMethod):
+    """A method with latents and a likelihood; see `LikelihoodMethod`.
+
+    Args:
         prior: distribution of the static latents without parents: "standard" (normal, nothing learned), "mixture" (of
             normals), "vamp" (of the guide's posteriors of learned pseudo-sequences) or "flow".
         prior_components: of "mixture" and "vamp".
@@ -86,21 +138,15 @@ class LatentMethod(Method):
         warm_up: steps over which the KL weight rises from 0 to 1.
         warm_up_shape: form of that rise.
         free_bits: nats per frame below which the KL of a latent, averaged over the batch, costs nothing more.
-        self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over a
-            third of training, after the first tenth, and carries no gradient. Nothing is fed to a model that reads no
-            x.
     """
 
     latent: Size = 16
-    emission: Literal["fixed", "unit", "normal", "student"] = "fixed"
-    residual: Share = 0.0
     prior: Literal["standard", "mixture", "vamp", "flow"] = "standard"
     prior_components: Annotated[int, Range(1, 1024)] = 16
     prior_steps: Annotated[int, Range(1, 1024)] = 16
     warm_up: Delay | None = 500
     warm_up_shape: Literal["linear", "cosine", "logistic"] = "linear"
     free_bits: Amount = 0.0
-    self_feeding: Share = 0.0
 
     @override
     def laws(self) -> Mapping[str, LawSpec]:
@@ -109,13 +155,7 @@ class LatentMethod(Method):
         Raises:
             ValueError: a prior without such a latent.
         """
-        emissions: dict[str, LawSpec] = {
-            "normal": Normal(residual=self.residual),
-            "fixed": FixedNormal(scale=0.1, learned=True, residual=self.residual),
-            "unit": FixedNormal(residual=self.residual),
-            "student": StudentT(residual=self.residual),
-        }
-        laws = {"p(x)": emissions[self.emission]}
+        laws = super().laws()
         if self.prior == "standard":
             return laws
         priors: dict[str, LawSpec] = {
@@ -130,15 +170,7 @@ class LatentMethod(Method):
                 f"prior={self.prior!r} is for a static latent without parents, such as p(w), which {p.text} does not "
                 'have; use prior="standard"'
             )
-        return laws | {f"p({name})": priors[self.prior] for name in latents}
-
-    @override
-    def build(self, data: Any) -> DynamicalVAE:
-        """The model of these equations."""
-        schema = Schema.of(data)
-        model = DynamicalVAE(**self.described(schema.sizes), view=schema.view)
-        model.feeding = SelfFeeding(0.0, gradient=False)
-        return model
+        return {**laws, **{f"p({name})": priors[self.prior] for name in latents}}
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
@@ -147,21 +179,13 @@ class LatentMethod(Method):
         Raises:
             ValueError: on preparing the model, the pseudo-sequences of a prior are longer than the windows.
         """
-        stages = [Stage(steps, self.objective())]
-        return Recipe(train, validation, stages, self._feeding(steps), partial(start_priors, train=train))
+        return replace(super().train(train, validation, steps), prepare=partial(start_priors, train=train))
 
+    @override
     def objective(self) -> Objective:
         """What training minimises."""
         weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0
         return Evidence(kl_weight=weight, free_bits=self.free_bits)
-
-    def _feeding(self, steps: int) -> Schedule | float:
-        """Probability of self-feeding over a run of `steps`; 0 for a model that reads no data, where nothing is fed."""
-        p, q = self.equations()
-        reads = {parent.name for factor in p.factors for parent in factor.parents}
-        if not self.self_feeding or not reads & (set(p.variables) - set(q.variables)):
-            return 0.0
-        return Ramp(0.0, self.self_feeding, steps=max(steps // 3, 1), delay=steps // 10)
 
 
 def start_priors(model: DynamicalVAE, train: Any) -> None:

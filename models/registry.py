@@ -27,6 +27,7 @@ METHODS = {
     "rvae-noncausal": "dvae.models.rvae:NonCausalRVAE",
     "dsae": "dvae.models.dsae:DSAE",
     "kvae": "dvae.models.kvae:KVAE",
+    "autoregressive": "dvae.models.autoregressive:Autoregressive",
     "hit-dvae": "dvae.models.hit_dvae:HiTDVAE",
     "gsps": "dvae.models.gsps:GSPS",
     "trajevae": "dvae.models.trajevae:TrajeVAE",

@@ -227,6 +227,8 @@ def criticise(
         ERROR.print(
             f"no calibration: sequences are simulated from nothing, but {loaded.method.name} starts from a pose"
         )
+    elif not model.latents:
+        ERROR.print(f"no calibration: {loaded.method.name} has no latents, and so no guide")
     else:
         calibration = calibrate(model, windows.length, simulations, draws, steps=steps, seed=seed)
         _add(document, "calibration", calibration, path, figure, "calibration")

@@ -6,20 +6,27 @@
 
 from .base import Law, LawSpec, Shape, renamed
 from .families import Delta, Directions, FixedNormal, Normal, StandardNormal, StudentT
+from .family import FAMILIES, Family, LowRankNormal, NormalMixture
 from .flow import FlowDistribution, QRFlow
 from .priors import Flow, Mixture, Vamp
+from .product import Product
 from .subset import Subset
 
 __all__ = [
+    "FAMILIES",
     "Delta",
     "Directions",
+    "Family",
     "FixedNormal",
     "Flow",
     "FlowDistribution",
     "Law",
     "LawSpec",
+    "LowRankNormal",
     "Mixture",
     "Normal",
+    "NormalMixture",
+    "Product",
     "QRFlow",
     "Shape",
     "StandardNormal",

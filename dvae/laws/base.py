@@ -58,9 +58,12 @@ class Law(nn.Module):
 
     deterministic: ClassVar[bool] = False
     """Whether the variable is a function of its parents, without a density."""
-    location_scale: ClassVar[bool] = False
-    """Whether the first two parameters (or the one) are a location and a scale, which `in_units` can put into another
-    unit. Probabilities and rates cannot be."""
+    location_scale: bool = False
+    """Whether `in_units` can put the parameters into another unit: a location and a scale, or a scale alone, as a rate.
+    Probabilities cannot be."""
+    events: Sequence[Sequence[int]] = ()
+    """Coordinates that are one event each, so that they are observed together or not at all, where a value has several
+    such events."""
 
     def __init__(self, residual: float = False):
         super().__init__()
@@ -84,9 +87,7 @@ class Law(nn.Module):
         return loc if previous is None else torch.add(loc, previous, alpha=self.residual)
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """Parameters, (..., D) or wider, from features and the variable's own previous value, where it is residual.
-
-        The first is the mean (..., D), which data have where they are missing; of a static latent it may be anything.
+        """Parameters, (..., P) each, from features and the variable's own previous value, where it is residual.
 
         Args:
             features: (B, T, H) at all steps, or (B, H) of a static variable or at step `t`.
@@ -102,6 +103,13 @@ class Law(nn.Module):
         (batch (...), event (D,)).
         """
         raise NotImplementedError
+
+    def mean(self, parameters: Parameters) -> Tensor:
+        """The mean (..., D), which the model reads where data are missing, and shows where they are not drawn.
+
+        Of a categorical variable it is the probabilities; here, the first of the parameters.
+        """
+        return parameters[0]
 
     def joint(self, parameters: Parameters) -> TorchDistribution:
         """The distribution with all coordinates as one event: batch (...), event (D,)."""

@@ -11,9 +11,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..data import BESIDE, Batch
-from ..networks.base import valid_steps
+from ..laws.product import ProductSupport
+from ..networks.base import once, valid_steps
 from ..notation import Factorization
 from ..views import LOG_DET, WHOLE, View
+from .conditional import Conditional
 from .rollout import Rollout
 
 CHUNK = 2048
@@ -33,7 +35,7 @@ class Reader:
         view: what the model sees of the data.
         extras: names of what else a batch may hold.
         made: those of the data that are functions of their parents, which a program is not given.
-        whole: data of which all that a step has is one event.
+        laws: conditionals of the data, which say where values are and which are one event.
         density: whether the data have one, of which a view that changes volume has to tell.
     """
 
@@ -44,7 +46,7 @@ class Reader:
     view: View
     extras: tuple[str, ...]
     made: frozenset[str]
-    whole: Collection[str]
+    laws: Mapping[str, Conditional]
     density: bool
 
     def read(self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor]) -> dict[str, Any]:
@@ -72,7 +74,7 @@ class Reader:
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
             )
-        values = _tensors(batch, dtype)
+        values = _tensors(batch, dtype, names)
         if "mask" in values:
             masks = values["mask"] if isinstance(values["mask"], Mapping) else {whole: values["mask"]}
             values["mask"] = masks
@@ -85,13 +87,14 @@ class Reader:
         seen = {name: value for name, value in seen.items() if name in values or name not in self.made}
         if "mask" in seen:  # of context too, which is told no more of it
             known = {name: mask for name, mask in seen["mask"].items() if name in seen}
-            for name in known.keys() & self.whole:
-                if not torch.equal(known[name].any(-1), known[name].all(-1)):
-                    raise ValueError(
-                        f"the mask of {name} hides some entries of a step and not others, but the law of {name} has "
-                        "one density for all of them; hide whole steps, or give it a law with one for each, such as "
-                        "Normal()"
-                    )
+            for name in known.keys() & self.laws.keys():
+                for event in map(list, self.laws[name].events):
+                    if not torch.equal(known[name][..., event].any(-1), known[name][..., event].all(-1)):
+                        raise ValueError(
+                            f"the mask of {name} hides some entries of a step and not others, but its law has one "
+                            f"density for {len(event)} of them; hide them together, or give {name} a law with one for "
+                            "each, such as Normal()"
+                        )
             seen |= {name: torch.where(mask, seen[name], means.get(name, 0.0)) for name, mask in known.items()}
             kept = {*self.observed, self.view.history}
             seen["mask"] = {name: mask for name, mask in known.items() if name in kept}
@@ -147,6 +150,8 @@ class Reader:
                     f"{name} holds values that are not finite; where entries are missing, set 'mask' False in the batch"
                 )
         self._check_context(factorization, values)
+        for name in values.keys() & self.laws.keys():
+            self._check_support(name, values[name], masks.get(name), lengths)
         return Rollout(
             factorization=factorization,
             conditionals=conditionals,
@@ -178,8 +183,26 @@ class Reader:
                     f"{shapes(values) or 'nothing'}"
                 )
 
+    def _check_support(self, name: str, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> None:
+        law = self.laws[name]
+        if (support := law.support) is None:
+            return
+        wrong = ~once(law, [value], lambda: support.check(value))
+        wrong = wrong[..., None].expand_as(value) if law.whole else wrong
+        if mask is not None:
+            wrong = wrong & mask
+        if lengths is not None and value.dim() == 3:
+            wrong = wrong & valid_steps(lengths, value.shape[1])[..., None]
+        if wrong.any():
+            place = wrong.nonzero()[0].tolist()
+            raise ValueError(
+                f"{name} holds {value[tuple(place)].item():g} (sequence {place[0]}, coordinate {place[-1]}), and by "
+                f"{law.factor}, {law.family}, values are {_meaning(support)}; give {name} another law, or hide "
+                "such entries by the 'mask' of the batch"
+            )
+
     def check(self, name: str, value: Tensor) -> None:
-        """Refuses a value (B, T, D), or (B, D), of another shape or of whole numbers.
+        """Refuses a value (B, T, D), or (B, D), of another shape.
 
         Raises:
             ValueError: saying what was expected.
@@ -190,15 +213,34 @@ class Reader:
             raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {expected}")
         if value.dim() == 3 and value.shape[1] == 0:
             raise ValueError(f"{name} has no steps: shape {tuple(value.shape)}")
-        if not value.is_floating_point():
-            raise ValueError(f"{name} is {value.dtype}, expected floating point {expected}")
 
 
-def _tensors(value: Any, dtype: torch.dtype) -> Any:
-    if isinstance(value, Mapping):
-        return {name: _tensors(v, dtype) for name, v in value.items()}
-    tensor = torch.as_tensor(value)
-    return tensor.to(dtype) if tensor.is_floating_point() else tensor
+def _tensors(value: Any, dtype: torch.dtype, names: Collection[str]) -> Any:
+    """Tensors, floating-point ones and those of these names in a precision; the others are counts and masks."""
+    found = {}
+    for name, each in value.items():
+        if isinstance(each, Mapping):
+            found[name] = _tensors(each, dtype, names if name == BESIDE else ())
+            continue
+        tensor = torch.as_tensor(each)
+        found[name] = tensor.to(dtype) if tensor.is_floating_point() or name in names else tensor
+    return found
+
+
+def _meaning(support: Any) -> str:
+    """Where values are, in words."""
+    if isinstance(support, ProductSupport):
+        return "; ".join(f"of {', '.join(map(str, places))}: {_meaning(own)}" for places, own in support.parts)
+    while hasattr(support, "base_constraint"):
+        support = support.base_constraint
+    return {
+        "Boolean()": "0 or 1",
+        "OneHot()": "1 at one coordinate and 0 at the others",
+        "IntegerGreaterThan(lower_bound=0)": "whole numbers from 0",
+        "GreaterThan(lower_bound=0.0)": "above 0",
+        "GreaterThanEq(lower_bound=0.0)": "at least 0",
+        "Interval(lower_bound=0.0, upper_bound=1.0)": "from 0 to 1",
+    }.get(str(support), str(support))
 
 
 def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tuple[int, int]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.distributions import constraints
 
 from ..laws.base import LawSpec, Parameters, Shape
 from ..laws.chain import DERIVATIVES, gaussian_chain
@@ -44,6 +45,19 @@ def evaluating(*modules: nn.Module) -> Iterator[None]:
             part.training = True
 
 
+def _is_fixed(support: Any) -> bool:
+    """Whether where values are is the same whatever the parameters."""
+    inner = [own for _, own in getattr(support, "parts", ())]
+    inner += [support.base_constraint] if hasattr(support, "base_constraint") else []
+    return all(map(_is_fixed, inner)) and not any(isinstance(value, Tensor) for value in vars(support).values())
+
+
+def _is_real(support: Any) -> bool:
+    while hasattr(support, "base_constraint"):
+        support = support.base_constraint
+    return support is constraints.real
+
+
 def like(module: nn.Module) -> Tensor:
     """A tensor of the module's type and device."""
     for tensor in module.parameters():
@@ -62,6 +76,8 @@ class Conditional(nn.Module):
         data: names of the data variables.
         guide: of a static latent without parents its q(w | ...), which some priors are made of.
     """
+
+    inside: Tensor | None
 
     def __init__(
         self,
@@ -85,13 +101,13 @@ class Conditional(nn.Module):
         self.parents = [parent.name for parent in factor.parents]
         self.units: dict[str, Units] = {}  # not registered here: they are the model's
         with evaluating(self.law, *([guide] if guide else [])):  # statistics of what they normalise are of data
-            self.discrete, self.reparameterised, self.whole = self._try_law(features)
+            self._try_law(features)
         for length in range(2, 9):
             self.check(length)
 
     @torch.inference_mode(False)
-    def _try_law(self, features: int) -> tuple[bool, bool, bool]:
-        """Whether the law's values are discrete, its draws have a gradient, and all coordinates are one event.
+    def _try_law(self, features: int) -> None:
+        """Draws once, which tells what the law is: see the attributes.
 
         Raises:
             ValueError: a distribution of another shape.
@@ -111,11 +127,24 @@ class Conditional(nn.Module):
                 f"{tuple(law.event_shape)}; it has either one density for each coordinate, here batch "
                 f"{(*rows, self.size)} and no event, or one for all of a step, batch {rows} and event {(self.size,)}"
             )
-        discrete = False
+        support: Any = None
         with suppress(NotImplementedError):  # a distribution that says nothing of its support
-            discrete = law.support is not None and law.support.is_discrete
+            support = law.support
+        self.family = type(law).__name__
+        self.discrete = support is not None and support.is_discrete
+        """Whether its values are discrete."""
         learns = value.requires_grad or not any(parameter.requires_grad for parameter in parameters)
-        return discrete, learns and not discrete, bool(law.event_shape)  # torch.bernoulli has a gradient, of zero
+        self.reparameterised = learns and not self.discrete  # torch.bernoulli has a gradient, of zero
+        """Whether its draws have a gradient."""
+        self.whole = bool(law.event_shape)
+        """Whether all coordinates are one event."""
+        self.events = [range(self.size)] if self.whole else self.law.events
+        """Coordinates that are one event each, and observed together."""
+        self.support = None if support is None or not _is_fixed(support) or _is_real(support) else support
+        """Where its values are, if that is somewhere in particular and the same whatever the parents."""
+        nothing = torch.zeros_like(value)
+        somewhere = self.support is None or bool(torch.isfinite(law.log_prob(nothing)).all())
+        self.register_buffer("inside", None if somewhere else value.detach().flatten(), persistent=False)
 
     def check(self, length: int) -> None:
         """Refuses a residual law that reads what the factor does not, at sequences of this length.
@@ -130,6 +159,19 @@ class Conditional(nn.Module):
                 f"at {length} steps; add {self.factor.child}_{{t-1}} or {self.factor.child}_{{<t}} to its parents, or "
                 "use residual=0"
             )
+
+    def scored(self, value: Tensor, counted: Tensor | None) -> Tensor:
+        """The value (..., D) with any other that has a density at entries that do not count.
+
+        What stands there may have none, as 0 of a positive variable, and its gradient would be NaN.
+
+        Args:
+            value: of the child.
+            counted: as the value, or (...) of whole events.
+        """
+        if self.inside is None or counted is None:
+            return value
+        return torch.where(counted if counted.dim() == value.dim() else counted[..., None], value, self.inside)
 
     def forward(
         self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None

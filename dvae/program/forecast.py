@@ -42,7 +42,7 @@ def forecast(
     size, past = (len(next(iter(data.values()))), 0) if first is None else first.shape[:2]
     given = {name: torch.as_tensor(value).to(like(model)) for name, value in (fix or {}).items()}
     fixed = _fixed(model, given, data, size, horizon)
-    drawn = {n: model.generator[n].discrete if draw_emission is None else draw_emission for n in model.observed}
+    drawn = {name: model.drawn(name) if draw_emission is None else draw_emission for name in model.observed}
     means = [name for name in model.observed if not drawn[name]]
     local = {name for name in data if name in model.context and data[name].dim() == 3}
     seen = {name: value[:, :past] if name in local else value for name, value in data.items()}
@@ -107,7 +107,7 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
             if name in model.observed and name not in rollout.values:  # a function of its parents
                 rollout.know(name, rollout.draw(name))
             if name in model.observed:
-                found[name] = rollout.evaluate(name, rollout.values[name]).mean
+                found[name] = model.generator[name].law.mean(rollout.parameters(name, rollout.values[name]))
         made = {name: mean.unflatten(0, (count, -1)) for name, mean in found.items()}
         return model.shown(made, rows(data, part))
 

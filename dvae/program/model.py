@@ -135,7 +135,7 @@ class DynamicalVAE(nn.Module):
             self.view,
             self.extras,
             frozenset(name for name in self.view.parts or () if self.generator[name].law.deterministic),
-            [name for name in self.observed if self.generator[name].whole],
+            {name: self.generator[name] for name in self.observed},
             self.likelihood,
         )
         self.units: Any = nn.ModuleDict()
@@ -194,6 +194,14 @@ class DynamicalVAE(nn.Module):
     def likelihood(self) -> bool:
         """Whether the data have a density given the latents; without it there is no bound (see `laws.Delta`)."""
         return not any(self.generator[name].law.deterministic for name in self.observed)
+
+    def drawn(self, name: str) -> bool:
+        """Whether forecasts of a data variable are draws where they are not told.
+
+        They are of discrete data, of which the mean is no value (.3 of a bit), and of a model without latents, whose
+        means would all be the same.
+        """
+        return self.generator[name].discrete or not self.latents
 
     # The Pyro program ----------------------------------------------------------------------------------------------
 
@@ -357,8 +365,7 @@ class DynamicalVAE(nn.Module):
             horizon: H, the number of steps to continue.
             samples: S, continuations of each sequence.
             draw_emission: draw the data from their distribution, or (False) take its mean, as the papers of human
-                motion do. Predictive densities need the draws. None for draws of data whose distribution is discrete,
-                of which the mean is no value (.3 of a bit), and for means of others.
+                motion do. Predictive densities need the draws. None for what `drawn` says.
             fix: what is the same in all samples: the future (B, H, D) of a data variable, or the value (B, D) of a
                 static latent, such as one sample of an earlier forecast. Later variables read it; latents are not
                 inferred from it.

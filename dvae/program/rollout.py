@@ -185,7 +185,7 @@ class Rollout:
         return self.conditionals[name].law.distribution(self.parameters(name, value))
 
     def parameters(self, name: str, value: Tensor) -> Parameters:
-        """Those of `evaluate`, (B, T, ...), of which the first is the mean (B, T, D); computed once for a value."""
+        """Those of `evaluate`, (B, T, ...); computed once for a value."""
         if name not in self._evaluated or self._evaluated[name][0] is not value:
             known = {**self.values, name: value, **self.history(name)}
             self._evaluated[name] = (value, self.conditionals[name](known, self.batch, self.length, self.lengths))
@@ -246,7 +246,8 @@ class Rollout:
         known = {**self.values, **self._fed}
         for _ in range(self.feeding.passes):
             for name in names:
-                mean = self.conditionals[name](known, self.batch, self.length, self.lengths)[0]
+                conditional = self.conditionals[name]
+                mean = conditional.law.mean(conditional(known, self.batch, self.length, self.lengths))
                 known[name] = self._hide(self.hidden[name].fill(self.values[name], mean))
         return {name: known[name] for name in names}
 
@@ -270,7 +271,8 @@ class Rollout:
         for name in live:
             conditional = self.conditionals[name]
             parameters = conditional(given, self.batch, self.length, self.lengths)
-            value = conditional.law.draw(parameters, noise[name]) if name in noise else parameters[0]
+            law = conditional.law
+            value = law.draw(parameters, noise[name]) if name in noise else law.mean(parameters)
             if hidden is not None:
                 value = hidden[name].fill(self.values[name], value)
             elif name in self.prefix:
@@ -307,7 +309,8 @@ class Rollout:
                 conditional = self.conditionals[name]
                 parameters, states[name] = conditional.step(states[name], t, drawn)
                 evaluated[name].append(parameters)
-                value = conditional.law.draw(parameters, steps[name][t]) if name in steps else parameters[0]
+                law = conditional.law
+                value = law.draw(parameters, steps[name][t]) if name in steps else law.mean(parameters)
                 if hidden is not None:
                     value = hidden[name].fill(self.values[name][:, t], value, t)
                 elif name in self.prefix and t < self.prefix[name].shape[1]:
@@ -376,13 +379,16 @@ class Sequence(TorchDistribution):
 
     def given(self, value: Tensor) -> TorchDistribution:
         """`steps` with padding and missing entries masked out: batch (B,), event (T, D)."""
-        base = self.steps(value)
-        mask = self.rollout.mask(self.name)
+        base, mask = self.steps(value), self.rollout.mask(self.name)
         return (base if mask is None else base.mask(mask)).to_event(2 - len(base.event_shape))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """(B,)."""
-        return self.given(value).log_prob(value)
+        return self.given(value).log_prob(self.scored(value))
+
+    def scored(self, value: Tensor) -> Tensor:
+        """The value at which densities are evaluated, see `Conditional.scored`."""
+        return self.rollout.conditionals[self.name].scored(value, self.rollout.mask(self.name))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> Sequence:
         """Itself: a run has one batch shape."""

@@ -60,7 +60,7 @@ class FactorizationContract:
         raise NotImplementedError("a FactorizationContract is subclassed: def build(self, size) returns the model")
 
     def data(self, size: int) -> AnyBatch:
-        """Sequences to train on: those that the model is made for, if not sine waves.
+        """Sequences to train on: those that the model is made for, if not sine waves, or draws of the model.
 
         Args:
             size: D. Of wider data, take the first coordinates.
@@ -179,7 +179,7 @@ class FactorizationContract:
         model = self._model()
         data: Any = self._data(model)
         names = [name for name in model.observed if self._local(model, name)]
-        data["mask"] = {name: torch.rand_like(data[name]) < 0.6 for name in names}
+        data["mask"] = {name: self._mask(model, name, data[name]) for name in names}
         values = [parameter.detach().clone() for parameter in model.parameters()]
         directions = [torch.randn_like(value) for value in values]
 
@@ -190,7 +190,7 @@ class FactorizationContract:
             torch.manual_seed(1)
             return SequenceELBO().terms(model, data).bound.sum()
 
-        away = 1e-5
+        away = 1e-6
         moved = float((bound(away) - bound(-away)).detach()) / (2 * away)
         gradient = torch.autograd.grad(bound(0.0), list(model.parameters()), allow_unused=True, materialize_grads=True)
         slope = sum(float((g * d).sum()) for g, d in zip(gradient, directions, strict=True))
@@ -242,7 +242,8 @@ class FactorizationContract:
         size = 4
         model, data = self.build(size), self.data(size)
         if not isinstance(data, Mapping):
-            data = {**self._data(model, *data.shape[:2]), model.observed[0]: data}
+            first, drawn = model.observed[0], self._data(model, *data.shape[:2])
+            data = {**drawn, first: data} if model.generator[first].support is None else drawn
         fit(model, data, steps=self.training_steps, batch_size=8, accelerator="cpu", progress=False)
         assert all(torch.isfinite(parameter).all() for parameter in model.parameters())
         past = {
@@ -258,12 +259,24 @@ class FactorizationContract:
         return self.build(size).double().eval()
 
     def _data(self, model: DynamicalVAE, batch: int = 0, steps: int = 0, names: Any = ()) -> dict[str, Tensor]:
-        """Values of the data and the context, or of other variables."""
+        """Values of the data and the context, or of other variables; where they have to be, draws of the model."""
         batch, steps = batch or self.batch, steps or self.steps
-        return {
+        found = {
             name: torch.randn(batch, *([steps] * self._local(model, name)), model.sizes[name], dtype=torch.float64)
             for name in names or (*model.observed, *model.context)
         }
+        if bounded := [name for name in model.observed if name in found and model.generator[name].support is not None]:
+            context = self._data(model, batch, steps, model.context) if model.context else {}
+            drawn = model.sample(batch, steps, context or None)
+            found |= {name: drawn[name] for name in bounded}
+        return found
+
+    def _mask(self, model: DynamicalVAE, name: str, values: Tensor) -> Tensor:
+        """Some entries of the data, of what is one event all or none."""
+        seen = torch.rand_like(values) < 0.6
+        for event in map(list, model.generator[name].events):
+            seen[..., event] = seen[..., event[:1]]
+        return seen
 
     def _local(self, model: DynamicalVAE, name: str) -> bool:
         generative = name in model.generative.variables or name in model.generative.context

@@ -188,7 +188,8 @@ def test_a_step_is_missing_as_a_whole_or_not_at_all():
     model, mask = build("all"), torch.ones(B, T, 3, dtype=torch.bool)
     mask[1, 2, 0] = False
     with pytest.raises(
-        ValueError, match=r"the mask of x hides some entries of a step and not others, but the law of x has"
+        ValueError,
+        match=r"the mask of x hides some entries of a step and not others, but its law has one density for 3",
     ):
         SequenceELBO().terms(model, data("all", mask=mask))
     assert torch.isfinite(SequenceELBO().terms(build("latents"), data("all", mask=mask)).bound).all()
