@@ -69,7 +69,17 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
 
     @property
     def description(self) -> Mapping[str, Any]:
-        """What else a record is to say of the data, in JSON's types; "title", if there, lists phrases for titles."""
+        """What else a record is to say of the data, in JSON's types, nothing of it being required.
+
+        "title" lists phrases for titles; "columns" {name: unit} names the coordinates of x, in their order, in units
+        that tables print, "" for none; "season" is a period of the data, in frames, for a reference row.
+        """
+
+
+def columns_of(windows: HeldOutWindows) -> Mapping[str, str]:
+    """The unit of every named column of x; empty where the windows name none."""
+    found: Mapping[str, str] = windows.description.get("columns", {})
+    return found
 
 
 @dataclass(frozen=True)
@@ -239,9 +249,12 @@ class ArrayWindows:
         multimodal_threshold: distance below which two last observed frames are alike, in the unit of x.
         clips: name of the clip each window was cut from; without it the windows count as independent.
         mask: `(N, T, D)`, True where an entry was observed, where some are missing.
+        columns: {name: unit} of the D coordinates, "" for no unit; tables print them.
+        season: a period of the data, in frames.
 
     Raises:
-        ValueError: x that is not `(N, T, D)`, a mask of another shape, or as many clip names as windows are not given.
+        ValueError: x that is not `(N, T, D)`, a mask of another shape, as many clip names as windows or columns as
+            coordinates are not given, or a season below 1.
 
     Example:
         >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=5, clips=["a", "a", "a", "b", "b", "b"])
@@ -254,6 +267,8 @@ class ArrayWindows:
     multimodal_threshold: float = 0.5
     clips: Sequence[str] | None = None
     mask: Tensor | np.ndarray | None = None
+    columns: Mapping[str, str] | None = None
+    season: int | None = None
 
     def __post_init__(self) -> None:
         if self.x.ndim != 3:
@@ -262,6 +277,10 @@ class ArrayWindows:
             raise ValueError(f"the mask has shape {tuple(self.mask.shape)}, expected that of x, {tuple(self.x.shape)}")
         if self.clips is not None and len(self.clips) != len(self.x):
             raise ValueError(f"{len(self.x)} windows need as many clip names, not {len(self.clips)}")
+        if self.columns is not None and len(self.columns) != self.x.shape[2]:
+            raise ValueError(f"{self.x.shape[2]} coordinates need as many columns, not {', '.join(self.columns)}")
+        if self.season is not None and self.season < 1:
+            raise ValueError(f"a season is at least 1 frame, not {self.season}")
 
     @property
     def protocol(self) -> ArrayProtocol:
@@ -276,8 +295,9 @@ class ArrayWindows:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Nothing: arrays are all there is."""
-        return {}
+        """Columns and season, if they were given."""
+        said = {"columns": None if self.columns is None else dict(self.columns), "season": self.season}
+        return {name: value for name, value in said.items() if value is not None}
 
     @property
     def fingerprint(self) -> str:
@@ -287,6 +307,7 @@ class ArrayWindows:
         return hashlib.sha256(f"{values.shape} {values.dtype}".encode() + values.tobytes() + seen).hexdigest()
 
     def all(self) -> Batch:
-        """All windows, x `(N, T, D)`, and the mask if there is one."""
-        batch = {"x": torch.as_tensor(self.x)}
+        """All windows, x `(N, T, D)`, whole numbers as floating-point ones, and the mask if there is one."""
+        x = torch.as_tensor(self.x)
+        batch = {"x": x if x.is_floating_point() else x.to(torch.get_default_dtype())}
         return batch if self.mask is None else {**batch, "mask": torch.as_tensor(self.mask)}

@@ -5,22 +5,22 @@ own, and `Measure`s compare the futures with the true one; the *log score* is th
 the true future. *Teacher-forced*: the model reads every frame of the window, and its bound on log p(x_{1:T}) is
 reported in nats per frame.
 
-Every evaluation carries two reference rows that any method should beat: zero velocity (the last frame repeated) and
-nearest neighbours (the futures of the K training windows with the closest last frames). Scores that are read by what
-they give the truth add a third, the true futures, which no method should be expected to beat. All rows score the same
-windows, and windows of one clip overlap, so that standard errors are clustered by clip and `Evaluation.difference` is
-paired.
+Every evaluation carries reference rows that any method should beat, such as the last value repeated; `References` has
+them all. Another reference for any data is a model without latents, given as one of the models. Scores that are read by
+what they give the truth add a row, the true futures, which no method should be expected to beat. All rows score the
+same windows, and windows of one clip overlap, so that standard errors are clustered by clip and
+`Evaluation.difference` is paired.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from ..data import HeldOutWindows, mask_of
+from ..data import HeldOutWindows, columns_of
 from ..program.model import DynamicalVAE
 from ..program.protocols import Forecasting
 from ..turns import alone
@@ -28,11 +28,9 @@ from .bounds import SequenceELBO, importance_bound
 from .evaluation import Evaluation, Row
 from .held import Held, hold, on_device_of, plain, refuse_non_finite, reproducibly
 from .predictive import predictive_bound
-from .references import nearest_neighbours, zero_velocity
+from .references import OF_TABLES, USUAL, Forecaster, References
 from .result import progress_bar
 from .scores import KL, LOG_SCORE, TEACHER_FORCED, Measure, Metric, Scores, clip_means, proper
-
-Forecaster = Callable[[slice], Tensor]  # which windows -> (K, B, H, D)
 
 
 @alone
@@ -47,8 +45,9 @@ def evaluate(
     draw_emission: bool = False,
     bound_particles: int = 0,
     log_score_particles: int = 0,
-    references: bool = True,
+    references: bool | Sequence[str] = True,
     training_windows: HeldOutWindows | None = None,
+    season: int | None = None,
     configs: Mapping[str, Mapping[str, Any]] | None = None,
     options: Mapping[str, Any] | None = None,
     progress: bool = True,
@@ -71,8 +70,9 @@ def evaluate(
             judge the model's predictive distribution only when x is drawn.
         bound_particles: particles of the importance-weighted bound and its k-hat; 0 leaves both out.
         log_score_particles: particles of the log score, see `predictive_bound`; 0 leaves it out.
-        references: whether to add the reference rows.
-        training_windows: where the nearest neighbours are taken from; without it that row is left out.
+        references: whether to add the reference rows, each where it can be had; or names of some, see `References`.
+        training_windows: what "mean", "climatology" and "nearest neighbours" know; without it these are left out.
+        season: the period of "seasonal", in frames; by default what the windows' description says.
         configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
         options: further arguments of the models' `forecast`, such as {"temperature": 0} for motion at the mean of
             TrajeVAE's prior.
@@ -83,8 +83,9 @@ def evaluate(
 
     Raises:
         TypeError: what is no model that forecasts.
-        ValueError: windows that are ragged or leave nothing to predict; a forecast of the wrong shape;
-            a model with the name of a reference row; fewer than one sample; two scores of one name.
+        ValueError: windows that are ragged or leave nothing to predict; a forecast of the wrong shape; a model with the
+            name of a reference row; a reference row that is asked for and cannot be had; fewer than one sample; two
+            scores of one name.
         FloatingPointError: a forecast or bound that is not finite, naming method and window.
 
     Example:
@@ -98,7 +99,8 @@ def evaluate(
     held = hold(windows)
     measures = _measures(scores, windows)
     judge = _Judge(held, measures, bound_particles, log_score_particles)
-    baselines = _references(held, samples, training_windows, measures) if references else {}
+    known = References(held, samples, seed, training_windows, season)
+    baselines = _references(references, known, measures)
     if clash := models.keys() & baselines.keys():
         raise ValueError(f"a model must not have the name of a reference row: {', '.join(sorted(clash))}")
 
@@ -238,31 +240,18 @@ class _Judge:
 
 
 def _references(
-    held: Held, samples: int, training_windows: HeldOutWindows | None, measures: Sequence[Measure]
+    asked: bool | Sequence[str], known: References, measures: Sequence[Measure]
 ) -> dict[str, tuple[int, Forecaster]]:
     """Number of forecasts and forecaster of each reference row."""
-    horizon = held.futures.shape[1]
-    rows: dict[str, tuple[int, Forecaster]] = {
-        measure.truth: (1, lambda part: held.futures[part][None]) for measure in measures if measure.truth
+    futures = known.held.futures
+    truths: dict[str, tuple[int, Forecaster]] = {
+        measure.truth: (1, lambda part: futures[part][None]) for measure in measures if measure.truth
     }
-
-    def still(part: slice) -> Tensor:
-        past = held.past(part)
-        return zero_velocity(past["x"], horizon, mask_of(past))
-
-    rows["zero velocity"] = 1, still
-    if training_windows is not None:
-        listed = training_windows.all()
-        training = listed["x"][:, : held.observed + horizon]
-        gaps = None if (mask := mask_of(listed)) is None else mask[:, : held.observed + horizon]
-        count = min(samples, len(training))
-
-        def remembered(part: slice) -> Tensor:
-            past = held.past(part)
-            return nearest_neighbours(past["x"], training, count, mask_of(past), gaps)
-
-        rows["nearest neighbours"] = count, remembered
-    return rows
+    if isinstance(asked, bool):
+        usual = OF_TABLES if columns_of(known.held.windows) else USUAL
+        asked = [name for name in usual if not known.lacking(name)] if asked else []
+        truths = truths if asked else {}
+    return truths | {name: known[name] for name in asked}
 
 
 def _forecaster(model: Any, held: Held, samples: int, options: Mapping[str, Any]) -> Forecaster:

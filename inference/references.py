@@ -1,9 +1,22 @@
 """References for forecasts of any sequences: what needs no model, and which other futures were possible."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
 import torch
 from torch import Tensor
 
-from ..data import Batch, HeldOutWindows, bridged, mask_of
+from ..data import Batch, HeldOutWindows, bridged, gapped, mask_of, mean_of_known
+from ..options import nearest
+from .held import Held
+
+Forecaster = Callable[[slice], Tensor]
+"""Which windows to (K, B, H, D)."""
+USUAL = ("zero velocity", "nearest neighbours")
+"""Reference rows of motion and of bare arrays."""
+OF_TABLES = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
+"""Those of windows that name their columns."""
 
 _EXACT = "donot_use_mm_for_euclid_dist"
 
@@ -106,6 +119,49 @@ def zero_velocity(observed: Tensor, horizon: int, mask: Tensor | None = None) ->
     return bridged(observed, mask)[None, :, -1:].expand(-1, -1, horizon, -1)
 
 
+def seasonal(observed: Tensor, horizon: int, season: int, mask: Tensor | None = None) -> Tensor:
+    """The last period repeated: every value is the one that was there a whole number of periods before.
+
+    Args:
+        observed: `(B, O, D)`.
+        horizon: frames H to predict.
+        season: frames of a period, at most O; 1 is the last value repeated.
+        mask: `(B, O, D)`, True where a coordinate was observed. Where the last period lacks a value it is that of the
+            latest period that has it, and where all of them do, on the straight line between its neighbours in time.
+
+    Returns:
+        One forecast, `(1, B, H, D)`.
+
+    Raises:
+        ValueError: a season that is not from 1 to O.
+    """
+    frames = observed.shape[1]
+    if not 1 <= season <= frames:
+        raise ValueError(f"a season is from 1 to the {frames} observed frames, not {season}")
+    last = bridged(observed, mask)[:, -season:]
+    if mask is not None:
+        periods = frames // season * season
+        x, seen = (each[:, -periods:].unflatten(1, (-1, season)).movedim(1, 2) for each in (observed, mask))
+        last = torch.where(seen.any(2), bridged(x, seen)[:, :, -1], last)
+    return last[None, :, torch.arange(horizon) % season]
+
+
+def climatology(futures: Tensor, count: int, samples: int, seed: int = 0) -> Callable[[slice], Tensor]:
+    """Futures of training windows drawn at random: what a forecaster says who knows the data and not the past.
+
+    Args:
+        futures: `(N, H, D)`, of training windows.
+        count: of windows to forecast.
+        samples: K, draws for each of them, independent and with replacement.
+        seed: of the draws.
+
+    Returns:
+        Which of the windows to `(K, B, H, D)`.
+    """
+    drawn = torch.randint(len(futures), (samples, count), generator=torch.Generator().manual_seed(seed))
+    return lambda part: futures[drawn[:, part]]
+
+
 def nearest_neighbours(
     observed: Tensor,
     training: Tensor,
@@ -140,3 +196,120 @@ def nearest_neighbours(
     there = last_places({"x": training} | ({} if training_mask is None else {"mask": training_mask}), frames)
     nearest = distances(here[0], there[0], here[1], there[1]).topk(samples, largest=False).indices
     return bridged(training, training_mask)[nearest.T, frames:]
+
+
+@dataclass(frozen=True)
+class References:
+    """Forecasters without a model, by name: `references["mean"]` is the number of its forecasts and a `Forecaster`.
+
+    | name | forecasts | needs |
+    |---|---|---|
+    | zero velocity | the last pose repeated: what motion calls the next | |
+    | last value | the last frame repeated | |
+    | seasonal | the last period repeated | a season that was observed |
+    | mean | of every column in the training windows, at all frames | training windows |
+    | climatology | K futures of training windows, drawn at random for each window | training windows |
+    | nearest neighbours | the futures of the K training windows with the closest last frames | training windows |
+
+    All but the last two are points: their energy score is a distance, their CRPS an absolute error, and intervals they
+    have none. Climatology is the distribution of what is forecast, by one who knows the data and not the past.
+
+    Args:
+        held: windows to forecast.
+        samples: K.
+        seed: of draws.
+        training: what may be known.
+        season: frames of a period; by default what the windows' description says.
+
+    Raises:
+        ValueError: by the index: no such reference, or one that cannot be had.
+    """
+
+    held: Held
+    samples: int
+    seed: int = 0
+    training: HeldOutWindows | None = None
+    season: int | None = None
+
+    def lacking(self, name: str) -> str:
+        """What a reference needs and has not; empty where it can be had.
+
+        Raises:
+            ValueError: no such reference.
+        """
+        if name not in self._makers:
+            raise ValueError(
+                f"no reference row {name!r}{nearest(name, self._makers)}; there are {', '.join(self._makers)}"
+            )
+        if name in ("mean", "climatology", "nearest neighbours"):
+            return "" if self.training is not None else "training windows"
+        if name == "seasonal" and not 1 <= (self._period or 0) <= self.held.observed:
+            given = f", not {self._period}" if self._period else ""
+            return f"a season of 1 to {self.held.observed} frames, which are observed{given}"
+        return ""
+
+    def __getitem__(self, name: str) -> tuple[int, Forecaster]:
+        if needed := self.lacking(name):
+            raise ValueError(f"the reference row {name!r} needs {needed}")
+        return self._makers[name]()
+
+    @property
+    def _makers(self) -> dict[str, Callable[[], tuple[int, Forecaster]]]:
+        return {
+            "zero velocity": self._last,
+            "last value": self._last,
+            "seasonal": self._seasonal,
+            "mean": self._mean,
+            "climatology": self._climatology,
+            "nearest neighbours": self._neighbours,
+        }
+
+    def _last(self) -> tuple[int, Forecaster]:
+        return 1, lambda part: zero_velocity(*self._past(part))
+
+    def _seasonal(self) -> tuple[int, Forecaster]:
+        def again(part: slice) -> Tensor:
+            x, horizon, mask = self._past(part)
+            return seasonal(x, horizon, self._period or 1, mask)
+
+        return 1, again
+
+    def _mean(self) -> tuple[int, Forecaster]:
+        assert self.training is not None
+        mean = mean_of_known(gapped(self.training.all()), (0, 1))
+        return 1, lambda part: mean.expand(1, len(self.held.x[part]), self._horizon, -1)
+
+    def _climatology(self) -> tuple[int, Forecaster]:
+        training, gaps = self._training
+        futures = bridged(training, gaps)[:, self.held.observed :]
+        return self.samples, climatology(futures, len(self.held.x), self.samples, self.seed)
+
+    def _neighbours(self) -> tuple[int, Forecaster]:
+        training, gaps = self._training
+        count = min(self.samples, len(training))
+
+        def remembered(part: slice) -> Tensor:
+            x, _, mask = self._past(part)
+            return nearest_neighbours(x, training, count, mask, gaps)
+
+        return count, remembered
+
+    @property
+    def _horizon(self) -> int:
+        return self.held.x.shape[1] - self.held.observed
+
+    @property
+    def _period(self) -> int | None:
+        return self.held.windows.description.get("season") if self.season is None else self.season
+
+    def _past(self, part: slice) -> tuple[Tensor, int, Tensor | None]:
+        past = self.held.past(part)
+        return past["x"], self._horizon, mask_of(past)
+
+    @cached_property
+    def _training(self) -> tuple[Tensor, Tensor | None]:
+        """As much of training windows as those to forecast have, and its mask."""
+        assert self.training is not None
+        listed, frames = self.training.all(), self.held.x.shape[1]
+        mask = mask_of(listed)
+        return listed["x"][:, :frames], None if mask is None else mask[:, :frames]
