@@ -66,15 +66,34 @@ def _correlation_length(x: Tensor) -> Tensor:
     return torch.where(below.any(-1), below.double().argmax(-1), length).double()
 
 
+def _persistence(x: Tensor) -> Tensor:
+    centred = x - mean_of_known(x, -2).unsqueeze(-2)
+    power = mean_of_known(centred.square(), (-2, -1))
+    return torch.where(power == 0, 1.0, mean_of_known(centred[..., 1:, :] * centred[..., :-1, :], (-2, -1)) / power)
+
+
+def _zeros(x: Tensor) -> Tensor:
+    return mean_of_known(torch.where(x.isnan(), torch.nan, (x == 0).to(x)), (-2, -1))
+
+
+def _smallest(x: Tensor) -> Tensor:
+    return x.where(~x.isnan(), torch.inf).amin((-2, -1))
+
+
 STATISTICS = {
     "mean": Statistic(lambda x: mean_of_known(x, (-2, -1))),
     "scale": Statistic(_scale),
     "roughness": Statistic(_roughness),
     "correlation length": Statistic(_correlation_length, "frames"),
+    "lag-1 correlation": Statistic(_persistence),
+    "zeros": Statistic(_zeros, "share"),
+    "smallest": Statistic(_smallest),
+    "largest": Statistic(lambda x: -_smallest(-x)),
 }
 """For any sequences: mean of all numbers; their standard deviation over time about it, coordinate by coordinate, and
-that of their steps from frame to frame (root mean squares over coordinates); and the lag at which the autocorrelation,
-pooled over coordinates, falls below 1/e, T where it never does. Means are of what was observed."""
+that of their steps from frame to frame (root mean squares over coordinates); the lag at which the autocorrelation,
+pooled over coordinates, falls below 1/e, T where it never does, and that at a lag of 1, 1 of what stands still; and of
+data that are counts or positive, the share of numbers that are 0, and the extremes. Means are of what was observed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -308,9 +308,16 @@ def test_statistics_of_any_sequences_have_their_known_values():
     centred = wave[:, 0].numpy() - 2
     correlation = np.correlate(centred, centred, "full")[63:] / (centred @ centred)
     assert found["correlation length"] == np.flatnonzero(correlation < math.exp(-1))[0]
+    assert found["lag-1 correlation"] == pytest.approx(correlation[1] * 64 / 63)
+    assert found["zeros"] == pytest.approx(0.5)
+    assert (found["smallest"], found["largest"]) == (pytest.approx(-1), pytest.approx(5))
     still = torch.ones(5, 4, 2)
     assert (STATISTICS["correlation length"].function(still) == 4).all()
+    assert (STATISTICS["lag-1 correlation"].function(still) == 1).all()
     assert all(statistic.function(torch.randn(2, 5, 4, 3)).shape == (2, 5) for statistic in STATISTICS.values())
+    gaps = torch.tensor([0.0, torch.nan, 3.0, torch.nan, -2.0, 0.0])[:, None]
+    known = [float(STATISTICS[name].function(gaps)) for name in ("zeros", "smallest", "largest")]
+    assert known == [0.5, -2, 3]
 
 
 def test_statistics_have_their_known_values():
