@@ -120,12 +120,7 @@ class Calibration(Result):
         Returns:
             Points k / (L + 1), and the least and largest share of ranks below k that still lie within, (L,) each.
         """
-        if not 0 < alpha < 1:
-            raise ValueError(f"alpha is a probability between 0 and 1, got {alpha}")
-        count = len(self.ranks)
-        within = _tails(count, self.draws) > _critical(alpha, count, self.draws)
-        points = np.arange(1, self.draws + 1) / (self.draws + 1)
-        return points, within.argmax(1) / count, 1 - within[:, ::-1].argmax(1) / count
+        return envelope(len(self.ranks), self.draws, alpha)
 
     def table(self, worst: int = 20) -> Table:
         """The quantities with the smallest p-values first."""
@@ -318,6 +313,27 @@ def calibrate(
     ]
     equations = {"generative": model.generative.text} | ({} if guide else {"inference": model.inference.text})
     return Calibration(torch.cat(ranks).numpy(), (*names, LOG_JOINT), draws, length, seed, equations)
+
+
+def envelope(count: int, draws: int, alpha: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the ECDF of independent uniform ranks lies, at all points at once, with probability at least 1 - alpha.
+
+    Args:
+        count: N, the ranks.
+        draws: L; ranks are on 0..L.
+        alpha: between 0 and 1.
+
+    Returns:
+        Points k / (L + 1), and the least and largest share of ranks below k that still lie within, (L,) each.
+
+    Raises:
+        ValueError: an alpha that is no such probability.
+    """
+    if not 0 < alpha < 1:
+        raise ValueError(f"alpha is a probability between 0 and 1, got {alpha}")
+    within = _tails(count, draws) > _critical(alpha, count, draws)
+    points = np.arange(1, draws + 1) / (draws + 1)
+    return points, within.argmax(1) / count, 1 - within[:, ::-1].argmax(1) / count
 
 
 def _ranks(

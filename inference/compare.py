@@ -40,7 +40,7 @@ def compare(
     estimates: int = 1,
     contrasts: int = 128,
     samples: int = 50,
-    draw_emission: bool = False,
+    draw_emission: bool | None = None,
     seed: int = 0,
     batch_size: int = 32,
     configs: Mapping[str, Mapping[str, Any]] | None = None,
@@ -83,7 +83,7 @@ def compare(
             0 leaves it out.
         samples: forecasts per window of the free-running scores; 0 leaves these out, which take longest. Data that are
             no windows have none.
-        draw_emission: forecast draws of x instead of its means; see `evaluate`.
+        draw_emission: forecast draws of x, or its means; see `evaluate`.
         seed: of every model's draws, and of the choice of contrasts.
         batch_size: sequences scored at once.
         configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
@@ -126,11 +126,13 @@ def compare(
     shared: dict[str, Any] = {"seed": seed, "batch_size": batch_size, "progress": progress}
     free: dict[str, dict[str, Any]] = {label: {} for label in labelled}
     measures: Sequence[Measure] = ()
+    emission = "drawn" if draw_emission else "mean"
     if windows is not None and samples:
         drawn: dict[str, Any] = {"samples": samples, "draw_emission": draw_emission, "references": False}
-        measures = scores(windows)
-        made = evaluate(labelled, windows, scores=lambda _: measures, **drawn, **shared).rows
-        free = {label: {m.name: np.array(made[label].clip_means[m.name]) for m in measures} for label in labelled}
+        measures = [measure for measure in scores(windows) if measure.least <= samples and not measure.bins]
+        made = evaluate(labelled, windows, scores=lambda _: measures, **drawn, **shared)
+        emission = made.emission
+        free = {label: {m.name: np.array(made.rows[label].clip_means[m.name]) for m in measures} for label in labelled}
     measured = {
         label: _measured(label, model, batch, keys, chosen, particles, estimates, **shared)
         | {"free_running": free[label]}
@@ -155,7 +157,7 @@ def compare(
         particles=particles,
         contrasts=len(chosen),
         samples=samples if windows is not None else 0,
-        emission="drawn" if draw_emission else "mean",
+        emission=emission,
         seed=seed,
         shown={measure.name: measure.unit for measure in measures if measure.headline},
         notes=list(dict.fromkeys(measure.note for measure in measures if measure.headline and measure.note)),

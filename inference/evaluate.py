@@ -42,7 +42,7 @@ def evaluate(
     samples: int = 50,
     seed: int = 0,
     batch_size: int = 32,
-    draw_emission: bool = False,
+    draw_emission: bool | None = None,
     bound_particles: int = 0,
     log_score_particles: int = 0,
     references: bool | Sequence[str] = True,
@@ -61,13 +61,15 @@ def evaluate(
     Args:
         model: a model (`Forecasting`), or `{name: model}`.
         windows: `ArrayWindows`, windows of `dvae.motion`, or any `HeldOutWindows`.
-        scores: of the forecasts, as a function of the windows: `proper` scoring rules, or `dvae.motion.scores`, with
-            judges as `functools.partial(dvae.motion.scores, pose_prior=..., classifiers=...)`.
+        scores: of the forecasts, as a function of the windows: `proper` scoring rules, `calibrated` with coverage and
+            PIT beside them, or `dvae.motion.scores`, with judges as `functools.partial(dvae.motion.scores,
+            pose_prior=..., classifiers=...)`.
         samples: K, the forecasts per window.
         seed: seed of every method's draws.
         batch_size: windows forecast at once.
-        draw_emission: forecast draws of x instead of its means. The motion papers score means; proper scoring rules
-            judge the model's predictive distribution only when x is drawn.
+        draw_emission: forecast draws of x, or (False) its means. The motion papers score means; proper scoring rules
+            judge the model's predictive distribution only when x is drawn. None for draws where a score is of nothing
+            else (`Measure.of_draws`), or where the data are discrete, and for means elsewhere.
         bound_particles: particles of the importance-weighted bound and its k-hat; 0 leaves both out.
         log_score_particles: particles of the log score, see `predictive_bound`; 0 leaves it out.
         references: whether to add the reference rows, each where it can be had; or names of some, see `References`.
@@ -98,6 +100,8 @@ def evaluate(
     _check(models, samples, batch_size, bound_particles, log_score_particles)
     held = hold(windows)
     measures = _measures(scores, windows)
+    if draw_emission is None and any(measure.of_draws for measure in measures):
+        draw_emission = True
     judge = _Judge(held, measures, bound_particles, log_score_particles)
     known = References(held, samples, seed, training_windows, season)
     baselines = _references(references, known, measures)
@@ -112,19 +116,21 @@ def evaluate(
                 yield slice(start, start + batch_size)
 
         for name, (count, forecaster) in baselines.items():
-            rows[name] = Row(count, judge.forecasts(name, forecaster, count, parts(name)))
+            means, histograms = judge.forecasts(name, forecaster, count, parts(name))
+            rows[name] = Row(count, means, histograms=histograms)
         for name, each in models.items():
             with reproducibly(each, seed):
                 forecaster = _forecaster(each, held, samples, {"draw_emission": draw_emission, **(options or {})})
-                means = judge.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
+                means, histograms = judge.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
             if each.likelihood:
                 with reproducibly(each, seed):
                     means |= judge.bounds(name, each, parts(f"{name}, bound"))
                 with reproducibly(each, seed):
                     means |= judge.log_score(name, each, parts(f"{name}, log score"))
             equations = {"generative": each.generative.text, "inference": each.inference.text}
-            rows[name] = Row(samples, means, equations, dict((configs or {}).get(name, {})))
+            rows[name] = Row(samples, means, equations, dict((configs or {}).get(name, {})), histograms)
 
+    kinds = {_emission(each, draw_emission) for each in models.values()} or {_emission(None, draw_emission)}
     return Evaluation(
         rows=rows,
         metrics=judge.metrics(rows),
@@ -132,13 +138,14 @@ def evaluate(
         data=held.description(),
         protocol=plain(dataclasses.asdict(windows.protocol)),
         samples=samples,
-        emission="drawn" if draw_emission else "mean",
+        emission=" or ".join(sorted(kinds)),
         bound_particles=bound_particles,
         seed=seed,
         log_score_particles=log_score_particles,
         basis={name: value for measure in measures for name, value in measure.basis.items()},
         notes=[
             *dict.fromkeys([*held.notes, *(measure.note for measure in measures if measure.note)]),
+            *_reservations(measures, samples, draw_emission),
             *(
                 f"bounds of {name}: densities of {each.view.measured}"
                 for name, each in models.items()
@@ -173,6 +180,21 @@ def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
     return measures
 
 
+def _emission(model: Any, draw_emission: bool | None) -> str:
+    """What a model forecasts, as `DynamicalVAE.forecast` decides where nobody says."""
+    if draw_emission is None and isinstance(model, DynamicalVAE):
+        draw_emission = any(model.generator[name].discrete for name in model.observed)
+    return "drawn" if draw_emission else "mean"
+
+
+def _reservations(measures: Sequence[Measure], samples: int, draw_emission: bool | None) -> Iterator[str]:
+    """Notes on scores that cannot be had of these forecasts, or say little."""
+    if lacking := [f"{measure.name} ({measure.least})" for measure in measures if measure.least > samples]:
+        yield f"left out, as they need more than {samples} forecasts: {', '.join(lacking)}"
+    if not draw_emission and (of_draws := [m.name for m in measures if m.of_draws and m.least <= samples]):
+        yield f"of means, which lack the emission's noise, and so too narrow: {', '.join(of_draws)}"
+
+
 @dataclass(frozen=True)
 class _Judge:
     """What is asked of every row of one evaluation; values are by clip."""
@@ -185,8 +207,9 @@ class _Judge:
     @torch.no_grad()
     def forecasts(
         self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]
-    ) -> dict[str, tuple[float, ...]]:
-        """Scores of free-running forecasts."""
+    ) -> tuple[dict[str, tuple[float, ...]], dict[str, tuple[tuple[float, ...], ...]]]:
+        """Scores and histograms of free-running forecasts, those that so many samples have."""
+        measures = [measure for measure in self.measures if measure.least <= samples]
         held, found = self.held, []
         index = torch.arange(len(held.keys))
         for part in parts:
@@ -197,9 +220,11 @@ class _Judge:
                 raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
             refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
             scored = forecasts.movedim(0, 1), truth, held.past(part), index[part]
-            found.append({measure.name: measure.function(*scored) for measure in self.measures})
+            found.append({measure.name: measure.function(*scored) for measure in measures})
         values = _concatenate(found)
-        return {m.name: tuple(m.pool(values[m.name], held.places)) for m in self.measures}
+        pooled = {measure.name: measure.pool(values[measure.name], held.places) for measure in measures}
+        scores = {measure.name: tuple(pooled[measure.name]) for measure in measures if not measure.bins}
+        return scores, {m.name: tuple(map(tuple, pooled[m.name])) for m in measures if m.bins}
 
     def bounds(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, tuple[float, ...]]:
         """Bounds and KL terms in nats per frame."""

@@ -14,17 +14,19 @@ from rich.text import Text
 from typing_extensions import override
 
 from ..options import nearest
+from .calibration import envelope
 from .held import plain
 from .references import multimodal_note
 from .result import Result, Table, canvas
 from .scores import Metric
-from .uncertainty import clustered_variance, linearised, student_interval
+from .uncertainty import clustered_variance, effective_number, linearised, student_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
 """By the direction that is better."""
+_MOST_RANKS = 10_000  # whose envelope is found in a second
 
 
 @dataclass(frozen=True)
@@ -57,12 +59,16 @@ class Score:
 
 @dataclass(frozen=True)
 class Row:
-    """One method: its number of samples, what it is, and each score's value for each clip (see `Measure.pool`)."""
+    """One method: its number of samples, what it is, and each score's value for each clip (see `Measure.pool`).
+
+    Histograms, such as that of the PIT, have as many shares as bins for each clip.
+    """
 
     samples: int
     clip_means: dict[str, tuple[float, ...]]
     equations: dict[str, str] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
+    histograms: dict[str, tuple[tuple[float, ...], ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, repr=False)
@@ -78,7 +84,8 @@ class Evaluation(Result):
         data: fingerprint, windows, frames and coordinates of a window, and what the windows say of themselves.
         protocol: the fields of the windows' protocol.
         samples: K, the number of forecasts asked of every method.
-        emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it.
+        emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it; "drawn or mean"
+            where those of discrete models were draws and those of others means.
         bound_particles: particles of the importance bound, 0 where it was not computed.
         seed: the seed of every method's draws.
         log_score_particles: particles of the log score, 0 where it was not computed.
@@ -188,6 +195,68 @@ class Evaluation(Result):
             panel.set_axis_off()
         return figure
 
+    def departure(self, method: str, histogram: str = "PIT", alpha: float = 0.05) -> tuple[np.ndarray, ...]:
+        """How far the distribution of the PIT of a method's forecasts is from uniform, with a simultaneous band.
+
+        The band is the exact envelope of independent uniform ranks (`calibration.envelope`), of as many as are worth
+        these dependent ones, by their spread over clips (`uncertainty.effective_number`): an approximation, but for
+        clips of one number each. A curve that leaves the band at any point is not that of calibrated forecasts.
+
+        Returns:
+            Points between bins, the share of the PIT below each less the point itself, and the least and the largest
+            of these that lie within, `(bins - 1,)` each; the band is NaN where there is one clip.
+
+        Raises:
+            KeyError: a method or a histogram that there is not.
+        """
+        shares = np.array(self._histogram(method, histogram)).cumsum(1)[:, :-1].T
+        points = np.arange(1, len(shares) + 1) / (len(shares) + 1)
+        below, deviations = linearised(shares, np.array(list(self.clips.values())))
+        if len(self.clips) == 1:
+            return points, below - points, points * np.nan, points * np.nan
+        numbers = self.data["windows"] * (self.data["frames"] - self.protocol["observed"]) * self.data["coordinates"]
+        worth = effective_number(points, deviations, min(numbers, _MOST_RANKS))
+        _, low, high = envelope(worth, len(points), alpha)
+        return points, below - points, low - points, high - points
+
+    def plot_calibration(self, histogram: str = "PIT") -> Figure:
+        """For each method, its histogram of the PIT, and below it the `departure` of its distribution from uniform.
+
+        The band of the histogram is two standard errors of each bin, that of the curve holds all of it with 95 %
+        probability where forecasts are calibrated. Methods without a histogram, such as points, are left out.
+
+        Raises:
+            KeyError: no method has the histogram.
+        """
+        methods = [method for method, row in self.rows.items() if histogram in row.histograms]
+        if not methods:
+            raise KeyError(f"no method has a histogram {histogram!r}; evaluate with scores=calibrated")
+        figure = canvas(0.8 + 2.4 * len(methods), 3.7)
+        panels = figure.subplots(2, len(methods), squeeze=False, sharex=True, sharey="row")
+        for (top, bottom), method in zip(panels.T, methods, strict=True):
+            clip_shares = np.array(self.rows[method].histograms[histogram]).T
+            bins = len(clip_shares)
+            shares, deviations = linearised(clip_shares, np.array(list(self.clips.values())))
+            errors = np.array([math.sqrt(clustered_variance(each)) for each in deviations])
+            edges = np.linspace(0, 1, bins + 1)
+            low, high = (bins * (shares + reach * errors) for reach in (-2, 2))
+            top.stairs(high, edges, baseline=low, fill=True, color="0.88")
+            top.stairs(bins * shares, edges, color="C0")
+            top.axhline(1, color="0.4", linewidth=0.8)
+            top.set_title(f"{method}, K = {self.rows[method].samples}", fontsize=8, parse_math=False)
+            points, departs, low, high = self.departure(method, histogram)
+            bottom.fill_between(points, low, high, color="0.88", step="mid", linewidth=0)
+            bottom.plot(points, departs, color="C0", linewidth=1.2)
+            bottom.axhline(0, color="0.4", linewidth=0.8)
+            for panel in (top, bottom):
+                panel.tick_params(labelsize=7)
+        panels[0, 0].set_ylim(bottom=0)
+        panels[0, 0].set_ylabel(f"{histogram}\nover uniform", fontsize=8, parse_math=False)
+        panels[1, 0].set_ylabel("ECDF\nless uniform", fontsize=8)
+        figure.suptitle(self._title(), fontsize=9, parse_math=False)
+        figure.supxlabel("PIT of the true future among the forecasts", fontsize=8)
+        return figure
+
     def to_json(self) -> str:
         """Everything, with means and standard errors written out; numbers that are not finite become null."""
         metrics = {name: dataclasses.asdict(metric) for name, metric in self.metrics.items()}
@@ -207,6 +276,13 @@ class Evaluation(Result):
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"this is not an evaluation written by Evaluation.to_json: {error!r}") from error
 
+    def _histogram(self, method: str, name: str) -> tuple[tuple[float, ...], ...]:
+        found = self._row(method).histograms
+        if name not in found:
+            has = ", ".join(found) or "none"
+            raise KeyError(f"{method!r} has no histogram {name!r}{nearest(name, found)}; it has {has}")
+        return found[name]
+
     def _row(self, method: str) -> Row:
         if method not in self.rows:
             raise KeyError(
@@ -221,7 +297,7 @@ class Evaluation(Result):
 
     def _document(self, method: str) -> dict[str, Any]:
         row = dataclasses.asdict(self.rows[method])
-        clip_means = row.pop("clip_means")
+        clip_means, histograms = row.pop("clip_means"), row.pop("histograms")
         row["scores"] = {
             name: {
                 **dataclasses.asdict(self.metrics[name]),
@@ -230,7 +306,7 @@ class Evaluation(Result):
             }
             for name, score in self[method].items()
         }
-        return plain(row)
+        return plain(row | ({"histograms": histograms} if histograms else {}))
 
     def _caption(self) -> str:
         freedom = f"{len(self.clips) - 1} degrees of freedom"

@@ -8,6 +8,12 @@ spreading its samples. The energy score (Gneiting and Raftery 2007, section 4.3)
 really is, the APDE and CMD of BeLFusion (Barquero, Escalera and Palmero 2023, arXiv:2211.14304). The Fréchet distance
 compares two sets of motions by features of them, and has shapes of its own.
 
+Calibration (coverage, PIT) rests on where each number of the truth lies among the K numbers of the samples. Of
+calibrated forecasts the truth is exchangeable with the samples, so that its rank, at random among ties, is uniform on
+0, ..., K. With L samples below it and E equal to it, its PIT is (L + V (E + 1)) / (K + 1), V uniform on 0 to 1: uniform
+on 0 to 1 for every K, of discrete data too (Czado, Gneiting and Held 2009). Shares and moments are expectations over
+V, so that nothing is drawn, and what they are of calibrated forecasts is exact for every K.
+
 Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`,
 or `(..., M, T, D)` where M futures are admissible; the result has the leading shape `(...)`. Torch tensors
 and numpy arrays are accepted, a tensor comes back. A displacement is the Euclidean norm over *all* D
@@ -18,6 +24,7 @@ raises ValueError for shapes that do not fit. Windows are scored one after anoth
 with their number.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -192,6 +199,139 @@ def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
     return _per_window(score, *_paired(samples, truth))
 
 
+def probability_integral_transform(samples: Array, truth: Array, uniform: Array) -> Tensor:
+    """PIT of every number of the truth; uniform on 0 to 1 where forecasts are calibrated, whatever K and the ties.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truth: `(..., T, D)`.
+        uniform: `(..., T, D)`, independent draws from 0 to 1, by which a truth has its place among equal samples and in
+            the gap between two. The same draws give the same transform.
+
+    Returns:
+        `(..., T, D)`, in double precision; NaN where the truth was not observed. Its rank among the K samples is
+        floor((K + 1) PIT).
+
+    Raises:
+        ValueError: draws of another shape than the truth, or beyond 0 and 1.
+    """
+    samples, truth = _paired(samples, truth)
+    uniform = torch.as_tensor(uniform, device=truth.device).double()
+    if uniform.shape != truth.shape or not ((uniform >= 0) & (uniform <= 1)).all():
+        raise ValueError(
+            f"a truth of shape {_shape(truth)} needs as many uniform draws, from 0 to 1; given are {_shape(uniform)} "
+            f"from {uniform.min():g} to {uniform.max():g}"
+        )
+    low, ties = _places(samples, truth)
+    return (low + uniform * ties) / (samples.shape[-3] + 1)
+
+
+def pit_mean(samples: Array, truth: Array) -> Tensor:
+    """Mean PIT over frames and coordinates: 1/2 of calibrated forecasts, below it of those that are too high.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truth: `(..., T, D)`.
+
+    Returns:
+        `(...)`, in double precision.
+    """
+    samples, truth = _paired(samples, truth)
+    low, ties = _places(samples, truth)
+    return mean_of_known(low + ties / 2, (-2, -1)) / (samples.shape[-3] + 1)
+
+
+def pit_variance(samples: Array, truth: Array) -> Tensor:
+    """Mean square of PIT - 1/2, in twelfths: 1 of calibrated forecasts, above it of those that are too narrow.
+
+    It is about 1/2, and not about its own mean: of forecasts that are too high or too low it is above 1, too. With
+    K = 1 it is 1 whatever is forecast; at its largest, the truth always beyond all samples, it is
+    3 - 6 / (K + 1) + 4 / (K + 1)^2. Shapes as in `pit_mean`.
+    """
+    samples, truth = _paired(samples, truth)
+    low, ties = _places(samples, truth)
+    count = samples.shape[-3] + 1
+    return mean_of_known(12 * (low + ties / 2 - count / 2).square() + ties.square(), (-2, -1)) / count**2
+
+
+def pit_histogram(samples: Array, truth: Array, bins: int = 20) -> Tensor:
+    """Shares of the PIT of all numbers in bins of equal width: 1 / bins each of calibrated forecasts.
+
+    Args:
+        samples: `(..., K, T, D)`; K below `bins` - 1 cannot tell bins apart.
+        truth: `(..., T, D)`.
+        bins: their number.
+
+    Returns:
+        `(..., bins)`, in double precision, which add up to 1.
+    """
+    samples, truth = _paired(samples, truth)
+    if bins < 1:
+        raise ValueError(f"a histogram has at least 1 bin, not {bins}")
+    low, ties = _places(samples, truth)
+    edges = [edge * (samples.shape[-3] + 1) / bins for edge in range(1, bins)]
+    inner = [mean_of_known(((edge - low) / ties).clamp(0, 1), (-2, -1)) for edge in edges]
+    whole = torch.where(low.isnan().all(-1).all(-1), torch.nan, 1.0).to(low)
+    return torch.stack([*inner, whole], -1).diff(dim=-1, prepend=whole[..., None] * 0)
+
+
+def coverage(samples: Array, truth: Array, level: float) -> Tensor:
+    """Share of the numbers of the truth that lie in the central interval of K samples: `level` if calibrated.
+
+    That is where the PIT is between (1 - level) / 2 and (1 + level) / 2. With h = (K + 1) (1 - level) / 2, the interval
+    of a whole h runs from the h-th smallest sample to the h-th largest one, which hold a truth that is exchangeable
+    with them with probability 1 - 2 h / (K + 1), exactly. Otherwise a truth in the gap of samples that h falls into
+    counts as the part of the gap, by its rank, that lies inside: as with an interval whose ends are drawn from the two
+    samples so that their mean ranks are h. A truth with ties counts as the part of its ranks that lies inside, so that
+    coverage is `level` of discrete data, too. (Intervals with all their ties hold more.)
+
+    Below h = 1, which is K < 2 / (1 - level) - 1, the interval reaches beyond all samples for a part 1 - h of the time:
+    its mean is still `level` of calibrated forecasts, but it says less of others, and with K = 1 nothing.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truth: `(..., T, D)`.
+        level: between 0 and 1.
+
+    Returns:
+        `(...)`, in double precision.
+
+    Raises:
+        ValueError: a level that is not between 0 and 1.
+    """
+    samples, truth = _paired(samples, truth)
+    end, count = _beyond(samples, level), samples.shape[-3] + 1
+    low, ties = _places(samples, truth)
+    inside = ((low + ties).clamp(max=count - end) - low.clamp(min=end)).clamp(min=0) / ties
+    return mean_of_known(inside, (-2, -1))
+
+
+def interval_width(samples: Array, level: float) -> Tensor:
+    """Width of the central interval of `coverage`, averaged over frames and coordinates: sharpness.
+
+    From the h-th smallest to the h-th largest of K samples, linear between them where h is not whole, and from the
+    smallest to the largest one below h = 1.
+
+    Args:
+        samples: `(..., K, T, D)`; places where they are NaN do not count.
+        level: between 0 and 1.
+
+    Returns:
+        `(...)`, in the unit of the data.
+
+    Raises:
+        ValueError: a level that is not between 0 and 1.
+    """
+    samples = _samples(samples)
+    end = max(_beyond(samples, level), 1.0) - 1  # from 0
+    first, ordered = int(end), samples.sort(-3).values
+    spread = ordered.flip(-3) - ordered
+    widths = spread[..., first, :, :]
+    if end > first:
+        widths = torch.lerp(widths, spread[..., first + 1, :, :], end - first)
+    return mean_of_known(widths, (-2, -1))
+
+
 def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
     """Variogram score of the coordinates of each frame; proper, lower is better (Scheuerer and Hamill 2015).
 
@@ -353,6 +493,21 @@ def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Te
 
 
 LAST = slice(-1, None)
+
+
+def _places(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """(..., T, D), how many samples are below the truth, and in how many ranks it may be: one, and one for each tie."""
+    actual = truth.unsqueeze(-3)
+    low, equal = (compared.sum(-3).double() for compared in (samples < actual, samples == actual))
+    return low.masked_fill(truth.isnan(), torch.nan), equal + 1
+
+
+def _beyond(samples: Tensor, level: float) -> float:
+    """How many of the K + 1 ranks lie on either side of a central interval."""
+    if not 0 < level < 1:
+        raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
+    found = (samples.shape[-3] + 1) * (1 - level) / 2  # of .9 and K = 19 not quite 1
+    return float(round(found)) if math.isclose(found, round(found)) else found
 
 
 def _observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:

@@ -6,18 +6,22 @@ a function of the windows that are evaluated on:
     speed = Measure("speed error", lambda forecasts, truth, past, index: ..., unit="m/s")
     dvae.evaluate(model, windows, scores=lambda windows: [*proper(windows), speed])
 
-`proper` are proper scoring rules. What a model explains (bound, importance bound, k-hat, KL, log score) needs the model
-and no forecasts; `dvae.evaluate` has options for it.
+`proper` are proper scoring rules, and `calibrated` adds coverage, sharpness and PIT: what there is to know of forecasts
+of any data. `by_column` has a score of every column alone, in its own unit. What a model explains (bound, importance
+bound, k-hat, KL, log score) needs the model and no forecasts; `dvae.evaluate` has options for it.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from ..data import Batch, HeldOutWindows
+from ..data import Batch, HeldOutWindows, columns_of, mask_of
 from . import metrics
 
 
@@ -47,29 +51,39 @@ TEACHER_FORCED = {
 KL = Metric("nats/frame", "teacher-forced", "")
 
 
-def clip_means(values: Tensor, clips: Tensor) -> Sequence[float]:
+def clip_means(values: Tensor, clips: Tensor) -> Sequence[Any]:
     """Means over the windows of each clip.
 
     Args:
-        values: `(N,)`, the score of every window.
+        values: `(N, ...)`, the score of every window.
         clips: `(N,)`, the clip of every window, from 0 to C - 1.
     """
     places = clips.numpy()
-    return (np.bincount(places, weights=values.double().numpy()) / np.bincount(places)).tolist()
+    found: list[Any] = (_sums(values.double().numpy(), places).T / np.bincount(places)).T.tolist()
+    return found
 
 
-def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[float]:
+def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[Any]:
     """Of scores that are NaN of windows that do not count: the mean over windows is that over those that do.
 
     R + N / M (s_c - R m_c) / n_c for each clip, s_c the sum over those m_c of its n_c windows that count, M of all N,
-    and R the mean over these M: a ratio of sums, linearised, so that errors are those of a ratio (Cochran 1977).
+    and R the mean over these M: a ratio of sums, linearised, so that errors are those of a ratio (Cochran 1977). NaN of
+    all clips where no window counts.
     """
     places, known = clips.numpy(), ~values.isnan().numpy()
-    windows, counted = np.bincount(places), np.bincount(places, weights=known)
-    sums = np.bincount(places, weights=values.nan_to_num().double().numpy())
-    ratio = sums.sum() / counted.sum()
-    found: list[float] = (ratio + (sums - ratio * counted) / windows * (len(places) / counted.sum())).tolist()
+    if not known.any():
+        return clip_means(values, clips)
+    windows, counted = np.bincount(places), _sums(known, places)
+    sums = _sums(values.nan_to_num().double().numpy(), places)
+    ratio = sums.sum(0) / counted.sum(0)
+    found: list[Any] = (ratio + ((sums - ratio * counted).T / windows).T * (len(places) / counted.sum(0))).tolist()
     return found
+
+
+def _sums(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(C, ...), of values (N, ...) over the windows of each clip."""
+    columns = values.reshape(len(values), -1).T
+    return np.stack([np.bincount(places, weights=each) for each in columns], -1).reshape(-1, *values.shape[1:])
 
 
 @dataclass(frozen=True)
@@ -83,11 +97,17 @@ class Measure:
             score `(B,)`, on the CPU.
         unit, better, partial: see `Metric`.
         pool: from what `function` gave of all windows, `(N, ...)`, and the clip of each, to a value for each clip, of
-            which the score is the mean weighted by windows. A score of the whole set gives pseudo-values.
+            which the score is the mean weighted by windows. A score of the whole set gives pseudo-values, a histogram
+            lists of shares.
         headline: whether a comparison shows it in its table.
         truth: name of a reference row that forecasts the true futures, where these are needed to read the score.
         note: a line below the table.
         basis: what the score rests on, by name, for the record, in JSON's types.
+        bins: 0 of a score; of a histogram, which is in `Row.histograms` and in no table, the number of its bins, and
+            `function` gives shares `(B, bins)`.
+        least: forecasts of a window that it needs; rows with fewer, such as points, are left without it.
+        of_draws: whether it judges the distribution that forecasts are drawn from, so that they are drawn where nobody
+            says otherwise, and a note says so of means.
     """
 
     name: str
@@ -95,11 +115,14 @@ class Measure:
     unit: str = ""
     better: str = "lower"
     partial: bool = False
-    pool: Callable[[Tensor, Tensor], Sequence[float]] = clip_means
+    pool: Callable[[Tensor, Tensor], Sequence[Any]] = clip_means
     headline: bool = False
     truth: str = ""
     note: str = ""
     basis: Mapping[str, Any] = field(default_factory=dict)
+    bins: int = 0
+    least: int = 1
+    of_draws: bool = False
 
     @property
     def metric(self) -> Metric:
@@ -118,8 +141,103 @@ CRPS = Measure("CRPS", paired(metrics.continuous_ranked_probability_score), head
 
 
 def proper(windows: HeldOutWindows) -> list[Measure]:
-    """Proper scoring rules: of the future as one vector, of dependence between coordinates, of each number alone."""
-    return [ENERGY, VARIOGRAM, CRPS]
+    """Proper scoring rules: of the future as one vector, of dependence between coordinates, of each number alone.
+
+    In the unit of the columns, if windows name them and they share one.
+    """
+    units = dict.fromkeys(columns_of(windows).values())
+    mixed = f"scores without a unit mix numbers in {', '.join(unit or '1' for unit in units)}; by_column has them apart"
+    shared: dict[str, Any] = {"note": mixed} if len(units) > 1 else {"unit": next(iter(units), "")}
+    return [replace(measure, **shared) for measure in (ENERGY, VARIOGRAM, CRPS)]
+
+
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+"""Of the intervals whose coverage is scored."""
+_CALIBRATED: dict[str, Any] = {
+    "better": "",
+    "of_draws": True,
+    "note": "calibrated forecasts cover as much as the level says, and their PIT has mean ½ and variance 1 twelfth; "
+    "above 1 they are too narrow or off, below it too wide",
+}
+
+
+def coverage_at(level: float) -> Measure:
+    """Coverage of the central interval of a level (`metrics.coverage`), of as many forecasts as reach around it."""
+    function = paired(partial(metrics.coverage, level=level))
+    return Measure(f"coverage {100 * level:g} %", function, "share", **_CALIBRATED, least=_reaching(level))
+
+
+def width_at(level: float) -> Measure:
+    """Width of the central interval of a level (`metrics.interval_width`), where there is a truth."""
+
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        return metrics.interval_width(forecasts.masked_fill(truth[:, None].isnan(), torch.nan), level)
+
+    return Measure(f"width {100 * level:g} %", function, better="", least=_reaching(level), of_draws=True)
+
+
+def _reaching(level: float) -> int:
+    """The fewest samples of which some lie beyond a central interval of this level."""
+    if not 0 < level < 1:
+        raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
+    return math.ceil(round(2 / (1 - level) - 1, 9))
+
+
+BINS = 20
+PIT = Measure(
+    "PIT", paired(partial(metrics.pit_histogram, bins=BINS)), "share", **_CALIBRATED, bins=BINS, least=BINS - 1
+)
+PIT_MEAN = Measure("PIT mean", paired(metrics.pit_mean), "share", **_CALIBRATED, least=BINS - 1)
+PIT_VARIANCE = Measure("PIT variance", paired(metrics.pit_variance), "1/12", **_CALIBRATED, least=BINS - 1)
+
+
+def calibrated(windows: HeldOutWindows) -> list[Measure]:
+    """Proper scores, and whether forecasts are calibrated and how sharp they are, for any data.
+
+    Coverage at 50, 80, 90 and 95 %, width of the intervals of 90 %, mean and variance of the PIT, and its histogram,
+    for `Evaluation.plot_calibration`. Coverage at 95 % needs 39 forecasts of a window.
+    """
+    found = proper(windows)
+    width = replace(width_at(0.9), unit=found[0].unit, note=found[0].note)
+    return [*found, *map(coverage_at, LEVELS), width, PIT_MEAN, PIT_VARIANCE, PIT]
+
+
+def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
+    """A score of every column alone, named "CRPS, speed", in the column's unit where the score's is that of the data.
+
+    Args:
+        measure: of forecasts of any number of columns, whose unit is "" or that of the data, such as `CRPS` or
+            `width_at(0.9)`; one in a unit of its own, such as a share, keeps it.
+        columns: {name: unit} of all columns, in the order of the data, "" for none; windows that name theirs have them
+            as `description["columns"]`.
+
+    Raises:
+        ValueError: other columns than forecasts have.
+
+    Example:
+        >>> [each.name for each in by_column(CRPS, {"speed": "m/s", "load": "kN"})]
+        ['CRPS, speed', 'CRPS, load']
+    """
+
+    def of(place: int) -> Callable[[Tensor, Tensor, Batch, Tensor], Tensor]:
+        column = slice(place, place + 1)
+
+        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+            if truth.shape[-1] != len(columns):
+                raise ValueError(f"{len(columns)} columns ({', '.join(columns)}) are not the {truth.shape[-1]} of x")
+            mask = mask_of(past)
+            seen = {"x": past["x"][..., column]} | ({} if mask is None else {"mask": mask[..., column]})
+            found = measure.function(forecasts[..., column], truth[..., column], {**past, **seen}, index)
+            nothing = truth[..., place].isnan().all(-1)
+            return found.masked_fill(nothing.reshape(-1, *[1] * (found.ndim - 1)), torch.nan)
+
+        return function
+
+    pool = means_of_those_that_count if measure.pool is clip_means else measure.pool
+    return [
+        replace(measure, name=f"{measure.name}, {name}", function=of(place), unit=measure.unit or unit, pool=pool)
+        for place, (name, unit) in enumerate(columns.items())
+    ]
 
 
 Scores = Callable[[HeldOutWindows], Sequence[Measure]]

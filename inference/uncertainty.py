@@ -19,6 +19,28 @@ def clustered_variance(deviations: np.ndarray) -> float:
     return clips / (clips - 1) * float((deviations**2).sum()) if clips > 1 else math.nan
 
 
+def effective_number(shares: np.ndarray, deviations: np.ndarray, most: float) -> int:
+    """How many independent draws have histograms as uncertain as one of draws that depend on each other within clips.
+
+    One over the root mean square over shares p of v / (p (1 - p)), v the clustered variance of what was found: for N
+    independent draws that is 1 / N. The mean in its place is the correction of Rao and Scott (1981) for design effects;
+    the root mean square is larger where these differ, as in their second-order correction (1984). Of few clips, whose
+    variances are badly known, the number is smaller as Student's interval is wider.
+
+    Args:
+        shares: `(G,)`, between 0 and 1, what they are where nothing is wrong.
+        deviations: `(G, C)`, what each of C > 1 clips adds to the error of the share that was found (`linearised`).
+        most: draws that there are.
+    """
+    clips = deviations.shape[-1]
+    if most <= clips:  # of one draw each, which are independent
+        return int(most)
+    effects = clips / (clips - 1) * (deviations**2).sum(-1) / (shares * (1 - shares))
+    wider = (special.stdtrit(clips - 1, 0.975) / special.ndtri(0.975)) ** 2
+    size = wider * math.sqrt((effects**2).mean())
+    return int(max(1.0, min(most, 1 / size if size else math.inf)))
+
+
 def student_interval(mean: float, error: float, freedom: float, level: float = 0.95) -> tuple[float, float]:
     """Two-sided interval of Student's t for a mean with a standard error of so many degrees of freedom.
 

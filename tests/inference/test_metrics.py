@@ -293,7 +293,9 @@ def test_cmd_of_a_set_is_of_its_classes_and_leaves_out_clip_after_clip():
 def test_all_scores_are_public():
     of_features = {frechet_distance, frechet_pseudo_values, gaussian_frechet_distance}
     of_motion = {average_pairwise_distance_error, cumulative_motion_distance, motion_pseudo_values}
-    public = {average_pairwise_distance, *of_features, *of_motion, *PAIRED, *MULTIMODAL}
+    of_ranks = {metrics.coverage, metrics.interval_width, metrics.probability_integral_transform}
+    of_ranks |= {metrics.pit_histogram, metrics.pit_mean, metrics.pit_variance}
+    public = {average_pairwise_distance, *of_features, *of_motion, *of_ranks, *PAIRED, *MULTIMODAL}
     functions = inspect.getmembers(metrics, inspect.isfunction)
     found = {score for name, score in functions if score.__module__ == metrics.__name__ and not name.startswith("_")}
     assert found == public
