@@ -508,7 +508,8 @@ def small(name):
     protocol = motion.PROTOCOLS["simulated-trajectories" if issubclass(kind, TrajectoryMethod) else "simulated"]
     protocol = replace(protocol, predicted=12, observed=min(protocol.observed, 6), train_stride=15)
     data = motion.MotionData("simulated", GAPS, protocol)
-    options = SMALL.get(name, {"latent": 4, "warm_up": 1} | ({"width": 8} if name == "equations" else {}))
+    own = {"latent": 4, "warm_up": 1} | ({"width": 8} if name == "equations" else {})
+    options = SMALL.get(name, {"width": 4} if name == "autoregressive" else own)
     return data, dvae.method(name, **options).suited(data.windows("train"))
 
 
