@@ -1,6 +1,6 @@
 """Linear-Gaussian chains with time-varying matrices: exact filter, smoother and draws, batched.
 
-    z_1 ~ N(m_1, P_1)        z_t = A_t z_{t-1} + b_t + N(0, Q)        weight of z_t: exp(g_t' z_t - z_t' G_t z_t / 2)
+    z_1 ~ N(m_1, P_1)        z_t = A_t z_{t-1} + b_t + N(0, Q_t)        weight of z_t: exp(g_t' z_t - z_t' G_t z_t / 2)
 
 The weights are what observations leave of themselves: a_t = C_t z_t + N(0, R) gives G_t = C_t' R^-1 C_t and
 g_t = C_t' R^-1 a_t, and a missing one zeros. All work is then in the dimension of z (Kalman, 1960; Rauch, Tung and
@@ -8,7 +8,7 @@ Striebel, 1965; in information form, Särkkä, Bayesian Filtering and Smoothing,
 
 The prediction is one autograd function. With W_t = (I + P_t G_t)^-1 and F_t = A_{t+1} W_t it is
 
-    P_{t+1} = Q + F_t P_t A_{t+1}'        m_{t+1} = F_t m_t + A_{t+1} W_t P_t g_t + b_{t+1}
+    P_{t+1} = Q_{t+1} + F_t P_t A_{t+1}'        m_{t+1} = F_t m_t + A_{t+1} W_t P_t g_t + b_{t+1}
 
 of which only the first is not linear; its derivative is F_t dP F_t'. So both recursions of the backward pass are linear
 with known matrices: three products a step, all else at all steps at once.
@@ -39,7 +39,7 @@ class LinearGaussianChain:
     Args:
         transition: A_2 to A_T, (T - 1, B, N, N).
         offset: b_2 to b_T, (T - 1, B, N).
-        noise: Q, (N, N).
+        noise: Q, (N, N), or Q_2 to Q_T, (T - 1, B, N, N).
         mean, covariance: m_1 (B, N) and P_1 (B, N, N).
         information: G, (T, B, N, N), symmetric.
         potential: g, (T, B, N).
@@ -60,7 +60,7 @@ class LinearGaussianChain:
             *Predict.apply(
                 self.transition,
                 self.offset,
-                self.noise,
+                self.noise.expand_as(self.transition),
                 self.mean,
                 self.covariance,
                 self.information,
@@ -133,21 +133,20 @@ class Predict(torch.autograd.Function):
         """Run the filter."""
         steps, batch, size = potential.shape
         identity = torch.eye(size, dtype=mean.dtype, device=mean.device).expand(batch, size, size)
-        noises = noise.expand(batch, size, size)
         covariances = torch.empty_like(information)
         covariances[0] = covariance
         shrink = torch.empty_like(transition).mT  # W; transposed, since the inverse is computed by columns
         carry = torch.empty_like(transition)  # F
         inside, right = (mean.new_empty(batch, size, size) for _ in range(2))
         info = torch.empty(batch, dtype=torch.int32, device=mean.device)
-        sequences = (tensor.unbind(0) for tensor in (transition, information, shrink, carry, covariances[1:]))
+        sequences = (tensor.unbind(0) for tensor in (transition, noise, information, shrink, carry, covariances[1:]))
         last = covariances[0]
-        for a, g, w, f, new in zip(*sequences, strict=False):
+        for a, q, g, w, f, new in zip(*sequences, strict=False):
             torch.baddbmm(identity, last, g, out=inside)
             torch.linalg.inv_ex(inside, out=(w, info))
             torch.bmm(a, w, out=f)
             torch.bmm(last, a.mT, out=right)
-            last = torch.baddbmm(noises, f, right, out=new)
+            last = torch.baddbmm(q, f, right, out=new)
         covariances = _symmetric(covariances)
         filtered = shrink @ covariances[:-1]
         gathered = (transition @ _column(filtered, potential[:-1])).add_(offset[..., None])
@@ -193,7 +192,7 @@ class Predict(torch.autograd.Function):
         return (
             to_transition,
             later[..., 0],
-            laters.sum((0, 1)),
+            laters,
             total[0, ..., 0],
             totals[0],
             to_information,
