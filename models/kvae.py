@@ -35,9 +35,9 @@ from typing_extensions import override
 
 from ..inference.recipe import Recipe
 from ..inference.training import Stage
-from ..laws.base import Law, LawSpec, Parameters, Shape
+from ..laws.base import LawSpec
 from ..laws.kalman import LinearGaussianChain, update
-from ..laws.triangular import InverseCholesky, TriangularNormal
+from ..laws.triangular import InverseCholesky, Triangular, refuse_half
 from ..networks import Dense, Input, Network, NetworkSpec
 from ..networks.base import valid_steps
 from ..networks.recurrent import lstm_cell
@@ -108,39 +108,6 @@ class KVAE(LatentMethod):
 
 
 @dataclass(frozen=True)
-class Triangular:
-    """A normal with full covariance, whose features are its location and whitening matrix."""
-
-    def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
-        needed = shape.size + shape.size**2
-        if shape.features != needed:
-            raise ValueError(f"a Triangular law takes {needed} features, but the network gives {shape.features}")
-        return TriangularLaw(shape.size)
-
-
-class TriangularLaw(Law):
-    """See `Triangular`; its parameters are (..., D) and (..., D * D)."""
-
-    def __init__(self, size: int):
-        super().__init__()
-        self.size = size
-
-    @override
-    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        return features.split([self.size, self.size**2], dim=-1)
-
-    @override
-    def distribution(self, parameters: Parameters) -> TriangularNormal:
-        loc, whitening = parameters
-        return TriangularNormal(loc, whitening.unflatten(-1, (self.size, self.size)), validate_args=False)
-
-    @override
-    def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        return self.distribution(parameters).color(noise)
-
-
-@dataclass(frozen=True)
 class Kalman:
     """The prediction of a_t from a_{<t} under a linear-Gaussian chain with mixed matrices; see the file.
 
@@ -170,6 +137,7 @@ class Kalman:
 class KalmanNetwork(Network):
     """See `Kalman`; the features are location and whitening matrix of the prediction, (..., D + D * D)."""
 
+    law = Triangular
     log_noise: Tensor
     log_emission: Tensor
 
@@ -223,11 +191,7 @@ class KalmanNetwork(Network):
         Raises:
             ValueError: parameters in half precision.
         """
-        if self.A.dtype in (torch.bfloat16, torch.float16):
-            raise ValueError(
-                f"a Kalman filter inverts covariances, which {self.A.dtype} cannot hold; "
-                "fit with precision='bf16-mixed' or '32-true'"
-            )
+        refuse_half(self.A.dtype)
         noise = self.log_noise.exp().diag()
         covariance = 20.0 * torch.eye(len(noise), dtype=noise.dtype, device=noise.device)
         return noise.new_zeros(batch, len(noise)), covariance.expand(batch, -1, -1), noise

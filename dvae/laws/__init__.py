@@ -11,6 +11,7 @@ from .flow import FlowDistribution, QRFlow
 from .priors import Flow, Mixture, Vamp
 from .product import Product
 from .subset import Subset
+from .triangular import Triangular
 
 __all__ = [
     "FAMILIES",
@@ -32,6 +33,7 @@ __all__ = [
     "StandardNormal",
     "StudentT",
     "Subset",
+    "Triangular",
     "Vamp",
     "renamed",
 ]

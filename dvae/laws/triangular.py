@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -11,6 +12,42 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.distributions import Normal, constraints
 from torch.distributions.kl import register_kl
+from typing_extensions import override
+
+from .base import Law, Parameters, Shape
+
+
+@dataclass(frozen=True)
+class Triangular:
+    """A normal with full covariance, whose features are its location and whitening matrix."""
+
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
+        needed = shape.size + shape.size**2
+        if shape.features != needed:
+            raise ValueError(f"a Triangular law takes {needed} features, but the network gives {shape.features}")
+        return TriangularLaw(shape.size)
+
+
+class TriangularLaw(Law):
+    """See `Triangular`; its parameters are (..., D) and (..., D * D)."""
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.size = size
+
+    @override
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        return features.split([self.size, self.size**2], dim=-1)
+
+    @override
+    def distribution(self, parameters: Parameters) -> TriangularNormal:
+        loc, whitening = parameters
+        return TriangularNormal(loc, whitening.unflatten(-1, (self.size, self.size)), validate_args=False)
+
+    @override
+    def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
+        return self.distribution(parameters).color(noise)
 
 
 class TriangularNormal(TorchDistribution):
@@ -96,3 +133,15 @@ class InverseCholesky(torch.autograd.Function):
         lower = torch.ones(size, size, dtype=inverse.dtype, device=inverse.device).tril_()
         lower.diagonal().mul_(0.5)
         return inverse.mT @ (to_inverse @ inverse.mT).mul_(-lower) @ inverse
+
+
+def refuse_half(dtype: torch.dtype) -> None:
+    """Refuses parameters in half precision.
+
+    Raises:
+        ValueError: saying in which they can be.
+    """
+    if dtype in (torch.bfloat16, torch.float16):
+        raise ValueError(
+            f"covariances are inverted, which {dtype} cannot hold; fit with precision='bf16-mixed' or '32-true'"
+        )

@@ -12,6 +12,7 @@ from .graphconv import GraphConv
 from .graphs import FrameGraph, NodeGraph
 from .linear import Linear
 from .recurrent import Recurrent
+from .sde import LinearSDE
 from .whole import WholeDecoder, WholeEncoder
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "GraphConv",
     "Input",
     "Linear",
+    "LinearSDE",
     "Network",
     "NetworkSpec",
     "NodeGraph",

@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -102,6 +102,9 @@ class Network(nn.Module):
         local: whether the child is a local variable. A static child has features (B, H) in place of (B, T, H).
         features: H.
     """
+
+    law: ClassVar[Any] = None
+    """Description of the law whose parameters the features are, where no other can read them."""
 
     def __init__(self, inputs: Sequence[Input], local: bool, features: int):
         super().__init__()

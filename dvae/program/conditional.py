@@ -75,6 +75,9 @@ class Conditional(nn.Module):
         generative: p rather than q.
         data: names of the data variables.
         guide: of a static latent without parents its q(w | ...), which some priors are made of.
+
+    Raises:
+        ValueError: a network and a law that do not go together.
     """
 
     inside: Tensor | None
@@ -96,6 +99,11 @@ class Conditional(nn.Module):
         inputs = [Input(p.name, sizes[p.name], p.relation if p.local else None) for p in factor.parents]
         if inputs or not generative:
             self.network = network.build(inputs or [Input(CONSTANT, 1)], factor.local, self.size)
+            if self.network.law and not isinstance(law, self.network.law):
+                raise ValueError(
+                    f"the features of {factor} by {network} are the parameters of a laws.{self.network.law.__name__}, "
+                    f"but its law is {law}; give it laws.{self.network.law.__name__}()"
+                )
         features = 0 if self.network is None else self.network.features
         self.law = law.build(Shape(self.size, features, factor.local, factor.child, data, guide))
         self.parents = [parent.name for parent in factor.parents]

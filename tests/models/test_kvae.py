@@ -12,8 +12,8 @@ import dvae
 from dvae.inference.fit import Callback
 from dvae.laws import Shape
 from dvae.laws.kalman import LinearGaussianChain
-from dvae.laws.triangular import InverseCholesky, TriangularNormal
-from dvae.models.kvae import KVAE, Kalman, KalmanNetwork, Triangular, smooth
+from dvae.laws.triangular import InverseCholesky, Triangular, TriangularNormal
+from dvae.models.kvae import KVAE, Kalman, KalmanNetwork, smooth
 from dvae.networks import Input
 from dvae.relations import Relation
 
@@ -394,7 +394,7 @@ def test_half_precision_is_left_at_the_filter():
     assert dvae.fit(model, x, precision="bf16-mixed", **options).history
     assert all(p.dtype == torch.float32 and p.isfinite().all() for p in model.parameters())
     with pytest.raises(
-        ValueError, match=r"inverts covariances, which torch\.bfloat16 cannot hold; fit with precision="
+        ValueError, match=r"covariances are inverted, which torch\.bfloat16 cannot hold; fit with precision="
     ):
         dvae.fit(model, x, precision="bf16-true", **options)
 

@@ -1,0 +1,372 @@
+"""The linear SDE: its transitions are those of the equation, over the shortest and the longest gaps."""
+
+import math
+from itertools import pairwise
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from scipy import integrate, linalg
+from torch.autograd import gradcheck
+from torch.distributions import MultivariateNormal
+
+import dvae
+from dvae import DynamicalVAE, laws
+from dvae.laws.kalman import LinearGaussianChain
+from dvae.networks import Dense, Input, LinearSDE, Recurrent
+from dvae.networks.sde import transition
+from dvae.relations import Relation
+from dvae.testing import FactorizationContract
+
+PAIR = "p(z_t | z_{t-1}, d_t) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T}, d_{1:T})"
+GAPS = [1e-6, 1e-3, 0.04, 0.7, 3.0, 40.0, 1e5]
+
+
+def double(*shape):
+    return torch.randn(*shape, dtype=torch.float64)
+
+
+def stable(size=4):
+    """Some stable A and L L', in no particular coordinates."""
+    turning, root = double(size, size), double(size, size)
+    return turning - turning.mT - 0.2 * root @ root.mT - 0.05 * torch.eye(size), double(size, size - 1)
+
+
+def network(size=3, dtype=torch.float64):
+    inputs = [Input("z", size, Relation.parse("t-1")), Input("d", 1, Relation.parse("t"))]
+    return LinearSDE((0.5, 8.0)).build(inputs, True, size).to(dtype)
+
+
+def model(guide=PAIR[1], scale=0.3):
+    networks = {"p(z)": LinearSDE((0.5, 8.0)), "p(x)": Dense(()), "q": Recurrent(4)}
+    given = {"p(z)": laws.Triangular(), "p(x)": laws.FixedNormal(scale)}
+    return DynamicalVAE(PAIR[0], guide, {"z": 2, "x": 3, "d": 1}, networks, given).double()
+
+
+# ------------------------------------------------------------------------------------------------- the transition
+
+
+def test_a_gap_is_two_gaps_one_after_the_other():
+    drift, root = stable()
+    noise = root @ root.mT
+    first, second = (torch.rand(50, dtype=torch.float64) * 10.0 ** torch.randint(-4, 3, (50,)) for _ in range(2))
+    (f1, q1), (f2, q2), (f, q) = (transition(drift, noise, gaps) for gaps in (first, second, first + second))
+    torch.testing.assert_close(f2 @ f1, f, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(f2 @ q1 @ f2.mT + q2, q, rtol=1e-10, atol=1e-10)
+
+
+def test_it_is_the_exponential_and_the_integral():
+    drift, root = stable()
+    noise, gaps = root @ root.mT, torch.tensor(GAPS[:-1], dtype=torch.float64)
+    matrix = drift.numpy()
+    size = len(matrix)
+    for gap, moved, spread in zip(GAPS[:-1], *transition(drift, noise, gaps), strict=True):
+        np.testing.assert_allclose(moved, linalg.expm(matrix * gap), rtol=1e-8, atol=1e-12)
+
+        def rate(s):
+            moved = linalg.expm(matrix * s)
+            return moved @ noise.numpy() @ moved.T
+
+        pieces = np.linspace(0, gap, 1 + math.ceil(gap))
+        summed = sum(integrate.quad_vec(rate, a, b, epsabs=1e-13)[0] for a, b in pairwise(pieces))
+        np.testing.assert_allclose(spread, summed, rtol=1e-8, atol=1e-8 * spread.abs().max().item())
+        if gap <= 3:  # Van Loan's exponential of both holds e^{-A d} too
+            both = linalg.expm(np.block([[-matrix, noise.numpy()], [np.zeros((size, size)), matrix.T]]) * gap)
+            together = both[size:, size:].T @ both[:size, size:]
+            np.testing.assert_allclose(spread, together, rtol=1e-8, atol=1e-8 * spread.abs().max().item())
+
+
+def test_its_gradient_is_that_of_finite_differences():
+    gaps = torch.tensor([1e-4, 0.3, 2.0, 30.0], dtype=torch.float64)
+    drift, root = stable(3)
+    assert gradcheck(lambda a, r: transition(a, r @ r.mT, gaps), [drift.requires_grad_(), root.requires_grad_()])
+    sde = network()
+    d, z = torch.rand(2, 4, 1, dtype=torch.float64) + 0.1, double(2, 4, 3)
+    assert gradcheck(lambda *_: sde({"z": z, "d": d}, 4), [*sde.parameters()])
+    assert gradcheck(lambda value: sde({"z": value, "d": d}, 4), [z.requires_grad_()])
+
+
+@pytest.mark.parametrize("size", [1, 8])
+def test_single_precision_holds_from_the_shortest_gaps_to_the_longest(size):
+    """Whether its coordinates forget at once or hardly ever: a covariance has a root, and both have their digits."""
+    inputs = [Input("z", size, Relation.parse("t-1")), Input("d", 1, Relation.parse("t"))]
+    exact = LinearSDE((0.1, 1000.0)).build(inputs, True, size).double()
+    with torch.no_grad():
+        exact.turning.mul_(3)
+    rough = LinearSDE().build(inputs, True, size)
+    rough.load_state_dict(exact.state_dict())
+    gaps = 10.0 ** torch.arange(-8, 9)
+    first = torch.zeros(len(gaps), dtype=torch.bool)
+    decay, whitening = rough.over(gaps, first)
+    expected, root = exact.over(gaps.double(), first)
+    torch.testing.assert_close(decay.double(), expected, rtol=0, atol=2e-6)
+    # of what the exact law makes white, so that a direction of little noise counts as any other
+    white = whitening.double() @ torch.linalg.inv(root)
+    torch.testing.assert_close(white, torch.eye(size).double().expand_as(white), rtol=0, atol=1e-5)
+    assert decay[-1].abs().max() < 1e-6
+    torch.testing.assert_close(whitening[-1], torch.eye(size), rtol=0, atol=1e-5)
+    whitening.log1p().sum().backward()
+    assert all(p.grad.isfinite().all() for p in rough.parameters())
+
+
+def test_its_stationary_law_is_standard_normal_and_so_is_its_first_step():
+    sde = network()
+    torch.testing.assert_close(sde.drift + sde.drift.mT + sde.noise, torch.zeros(3, 3).double())
+    d = torch.tensor([[[-5.0], [1e6]], [[0.0], [0.2]]], dtype=torch.float64)
+    loc, whitening = sde({"z": double(2, 2, 3), "d": d}, 2).split([3, 9], dim=-1)
+    white = torch.eye(3).flatten().double()
+    for at in ((0, 0), (0, 1), (1, 0)):
+        torch.testing.assert_close(loc[at], torch.zeros(3).double(), rtol=0, atol=1e-9)
+        torch.testing.assert_close(whitening[at], white, rtol=0, atol=1e-9)
+    assert (whitening[1, 1] - white).abs().max() > 0.1
+
+
+def test_any_stable_equation_is_a_linear_map_of_one_of_these():
+    drift, root = stable()
+    root = torch.cat([root, 0.3 * double(4, 1)], 1)
+    noise = root @ root.mT
+    stationary = torch.as_tensor(linalg.solve_continuous_lyapunov(drift.numpy(), -noise.numpy()))
+    into = torch.linalg.inv(torch.linalg.cholesky(stationary))
+    into = torch.linalg.eigh(into @ noise @ into.mT)[1].mT @ into
+    back = torch.linalg.inv(into)
+    own = into @ drift @ back
+    sde = network(4)
+    with torch.no_grad():
+        sde.log_rate.copy_((-own.diagonal()).log())
+        sde.turning.copy_(own.tril(-1))
+    torch.testing.assert_close(sde.drift, own, rtol=1e-9, atol=1e-9)
+    gaps = torch.tensor([0.1, 2.0, 30.0], dtype=torch.float64)
+    moved, spread = transition(drift, noise, gaps)
+    ours, covariance = transition(sde.drift, sde.noise, gaps)
+    torch.testing.assert_close(back @ ours @ into, moved, rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close(back @ covariance @ back.mT, spread, rtol=1e-8, atol=1e-9)
+
+
+# ---------------------------------------------------------------------------------------------------- as a network
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("given", ["zd", "d", "z", ""])
+def test_one_step_at_a_time_is_all_steps_at_once(given, dtype):
+    sde = network(dtype=dtype)
+    values = {"z": torch.randn(4, 6, 3, dtype=dtype), "d": torch.rand(4, 6, 1, dtype=dtype) + 0.01}
+    expected, rows = sde(values, 6), torch.tensor([2, 2, 0])
+    state = sde.start({name: values[name] for name in given}, 4, 6)
+    moved = sde.select(sde.start({name: values[name] for name in given}, 4, 6), rows)
+    drawn = {name: values[name].unbind(1) for name in values if name not in given}
+    for t in range(6):
+        features, state = sde.step(state, t, drawn)
+        torch.testing.assert_close(features, expected[:, t], rtol=1e-5 if dtype == torch.float32 else 1e-10, atol=1e-6)
+        chosen, moved = sde.step(moved, t, {name: [v[rows] for v in value] for name, value in drawn.items()})
+        torch.testing.assert_close(chosen, features[rows])
+
+
+def test_padding_has_no_gap():
+    sde, lengths = network(), torch.tensor([5, 2])
+    d, z = torch.rand(2, 5, 1, dtype=torch.float64) + 0.1, double(2, 5, 3)
+    d[1, 2:], z[1, 2:] = 0, 0
+    features = sde({"z": z, "d": d}, 5, lengths)
+    torch.testing.assert_close(features[1, :2], sde({"z": z[1:, :2], "d": d[1:, :2]}, 2)[0])
+    assert features.isfinite().all()
+    with pytest.raises(ValueError, match="d is 0 at step 2 of sequence 1, counted from 0; a gap is the time since"):
+        sde({"z": z, "d": d}, 5)
+
+
+def test_gaps_that_are_equal_are_computed_once(monkeypatch):
+    seen = []
+    monkeypatch.setattr("dvae.networks.sde.transition", lambda a, n, gaps: seen.append(gaps) or transition(a, n, gaps))
+    d = torch.randint(1, 4, (50, 20, 1)).double()
+    network()({"z": double(50, 20, 3), "d": d}, 20)
+    assert [gaps.tolist() for gaps in seen] == [[1.0, 2.0, 3.0]]
+
+
+@pytest.mark.parametrize("gap", [0.0, -1.5])
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda built, batch: built.log_joint(batch, built.guide(batch)),
+        lambda built, batch: built.sample(batch={"d": batch["d"]}),
+        dvae.particle_bound,
+        dvae.importance_bound,
+    ],
+)
+def test_gaps_that_are_not_positive_are_refused(run, gap):
+    built, batch = model(), {"x": torch.randn(2, 5, 3), "d": torch.ones(2, 5, 1)}
+    batch["d"][1, 3] = gap
+    with pytest.raises(ValueError, match=rf"d is {gap:g} at step 3 of sequence 1, counted from 0; .* and above 0"):
+        run(built, batch)
+
+
+def test_gaps_that_are_drawn_are_refused_where_they_are_not_positive():
+    sde = network()
+    state = sde.start({"z": double(2, 5, 3)}, 2, 5)
+    with pytest.raises(ValueError, match="d is -1 at step 2 of sequence 0, counted from 0"):
+        sde.step(state, 2, {"d": [torch.full((2, 1), -1.0)] * 3})
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_t)", {"z": 2, "x": 2}, LinearSDE()),
+            r"over a gap of size 1, p\(z_t \| z_\{t-1\}, d_t\), but for a child of size 2 the parents .* z at \{t-1\}",
+        ),
+        (
+            lambda: DynamicalVAE(*PAIR, {"z": 2, "x": 2, "d": 3}, {"p(z)": LinearSDE()}),
+            r"for a child of size 2 the parents here are z at \{t-1\} \(2\), d at \{t\} \(3\)",
+        ),
+        (
+            lambda: DynamicalVAE(*PAIR, {"z": 2, "x": 2, "d": 1}, {"p(z)": LinearSDE()}),
+            r"the features of p\(z_t \| z_\{t-1\}, d_t\) by LinearSDE.* are the parameters of a laws\.Triangular, "
+            r"but its law is Normal\(.*\); give it laws\.Triangular\(\)",
+        ),
+        (lambda: LinearSDE((0.0, 1.0)).build([], True, 2), r"times are positive, .* but these are \(0\.0, 1\.0\)"),
+        (lambda: LinearSDE((2.0, 1.0)).build([], True, 2), r"times are positive, the shortest and the longest"),
+    ],
+)
+def test_what_does_not_fit_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+# --------------------------------------------------------------------------------------------------- in the engine
+
+
+class TestModel(FactorizationContract):
+    """All laws of the engine; gaps are positive, and that of the first step is not read."""
+
+    missing: ClassVar = {}
+
+    def build(self, size):
+        networks = {"p(z)": LinearSDE((0.5, 8.0)), "p(x)": Dense((4,)), "q": Recurrent(4)}
+        return DynamicalVAE(*PAIR, {"z": size, "x": size, "d": 1}, networks, {"p(z)": laws.Triangular()})
+
+    def _data(self, *args, **kwargs):
+        data = super()._data(*args, **kwargs)
+        return {**data, "d": data["d"].exp()}
+
+    def _reads(self, conditional, values, name):
+        read = super()._reads(conditional, values, name)
+        if name == "d" and conditional.factor.kind == "p":
+            assert not read[0].any()
+            read[0, 0] = True
+        return read
+
+
+def kernel(built, times):
+    """Covariance (T D, T D) of the stationary solution at these times (T,)."""
+    sde = built.generator["z"].network
+    size, steps = len(sde.drift), len(times)
+    found = torch.zeros(steps, size, steps, size, dtype=torch.float64)
+    for t in range(steps):
+        for s in range(t + 1):
+            moved = torch.as_tensor(linalg.expm((sde.drift.detach() * (times[t] - times[s])).numpy()))
+            found[t, :, s], found[s, :, t] = moved, moved.mT
+    return found.view(steps * size, -1)
+
+
+def dense(built, times, kept=slice(None)):
+    """The law of x at these times (T,), of the steps that are kept; and C, b and R of x = C z + b + noise."""
+    emission = built.generator["x"].law
+    c, b = emission.out.weight.detach(), emission.out.bias.detach()
+    r = (2 * emission.log_scale).exp().diag().expand(len(times), -1, -1)
+    seen = torch.block_diag(*[c] * len(times))
+    law = MultivariateNormal(b.repeat(len(times)), seen @ kernel(built, times) @ seen.mT + torch.block_diag(*r))
+    places = torch.arange(len(b) * len(times)).view(len(times), -1)[kept].flatten()
+    marginal = MultivariateNormal(law.mean[places], law.covariance_matrix[places][:, places])
+    return marginal, (c, b, r[0])
+
+
+def filtered(built, times, x, seen=None):
+    """log p(x) by the Kalman filter through the network's transitions."""
+    _, (c, b, r) = dense(built, times)
+    gaps = times.diff(prepend=times[:1])[None]
+    moves, whitening = built.generator["z"].network._transitions(gaps, None)
+    spread = torch.linalg.inv(whitening.mT @ whitening)
+    counted = torch.ones(len(times), dtype=torch.float64) if seen is None else seen.double()
+    weighted, e = c.mT @ torch.linalg.inv(r), x - b
+    chain = LinearGaussianChain(
+        transition=moves[0, 1:, None],
+        offset=torch.zeros(len(times) - 1, 1, len(c.T)).double(),
+        noise=spread[0, 1:, None],
+        mean=torch.zeros(1, len(c.T)).double(),
+        covariance=spread[:, 0],
+        information=(weighted @ c * counted[:, None, None])[:, None],
+        potential=(e @ weighted.mT * counted[:, None])[:, None],
+    )
+    mean, covariance = chain.predicted
+    law = MultivariateNormal((c @ mean[..., None])[:, 0, :, 0] + b, c @ covariance[:, 0] @ c.mT + r)
+    return (law.log_prob(x) * counted).sum()
+
+
+def irregular(steps=7):
+    return torch.cumsum(torch.rand(steps, dtype=torch.float64) * 10.0 ** torch.randint(-2, 2, (steps,)), 0)
+
+
+def test_the_evidence_is_that_of_the_equation_s_kernel():
+    built, times, x = model(), irregular(), double(7, 3)
+    law, _ = dense(built, times)
+    with torch.no_grad():
+        assert filtered(built, times, x).item() == pytest.approx(law.log_prob(x.flatten()).item(), abs=1e-8)
+
+
+@pytest.mark.parametrize("left_out", [0, 3, 6])
+def test_a_step_that_is_left_out_makes_one_gap_of_two(left_out):
+    built, times, x = model(), irregular(), double(7, 3)
+    seen = torch.arange(7) != left_out
+    law, _ = dense(built, times, seen)
+    with torch.no_grad():
+        hidden, merged = filtered(built, times, x, seen), filtered(built, times[seen], x[seen])
+    assert hidden.item() == pytest.approx(merged.item(), abs=1e-9)
+    assert merged.item() == pytest.approx(law.log_prob(x[seen].flatten()).item(), abs=1e-8)
+
+
+def test_the_log_joint_is_that_of_the_equation_s_kernel():
+    built, times, z, x = model(), irregular(), double(1, 7, 2), double(1, 7, 3)
+    gaps = times.diff(prepend=times[:1])[None, :, None]
+    found = built.log_joint({"x": x, "d": gaps}, {"z": z})["z"]
+    law = MultivariateNormal(torch.zeros(14).double(), kernel(built, times))
+    assert found.item() == pytest.approx(law.log_prob(z.flatten()).item(), abs=1e-8)
+
+
+def test_half_precision_is_left_at_the_transition():
+    built, x = model().float(), {"x": torch.randn(8, 5, 3), "d": torch.rand(8, 5, 1) + 0.1}
+    options = {"steps": 3, "accelerator": "cpu", "progress": False}
+    assert dvae.fit(built, x, precision="bf16-mixed", **options).history
+    assert all(p.dtype == torch.float32 and p.isfinite().all() for p in built.parameters())
+    sde, values = built.generator["z"].network, {"z": torch.randn(8, 5, 2), "d": x["d"]}
+    with torch.autocast("cpu", torch.bfloat16):
+        half = sde(values, 5)
+    assert torch.equal(half, sde(values, 5))
+    with pytest.raises(ValueError, match=r"covariances are inverted, which torch\.bfloat16 cannot hold; fit with"):
+        dvae.fit(built, x, precision="bf16-true", **options)
+
+
+def test_particles_estimate_the_evidence():
+    built, times, x, n = model(guide=None, scale=1.0), irregular(), double(7, 3), 400
+    expected = dense(built, times)[0].log_prob(x.flatten())
+    gaps = times.diff(prepend=times[:1])[None, :, None].expand(n, -1, -1)
+    found = dvae.particle_bound(built, {"x": x.expand(n, -1, -1), "d": gaps}, particles=100)
+    ratio = (found.bound - expected).exp()
+    assert ratio.std() < 1
+    assert abs(ratio.mean() - 1) < 4 * ratio.std() / n**0.5
+    assert found.resamplings.any()
+
+
+def test_free_runs_have_the_equation_s_covariance():
+    built, times, n = model(), irregular(4), 20_000
+    gaps = times.diff(prepend=times[:1])[None, :, None].expand(n, -1, -1)
+    z = built.sample(batch={"d": gaps})["z"].flatten(1)
+    assert (torch.cov(z.T) - kernel(built, times)).abs().max() < 5 * (2 / n) ** 0.5
+
+
+def test_a_forecast_goes_over_the_gaps_that_it_is_given():
+    built, x, d = model(), double(3, 5, 3), torch.ones(3, 7, 1).double()
+    d[:, 5], d[:, 6] = 1e-8, 1e6
+    z = built.forecast({"x": x, "d": d}, horizon=2, samples=2000)["z"]
+    torch.testing.assert_close(z[:, :, 5], z[:, :, 4], rtol=0, atol=2e-3)  # nothing happens in no time
+    assert z[:, :, 6].mean(0).abs().max() < 5 / 2000**0.5
+    assert (z[:, :, 6].var(0) - 1).abs().max() < 5 * (2 / 2000) ** 0.5
+    with pytest.raises(ValueError, match="expected 7 steps"):
+        built.forecast({"x": x, "d": d[:, :5]}, horizon=2)
