@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ..data import each
 from ..laws.base import Parameters
-from ..networks.base import computing_once, valid_steps
+from ..networks.base import computing_once, presence, valid_steps
 from ..networks.rows import Rows, pick, select
 from ..notation import Factor, Parent
 from ..program.batch import AnyBatch
@@ -249,7 +249,8 @@ class Filter:
         What is the same for all particles of a sequence is computed once for them.
         """
         lengths = self.known.lengths
-        given = {name: shared[name] for name in conditional.parents if name in shared}
+        there = {presence(name): steps for name, steps in self.known.present.items() if name in conditional.parents}
+        given = {**{name: shared[name] for name in conditional.parents if name in shared}, **there}
         own = {name: value for name, value in self.drawn.items() if name in conditional.parents and name not in shared}
         if not own:
             return given, self.known.batch, lengths, self.sequence

@@ -16,6 +16,10 @@ p(a_t | a_{<t}) is the prediction of the Kalman filter. Its divergence is analyt
 forecasts carry the whole distribution of z_t. `smooth` gives z back. The guide drops what the posterior of a_t reads
 besides x_t: the past a_{<t}, and the frames after it.
 
+A frame of which nothing was observed is not encoded: its a_t is integrated out, as z is, and leaves filter and bound.
+What mixes the matrices reads the prediction C_t E(z_t | a_{<t}) in its place, as where the paper imputes. What the
+guide hands out there is drawn from p(a_t | all other a), so that frames are imputed from both sides.
+
 Fraccaro, Kamronn, Paquet and Winther, 2017, arXiv 1710.05741; B_t a_{t-1} as in the public implementation of Girin et
 al., 2021, arXiv 2008.12595, in whose layer sizes the defaults are.
 """
@@ -24,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Annotated, Any
 
@@ -39,11 +43,15 @@ from ..laws.base import LawSpec
 from ..laws.kalman import LinearGaussianChain, update
 from ..laws.triangular import InverseCholesky, Triangular, refuse_half
 from ..networks import Dense, Input, Network, NetworkSpec
-from ..networks.base import valid_steps
+from ..networks.base import presence, valid_steps
 from ..networks.recurrent import lstm_cell
+from ..notation import Factorization
 from ..options import Range, Size
 from ..program.batch import AnyBatch, repeat
 from ..program.model import DynamicalVAE
+from ..program.rollout import Rollout
+from ..schema import Schema
+from ..views import WHOLE
 from .method import LatentMethod
 
 
@@ -95,6 +103,12 @@ class KVAE(LatentMethod):
         return {**super().laws(), "p(a)": Triangular()}
 
     @override
+    def build(self, data: Any) -> KalmanVAE:
+        """The model of these equations."""
+        schema = Schema.of(data)
+        return KalmanVAE(**self.described(schema.sizes), view=schema.view)
+
+    @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """In `phases`; in a run of fewer than three steps there is one."""
         recipe = super().train(train, validation, steps)
@@ -105,6 +119,49 @@ class KVAE(LatentMethod):
         frozen = [(network,), tuple(network + name for name in ("memory.", "weights.", "first")), ()]
         stages = [Stage(b - a, self.objective(), frozen=f) for (a, b), f in zip(pairwise(ends), frozen, strict=True)]
         return replace(recipe, stages=stages)
+
+
+class KalmanVAE(DynamicalVAE):
+    """The model of `KVAE`: a_t is there at the frames of which something was observed."""
+
+    @override
+    def _rollout(
+        self, factorization: Factorization, conditionals: Any, batch: AnyBatch | None, length: int | None, size: int
+    ) -> Rollout:
+        run = super()._rollout(factorization, conditionals, batch, length, size)
+        if WHOLE not in run.observed:
+            return run
+        seen = run.observed[WHOLE].any(-1)
+        present = functional.pad(seen, (0, run.length - seen.shape[1]), value=True)  # what is drawn on is there
+        valid = None if run.lengths is None else valid_steps(run.lengths, run.length)
+        present = present if valid is None else present | ~valid
+        if not present.all():
+            run.present = {"a": present}
+        if conditionals is self.encoder and run.present:
+            return Encoding(**{f.name: getattr(run, f.name) for f in fields(run)}, network=self.generator["a"].network)
+        return run
+
+
+@dataclass
+class Encoding(Rollout):
+    """A run of the guide whose a_t is drawn from p(a_t | all other a) where the frame is not encoded.
+
+    Not where gradients are taken: a bound leaves these frames out, and drawing them takes as long as all else of it.
+
+    Args:
+        network: of p(a).
+    """
+
+    network: Any = None
+
+    @override
+    def draw(self, name: str) -> Tensor:
+        drawn = super().draw(name)
+        if torch.is_grad_enabled():
+            return drawn
+        value: Tensor = self.network.completed(drawn, self.present[name], self.lengths)
+        self._evaluated[name] = (value, self._evaluated[name][1])  # the guide's conditionals read no a
+        return value
 
 
 @dataclass(frozen=True)
@@ -160,30 +217,88 @@ class KalmanNetwork(Network):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        a = parents[self.inputs[0].name].to(self.A.dtype).transpose(0, 1)
+        name = self.inputs[0].name
+        a, present = parents[name].to(self.A.dtype).transpose(0, 1), parents.get(presence(name))
         with torch.autocast(a.device.type, enabled=False):
-            chain, emission, _ = self.chain_of(a)
+            chain, emission, _ = self.chain_of(a, None if present is None else present.t())
             parts = self.parts_of(*chain.predicted, emission)
         return torch.cat([part.transpose(0, 1) for part in parts], dim=-1)
 
-    def chain_of(self, a: Tensor, valid: Tensor | None = None) -> tuple[LinearGaussianChain, Tensor, Tensor]:
+    def chain_of(
+        self, a: Tensor, present: Tensor | None = None, valid: Tensor | None = None
+    ) -> tuple[LinearGaussianChain, Tensor, Tensor]:
         """The chain of z given a (T, B, D), its C (T, B, D, N) and the weights alpha (T, B, K).
 
         Args:
             a: the encoded frames.
-            valid: (T, B) False at frames that say nothing of z.
+            present: (T, B) False at frames that are not encoded, whose a is integrated out.
+            valid: (T, B) False at padding.
         """
-        before = torch.cat([self.first.expand(1, a.shape[1], -1), a[:-1]])
+        before = torch.cat([self.first.expand(1, a.shape[1], -1), self.filled(a, present)[:-1]])
         alpha = self.weights(self.memory(before)[0]).softmax(-1)
         transition, control, emission = self.mixed(alpha)
-        information, potential = self.seen(emission, a)
-        if valid is not None:
-            information = information * valid[..., None, None]
-            potential = potential * valid[..., None]
         mean, covariance, noise = self.start_of(a.shape[1])
-        offset = (control[1:] @ a[:-1, ..., None])[..., 0]
-        chain = LinearGaussianChain(transition[1:], offset, noise, mean, covariance, information, potential)
+        transition, control = transition[1:], control[1:]
+        information, potential = self.seen(emission, a)
+        for told in (present, valid):
+            if told is not None:
+                information, potential = information * told[..., None, None], potential * told[..., None]
+        if present is not None:
+            transition, noise = self.past(transition, control, emission[:-1], present[:-1])
+            a = a * present[..., None]
+        offset = (control @ a[:-1, ..., None])[..., 0]
+        chain = LinearGaussianChain(transition, offset, noise, mean, covariance, information, potential)
         return chain, emission, alpha
+
+    def filled(self, a: Tensor, present: Tensor | None) -> Tensor:
+        """a (T, B, D), with its prediction where it is not there: what mixes the matrices, if there is anything to mix.
+
+        A loop, since every prediction is by matrices that the ones before have mixed.
+        """
+        if present is None or self.spec.components == 1:
+            return a
+        name = self.inputs[0].name
+        state = self.start({name: a.transpose(0, 1), presence(name): present.t()}, a.shape[1], len(a))
+        rows = []
+        for t, there in enumerate(present):
+            state = self.ahead(state, t, {})
+            rows.append(torch.where(there[:, None], a[t], (state.emission @ state.mean[..., None])[..., 0]))
+        return torch.stack(rows)
+
+    def past(self, transition: Tensor, control: Tensor, emission: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+        """A_t and Q (..., N, N) each, with a_{t-1} = C_{t-1} z_{t-1} + N(0, R) integrated out where it is not there.
+
+        Args:
+            transition, control: A_t and B_t, (..., N, N) and (..., N, D).
+            emission, present: of t - 1, (..., D, N) and (...).
+        """
+        absent = control * ~present[..., None, None]
+        noise = self.log_noise.exp().diag() + (absent * self.log_emission.exp()) @ absent.mT
+        return transition + absent @ emission, noise
+
+    @torch.no_grad()
+    def completed(self, a: Tensor, present: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """a (B, T, D), with draws of p(a_t | all that is there) at frames that are not (B, T)."""
+        valid = None if lengths is None else valid_steps(lengths, a.shape[1]).t()
+        chain, _, alpha = self.chain_of(a.transpose(0, 1), present.t(), valid)
+        drawn = self.emitted(chain.draw(torch.randn_like(chain.potential)), alpha).transpose(0, 1)
+        return torch.where(present[..., None], a, drawn)
+
+    def emitted(self, z: Tensor, alpha: Tensor) -> Tensor:
+        """Draws of a (T, B, D) given z_{1:T} (T, B, N), where it is not there.
+
+        a_t is C_t z_t + N(0, R), and moves z_{t+1}: what its draw misses that by is put right (Matheron's rule).
+        """
+        transition, control, emission = self.mixed(alpha)
+        noise, spread = self.log_noise.exp(), self.log_emission.exp()
+        a = (emission @ z[..., None])[..., 0]
+        a = a + spread.sqrt() * torch.randn_like(a)
+        transition, control = transition[1:], control[1:]
+        moved = (transition @ z[:-1, ..., None] + control @ a[:-1, ..., None])[..., 0]
+        missed = z[1:] - moved - noise.sqrt() * torch.randn_like(moved)
+        whole = (control * spread) @ control.mT + noise.diag()
+        back = spread * (control.mT @ torch.linalg.solve(whole, missed[..., None]))[..., 0]
+        return torch.cat([a[:-1] + back, a[-1:]])
 
     def start_of(self, batch: int) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (B, N) and covariance (B, N, N) of z_1, and Q (N, N).
@@ -217,26 +332,59 @@ class KalmanNetwork(Network):
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        known = given.get(self.inputs[0].name)
-        zero = self.first.new_zeros(batch, self.spec.width)
-        return None if known is None else known.unbind(1), (zero, zero), self.start_of(batch)[:2], None
+        name, zero = self.inputs[0].name, self.first.new_zeros(batch, self.spec.width)
+        known, present = (given[key].unbind(1) if key in given else None for key in (name, presence(name)))
+        return Predicted(known, present, (zero, zero), *self.start_of(batch)[:2], None)
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        known, hidden, (mean, covariance), emission = state
-        values = drawn[self.inputs[0].name] if known is None else known
+        with torch.autocast(self.A.device.type, enabled=False):
+            state = self.ahead(state, t, drawn)
+            features = torch.cat(self.parts_of(state.mean, state.covariance, state.emission), dim=-1)
+        return features, state
+
+    def ahead(self, state: Predicted, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Predicted:
+        """The prediction of step t from that of the last one, and what is known by then."""
+        mean, covariance, emission = state.mean, state.covariance, state.emission
+        values = drawn[self.inputs[0].name] if state.known is None else state.known
         before = values[t - 1].to(self.A.dtype) if t else self.first.expand(len(mean), -1)
-        with torch.autocast(before.device.type, enabled=False):
-            gates = functional.linear(before, self.memory.weight_ih_l0, self.memory.bias_ih_l0)
-            hidden = lstm_cell(gates, hidden, self.memory)
-            transition, control, emitted = self.mixed(self.weights(hidden[0]).softmax(-1))
-            if t:
-                information, potential = self.seen(emission, before)
-                mean, covariance = update(mean, covariance, information, potential)
-                mean = (transition @ mean[..., None] + control @ before[..., None])[..., 0]
-                covariance = transition @ covariance @ transition.mT + self.log_noise.exp().diag()
-            features = torch.cat(self.parts_of(mean, covariance, emitted), dim=-1)
-        return features, (known, hidden, (mean, covariance), emitted)
+        present = None if state.present is None or not t else state.present[t - 1]
+        if present is not None:
+            before = torch.where(present[:, None], before, (emission @ mean[..., None])[..., 0])
+        gates = functional.linear(before, self.memory.weight_ih_l0, self.memory.bias_ih_l0)
+        hidden = lstm_cell(gates, state.hidden, self.memory)
+        transition, control, emitted = self.mixed(self.weights(hidden[0]).softmax(-1))
+        if t:
+            information, potential = self.seen(emission, before)
+            noise = self.log_noise.exp().diag()
+            if present is not None:
+                information, potential = information * present[:, None, None], potential * present[:, None]
+            mean, covariance = update(mean, covariance, information, potential)
+            mean = (transition @ mean[..., None] + control @ before[..., None])[..., 0]
+            if present is not None:
+                transition, noise = self.past(transition, control, emission, present)
+            covariance = transition @ covariance @ transition.mT + noise
+        return Predicted(state.known, state.present, hidden, mean, covariance, emitted)
+
+
+@dataclass
+class Predicted:
+    """The state of a `KalmanNetwork`: what is known of a, and z_t by what came before t.
+
+    Args:
+        known: a by step, None where the loop draws it.
+        present: (B,) by step, whether it is there; None where it always is.
+        hidden: of the memory.
+        mean, covariance: of z_t.
+        emission: C_t; None before the first step.
+    """
+
+    known: Sequence[Tensor] | None
+    present: Sequence[Tensor] | None
+    hidden: tuple[Tensor, Tensor]
+    mean: Tensor
+    covariance: Tensor
+    emission: Any
 
 
 @dataclass(frozen=True)
@@ -244,10 +392,10 @@ class SmoothedLatents:
     """What a sequence says of the latents of a `kvae` model, at S draws of a.
 
     Args:
-        a: draws from the guide, (S, B, T, D).
-        z: a draw of z_{1:T} given a for each, (S, B, T, N).
-        mean, covariance: of z_t given a_{1:T}, (S, B, T, N) and (S, B, T, N, N).
-        lag_one: Cov(z_{t+1}, z_t) given a_{1:T}, (S, B, T - 1, N, N).
+        a: draws from the guide, (S, B, T, D), and at frames that are not encoded of a_t given the others and z.
+        z: a draw of z_{1:T} given the encoded a for each, (S, B, T, N).
+        mean, covariance: of z_t given these, (S, B, T, N) and (S, B, T, N, N).
+        lag_one: Cov(z_{t+1}, z_t) given these, (S, B, T - 1, N, N).
         weights: alpha_t, (S, B, T, K).
     """
 
@@ -278,12 +426,14 @@ def smooth(model: DynamicalVAE, batch: AnyBatch, samples: int = 1) -> SmoothedLa
     if samples < 1:
         raise ValueError(f"samples is at least 1, got {samples}")
     data = {name: repeat(value, samples) for name, value in model.read(batch).items()}
+    run = model._rollout(model.inference, model.encoder, data, None, 1)
+    present, valid = run.present.get("a"), None if run.lengths is None else valid_steps(run.lengths, run.length).t()
     a = model.guide(data)["a"].transpose(0, 1)
-    lengths = data.get("lengths")
-    valid = None if lengths is None else valid_steps(lengths, len(a)).t()
-    chain, _, alpha = network.chain_of(a, valid)
+    chain, _, alpha = network.chain_of(a, None if present is None else present.t(), valid)
     mean, covariance = chain.smoothed
     z = chain.draw(torch.randn_like(mean))
+    if present is not None:
+        a = torch.where(present.t()[..., None], a, network.emitted(z, alpha))
     results = [a, z, mean, covariance, chain.lag_one, alpha]
     if valid is not None:
         results = [r * valid[-len(r) :].view(*valid[-len(r) :].shape, *[1] * (r.dim() - 2)) for r in results]

@@ -169,6 +169,14 @@ class AtOnce(Network):
         return state[t], state
 
 
+def presence(name: str) -> str:
+    """Under which a network finds, among its parents, at which steps (B, T) a latent is there, if not at all of them.
+
+    At the others it is integrated out (`Rollout.present`), and its values are not to be read.
+    """
+    return f"{name} is there"
+
+
 def share_modules(networks: Sequence[Any], *names: str) -> None:
     """Gives networks the modules of these names of the first of them."""
     for network in networks[1:]:

@@ -14,7 +14,7 @@ from torch.distributions import constraints
 from ..laws.base import LawSpec, Parameters, Shape
 from ..laws.chain import DERIVATIVES, gaussian_chain
 from ..laws.families import NormalLaw
-from ..networks.base import Input, Network, NetworkSpec, at, once_valid, shift
+from ..networks.base import Input, Network, NetworkSpec, at, once_valid, presence, shift
 from ..networks.rows import Rows
 from ..notation import Factor
 from ..units import Units
@@ -199,7 +199,8 @@ class Conditional(nn.Module):
         """The parents among `values`, without unit, or a constant in place of none."""
         if not self.parents:
             return {CONSTANT: next(self.parameters()).new_ones(batch, 1)}
-        found = {name: values[name] for name in self.parents if name in values}
+        read = [*self.parents, *map(presence, self.parents)]
+        found = {name: values[name] for name in read if name in values}
         return found | {n: once_valid(self.units[n], v, lengths) for n, v in found.items() if n in self.units}
 
     @property

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from ..laws.base import Parameters
-from ..networks.base import valid_steps
+from ..networks.base import presence, valid_steps
 from ..notation import Block, Factorization
 from .conditional import Conditional, like
 
@@ -84,6 +84,8 @@ class Rollout:
         lengths: (B,) valid steps of a ragged batch.
         observed: name to (B, T, D) True where an entry of the data was observed. The model reads its own mean in
             place of the others, the guide 0.
+        present: name of a local latent to (B, T), False at steps at which it is integrated out: its density does not
+            count there, and networks that read it are told (`networks.base.presence`).
         prefix: name to (B, O, D) first values of a variable that is then drawn on.
         mean_emission: names of data variables that are not drawn but set to their means.
         feeding: self-feeding of the data's history, or None.
@@ -98,6 +100,7 @@ class Rollout:
     data: frozenset[str] = frozenset()
     lengths: Tensor | None = None
     observed: Mapping[str, Tensor] = field(default_factory=dict)
+    present: Mapping[str, Tensor] = field(default_factory=dict)
     prefix: Mapping[str, Tensor] = field(default_factory=dict)
     mean_emission: Collection[str] = ()
     feeding: SelfFeeding | None = None
@@ -134,6 +137,7 @@ class Rollout:
             values=again(self.values),
             lengths=None if self.lengths is None else self.lengths.repeat(n),
             observed=again(self.observed),
+            present=again(self.present),
             prefix=again(self.prefix),
         )
 
@@ -148,11 +152,16 @@ class Rollout:
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)
-        known = {**self.values, **self.history(name)}
+        known = {**self.known, **self.history(name)}
         parameters = conditional(known, self.batch, self.length, self.lengths)
         law = conditional.law.distribution(tuple(p.repeat(draws, *[1] * (p.dim() - 1)) for p in parameters))
         mask = self.mask(name)
         return (law if mask is None else law.mask(mask)).to_event(1 - len(law.event_shape))
+
+    @property
+    def known(self) -> dict[str, Tensor]:
+        """The values, and at which steps latents are there."""
+        return {**self.values, **{presence(name): steps for name, steps in self.present.items()}}
 
     def know(self, name: str, value: Tensor) -> None:
         """Record the value of a site, which later sites read."""
@@ -173,6 +182,8 @@ class Rollout:
         """
         conditional = self.conditionals[name]
         mask = self.observed.get(name)
+        if name in self.present:
+            mask = self.present[name][..., None].expand(-1, -1, conditional.size)
         if mask is not None and conditional.whole:
             mask = mask.all(-1)
         if self._valid is None or not conditional.factor.local:
@@ -187,7 +198,7 @@ class Rollout:
     def parameters(self, name: str, value: Tensor) -> Parameters:
         """Those of `evaluate`, (B, T, ...); computed once for a value."""
         if name not in self._evaluated or self._evaluated[name][0] is not value:
-            known = {**self.values, name: value, **self.history(name)}
+            known = {**self.known, name: value, **self.history(name)}
             self._evaluated[name] = (value, self.conditionals[name](known, self.batch, self.length, self.lengths))
         return self._evaluated[name][1]
 
@@ -243,7 +254,7 @@ class Rollout:
             return {}
         if self.feeding is None or self.feeding.passes is None or not self.feeding.probability:
             return self._run(block, self._fed, self.hidden)
-        known = {**self.values, **self._fed}
+        known = {**self.known, **self._fed}
         for _ in range(self.feeding.passes):
             for name in names:
                 conditional = self.conditionals[name]
@@ -256,7 +267,7 @@ class Rollout:
     ) -> dict[str, Tensor]:
         """Values of the unknown variables of a block; with `hidden`, of its data, with own means at those entries."""
         live = [name for name in block.names if (name not in self.values if hidden is None else name in hidden)]
-        given = {name: value for name, value in {**self.values, **(fed or {})}.items() if name not in live}
+        given = {name: value for name, value in {**self.known, **(fed or {})}.items() if name not in live}
         loop = any(parent in live for name in live for parent in self.conditionals[name].parents)
         noise = {
             name: self.conditionals[name].law.noise(
