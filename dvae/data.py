@@ -195,6 +195,64 @@ def bridged(x: Tensor, mask: Tensor | None) -> Tensor:
     return torch.where(mask, x, torch.where(mask.any(-2, keepdim=True), line, 0.0))
 
 
+def gaps(times: Tensor | np.ndarray, lengths: Tensor | None = None) -> Tensor:
+    """The time (B, T, 1) since the step before: a covariate of irregular steps that any network reads.
+
+    That of the first step, before which there is nothing, is 0; so are those of padding.
+
+    Args:
+        times: (B, T), rising, in any unit. Days since 1970 in single precision have no minutes: give double, or take
+            the start of each sequence from it.
+        lengths: (B,) valid steps, where some are padding.
+
+    Raises:
+        ValueError: times that are not finite, or do not rise.
+
+    Example:
+        >>> gaps(torch.tensor([[3.0, 4.0, 6.5, 0.0]]), torch.tensor([3])).flatten().tolist()
+        [0.0, 1.0, 2.5, 0.0]
+    """
+    times = torch.as_tensor(times)
+    if times.ndim != 2:
+        raise ValueError(f"times are (sequences, steps), but these have shape {tuple(times.shape)}")
+    rise = times.diff(dim=1, prepend=times[:, :1])
+    bad = ~((rise > 0) & torch.isfinite(rise))
+    bad[:, :1] = ~torch.isfinite(times[:, :1])
+    if lengths is not None:
+        padding = torch.arange(times.shape[1], device=times.device) >= lengths[:, None]
+        bad, rise = bad & ~padding, rise.masked_fill(padding, 0)
+    if bad.any():
+        row, step = bad.nonzero()[0].tolist()
+        raise ValueError(
+            f"the times of sequence {row} are {', '.join(f'{t:g}' for t in times[row, max(step - 1, 0) : step + 1])} "
+            f"at steps {max(step - 1, 0)} to {step}, counted from 0; times are finite and rise: sort them, make one "
+            "step of values at one time, and leave out steps without a time"
+        )
+    return rise[..., None] if rise.is_floating_point() else rise[..., None].to(torch.get_default_dtype())
+
+
+def since_observed(mask: Tensor, gaps: Tensor | None = None) -> Tensor:
+    """The time (B, T, D) since each entry was last observed, before this step: a covariate of missing values.
+
+    Of one that never was, the time since the first step; 0 there. (Che et al., 2018, "Recurrent neural networks for
+    multivariate time series with missing values", where it is delta.)
+
+    Args:
+        mask: (B, T, D), True where an entry was observed.
+        gaps: (B, T, 1), see `gaps`; where nothing is said, every step takes 1.
+
+    Example:
+        >>> mask = torch.tensor([[[True], [False], [False], [True], [True]]])
+        >>> since_observed(mask).flatten().tolist()
+        [0.0, 1.0, 2.0, 3.0, 1.0]
+    """
+    steps = torch.ones_like(mask[..., :1], dtype=torch.get_default_dtype()) if gaps is None else gaps
+    clock = steps.double().cumsum(1)  # in double: a short gap late in a sequence is not lost
+    clock = (clock - clock[:, :1]).expand(mask.shape)
+    last = torch.where(mask, clock, 0.0).cummax(1).values
+    return (clock - torch.cat([clock[:, :1], last[:, :-1]], 1)).to(steps.dtype)
+
+
 def leaves(batch: Batch) -> dict[str, Tensor]:
     """Every tensor by name; those of a mapping under "name/key"."""
     flat: dict[str, Tensor] = {}
