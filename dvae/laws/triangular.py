@@ -107,6 +107,13 @@ def _from_diagonal(q: Normal, p: TriangularNormal) -> Tensor:
     return 0.5 * (distance + spread - p.event_shape[0]) - p.log_precision - q.scale.log().sum(-1)
 
 
+@register_kl(TriangularNormal, TriangularNormal)
+def _from_triangular(q: TriangularNormal, p: TriangularNormal) -> Tensor:
+    between = torch.linalg.solve_triangular(q.whitening.mT, p.whitening.mT, upper=True)  # (U_p U_q^-1)'
+    distance = (p.whiten(q.loc) ** 2).sum(-1) + (between**2).sum((-2, -1)) - p.event_shape[0]
+    return 0.5 * distance + q.log_precision - p.log_precision
+
+
 class InverseCholesky(torch.autograd.Function):
     """Symmetric positive definite S (..., D, D) to the lower triangular U with U'U = S^-1; nan where S is not that.
 

@@ -12,7 +12,7 @@ from .graphconv import GraphConv
 from .graphs import FrameGraph, NodeGraph
 from .linear import Linear
 from .recurrent import Recurrent
-from .sde import LinearSDE
+from .sde import LinearSDE, LinearSDEGuide
 from .whole import WholeDecoder, WholeEncoder
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "Input",
     "Linear",
     "LinearSDE",
+    "LinearSDEGuide",
     "Network",
     "NetworkSpec",
     "NodeGraph",

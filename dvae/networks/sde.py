@@ -13,14 +13,21 @@ Every stable linear equation whose noise spreads to all coordinates is a linear 
 some r vanish, and what reads z learns that map. So nothing grows in a gap however long, at the end of which z is as at
 the start; the first step of a sequence has no law of its own; and to leave out a step is to make one gap of two.
 
-(Särkkä and Solin, Applied Stochastic Differential Equations, 2019, chapter 6.)
+LinearSDEGuide has such a transition too, and makes a Gaussian potential of all else that it reads:
+
+    q(z_t | z_{t-1}, d_t, ...) = N(F z_{t-1}, Q) N(e_t; W_t' z_t, I) / constant
+
+With what a linear-Gaussian model's data from t on say of z_t for e_t and W_t, it is that model's exact posterior.
+
+(Särkkä and Solin, Applied Stochastic Differential Equations, 2019, chapter 6. A guide of the prior's transition and
+potentials that a network makes: Johnson et al., 2016, arXiv 1603.06277.)
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -28,7 +35,9 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from ..laws.triangular import InverseCholesky, Triangular, refuse_half
-from .base import Input, Network, at, shift, valid_steps
+from .base import Input, Network, NetworkSpec, at, once, shift, valid_steps
+from .recurrent import Recurrent
+from .rows import select
 
 ORDER = 22
 """Terms of the series over a gap of norm 1: in double precision the rest is below rounding, 2^22 / 23! = 2e-16."""
@@ -42,9 +51,10 @@ class LinearSDE:
         times: between which the coordinates' times of forgetting, 1 / r, are spread at the start; in the unit of gaps.
 
     Example:
-        >>> parts = {"p(z)": dvae.networks.LinearSDE()}, {"p(z)": dvae.laws.Triangular()}
+        >>> networks = {"p(z)": dvae.networks.LinearSDE(), "q(z)": dvae.networks.LinearSDEGuide()}
+        >>> laws = {"p(z)": dvae.laws.Triangular(), "q(z)": dvae.laws.Triangular()}
         >>> pair = "p(z_t | z_{t-1}, d_t) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T}, d_{1:T})"
-        >>> model = dvae.DynamicalVAE(*pair, {"z": 4, "x": 3, "d": 1}, *parts)
+        >>> model = dvae.DynamicalVAE(*pair, {"z": 4, "x": 3, "d": 1}, networks, laws)
         >>> model.sample(batch={"d": 10 * torch.rand(5, 20, 1) + 0.1})["x"].shape
         torch.Size([5, 20, 3])
     """
@@ -57,52 +67,126 @@ class LinearSDE:
         Raises:
             ValueError: other parents, or times that are not positive or not in order.
         """
-        if not 0 < self.times[0] <= self.times[1] < math.inf:
-            raise ValueError(f"times are positive, the shortest and the longest, but these are {self.times}")
         before = [p for p in inputs if p.lags == (-1,) and p.size == size]
         gaps = [p for p in inputs if p.lags == (0,) and p.size == 1]
         if not (local and len(before) == len(gaps) == 1 and len(inputs) == 2):
             raise ValueError(
                 "a LinearSDE network goes from a variable's last value over a gap of size 1, p(z_t | z_{t-1}, d_t), "
-                f"but for a child of size {size} the parents here are "
-                + ", ".join(f"{p.name} at {p.relation and p.relation.name} ({p.size})" for p in inputs)
+                + _but(inputs, size)
             )
-        return LinearSDENetwork(self, before[0], gaps[0])
+        return LinearSDENetwork(inputs, before[0], gaps[0].name, self.times)
 
 
-class LinearSDENetwork(Network):
-    """What `LinearSDE` describes; the features are location and whitening matrix, (..., D + D * D)."""
+@dataclass(frozen=True)
+class LinearSDEGuide:
+    """The transition of a `LinearSDE` times a Gaussian potential, for the law `laws.Triangular`; see the file.
 
-    law = Triangular
+    A network that only reads z_{t-1} beside the gap has to learn how z turns in any time before it can be near a prior
+    of little noise. This one turns with it from the start. `networks.base.share_modules(networks, "equation")` of both
+    factors' networks gives it the prior's own equation, which is then computed once for both.
 
-    def __init__(self, spec: LinearSDE, before: Input, gap: Input):
-        size = before.size
-        super().__init__([before, gap], True, size + size**2)
-        self.before, self.gap = before.name, gap.name
-        shortest, longest = map(math.log, spec.times)
+    Args:
+        potential: description of the network of the other parents that makes e_t and W_t.
+        times: see `LinearSDE`.
+        gap: name of the time since the step before, which `potential` reads too.
+    """
+
+    potential: NetworkSpec = field(default_factory=Recurrent)
+    times: tuple[float, float] = (1.0, 100.0)
+    gap: str = "d"
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> LinearSDEGuideNetwork:
+        """The network of a factor q(z_t | z_{t-1}, d_t, ...), for z of dimension `size`.
+
+        Raises:
+            ValueError: no last value or no gap among the parents.
+        """
+        before = [p for p in inputs if p.lags == (-1,) and p.size == size]
+        gaps = [p for p in inputs if p.name == self.gap and p.relation and p.relation.reads(0, 2) and p.size == 1]
+        if not (local and len(before) == len(gaps) == 1):
+            raise ValueError(
+                f"a LinearSDEGuide network goes from a variable's last value over a gap {self.gap} of size 1, such as "
+                f"q(z_t | z_{{t-1}}, x_{{1:T}}, {self.gap}_{{1:T}}), " + _but(inputs, size)
+            )
+        return LinearSDEGuideNetwork(self, inputs, before[0])
+
+
+def _but(inputs: Sequence[Input], size: int) -> str:
+    parents = ", ".join(f"{p.name} at {p.relation and p.relation.name} ({p.size})" for p in inputs)
+    return f"but for a child of size {size} the parents here are {parents}"
+
+
+class Equation(nn.Module):
+    """A and L L' in their coordinates, and what they do over gaps.
+
+    Args:
+        size: D.
+        times: see `LinearSDE`.
+    """
+
+    unit: Tensor
+
+    def __init__(self, size: int, times: tuple[float, float]):
+        super().__init__()
+        shortest, longest = times
+        if not 0 < shortest <= longest < math.inf:
+            raise ValueError(f"times are positive, the shortest and the longest, but these are {times}")
         places = (torch.arange(size) + 0.5) / size
-        self.log_rate = nn.Parameter(-shortest - (longest - shortest) * places)
+        self.log_rate = nn.Parameter(-math.log(shortest) - math.log(longest / shortest) * places)
         root = (0.5 * self.log_rate.detach()).exp()
-        self.turning = nn.Parameter(0.3 * torch.randn(size, size) * root * root[:, None])
+        self.turning = nn.Parameter(0.3 * shortest * torch.randn(size, size) * root * root[:, None])  # without unit
+        self.register_buffer("unit", torch.tensor(1 / shortest))
 
     @property
     def drift(self) -> Tensor:
         """A, (D, D)."""
-        return self.turning - self.turning.mT - self.log_rate.exp().diag()
+        return self.unit * (self.turning - self.turning.mT) - self.log_rate.exp().diag()
 
     @property
     def noise(self) -> Tensor:
         """L L', (D, D)."""
         return 2 * self.log_rate.exp().diag()
 
-    def over(self, gaps: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-        """F and the whitening matrix of Q, (..., D, D) each, over gaps (...); once for gaps that are equal.
+    def at_all(self, gaps: Tensor, lengths: Tensor | None, name: str) -> tuple[Tensor, Tensor]:
+        """F and the whitening matrix of Q, (B, T, D, D) each, at all steps.
 
         Args:
-            gaps: d.
-            first: (...) True where z is from its stationary law, whatever the gap.
+            gaps: d, (B, T, 1); that of the first step, before which there is nothing, is not read.
+            lengths: (B,) valid steps.
+            name: of the gaps.
+
+        Raises:
+            ValueError: gaps that are not positive.
         """
-        distinct = gaps[~first]
+
+        def compute() -> tuple[Tensor, Tensor]:
+            there = torch.ones_like(gaps[..., 0], dtype=torch.bool)
+            if lengths is not None:
+                there &= valid_steps(lengths, gaps.shape[1])
+            there[:, 0] = False
+            return self.over(gaps[..., 0], there, name)
+
+        return once(self, [gaps, lengths], compute)
+
+    def over(self, gaps: Tensor, there: Tensor, name: str, first: int = 0) -> tuple[Tensor, Tensor]:
+        """F and the whitening matrix of Q, (B, T, D, D) each; once for gaps that are equal.
+
+        Args:
+            gaps: d, (B, T).
+            there: (B, T) False where there is no step before, and z is from its stationary law.
+            name: of the gaps.
+            first: the number of the first step, counted from 0.
+
+        Raises:
+            ValueError: gaps that are not positive.
+        """
+        if (bad := there & ~((gaps > 0) & (gaps < math.inf))).any():
+            row, t = bad.nonzero()[0].tolist()
+            raise ValueError(
+                f"{name} is {gaps[row, t]:g} at step {first + t} of sequence {row}, counted from 0; a gap is the time "
+                "since the step before, in its own unit and above 0 (values at one time make one step)"
+            )
+        distinct = gaps[there]
         place = torch.arange(len(distinct), device=gaps.device)
         if not gaps.requires_grad:
             distinct, place = distinct.unique(return_inverse=True)
@@ -113,56 +197,127 @@ class LinearSDENetwork(Network):
             decay = torch.cat([decay, torch.zeros_like(self.turning)[None]])
             whitening = torch.cat([InverseCholesky.apply(covariance), torch.eye(len(self.turning)).to(decay)[None]])
         which = torch.full(gaps.shape, len(distinct), device=gaps.device)
-        which[~first] = place
+        which[there] = place
         return decay[which], whitening[which]
 
-    def refuse(self, gaps: Tensor, counted: Tensor, first: int = 0) -> None:
-        """Refuses gaps (B, T) that count and are not positive."""
-        if (bad := counted & ~((gaps > 0) & (gaps < math.inf))).any():
-            row, t = bad.nonzero()[0].tolist()
-            raise ValueError(
-                f"{self.gap} is {gaps[row, t]:g} at step {first + t} of sequence {row}, counted from 0; a gap is the "
-                "time since the step before, in its own unit and above 0 (values at one time make one step)"
-            )
 
-    def _transitions(self, gaps: Tensor, lengths: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Of all steps, (B, T, D, D) each, from gaps (B, T)."""
-        counted = torch.ones_like(gaps, dtype=torch.bool)
-        if lengths is not None:
-            counted &= valid_steps(lengths, gaps.shape[1])
-        counted[:, 0] = False  # nothing is before the first step
-        self.refuse(gaps, counted)
-        return self.over(gaps, ~counted)
+class LinearSDENetwork(Network):
+    """What `LinearSDE` describes; the features are location and whitening matrix, (..., D + D * D).
+
+    Args:
+        inputs: the parents.
+        before: that of them which is z_{t-1}.
+        gap: the name of that which is d_t.
+        times: see `LinearSDE`.
+    """
+
+    law = Triangular
+
+    def __init__(self, inputs: Sequence[Input], before: Input, gap: str, times: tuple[float, float]):
+        super().__init__(inputs, True, before.size + before.size**2)
+        self.before, self.gap, self.size = before.name, gap, before.size
+        self.equation: Any = Equation(before.size, times)
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        decay, whitening = self._transitions(parents[self.gap][..., 0], lengths)
-        return _features(decay, whitening, shift(parents[self.before], -1))
+        moved, whitening = self.equation.at_all(parents[self.gap], lengths, self.gap)
+        return _features(moved, None, whitening, shift(parents[self.before], -1))
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         made = None
         if self.gap in given:
-            made = tuple(part.unbind(1) for part in self._transitions(given[self.gap][..., 0], lengths))
+            made = tuple(part.unbind(1) for part in self.equation.at_all(given[self.gap], lengths, self.gap))
         return made, given[self.before].unbind(1) if self.before in given else None
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         made, known = state
-        if made is None:  # the loop draws the gaps too
-            gaps = drawn[self.gap][t]
-            self.refuse(gaps, torch.full_like(gaps, t > 0, dtype=torch.bool), t)
-            decay, whitening = self.over(gaps[:, 0], torch.full_like(gaps[:, 0], t == 0, dtype=torch.bool))
-        else:
-            decay, whitening = made[0][t], made[1][t]
-        before = at(drawn[self.before] if known is None else known, t - 1, decay, decay.shape[-1])
-        return _features(decay, whitening, before), state
+        moved, whitening = self.drawn_over(t, drawn) if made is None else (part[t] for part in made)
+        return _features(moved, None, whitening, self._last(known, t, drawn, moved)), state
+
+    def drawn_over(self, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
+        """F and the whitening matrix of Q, (B, D, D) each, over gaps that the loop draws too."""
+        gaps = drawn[self.gap][t]
+        moved, whitening = self.equation.over(gaps, torch.full_like(gaps, t > 0, dtype=torch.bool), self.gap, t)
+        return moved[:, 0], whitening[:, 0]
+
+    def _last(self, known: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], like: Tensor) -> Tensor:
+        return at(drawn[self.before] if known is None else known, t - 1, like, self.size)
 
 
-def _features(decay: Tensor, whitening: Tensor, before: Tensor) -> Tensor:
-    with torch.autocast(decay.device.type, enabled=False):
-        loc = (decay @ before.to(decay)[..., None])[..., 0]
-    return torch.cat([loc, whitening.flatten(-2)], dim=-1)
+class LinearSDEGuideNetwork(LinearSDENetwork):
+    """What `LinearSDEGuide` describes."""
+
+    def __init__(self, spec: LinearSDEGuide, inputs: Sequence[Input], before: Input):
+        super().__init__(inputs, before, spec.gap, spec.times)
+        size = before.size
+        self.potential = spec.potential.build([p for p in inputs if p is not before], True, size)
+        self.out = nn.Linear(self.potential.features, size + size**2)
+        with torch.no_grad():  # at the start, every coordinate is told with unit noise
+            self.out.weight[size:] *= 0.1
+            self.out.bias[size:] = torch.eye(size).flatten()
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        return _features(*self._at_all(parents, length, lengths), shift(parents[self.before], -1))
+
+    @override
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        if all(parent.name in given for parent in self.potential.inputs):
+            made = tuple(part.unbind(1) for part in self._at_all(given, length, lengths))
+            return made, given[self.before].unbind(1) if self.before in given else None, None
+        others = {parent.name: given[parent.name] for parent in self.potential.inputs if parent.name in given}
+        return *super().start(given, batch, length, lengths), self.potential.start(others, batch, length, lengths)
+
+    @override
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        made, known, potential = state
+        if potential is None:
+            moved, offset, whitening = (part[t] for part in made)
+            return _features(moved, offset, whitening, self._last(known, t, drawn, moved)), state
+        moved, whitening = self.drawn_over(t, drawn) if made is None else (part[t] for part in made)
+        features, potential = self.potential.step(potential, t, drawn)
+        last = self._last(known, t, drawn, moved)
+        return _features(*self.updated(moved, whitening, features), last), (made, known, potential)
+
+    @override
+    def select(self, state: Any, rows: Tensor) -> Any:
+        made, known, potential = state
+        return *select((made, known), rows), None if potential is None else self.potential.select(potential, rows)
+
+    def _at_all(
+        self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        moved, whitening = self.equation.at_all(parents[self.gap], lengths, self.gap)
+        others = {parent.name: parents[parent.name] for parent in self.potential.inputs}
+        return self.updated(moved, whitening, self.potential(others, length, lengths))
+
+    def updated(self, moved: Tensor, whitening: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """M, c and V of q(z_t | z_{t-1}, ...) = N(M z_{t-1} + c, (V'V)^-1): (..., D, D), (..., D) and (..., D, D).
+
+        With G = U'^-1 W, where U whitens Q, all that is inverted is I + G'G, which is near I over short gaps.
+
+        Args:
+            moved, whitening: F and U, (..., D, D) each.
+            features: (..., H) of the network of the other parents.
+        """
+        with torch.autocast(moved.device.type, enabled=False):
+            told, scale = self.out(features.to(moved)).split([self.size, self.size**2], dim=-1)
+            weight = scale.unflatten(-1, moved.shape[-2:])
+            g = torch.linalg.solve_triangular(whitening.mT, weight, upper=True)
+            identity = torch.eye(self.size, dtype=g.dtype, device=g.device)
+            # of T'T = I + G G', T lower triangular: the root of the matrix with rows and columns in reverse
+            root = torch.linalg.cholesky((identity + g @ g.mT).flip(-1, -2)).flip(-1, -2).mT
+            inner = torch.linalg.cholesky(identity + g.mT @ g)
+            gain = torch.linalg.solve_triangular(whitening, torch.cholesky_solve(g.mT, inner).mT, upper=False)
+            return moved - gain @ (weight.mT @ moved), (gain @ told[..., None])[..., 0], root @ whitening
+
+
+def _features(moved: Tensor, offset: Tensor | None, whitening: Tensor, before: Tensor) -> Tensor:
+    with torch.autocast(moved.device.type, enabled=False):
+        loc = (moved @ before.to(moved)[..., None])[..., 0]
+    return torch.cat([loc if offset is None else loc + offset, whitening.flatten(-2)], dim=-1)
 
 
 def transition(drift: Tensor, noise: Tensor, gaps: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,7 @@
 """The linear SDE: its transitions are those of the equation, over the shortest and the longest gaps."""
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar
 
@@ -9,13 +10,15 @@ import pytest
 import torch
 from scipy import integrate, linalg
 from torch.autograd import gradcheck
-from torch.distributions import MultivariateNormal
+from torch.distributions import MultivariateNormal, kl_divergence
 
 import dvae
 from dvae import DynamicalVAE, laws
 from dvae.laws.kalman import LinearGaussianChain
-from dvae.networks import Dense, Input, LinearSDE, Recurrent
-from dvae.networks.sde import transition
+from dvae.laws.triangular import TriangularNormal
+from dvae.networks import Dense, Input, LinearSDE, LinearSDEGuide, Network, Recurrent
+from dvae.networks.base import computing_once, share_modules
+from dvae.networks.sde import Equation, transition
 from dvae.relations import Relation
 from dvae.testing import FactorizationContract
 
@@ -91,15 +94,15 @@ def test_its_gradient_is_that_of_finite_differences():
 def test_single_precision_holds_from_the_shortest_gaps_to_the_longest(size):
     """Whether its coordinates forget at once or hardly ever: a covariance has a root, and both have their digits."""
     inputs = [Input("z", size, Relation.parse("t-1")), Input("d", 1, Relation.parse("t"))]
-    exact = LinearSDE((0.1, 1000.0)).build(inputs, True, size).double()
+    exact = LinearSDE((0.1, 1000.0)).build(inputs, True, size).equation.double()
     with torch.no_grad():
         exact.turning.mul_(3)
-    rough = LinearSDE().build(inputs, True, size)
+    rough = LinearSDE().build(inputs, True, size).equation
     rough.load_state_dict(exact.state_dict())
     gaps = 10.0 ** torch.arange(-8, 9)
-    first = torch.zeros(len(gaps), dtype=torch.bool)
-    decay, whitening = rough.over(gaps, first)
-    expected, root = exact.over(gaps.double(), first)
+    there = torch.ones(len(gaps), dtype=torch.bool)
+    decay, whitening = (part[0] for part in rough.over(gaps[None], there[None], "d"))
+    expected, root = (part[0] for part in exact.over(gaps[None].double(), there[None], "d"))
     torch.testing.assert_close(decay.double(), expected, rtol=0, atol=2e-6)
     # of what the exact law makes white, so that a direction of little noise counts as any other
     white = whitening.double() @ torch.linalg.inv(root)
@@ -112,7 +115,8 @@ def test_single_precision_holds_from_the_shortest_gaps_to_the_longest(size):
 
 def test_its_stationary_law_is_standard_normal_and_so_is_its_first_step():
     sde = network()
-    torch.testing.assert_close(sde.drift + sde.drift.mT + sde.noise, torch.zeros(3, 3).double())
+    equation = sde.equation
+    torch.testing.assert_close(equation.drift + equation.drift.mT + equation.noise, torch.zeros(3, 3).double())
     d = torch.tensor([[[-5.0], [1e6]], [[0.0], [0.2]]], dtype=torch.float64)
     loc, whitening = sde({"z": double(2, 2, 3), "d": d}, 2).split([3, 9], dim=-1)
     white = torch.eye(3).flatten().double()
@@ -131,10 +135,10 @@ def test_any_stable_equation_is_a_linear_map_of_one_of_these():
     into = torch.linalg.eigh(into @ noise @ into.mT)[1].mT @ into
     back = torch.linalg.inv(into)
     own = into @ drift @ back
-    sde = network(4)
+    sde = network(4).equation
     with torch.no_grad():
         sde.log_rate.copy_((-own.diagonal()).log())
-        sde.turning.copy_(own.tril(-1))
+        sde.turning.copy_(own.tril(-1) / sde.unit)
     torch.testing.assert_close(sde.drift, own, rtol=1e-9, atol=1e-9)
     gaps = torch.tensor([0.1, 2.0, 30.0], dtype=torch.float64)
     moved, spread = transition(drift, noise, gaps)
@@ -221,8 +225,12 @@ def test_gaps_that_are_drawn_are_refused_where_they_are_not_positive():
             r"the features of p\(z_t \| z_\{t-1\}, d_t\) by LinearSDE.* are the parameters of a laws\.Triangular, "
             r"but its law is Normal\(.*\); give it laws\.Triangular\(\)",
         ),
-        (lambda: LinearSDE((0.0, 1.0)).build([], True, 2), r"times are positive, .* but these are \(0\.0, 1\.0\)"),
-        (lambda: LinearSDE((2.0, 1.0)).build([], True, 2), r"times are positive, the shortest and the longest"),
+        (lambda: Equation(2, (0.0, 1.0)), r"times are positive, .* but these are \(0\.0, 1\.0\)"),
+        (lambda: Equation(2, (2.0, 1.0)), r"times are positive, the shortest and the longest"),
+        (
+            lambda: DynamicalVAE(*PAIR, {"z": 2, "x": 2, "d": 1}, {"q": LinearSDEGuide(gap="x")}),
+            r"over a gap x of size 1, such as q\(z_t \| z_\{t-1\}, x_\{1:T\}, x_\{1:T\}\), but for a child of size 2",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(make, message):
@@ -234,13 +242,14 @@ def test_what_does_not_fit_is_refused(make, message):
 
 
 class TestModel(FactorizationContract):
-    """All laws of the engine; gaps are positive, and that of the first step is not read."""
+    """All laws of the engine; gaps are positive, and that of the first step is read by no transition."""
 
     missing: ClassVar = {}
+    networks: ClassVar = {"p(z)": LinearSDE((0.5, 8.0)), "p(x)": Dense((4,)), "q": Recurrent(4)}
+    given: ClassVar = {"p(z)": laws.Triangular()}
 
     def build(self, size):
-        networks = {"p(z)": LinearSDE((0.5, 8.0)), "p(x)": Dense((4,)), "q": Recurrent(4)}
-        return DynamicalVAE(*PAIR, {"z": size, "x": size, "d": 1}, networks, {"p(z)": laws.Triangular()})
+        return DynamicalVAE(*PAIR, {"z": size, "x": size, "d": 1}, self.networks, self.given)
 
     def _data(self, *args, **kwargs):
         data = super()._data(*args, **kwargs)
@@ -254,9 +263,25 @@ class TestModel(FactorizationContract):
         return read
 
 
+class TestGuide(TestModel):
+    """With a guide that has a transition too."""
+
+    networks: ClassVar = {**TestModel.networks, "q": LinearSDEGuide(Recurrent(4), (0.5, 8.0))}
+    given: ClassVar = {"p(z)": laws.Triangular(), "q": laws.Triangular()}
+
+
+class TestShared(TestGuide):
+    """That is the prior's own."""
+
+    def build(self, size):
+        built = super().build(size)
+        share_modules([built.generator["z"].network, built.encoder["z"].network], "equation")
+        return built
+
+
 def kernel(built, times):
     """Covariance (T D, T D) of the stationary solution at these times (T,)."""
-    sde = built.generator["z"].network
+    sde = built.generator["z"].network.equation
     size, steps = len(sde.drift), len(times)
     found = torch.zeros(steps, size, steps, size, dtype=torch.float64)
     for t in range(steps):
@@ -281,8 +306,7 @@ def dense(built, times, kept=slice(None)):
 def filtered(built, times, x, seen=None):
     """log p(x) by the Kalman filter through the network's transitions."""
     _, (c, b, r) = dense(built, times)
-    gaps = times.diff(prepend=times[:1])[None]
-    moves, whitening = built.generator["z"].network._transitions(gaps, None)
+    moves, whitening = built.generator["z"].network.equation.at_all(gaps_of(times), None, "d")
     spread = torch.linalg.inv(whitening.mT @ whitening)
     counted = torch.ones(len(times), dtype=torch.float64) if seen is None else seen.double()
     weighted, e = c.mT @ torch.linalg.inv(r), x - b
@@ -298,6 +322,11 @@ def filtered(built, times, x, seen=None):
     mean, covariance = chain.predicted
     law = MultivariateNormal((c @ mean[..., None])[:, 0, :, 0] + b, c @ covariance[:, 0] @ c.mT + r)
     return (law.log_prob(x) * counted).sum()
+
+
+def gaps_of(times, n=1):
+    """(n, T, 1)."""
+    return times.diff(prepend=times[:1])[None, :, None].expand(n, -1, -1)
 
 
 def irregular(steps=7):
@@ -324,8 +353,7 @@ def test_a_step_that_is_left_out_makes_one_gap_of_two(left_out):
 
 def test_the_log_joint_is_that_of_the_equation_s_kernel():
     built, times, z, x = model(), irregular(), double(1, 7, 2), double(1, 7, 3)
-    gaps = times.diff(prepend=times[:1])[None, :, None]
-    found = built.log_joint({"x": x, "d": gaps}, {"z": z})["z"]
+    found = built.log_joint({"x": x, "d": gaps_of(times)}, {"z": z})["z"]
     law = MultivariateNormal(torch.zeros(14).double(), kernel(built, times))
     assert found.item() == pytest.approx(law.log_prob(z.flatten()).item(), abs=1e-8)
 
@@ -346,8 +374,7 @@ def test_half_precision_is_left_at_the_transition():
 def test_particles_estimate_the_evidence():
     built, times, x, n = model(guide=None, scale=1.0), irregular(), double(7, 3), 400
     expected = dense(built, times)[0].log_prob(x.flatten())
-    gaps = times.diff(prepend=times[:1])[None, :, None].expand(n, -1, -1)
-    found = dvae.particle_bound(built, {"x": x.expand(n, -1, -1), "d": gaps}, particles=100)
+    found = dvae.particle_bound(built, {"x": x.expand(n, -1, -1), "d": gaps_of(times, n)}, particles=100)
     ratio = (found.bound - expected).exp()
     assert ratio.std() < 1
     assert abs(ratio.mean() - 1) < 4 * ratio.std() / n**0.5
@@ -356,8 +383,7 @@ def test_particles_estimate_the_evidence():
 
 def test_free_runs_have_the_equation_s_covariance():
     built, times, n = model(), irregular(4), 20_000
-    gaps = times.diff(prepend=times[:1])[None, :, None].expand(n, -1, -1)
-    z = built.sample(batch={"d": gaps})["z"].flatten(1)
+    z = built.sample(batch={"d": gaps_of(times, n)})["z"].flatten(1)
     assert (torch.cov(z.T) - kernel(built, times)).abs().max() < 5 * (2 / n) ** 0.5
 
 
@@ -370,3 +396,160 @@ def test_a_forecast_goes_over_the_gaps_that_it_is_given():
     assert (z[:, :, 6].var(0) - 1).abs().max() < 5 * (2 / 2000) ** 0.5
     with pytest.raises(ValueError, match="expected 7 steps"):
         built.forecast({"x": x, "d": d[:, :5]}, horizon=2)
+
+
+# ----------------------------------------------------------------------------------------------------- of the guide
+
+
+@dataclass(frozen=True)
+class Told:
+    """Potentials that are what they are, (1, T, H), whatever the parents."""
+
+    features: torch.Tensor
+
+    def build(self, inputs, local, size):
+        return ToldNetwork(self, inputs)
+
+
+class ToldNetwork(Network):
+    def __init__(self, spec, inputs):
+        super().__init__(inputs, True, spec.features.shape[-1])
+        self.told = spec.features
+
+    def forward(self, parents, length, lengths=None):
+        return self.told.expand(len(parents["x"]), -1, -1)
+
+
+def potential(information, pull):
+    """Of N(e; W'z, I) for exp(h'z - z'Gz/2): W = root of G, e = W^-1 h; as features (D + D * D)."""
+    root = torch.linalg.cholesky(information)
+    return torch.cat([torch.linalg.solve(root, pull), root.flatten()])
+
+
+def exact(built, times, x):
+    """Features that make a guide the posterior: at every step, what all x from there on say of z."""
+    _, (c, b, r) = dense(built, times)
+    moves, whitening = (part[0] for part in built.generator["z"].network.equation.at_all(gaps_of(times), None, "d"))
+    spread = torch.linalg.inv(whitening.mT @ whitening)
+    weighted, rows, eye = c.mT @ torch.linalg.inv(r), [], torch.eye(2).double()
+    information, pull = torch.zeros(2, 2).double(), torch.zeros(2).double()
+    for t in range(len(times) - 1, -1, -1):
+        if t + 1 < len(times):
+            rest = moves[t + 1].mT @ torch.linalg.inv(eye + information @ spread[t + 1])
+            information, pull = rest @ information @ moves[t + 1], rest @ pull
+        information, pull = information + weighted @ c, pull + weighted @ (x[t] - b)
+        rows.append(potential(0.5 * (information + information.mT), pull))
+    return torch.stack(rows[::-1])[None]
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7])
+def test_the_guide_of_a_linear_model_s_messages_is_its_posterior(steps):
+    built, times, x = model(), irregular(steps), double(steps, 3)
+    with torch.no_grad():
+        features = exact(built, times, x)
+    spec = LinearSDEGuide(Told(features), (0.5, 8.0))
+    networks, given = {**built.networks, "q": spec}, {**built.laws, "q": laws.Triangular()}
+    guided = DynamicalVAE(*PAIR, {"z": 2, "x": 3, "d": 1}, networks, given).double()
+    guided.generator.load_state_dict(built.generator.state_dict())
+    share_modules([guided.generator["z"].network, guided.encoder["z"].network], "equation")
+    guide = guided.encoder["z"].network
+    guide.out = torch.nn.Identity()
+    evidence = dense(built, times)[0].log_prob(x.flatten())
+    batch = {"x": x.expand(5, -1, -1), "d": gaps_of(times, 5)}
+    for found in (
+        dvae.importance_bound(guided, batch, 1).bound,
+        dvae.particle_bound(guided, batch, 3, resample_below=0).bound,  # on the way weights differ: it knows the future
+    ):
+        torch.testing.assert_close(found, evidence.expand(5), rtol=0, atol=1e-8)  # of every draw
+
+
+def guide(**options):
+    inputs = [
+        Input("z", 3, Relation.parse("t-1")),
+        Input("x", 2, Relation.parse("1:T")),
+        Input("y", 2, Relation.parse("<=t")),
+        Input("d", 1, Relation.parse("<=t")),
+    ]
+    built = LinearSDEGuide(Recurrent(4, hidden=(5,)), (0.5, 8.0), **options).build(inputs, True, 3).double()
+    with torch.no_grad():
+        built.out.weight.add_(0.2 * torch.randn_like(built.out.weight))
+    return built
+
+
+def test_the_guide_is_the_transition_times_the_potential():
+    sde = guide()
+    moved, whitening = sde.equation.over(torch.tensor([GAPS], dtype=torch.float64), torch.ones(1, 7).bool(), "d")
+    features = double(1, 7, sde.potential.features)
+    m, c, v = (part[0] for part in sde.updated(moved, whitening, features))
+    told, weight = sde.out(features)[0].split([3, 9], -1)
+    weight, before = weight.unflatten(-1, (3, 3)), double(3)
+    precision = whitening[0].mT @ whitening[0] + weight @ weight.mT
+    pull = whitening[0].mT @ whitening[0] @ moved[0] @ before + (weight @ told[..., None])[..., 0]
+    torch.testing.assert_close(v.tril(), v)
+    assert (v.diagonal(dim1=-2, dim2=-1) > 0).all()
+    torch.testing.assert_close(v.mT @ v, precision, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(m @ before + c, torch.linalg.solve(precision, pull), rtol=1e-8, atol=1e-9)
+
+
+def test_single_precision_holds_for_the_guide_too():
+    """Its mean, in units of its own scale, from gaps in which nothing happens to those in which all is forgotten."""
+    sde, before = guide(), double(17, 3)
+    gaps, there = 10.0 ** torch.arange(-8, 9, dtype=torch.float64)[None], torch.ones(1, 17).bool()
+    features = double(1, 17, sde.potential.features)
+    m, c, v = (part[0] for part in sde.updated(*sde.equation.over(gaps, there, "d"), features))
+    sde.float()
+    made = sde.updated(*sde.equation.over(gaps.float(), there, "d"), features.float())
+    rough_m, rough_c, rough_v = (part[0] for part in made)
+    loc = (m @ before[..., None])[..., 0] + c
+    rough = (rough_m @ before.float()[..., None])[..., 0] + rough_c
+    white = (v @ (rough.double() - loc)[..., None])[..., 0]
+    assert white.abs().max() < 1e-2  # at 1e-8, a scale of 1e-4 beside values of 1
+    between = rough_v.double() @ torch.linalg.inv(v)
+    torch.testing.assert_close(between, torch.eye(3).double().expand_as(between), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("given", ["zxyd", "xyd", "zxd", "xd", "x"])
+def test_one_step_at_a_time_is_all_steps_at_once_in_the_guide(given):
+    sde = guide()
+    values = {name: double(4, 6, parent.size) for name, parent in zip("zxyd", sde.inputs, strict=True)}
+    values["d"] = values["d"].exp()
+    expected, rows = sde(values, 6), torch.tensor([2, 2, 0])
+    known = {name: values[name] for name in given}
+    state, moved = sde.start(known, 4, 6), sde.select(sde.start(known, 4, 6), rows)
+    drawn = {name: values[name].unbind(1) for name in values if name not in given}
+    for t in range(6):
+        features, state = sde.step(state, t, drawn)
+        torch.testing.assert_close(features, expected[:, t], rtol=1e-10, atol=1e-10)
+        chosen, moved = sde.step(moved, t, {name: [v[rows] for v in value] for name, value in drawn.items()})
+        torch.testing.assert_close(chosen, features[rows])
+
+
+def test_gradients_of_the_guide_are_those_of_finite_differences():
+    sde = guide()
+    values = {name: double(2, 4, parent.size) for name, parent in zip("zxyd", sde.inputs, strict=True)}
+    values["d"] = values["d"].exp()
+    assert gradcheck(lambda *_: sde(values, 4), [*sde.equation.parameters(), *sde.out.parameters()], atol=1e-4)
+
+
+def test_an_equation_that_is_shared_is_solved_once(monkeypatch):
+    solved = []
+    monkeypatch.setattr("dvae.networks.sde.transition", lambda *args: solved.append(args) or transition(*args))
+    built = TestShared().build(2)
+    batch = {"x": torch.randn(3, 5, 2), "d": torch.rand(3, 5, 1) + 0.1}
+    dvae.SequenceELBO().terms(built, batch)
+    assert len(solved) == 1
+    with computing_once():
+        dvae.SequenceELBO().terms(TestGuide().build(2), batch)
+    assert len(solved) == 3
+
+
+def test_the_divergence_of_two_normals_with_full_covariance_is_exact():
+    made = []
+    for _ in range(2):
+        root, loc = double(4, 3, 3).tril(-1), double(4, 3)
+        root += torch.diag_embed(torch.rand(4, 3, dtype=torch.float64) + 0.3)
+        whole = MultivariateNormal(loc, precision_matrix=root.mT @ root)
+        made.append((TriangularNormal(loc, root), whole))
+    (q, whole_q), (p, whole_p) = made
+    torch.testing.assert_close(kl_divergence(q, p), kl_divergence(whole_q, whole_p))
+    assert kl_divergence(q, q).abs().max() < 1e-12
