@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, NoReturn
@@ -220,6 +220,26 @@ class Factorization:
         """The prior as a guide: the factors of the latents, as q. Without latents it has no factor."""
         observed = tuple(observed)
         return Factorization("q", tuple(replace(f, kind="q") for f in self.factors if f.child not in observed))
+
+    def given(self, local: Iterable[str], static: Iterable[str], but: Collection[str] = ()) -> Factorization:
+        """The same with context that factors read too: those of local variables at t, those of static latents nothing.
+
+        A static variable of a guide reads all steps of local context.
+
+        Args:
+            local, static: names of the context.
+            but: factors that read none, such as "p(z)".
+        """
+        factors = []
+        for factor in self.factors:
+            if f"{factor.kind}({factor.child})" in but or not (factor.local or factor.parents):
+                factors.append(factor)
+                continue
+            relation = Relation.of([(0, 0)]) if factor.local else ALL
+            own = [Parent(name, True, relation) for name in local] + [Parent(name, False) for name in static]
+            known = {parent.name for parent in factor.parents}
+            factors.append(replace(factor, parents=(*factor.parents, *(p for p in own if p.name not in known))))
+        return replace(self, factors=tuple(factors))
 
     def local(self, name: str) -> bool:
         """True for a variable with one value per time step, False for one per sequence."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
+from .laws.base import LawSpec
 from .options import Frames, Size, check
 from .views import View
 
@@ -40,6 +41,21 @@ class Schema:
     def view(self) -> View:
         """What models see of the data."""
         return View()
+
+    @property
+    def emission(self) -> LawSpec | None:
+        """The law of x that suits the data, where they say one."""
+        return None
+
+    @property
+    def covariates(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Names of local and of static context that methods have their factors read, where the data have such."""
+        return (), ()
+
+    @property
+    def units(self) -> Mapping[str, tuple[Sequence[float], Sequence[float]]]:
+        """Variable to means and scales of its coordinates, by which networks read and make it without unit."""
+        return {}
 
     def size(self, name: str) -> int:
         """The size of a variable.

@@ -10,6 +10,8 @@ unit where it is made (`Head.in_units`, the push-forward), so that given scales 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -19,15 +21,22 @@ class Units(nn.Module):
 
     Args:
         size: D.
+        columns: a scale for every coordinate, as of columns of a table.
     """
 
     mean: Tensor
     scale: Tensor
 
-    def __init__(self, size: int):
+    def __init__(self, size: int, columns: bool = False):
         super().__init__()
         self.register_buffer("mean", torch.zeros(size))
-        self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("scale", torch.ones(size if columns else ()))
+
+    @torch.no_grad()
+    def set(self, mean: Sequence[float], scale: Sequence[float]) -> None:
+        """Takes a mean and a scale for each coordinate; it must have been made for `columns`."""
+        self.mean.copy_(self.mean.new_tensor(mean))
+        self.scale.copy_(self.scale.new_tensor(scale))
 
     @torch.no_grad()
     def fit(self, values: Tensor) -> None:
@@ -43,7 +52,8 @@ class Units(nn.Module):
                 f"{'' if rows.shape[1:] != self.mean.shape else ' without variance'}"
             )
         self.mean.copy_(rows.mean(0))
-        self.scale.copy_(rows.var(0).mean().sqrt())
+        variance = rows.var(0)
+        self.scale.copy_((variance if self.scale.dim() else variance.mean()).sqrt())
 
     def forward(self, values: Tensor) -> Tensor:
         """Values (..., D) without unit."""
@@ -55,4 +65,5 @@ class Units(nn.Module):
 
     def log_det(self, values: Tensor) -> Tensor:
         """(B,) log of the determinant of the Jacobian of `forward` at values (B, ..., D)."""
-        return -self.scale.log().expand(len(values)) * values[0].numel()
+        each: Tensor = -self.scale.log().mean() * values[0].numel()
+        return each.expand(len(values))

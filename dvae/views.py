@@ -112,6 +112,21 @@ class View:
         return log_det.sum(-1)
 
 
+@dataclass(frozen=True)
+class Offered(View):
+    """The data as they are, beside context that a model need not read.
+
+    Args:
+        names: of the context, which batches may hold whether the model has such variables or not.
+    """
+
+    names: tuple[str, ...] = ()
+
+    @override
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        return {name: value for name, value in seen.items() if name not in self.names}
+
+
 class Views(View):
     """Views one after the other.
 

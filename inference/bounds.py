@@ -11,6 +11,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from torch.distributions import kl_divergence
 from ..graph import analytic_kl
 from ..networks.base import computing_once
 from ..program.batch import AnyBatch, repeat
+from ..program.groups import GROUP, Groups
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, Sequence
 from ..turns import alone
@@ -343,24 +345,42 @@ def importance_bound(
         if not model.latents:
             evidence = _log_weights(model, data, options)
             return ImportanceBound(evidence, torch.zeros_like(evidence), particles)
-        return importance_mean(lambda count: _log_weights(model, repeat(data, count), options), size, particles, chunk)
+        groups = Groups.of(data[GROUP]) if model.grouped and GROUP in data else None
+        weights = partial(_repeated_weights, model, data, options)
+        return importance_mean(weights, size, particles, chunk, groups)
 
 
 def importance_mean(
-    log_weights_of: Callable[[int], Tensor], size: int, particles: int, chunk: int = 4096
+    log_weights_of: Callable[[int], Tensor],
+    size: int,
+    particles: int,
+    chunk: int = 4096,
+    groups: Groups | None = None,
 ) -> ImportanceBound:
     """The log of the mean weight of every sequence, and the shape of the weights' tail.
+
+    Sequences that share latents have one weight together, and each an equal share of its logarithm.
 
     Args:
         log_weights_of: from a number n of particles to the logs (n B,) of weights, particle by particle.
         size: B.
         particles: K.
         chunk: sequences times particles to hold at once.
+        groups: of sequences that share latents.
     """
     at_once = max(1, min(particles, chunk // size))
     counts = [min(at_once, particles - first) for first in range(0, particles, at_once)]
     log_weights = torch.cat([log_weights_of(count).unflatten(0, (count, size)) for count in counts])
-    return ImportanceBound(log_weights.logsumexp(0) - math.log(particles), _khat(log_weights), particles)
+    if groups is not None:
+        log_weights = groups.summed(log_weights)
+    bound, khat = log_weights.logsumexp(0) - math.log(particles), _khat(log_weights)
+    if groups is not None:
+        bound, khat = groups.dealt(bound), khat[groups.place]
+    return ImportanceBound(bound, khat, particles)
+
+
+def _repeated_weights(model: DynamicalVAE, data: AnyBatch, options: Mapping[str, Any], count: int) -> Tensor:
+    return _log_weights(model, repeat(data, count), options)
 
 
 def _log_weights(model: DynamicalVAE, batch: AnyBatch, options: Mapping[str, Any]) -> Tensor:

@@ -27,6 +27,7 @@ from ..networks.rows import Rows, pick, select
 from ..notation import Factor, Parent
 from ..program.batch import AnyBatch
 from ..program.conditional import Conditional, like
+from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout
 from ..turns import alone
@@ -347,6 +348,11 @@ def _waits(factor: Factor, names: set[str]) -> bool:
 def _check_order(model: DynamicalVAE, run: Rollout) -> None:
     """Refuses what cannot be drawn and weighed forward, step by step."""
     instead = "use importance_bound"
+    if run.groups is not None:
+        raise ValueError(
+            f"particles are of one sequence each, but groups share {', '.join(model.grouped)}; {instead}, or leave "
+            f"{GROUP!r} out of the batch, where every sequence is a group"
+        )
     for block in model.inference.blocks:
         if block.direction < 0:
             raise ValueError(

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from ..data import each
 from ..program.batch import AnyBatch, repeat
+from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from ..turns import alone
 from ..views import LOG_DET
@@ -63,6 +64,8 @@ def predictive_bound(
     data = model.read(batch)
     size, length = data[model.observed[0]].shape[:2]
     observed -= model.view.past  # the others are context, and given anyhow
+    if model.grouped and GROUP in data:
+        raise ValueError(f"groups share {', '.join(model.grouped)}, and a log score is of one sequence; leave it out")
     if "lengths" in data:
         raise ValueError("a log score needs sequences of one length, but these have lengths")
     first = 0 if model.view.past else 1

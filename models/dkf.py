@@ -113,6 +113,7 @@ class DKF(LatentMethod):
     source = "Krishnan, Shalit and Sontag, 2015, arXiv 1511.05121"
     generative = "p(z_t | z_{t-1}) p(x_t | z_t)"
     inference = "q(z_t | z_{t-1}, x_{t:T})"
+    apart = ("p(z)", "q(z)")
 
     width: Size = 64
     embed: Extra = 64

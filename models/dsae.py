@@ -116,6 +116,7 @@ class DSAE(LatentMethod):
     source = "Li and Mandt, 2018, arXiv 1803.02991"
     generative = "p(w) p(z_t | z_{<t}) p(x_t | z_t, w)"
     inference = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
+    apart = ("q(z)", "q(w)")
 
     static: Size = 16
     width: Size = 64

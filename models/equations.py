@@ -26,6 +26,7 @@ class Equations(LatentMethod):
         network: "recurrent", "attention", "dense" or "linear", for every factor.
         width: of the networks.
         latents: sizes of the latents, where they differ from `latent`.
+        grouped: static latents that the sequences of a group share, see `dvae.program.groups`.
     """
 
     name = "equations"
@@ -37,6 +38,7 @@ class Equations(LatentMethod):
     network: str = "recurrent"
     width: Size = 64
     latents: dict[str, Size] = field(default_factory=dict)
+    grouped: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -67,6 +69,11 @@ class Equations(LatentMethod):
         return {"default": kinds[self.network]}
 
     @override
+    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        """With what groups share."""
+        return {**super().described(sizes), "grouped": self.grouped}
+
+    @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model; `residual` holds where p(x_t | ...) reads x_{t-1}, and gradients flow through fed means."""
-        return DynamicalVAE(**self.described(Schema.of(data).sizes))
+        """The model of these equations and no others; gradients flow through fed means."""
+        return self.suited_to(Schema.of(data), extended=False)

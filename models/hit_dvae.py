@@ -150,7 +150,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.loss == "best-of-many" and self.emission not in ("fixed", "unit"):
+        if self.loss == "best-of-many" and self.emission not in (None, "fixed", "unit"):
             raise ValueError(
                 f"emission={self.emission!r} needs loss='evidence'; with best-of-many it is 'fixed' or 'unit'"
             )
@@ -217,11 +217,11 @@ class HiTDVAE(EnergyMethod, LatentMethod):
                 described["laws"]["p(x)"] = Directions(residual=method.residual) if method.bones else fitted
             model: DynamicalVAE = HiTModel(method, schema.skeleton, observed, **described)
         else:
-            model = DynamicalVAE(**described)
+            model = method.suited_to(schema, extended=True)
         if method.pose_width:
             for side in (model.generator, model.encoder):
                 share("x", *(conditional.network for conditional in side.values() if conditional.network is not None))
-        if self.standardise:
+        if self.standardise and not schema.units:
             model.standardise(WHOLE)
         kept = 0 if self.feed_observed else observed
         model.feeding = SelfFeeding(0.0, self.feeding_passes or None, self.feeding_gradient, kept)
@@ -262,10 +262,10 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         start_priors(model, windows)
         if isinstance(model, EnergyModel):
             super().start(model, windows)
-        if self.standardise:
+        if self.standardise and not model.units[WHOLE].scale.dim():  # those of columns are known
             poses = model.read(windows.sample(1024, torch.default_generator))
             model.units[WHOLE].fit(bridged(poses[WHOLE], poses.get("mask", {}).get(WHOLE)))
-            if self.emission == "fixed" and not self.bones:
+            if self.emission in (None, "fixed") and not self.bones:
                 nn.init.zeros_(model.generator[WHOLE].law.log_scale)
 
     @override

@@ -74,6 +74,7 @@ class KVAE(LatentMethod):
     source = "Fraccaro et al., 2017, arXiv 1710.05741"
     generative = "p(a_t | a_{<t}) p(x_t | a_t)"
     inference = "q(a_t | x_t)"
+    apart = ("p(a)",)
 
     latent: Annotated[int, Range(1, 256)] = 8
     auxiliary: Annotated[int, Range(1, 256)] = 16
@@ -103,10 +104,9 @@ class KVAE(LatentMethod):
         return {**super().laws(), "p(a)": Triangular()}
 
     @override
-    def build(self, data: Any) -> KalmanVAE:
-        """The model of these equations."""
-        schema = Schema.of(data)
-        return KalmanVAE(**self.described(schema.sizes), view=schema.view)
+    def build(self, data: Any) -> DynamicalVAE:
+        """The model of these equations, that integrates out frames that are missing."""
+        return self.suited_to(Schema.of(data), extended=True, kind=KalmanVAE)
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:

@@ -66,7 +66,7 @@ class Method(Trainable):
         """What a `DynamicalVAE` is built from, for data of these sizes."""
         generative, inference = self.equations()
         given = {"generative": generative, "inference": inference, "sizes": {**self.sizes(), **sizes}}
-        return {**given, "network": self.networks(), "laws": self.laws()}
+        return {**given, "network": self.networks(), "laws": dict(self.laws())}
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ class LikelihoodMethod(Method):
 
     Args:
         emission: distribution of x: "fixed" (normal, one learned scale per coordinate), "unit" (normal, variance 1),
-            "normal" (scale read from the parents) or "student" (Student t).
+            "normal" (scale read from the parents) or "student" (Student t). Where it is left open, what the columns of
+            a table say, or "fixed".
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1, an offset, one step
             ahead is sharp, but a free run can drift without bound; somewhat less forgets where it was.
         self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over a
@@ -85,27 +86,51 @@ class LikelihoodMethod(Method):
             x.
     """
 
-    emission: Literal["fixed", "unit", "normal", "student"] = "fixed"
+    apart: ClassVar[tuple[str, ...]] = ()
+    """Factors that read no covariates, such as "p(z)"."""
+
+    emission: Literal["fixed", "unit", "normal", "student"] | None = None
     residual: Share = 0.0
     self_feeding: Share = 0.0
 
     @override
     def laws(self) -> Mapping[str, LawSpec]:
-        """Laws by factor: that of x."""
+        """Laws by factor: that of x, where the data say none."""
         emissions: dict[str, LawSpec] = {
             "normal": Normal(residual=self.residual),
             "fixed": FixedNormal(scale=0.1, learned=True, residual=self.residual),
             "unit": FixedNormal(residual=self.residual),
             "student": StudentT(residual=self.residual),
         }
-        return {"p(x)": emissions[self.emission]}
+        return {"p(x)": emissions[self.emission or "fixed"]}
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model of these equations."""
-        schema = Schema.of(data)
-        model = DynamicalVAE(**self.described(schema.sizes), view=schema.view)
+        """The model of these equations, whose factors read the covariates of the data too."""
+        model = self.suited_to(Schema.of(data), extended=True)
         model.feeding = SelfFeeding(0.0, gradient=False)
+        return model
+
+    def suited_to(self, schema: Schema, extended: bool, kind: type[DynamicalVAE] = DynamicalVAE) -> DynamicalVAE:
+        """The model for data, with their law and their units.
+
+        Args:
+            schema: of the data.
+            extended: whether factors read the covariates of the data too, whatever the equations say.
+            kind: of the model.
+        """
+        generative, inference = self.equations()
+        names = {name for part in (generative, inference) for name in (*part.variables, *part.context)}
+        if extended:
+            generative, inference = (part.given(*schema.covariates, self.apart) for part in (generative, inference))
+            names |= {name for part in schema.covariates for name in part}
+        described = self.described({name: size for name, size in schema.sizes.items() if name in names})
+        described |= {"generative": generative, "inference": inference}
+        if schema.emission is not None and self.emission is None:
+            described["laws"]["p(x)"] = schema.emission
+        model = kind(**described, view=schema.view)
+        for name, (mean, scale) in schema.units.items():
+            model.standardise(name, columns=True).set(mean, scale)
         return model
 
     @override

@@ -18,6 +18,7 @@ LAYERS = {
     "dvae": 0,
     "dvae.inference": 1,
     "dvae.motion": 2,
+    "dvae.tables": 2,
     "dvae.models": 3,
     "dvae.runs": 4,
     "dvae.report": 4,

@@ -10,6 +10,7 @@ import tyro
 from .. import motion
 from ..motion.dataset import SIMULATED
 from ..motion.files import reading, writing
+from . import tables
 from .console import ERROR, OUT, Missing, UsageError
 
 ONTO = {skeleton.name: skeleton for skeleton in (motion.WALKER, motion.HUMAN36M, motion.HUMANEVA)}
@@ -31,8 +32,9 @@ def data(
     skip_bad: bool = False,
     missing: Missing = False,
 ) -> None:
-    """Look into motion files, convert them, or get some.
+    """Look into motion files and tables, convert motion, or get some.
 
+    info of a table says what its columns probably are, as a schema to correct: --out riders.toml writes it.
     info says what they hold: splits, clips, skeleton, how units and axes were understood, how rigid bones are, labels.
     convert writes them anew: --out motion.npz holds all clips; a folder, with --format, gets a file for each.
     get cmu downloads recordings of the CMU Graphics Lab into the folder --out, and checks them.
@@ -52,9 +54,14 @@ def data(
         skip_bad: leave out clips that cannot be used, and list them, instead of refusing the file.
     """
     if action == "info":
-        if out or format or fps or onto or url:
-            raise UsageError("--out, --format, --fps, --onto and --url are of convert and get; info writes nothing")
-        for file in files:
+        if format or fps or onto or url:
+            raise UsageError("--format, --fps, --onto and --url are of convert and get")
+        found = [file for file in files if tables.is_table(file)]
+        if out and len(found) < len(files):
+            raise UsageError("--out takes the schema that info proposes for a table; of motion info writes nothing")
+        if found:
+            tables.info(found, out)
+        for file in files if not found else [file for file in files if file not in found]:
             OUT.print(_read(file, metres, up, recorded, skip_bad, missing).info())
         return
     if out is None:

@@ -32,6 +32,7 @@ from ..runs import directory as runs
 from ..runs.kinds import DATA
 from ..runs.sweep import sweep as sweep_methods
 from .console import OUT, Missing, UsageError, arguments, at_least
+from .tables import is_table
 
 DEFAULT = Training(decay=0.5)
 """How the command line trains, where it is not told."""
@@ -81,10 +82,10 @@ else:
 
 @dataclass(frozen=True)
 class DataOptions:
-    """Motion data to fit to.
+    """Data to fit to: motion, or a table.
 
     Args:
-        data: a motion file or a folder of them, or "simulated".
+        data: a motion file or a folder of them, or "simulated"; or a table: CSV, TSV, Parquet or npz.
         skip_bad: leave out clips that cannot be used instead of refusing the file.
         protocol: how windows are cut, by default as suits the skeleton.
         representation: what the model sees: positions; or turns of joints in this form, and bones then keep their
@@ -93,6 +94,18 @@ class DataOptions:
         scaling: of motion-latent: of turns, less no turn, or less their mean and by their deviation.
         warped: of motion-latent: time goes along the most typical gait cycles, instead of evenly.
         bodies: of motion-latent: deviation of shapes of bodies that are drawn for training segments; 0 for their own.
+        columns: of a table: what is modelled, each as NAME, NAME:FAMILY or NAME:FAMILY:UNIT, such as
+            riders:count:people. Without it, all that is nothing else; a schema beside the file says the same.
+        covariates: of a table: columns that forecasts are given for the future too, such as a calendar.
+        past: of a table: columns that forecasts are given up to the present.
+        static: of a table: columns with one value a sequence.
+        id: of a table: columns that tell sequences apart.
+        time: of a table: column of dates or numbers.
+        group: of a table: column that is the same within a sequence.
+        observed: of a table: steps that a forecast is given.
+        horizon: of a table: steps to forecast.
+        stride: of a table: steps from one test window to the next.
+        split: of a table: what is divided into training, validation and test.
     """
 
     data: str = SIMULATED
@@ -104,6 +117,17 @@ class DataOptions:
     scaling: Literal["identity", "deviation"] = "identity"
     warped: bool = False
     bodies: Amount = 1.0
+    columns: tuple[str, ...] = ()
+    covariates: tuple[str, ...] = ()
+    past: tuple[str, ...] = ()
+    static: tuple[str, ...] = ()
+    id: tuple[str, ...] = ()
+    time: str | None = None
+    group: str | None = None
+    observed: int | None = None
+    horizon: int | None = None
+    stride: int | None = None
+    split: Literal["sequence", "time", "group"] | None = None
 
     def open(self, *methods: Trainable) -> Any:
         """The data on which methods are fitted, of one kind.
@@ -116,14 +140,24 @@ class DataOptions:
             said = " and ".join(f"{name} on {kind}" for kind, name in kinds.items())
             raise UsageError(f"methods are fitted on data of their kind, {said}; give those of one kind")
         ((kind, name),) = kinds.items()
+        if kind == "motion" and (is_table(self.data) or any(getattr(self, each) for each in OF_KINDS["panel"])):
+            kind = "panel"
         given = {option: value for option, value in vars(self).items() if value != getattr(DataOptions, option)}
         for other, options in OF_KINDS.items():
-            if other != kind and (strange := given.keys() & {*options}):
+            if other != kind and (strange := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
                 raise UsageError(f"--{min(strange)} is about {other}, and {name} is fitted on {kind}")
-        return DATA[kind].open(given.pop("data", SIMULATED), **given)
+        with arguments() if kind == "panel" else nullcontext():  # of which columns are arguments
+            return DATA[kind].open(given.pop("data", SIMULATED), **given)
 
 
-OF_KINDS = {"motion": ("protocol", "representation", "missing"), "segments": ("cut", "scaling", "warped", "bodies")}
+OF_KINDS = {
+    "motion": ("protocol", "representation", "missing", "skip_bad"),
+    "segments": ("cut", "scaling", "warped", "bodies", "skip_bad"),
+    "panel": (
+        *("columns", "covariates", "past", "static", "id", "time", "group"),
+        *("observed", "horizon", "stride", "split"),
+    ),
+}
 """Options by the kind of data that has them."""
 
 
@@ -134,7 +168,7 @@ def fit(
     source: DataOptions,
     tensorboard: bool = False,
 ) -> None:
-    """Fit a method, or equations of your own, to motion data.
+    """Fit a method, or equations of your own, to motion or to a table.
 
     Options may stand before or after the method; `dvae fit METHOD --help` lists those of a method.
 
@@ -269,6 +303,10 @@ def _use(name: str, run: Path) -> str:
         what = "the poses of forecasts" if name == "pose-prior" else "forecasts"
         option = "--pose-prior" if name == "pose-prior" else "--classifier"
         return f"score {what} with: dvae evaluate RUN {option} {run}"
+    if Run(run).config["data"].get("kind") == "panel":
+        return (
+            f"score it with: dvae evaluate {run}, forecast with: dvae forecast {run} --out FILE.csv --figure FILE.png"
+        )
     if methods()[name].fitted_on == "segments":
         between = f"go from one segment to another with: dvae interpolate {run} --from CLIP --to CLIP"
         return (

@@ -20,8 +20,9 @@ from ..motion.dataset import SIMULATED
 from ..motion.files.writing import format_of
 from ..options import nearest
 from ..runs import directory as runs
+from . import tables
 from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, save_figure
-from .opening import data_of, load_run
+from .opening import data_of, kind_of, load_run
 
 
 def forecast(
@@ -35,8 +36,12 @@ def forecast(
     data: str | None = None,
     missing: Missing = False,
     figure: Path | None = None,
+    beyond: bool = False,
 ) -> None:
-    """Forecast the test windows, or those of one clip, many times each.
+    """Forecast the test windows, or those of one clip or sequence, many times each.
+
+    Of a table, a CSV or Parquet gets a row for each window, step and column, with mean and quantiles, an npz the draws;
+    --figure draws their fans.
 
     A name that ends in .bvh gets the first future of the window that moves most, after what was observed of it; one
     without an ending is a new folder, and gets a BVH file for every window and future: Blender opens these.
@@ -48,8 +53,9 @@ def forecast(
     Args:
         run: the run directory.
         out: the npz file to write, a BVH file, or a folder of these.
-        clip: name of a clip, or split/name where the name is not unique; of any split.
+        clip: name of a clip, or split/name where the name is not unique; of a table, of a sequence; of any split.
         horizon: frames to forecast; by default those of the protocol.
+        beyond: of a table: what comes after its last row with a target, from rows behind that with known covariates.
         samples: forecasts of each window.
         fix: parts of the body, such as lower, or static latents, of which all forecasts of a window share one draw.
         seed: of the draws.
@@ -57,6 +63,13 @@ def forecast(
         figure: save a figure of the first window's futures.
     """
     at_least(1, samples=samples, horizon=horizon)
+    if kind_of([run], data) == "panel":
+        if fix or missing:
+            raise UsageError(f"--{'fix' if fix else 'missing'} is about motion, and {run} is of a table")
+        tables.forecast(run, out, clip, horizon, samples, seed, data, figure, beyond)
+        return
+    if beyond:
+        raise UsageError(f"--beyond is about tables, and {run} is of motion")
     suffix = out.suffix.lower()
     check_files(out, figure, ".npz", ".bvh", "")
     loaded = load_run(run, data)
@@ -165,6 +178,11 @@ def impute(
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
     """
     at_least(1, samples=samples)
+    if kind_of([run], data) == "panel":
+        if out is None or filled is not None or clip is not None:
+            raise UsageError("of a table, impute writes --out FILE.csv, .parquet or .npz")
+        tables.impute(run, out, samples, seed, data)
+        return
     check_files(out, None, ".npz")
     if out is None and filled is None:
         raise UsageError("impute writes files; say which, by --out or --filled")

@@ -15,13 +15,14 @@ import tyro
 from .. import files, motion
 from ..inference.calibration import calibrate
 from ..inference.checkpoints import CheckpointError, Run
-from ..inference.checks import predictive_checks
+from ..inference.checks import STATISTICS, predictive_checks
 from ..inference.compare import compare as compare_models
 from ..inference.evaluate import evaluate as evaluate_models
+from ..inference.scores import proper
 from ..models.trajectories import TrajectoryModel
 from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
-from . import opening
+from . import opening, tables
 from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, note, save_figure
 from .futures import joint_names
 
@@ -166,7 +167,33 @@ def _segments(paths: Sequence[Path], data: str | None, how: Judged, **settings: 
     return result, opening.record("evaluation", loaded[0], opened)
 
 
-SCORERS = {"motion": _forecasts, "segments": _segments}
+def _tables(paths: Sequence[Path], data: str | None, how: Judged, **settings: Any) -> tuple[Any, str]:
+    """Scores of forecasts of a table's test windows, and what to call them."""
+    odd = [
+        name
+        for name in ("pose_prior", "classifier", "control", "missing")
+        if getattr(how, name) != getattr(Judged, name)
+    ]
+    if odd:
+        raise UsageError(f"--{odd[0].replace('_', '-')} is about motion, and {paths[0]} is of a table")
+    loaded = opening.alike(paths, data, "panel")
+    opened = opening.data_of(data, *loaded)
+    opening.note_unfinished(loaded)
+    called = dict(zip(opening.names(loaded), loaded, strict=True))
+    result = evaluate_models(
+        {name: each.model for name, each in called.items()},
+        tables.windows(loaded[0], opened),
+        scores=tables.scores,
+        samples=how.samples,
+        log_score_particles=how.log_score_particles,
+        training_windows=opened.windows("train+validation") if opening.own(loaded[0], opened) else None,
+        configs={name: Run(each.path).config for name, each in called.items()},
+        **settings,
+    )
+    return result, opening.record("evaluation", loaded[0], opened)
+
+
+SCORERS = {"motion": _forecasts, "segments": _segments, "panel": _tables}
 """What `evaluate` does with runs, by the kind of their data."""
 
 
@@ -178,6 +205,8 @@ def _keep(result: Any, paths: Sequence[Path], figure: Path | None) -> None:
         ERROR.print(f"wrote {path}")
     if figure is not None:
         save_figure(result.plot(), figure)
+        if "PIT" in {name for row in getattr(result, "rows", {}).values() for name in getattr(row, "histograms", {})}:
+            save_figure(result.plot_calibration(), figure.with_stem(f"{figure.stem}-calibration"))
 
 
 def criticise(
@@ -216,16 +245,18 @@ def criticise(
     at_least(1, simulations=simulations, draws=draws, ranked_steps=ranked_steps, batch_size=batch_size)
     at_least(19, samples=samples)
     check_files(out, figure, ".json")
-    loaded = opening.load_run(run, data)
+    kind = opening.kind_of([run], data)
+    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion")
     opening.note_unfinished([loaded])
     opened, model = opening.data_of(data, loaded, missing=missing), loaded.model
-    windows = opened.windows("test")
+    windows: Any = tables.windows(loaded, opened) if kind == "panel" else opened.windows("test")
     steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
     document: dict[str, Any] = {}
     path = out or run / f"{opening.record('criticism', loaded, opened)}.json"
     if model.context:
         ERROR.print(
-            f"no calibration: sequences are simulated from nothing, but {loaded.method.name} starts from a pose"
+            f"no calibration: sequences are simulated from nothing, but {loaded.method.name} is given "
+            f"{', '.join(model.context)}"
         )
     elif not model.latents:
         ERROR.print(f"no calibration: {loaded.method.name} has no latents, and so no guide")
@@ -235,7 +266,7 @@ def criticise(
     checks = predictive_checks(
         {loaded.method.name: model},
         windows,
-        motion.statistics(windows),
+        STATISTICS if kind == "panel" else motion.statistics(windows),
         samples=samples,
         draw_emission=draw_emission and not isinstance(model, TrajectoryModel),
         seed=seed,
@@ -262,7 +293,7 @@ def compare(
     contrasts: int = 128,
     samples: int = 50,
     forecasts: bool = True,
-    draw_emission: bool = False,
+    draw_emission: bool | None = None,
     stride: int | None = None,
     seed: int = 0,
     batch_size: int = 32,
@@ -281,7 +312,7 @@ def compare(
         contrasts: windows among which the information of latents is measured; 0 leaves it out.
         samples: forecasts of each window.
         forecasts: score forecasts too, which takes longest.
-        draw_emission: forecast draws of x instead of its means.
+        draw_emission: forecast draws of x, or its means; by default means, but of discrete data.
         stride: frames between the starts of test windows, in place of the protocol's: more is faster.
         seed: of the draws.
         batch_size: windows scored at once.
@@ -291,15 +322,17 @@ def compare(
     at_least(1, particles=particles, estimates=estimates, samples=samples, batch_size=batch_size, stride=stride)
     at_least(0, contrasts=contrasts)
     check_files(out, figure, ".json")
-    loaded, opened = opening.on_the_same_data(run, data, missing)
+    kind = opening.kind_of(run, data)
+    loaded = opening.alike(run, data, kind if kind == "panel" else "motion")
+    opened = opening.data_of(data, *loaded, missing=missing)
     if stopped := opening.unfinished(loaded):
         raise ValueError("\n".join(stopped))
-    protocol = opened.protocol if stride is None else replace(opened.protocol, test_stride=stride)
+    windows, judged = _compared(loaded[0], opened, stride)
     shown = opening.rows(loaded)
     result = compare_models(
         {name: [each.model for each in row] for name, row in shown.items()},
-        motion.windows(opened.motion, protocol, "test"),
-        scores=motion.scores,
+        windows,
+        scores=judged,
         particles=particles,
         estimates=estimates,
         contrasts=contrasts,
@@ -310,6 +343,17 @@ def compare(
         configs={name: opening.config_without_seed(row[0]) for name, row in shown.items()},
     )
     _keep(result, [] if out is None else [out], figure)
+
+
+def _compared(first: runs.Loaded, opened: Any, stride: int | None) -> tuple[Any, Any]:
+    """Test windows, so far apart, and what forecasts of them are scored by."""
+    if first.config.kind == "panel":
+        schema = (
+            opened.schema if stride is None else replace(opened.schema, cut=replace(opened.schema.cut, stride=stride))
+        )
+        return tables.windows(first, replace(opened, schema=schema)), proper
+    protocol = opened.protocol if stride is None else replace(opened.protocol, test_stride=stride)
+    return motion.windows(opened.motion, protocol, "test"), motion.scores
 
 
 def _pose_prior(path: Path, data: str | None, skeleton: motion.Skeleton) -> Any:

@@ -16,6 +16,7 @@ from ..networks.base import once, valid_steps
 from ..notation import Factorization
 from ..views import LOG_DET, WHOLE, View
 from .conditional import Conditional
+from .groups import GROUP, Groups
 from .rollout import Rollout
 
 CHUNK = 2048
@@ -37,6 +38,7 @@ class Reader:
         made: those of the data that are functions of their parents, which a program is not given.
         laws: conditionals of the data, which say where values are and which are one event.
         density: whether the data have one, of which a view that changes volume has to tell.
+        grouped: names of static latents that groups of sequences share.
     """
 
     sizes: Mapping[str, int]
@@ -48,6 +50,7 @@ class Reader:
     made: frozenset[str]
     laws: Mapping[str, Conditional]
     density: bool
+    grouped: tuple[str, ...]
 
     def read(self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor]) -> dict[str, Any]:
         """The batch by name, in this precision, as the model sees it; what was read stays as it is.
@@ -69,7 +72,7 @@ class Reader:
                 raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
             batch = {whole: batch}
         if unknown := [
-            name for name in batch if name not in (*names, *self.extras, "lengths", "mask", LOG_DET, BESIDE)
+            name for name in batch if name not in (*names, *self.extras, "lengths", "mask", GROUP, LOG_DET, BESIDE)
         ]:
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
@@ -130,6 +133,7 @@ class Reader:
             ValueError: a batch that cannot be read.
         """
         lengths, masks = values.get("lengths"), values.get("mask", {})
+        groups = Groups.of(values[GROUP]) if self.grouped and GROUP in values else None
         values = {name: value for name, value in values.items() if name in self.sizes}
         for name, value in values.items():
             self.check(name, value)
@@ -162,6 +166,8 @@ class Reader:
             lengths=lengths,
             observed={name: masks[name] for name in self.observed if name in masks},
             prefix={name: values[name] for name in prefix},
+            groups=groups,
+            grouped=self.grouped,
         )
 
     def _extend_history(self, factorization: Factorization, values: dict[str, Any], length: int) -> None:
@@ -269,9 +275,13 @@ def shapes(values: Mapping[str, Tensor]) -> str:
 
 
 def repeat(value: Any, samples: int) -> Any:
-    """A batch, or a tensor (B, ...), `samples` times over: (samples * B, ...), sample by sample."""
+    """A batch, or a tensor (B, ...), `samples` times over: (samples * B, ...), sample by sample.
+
+    Each time its groups are others.
+    """
     if isinstance(value, Mapping):
-        return {name: repeat(v, samples) for name, v in value.items()}
+        found = {name: repeat(v, samples) for name, v in value.items()}
+        return found | ({GROUP: Groups.of(value[GROUP]).again(samples).place} if GROUP in value else {})
     return value.repeat(samples, *[1] * (value.dim() - 1))
 
 

@@ -18,6 +18,7 @@ from ..networks.base import Input, Network, NetworkSpec, at, once_valid, presenc
 from ..networks.rows import Rows
 from ..notation import Factor
 from ..units import Units
+from .groups import Groups
 
 CONSTANT = "1"
 """What the network of a guide's factor without parents reads."""
@@ -182,14 +183,20 @@ class Conditional(nn.Module):
         return torch.where(counted if counted.dim() == value.dim() else counted[..., None], value, self.inside)
 
     def forward(
-        self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None
+        self,
+        parents: Mapping[str, Tensor],
+        batch: int,
+        length: int,
+        lengths: Tensor | None = None,
+        groups: Groups | None = None,
     ) -> Parameters:
-        """The law's parameters at all steps, (B, T, D), or (B, D) for a static child."""
+        """The law's parameters at all steps, (B, T, D), or (B, D) for a static child, of which groups share one."""
         if self.network is None:
             shape = (batch, length, 0) if self.factor.local else (batch, 0)
             return self._in_units(self.law(like(self.law).new_empty(shape)))
         read = self._read(parents, batch, lengths)
         features = self.network(read, length, lengths)
+        features = features if groups is None else groups.pooled(features)
         previous = None
         if self.law.residual:
             previous = shift((parents if self._made_in is None else read)[self.factor.child], -1)

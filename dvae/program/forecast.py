@@ -15,6 +15,7 @@ from torch import Tensor
 from ..views import WHOLE
 from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like
+from .groups import GROUP
 
 
 def forecast(
@@ -69,7 +70,7 @@ def forecast(
         return model.shown({**made, **again}) if again else made  # as it was given: the way there and back rounds
 
     with model._evaluating():
-        return in_chunks(futures, size, samples, chunk)
+        return in_chunks(futures, size, samples, _together(model, data, size, chunk))
 
 
 def _fixed(
@@ -112,20 +113,44 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
         return model.shown(made, rows(data, part))
 
     with model._evaluating():
-        return in_chunks(means, whole.batch, samples, chunk)
+        return in_chunks(means, whole.batch, samples, _together(model, data, whole.batch, chunk))
 
 
-def impute(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
-    """The data, with means given latents from the guide where they are missing."""
+def impute(model: Any, batch: AnyBatch, samples: int, chunk: int, draw: bool | None) -> dict[str, Tensor]:
+    """The data, where they are missing with means given latents from the guide, or draws one after the other."""
     given: Any = batch if isinstance(batch, Mapping) else {}
     masks = given.get("mask", {})
     masks = masks if isinstance(masks, Mapping) else {WHOLE if model.view.parts else model.observed[0]: masks}
     if not masks:
         raise ValueError("nothing is missing in this batch; give a 'mask' that is False where entries are to be filled")
-    made, found = model.reconstruct(batch, samples, chunk=chunk), {}
+    drawn = any(map(model.drawn, model.observed)) if draw is None else draw
+    made = _filled(model, batch, samples, chunk) if drawn else model.reconstruct(batch, samples, chunk=chunk)
+    found = {}
     for name, mask in masks.items():
         value = made[name]
         lacking = mask.shape[1] - value.shape[2]  # frames that the model starts from, and does not make
         value = torch.cat([value[:, :, :1].expand(-1, -1, lacking, -1), value], 2)
         found[name] = torch.where(torch.as_tensor(mask), torch.as_tensor(given[name]).to(value), value)
     return found
+
+
+def _filled(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
+    """The data with draws of what is missing, each given latents from the guide and what came before it."""
+    data = model.read(batch)
+    whole = model._rollout(model.inference, model.encoder, data, None, 1)  # refuses what cannot be read
+
+    def draws(part: slice, count: int) -> dict[str, Tensor]:
+        some = repeat(rows(data, part), count)
+        rollout = model._rollout(model.generative, model.generator, some, None, 1)
+        rollout.drawing = True
+        rollout.values.update(model.guide(some))
+        values = {name: {**rollout.values, **rollout.history(name)}[name] for name in model.observed}
+        return model.shown({n: v.unflatten(0, (count, -1)) for n, v in values.items()}, rows(data, part))
+
+    with model._evaluating():
+        return in_chunks(draws, whole.batch, samples, _together(model, data, whole.batch, chunk))
+
+
+def _together(model: Any, data: Mapping[str, Any], size: int, chunk: int) -> int:
+    """The most sequences times samples at once: at least all sequences, where groups of them share latents."""
+    return max(chunk, size) if model.grouped and GROUP in data else chunk

@@ -58,6 +58,8 @@ class DynamicalVAE(nn.Module):
         view: what the model sees of the data, such as their parts; as it is where nothing is said (see `dvae.views`).
         shared: static context that the programs draw themselves, once for all sequences of a batch, where it does not
             hold it: name to law. A forecast draws it once for each sample.
+        grouped: static latents that the sequences of a group share, of which a batch says "group" (B,); see
+            `dvae.program.groups`. Without that every sequence is a group.
 
     Raises:
         ValueError: equations that cannot be read or do not fit together; sizes missing or unknown.
@@ -86,6 +88,7 @@ class DynamicalVAE(nn.Module):
         *,
         view: View | None = None,
         shared: Mapping[str, Subset] | None = None,
+        grouped: Collection[str] = (),
     ):
         super().__init__()
         self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
@@ -116,6 +119,8 @@ class DynamicalVAE(nn.Module):
                     f"{name} is to be drawn once for all sequences, so that it is static context: a parent without a "
                     f"factor of its own, such as in p(x_t | {name}); context is {', '.join(self.context) or 'nothing'}"
                 )
+        self.grouped = tuple(grouped)
+        self._check_grouped()
         roots, rest = ([f for f in self.generative.factors if bool(f.parents) == more] for more in (False, True))
         self.generator: Any = self._conditionals(rest)
         guides = {} if inference is None else self._conditionals(self.inference.factors)
@@ -137,6 +142,7 @@ class DynamicalVAE(nn.Module):
             frozenset(name for name in self.view.parts or () if self.generator[name].law.deterministic),
             {name: self.generator[name] for name in self.observed},
             self.likelihood,
+            self.grouped,
         )
         self.units: Any = nn.ModuleDict()
 
@@ -162,6 +168,17 @@ class DynamicalVAE(nn.Module):
             }
         )
 
+    def _check_grouped(self) -> None:
+        for name in self.grouped:
+            if name not in self.latents or self.generative.local(name):
+                raise ValueError(f"groups share static latents, and {name!r} is none of {self.generative.text!r}")
+            others = [p.name for p in self.generative.factor(name).parents if p.name not in self.grouped]
+            if others:
+                raise ValueError(
+                    f"{self.generative.factor(name)} reads {', '.join(others)}, which sequences of a group have each "
+                    "their own; what a group shares is made of what groups share"
+                )
+
     def _check_latents(self) -> None:
         for name in self.latents:
             for conditional in (self.generator[name], self.encoder[name]):
@@ -173,19 +190,23 @@ class DynamicalVAE(nn.Module):
                         f"laws.Normal(), or name {name} as observed where it is data"
                     )
 
-    def standardise(self, name: str) -> Units:
-        """Has networks read a variable without unit, by a mean and a scale that `fit` of the result takes.
+    def standardise(self, name: str, columns: bool = False) -> Units:
+        """Has networks read a variable without unit, by a mean and a scale that `fit` or `set` of the result takes.
 
         They make it without unit too where its law is a location and a scale (`Law.location_scale`); probabilities
         and rates are made as they are. Densities and values stay in the variable's own unit; call it before the model
         is fitted.
+
+        Args:
+            name: of the variable.
+            columns: a scale for each coordinate, as of columns of a table, in place of one for all.
 
         Raises:
             ValueError: an unknown variable.
         """
         if name not in self.sizes:
             raise ValueError(f"no variable {name!r}; there are {', '.join(self.sizes)}")
-        self.units[name] = Units(self.sizes[name])
+        self.units[name] = Units(self.sizes[name], columns)
         for conditional in (*self.generator.values(), *self.encoder.values()):
             conditional.units[name] = self.units[name]
         return self.units[name]
@@ -397,16 +418,20 @@ class DynamicalVAE(nn.Module):
 
     @alone
     @torch.no_grad()
-    def impute(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
-        """The data with their missing entries filled in, S times: as observed, or means given latents from the guide.
+    def impute(
+        self, batch: AnyBatch, samples: int = 1, *, draw: bool | None = None, chunk: int = CHUNK
+    ) -> dict[str, Tensor]:
+        """The data with their missing entries filled in, S times: as observed, or given latents of the guide.
 
-        The guide reads all that was observed, before and after a gap. How far samples differ says how sure the model is
-        of an entry, but for the noise of the emission. Frames that a model starts from and does not make, as the first
-        pose of those along paths, take the places of the first frame that it makes.
+        The guide reads all that was observed, before and after a gap. Means differ as far as latents do; draws of an
+        entry have the noise of the emission too, and a later entry reads an earlier one that was drawn. What was
+        observed after a gap is told by the latents alone. Frames that a model starts from and does not make, as the
+        first pose of those along paths, take the places of the first frame that it makes.
 
         Args:
             batch: with a "mask", see `model`.
             samples: S, draws of the latents for each sequence.
+            draw: draw the missing entries, or take their means; None for what `drawn` says.
             chunk: sequences times samples to hold at once, beside the result.
 
         Returns:
@@ -415,7 +440,7 @@ class DynamicalVAE(nn.Module):
         Raises:
             ValueError: a batch without a mask.
         """
-        return impute(self, batch, samples, chunk)
+        return impute(self, batch, samples, chunk, draw)
 
     @alone
     @torch.no_grad()

@@ -22,6 +22,7 @@ from ..laws.base import Parameters
 from ..networks.base import presence, valid_steps
 from ..notation import Block, Factorization
 from .conditional import Conditional, like
+from .groups import Grouped, Groups
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,9 @@ class Rollout:
         mean_emission: names of data variables that are not drawn but set to their means.
         feeding: self-feeding of the data's history, or None.
         draws: how many rows each sequence of the data has by now (see `fork`).
+        drawing: what the model may not read is drawn, in place of the model's own mean.
+        groups: which sequences share values of the `grouped` variables, or None where each is a group.
+        grouped: names of static latents that groups share.
     """
 
     factorization: Factorization
@@ -105,6 +109,9 @@ class Rollout:
     mean_emission: Collection[str] = ()
     feeding: SelfFeeding | None = None
     draws: int = 1
+    drawing: bool = False
+    groups: Groups | None = None
+    grouped: Collection[str] = ()
 
     def __post_init__(self) -> None:
         _check_custom_masks(self.factorization, self.length)
@@ -139,6 +146,7 @@ class Rollout:
             observed=again(self.observed),
             present=again(self.present),
             prefix=again(self.prefix),
+            groups=None if self.groups is None else self.groups.again(n),
         )
 
     def law(self, name: str, draws: int = 1) -> TorchDistribution:
@@ -152,11 +160,12 @@ class Rollout:
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)
-        known = {**self.known, **self.history(name)}
-        parameters = conditional(known, self.batch, self.length, self.lengths)
+        known, groups = {**self.known, **self.history(name)}, self.groups if name in self.grouped else None
+        parameters = conditional(known, self.batch, self.length, self.lengths, groups)
         law = conditional.law.distribution(tuple(p.repeat(draws, *[1] * (p.dim() - 1)) for p in parameters))
         mask = self.mask(name)
-        return (law if mask is None else law.mask(mask)).to_event(1 - len(law.event_shape))
+        law = (law if mask is None else law.mask(mask)).to_event(1 - len(law.event_shape))
+        return law if groups is None else Grouped(law, groups.again(draws))
 
     @property
     def known(self) -> dict[str, Tensor]:
@@ -274,7 +283,7 @@ class Rollout:
                 (self.batch, self.length, self.conditionals[name].size), like(self.conditionals[name])
             )
             for name in live
-            if hidden is None and name not in self.mean_emission
+            if (hidden is None or self.drawing) and name not in self.mean_emission
         }
         if loop:
             return self._loop(block, live, given, noise, hidden)

@@ -14,11 +14,17 @@ SCHEMAS = Registry(
         "sequences": "dvae.schema:Schema",
         "poses": "dvae.motion.protocols:Poses",
         "segments": "dvae.motion.segments.embodied:SegmentSchema",
+        "panel": "dvae.tables.encoding:PanelSchema",
     },
     "dvae.schemas",
 )
 DATA = Registry(
-    {"motion": "dvae.motion.dataset:MotionData", "segments": "dvae.motion.segments.dataset:SegmentData"}, "dvae.data"
+    {
+        "motion": "dvae.motion.dataset:MotionData",
+        "segments": "dvae.motion.segments.dataset:SegmentData",
+        "panel": "dvae.tables.dataset:PanelData",
+    },
+    "dvae.data",
 )
 """Kinds of schemas and of data, by the name that a config gives them."""
 

@@ -1,0 +1,13 @@
+"""Tables: sequences of numbers, counts and classes with covariates, from whatever holds them, as data to fit to.
+
+>>> import pandas as pd
+>>> frame = pd.DataFrame({"day": range(6), "riders": [3, 5, 2, 4, 6, 1], "open": [1, 1, 0, 1, 1, 0]})
+>>> table = dvae.tables.Panel.of(frame)
+>>> {column.name: column.family for column in table.columns.targets}
+{'riders': 'count', 'open': 'binary'}
+"""
+
+from .columns import Column, Columns
+from .panel import Panel, Series
+
+__all__ = ["Column", "Columns", "Panel", "Series"]

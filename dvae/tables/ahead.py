@@ -1,0 +1,64 @@
+"""The windows at the end of a table: what was observed last, and the steps after it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .encoding import PanelSchema
+from .panel import Panel, Series
+from .windows import PanelWindows
+
+
+def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> PanelWindows:
+    """One window for each sequence, whose future is after the last row that has a target.
+
+    Rows behind that one hold covariates that are known in the future, their targets empty.
+
+    Args:
+        panel: the sequences.
+        schema: of the run.
+        horizon: steps of the future; by default those of the schema.
+
+    Raises:
+        ValueError: whole sequences; sequences shorter than what is observed; or covariates that the future lacks,
+            saying which, and of which sequence.
+    """
+    observed, steps = schema.cut.observed, horizon or schema.cut.horizon
+    if observed is None or steps is None:
+        raise ValueError("whole sequences have no horizon; fit with observed and horizon steps to forecast")
+    targets = [schema.places[column.name] for column in schema.columns.targets]
+    known = schema.columns.of("known")
+    found = []
+    for one in panel:
+        present = int(np.flatnonzero(~np.isnan(one.values[:, targets]).all(1)).max(initial=-1)) + 1
+        if present < observed:
+            raise ValueError(
+                f"sequence {one.name!r} has {present} steps up to its last target, and {observed} are to be observed"
+            )
+        future = one.values[present : present + steps]
+        missing = [c.name for c in known if np.isnan(future[:, schema.places[c.name]]).any() or len(future) < steps]
+        if missing:
+            raise ValueError(
+                f"a forecast of {steps} steps needs {', '.join(missing)}, known in the future too, and sequence "
+                f"{one.name!r} has {len(future)} rows after its last target at row {present - 1}; append rows with "
+                f"{'these' if len(missing) > 1 else 'it'} to the table, their targets empty"
+            )
+        if len(future) < steps:
+            future = np.concatenate([future, np.full((steps - len(future), future.shape[1]), np.nan)])
+        values = np.concatenate([one.values[present - observed : present], future])
+        values[observed:, targets] = np.nan
+        found.append(Series(one.name, values, _times(one, present - observed, len(values)), one.group))
+    cut = replace(schema.cut, horizon=steps, split="sequence")
+    return PanelWindows(replace(panel, series=found), replace(schema, cut=cut), "all")
+
+
+def _times(one: Series, first: int, count: int) -> np.ndarray | None:
+    """Times of so many steps, behind the last one as far apart as the median of them all."""
+    if one.times is None:
+        return None
+    times = one.times[first : first + count]
+    lacking = count - len(times)
+    step = np.median(np.diff(one.times)) if len(one) > 1 else 1.0
+    return np.concatenate([times, times[-1] + step * np.arange(1, lacking + 1)])

@@ -1,0 +1,207 @@
+"""Columns: what each column of a table holds and what it is for, as a small schema that stands beside the file.
+
+id = ["station"]                      # tell sequences apart
+time = "date"
+group = "region"                      # of sequences, for panels
+split = "part"                        # train, validation or test, where the data say it
+
+[columns.riders]                      # a target, if not told otherwise
+family = "count"                      # one of dvae.laws.FAMILIES
+unit = "people"
+
+[columns.temperature]
+role = "known"                        # a covariate that a forecast is given for the future too, such as a plan
+unit = "°C"
+
+[columns.weather]
+role = "past"                         # one that ends with the present
+family = "category"
+classes = ["clear", "rain"]
+
+[columns.height]
+role = "static"                       # one value for each sequence
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal, Self
+
+from ..laws.family import FAMILIES
+from ..options import check, nearest, tuples
+
+Role = Literal["target", "known", "past", "static"]
+WHOLE_STEPS = ("correlated",)
+"""Families whose columns are one event together."""
+MOST = 4096
+"""Columns, and classes of one."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column.
+
+    Args:
+        name: of the column.
+        role: "target" for data that are modelled, "known" or "past" for covariates that are known in the future too or
+            end with the present, "static" for one value a sequence.
+        family: of the values, one of `dvae.laws.FAMILIES`; of covariates "category" or "real".
+        unit: in which the values are, for tables and pictures.
+        classes: of a category, in the order of its coordinates.
+
+    Raises:
+        ValueError: a family that is none, or a category without classes.
+    """
+
+    name: str
+    role: Role = "target"
+    family: str = "real"
+    unit: str = ""
+    classes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check(self)
+        known = FAMILIES if self.role == "target" else ("real", "category")
+        if self.family not in known:
+            raise ValueError(
+                f"column {self.name!r} has family {self.family!r}{nearest(self.family, known)}; a {self.role} has one "
+                f"of {', '.join(known)}"
+            )
+        if (self.family == "category") != bool(self.classes):
+            raise ValueError(
+                f"column {self.name!r} is of family {self.family!r} and has {len(self.classes)} classes; a category, "
+                'and nothing else, has classes = ["…", "…"]'
+            )
+        if len(set(self.classes)) < len(self.classes) or len(self.classes) == 1:
+            raise ValueError(
+                f"column {self.name!r} has the classes {', '.join(self.classes)}; two or more, all different"
+            )
+
+    @property
+    def coordinates(self) -> list[str]:
+        """Names of its coordinates: of a category one for each class."""
+        return [f"{self.name}={each}" for each in self.classes] or [self.name]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What the columns of a table are.
+
+    Args:
+        columns: those that are read, in order.
+        id: names of the columns that tell sequences apart; none for one sequence.
+        time: name of the column that orders them, dates or numbers; rows as they stand, where there is none.
+        group: name of a column that is the same within each sequence, for panels.
+        split: name of a column that says "train", "validation" or "test".
+
+    Raises:
+        ValueError: two columns of one name, or no target.
+    """
+
+    columns: tuple[Column, ...]
+    id: tuple[str, ...] = ()
+    time: str | None = None
+    group: str | None = None
+    split: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.targets:
+            raise ValueError(
+                f"no column is a target; given are {', '.join(each.name for each in self.columns) or 'none'}"
+            )
+        names = [*(each.name for each in self.columns), *self.id, *filter(None, (self.time, self.split))]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise ValueError(f"{', '.join(sorted(twice))} has two parts to play; every column has one")
+        if len(names) > MOST:
+            raise ValueError(f"{len(names)} columns; at most {MOST} are read")
+
+    def of(self, *roles: Role) -> list[Column]:
+        """The columns that play one of these roles."""
+        return [column for column in self.columns if column.role in roles]
+
+    @property
+    def targets(self) -> list[Column]:
+        """The columns that are modelled."""
+        return self.of("target")
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns that are read."""
+        return [column.name for column in self.columns]
+
+    @property
+    def needed(self) -> list[str]:
+        """Names of all columns that a table must have."""
+        return [*self.id, *filter(None, (self.time, self.group, self.split)), *self.names]
+
+    def config(self) -> dict[str, Any]:
+        """It in JSON's types; `from_config` reads it."""
+        found: dict[str, Any] = {"id": list(self.id), "time": self.time, "group": self.group, "split": self.split}
+        columns = {}
+        for column in self.columns:
+            own = {field.name: getattr(column, field.name) for field in fields(Column) if field.name != "name"}
+            columns[column.name] = {**own, "classes": list(column.classes)}
+        return {**found, "columns": columns}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """What `config` wrote, or a person in TOML; columns are real targets where nothing is said.
+
+        Raises:
+            ValueError: entries that are none, with the nearest known one.
+        """
+        rest = {**config}
+        columns = rest.pop("columns", {})
+        if not isinstance(columns, Mapping):
+            raise ValueError(f"columns is {columns!r}; expected a table for each column, such as [columns.riders]")
+        _refuse_others(rest, (field.name for field in fields(cls)), "the schema")
+        found = []
+        for name, told in columns.items():
+            if not isinstance(told, Mapping):
+                raise ValueError(f"column {name!r} is {told!r}; expected a table, [columns.{name}]")
+            _refuse_others(told, (field.name for field in fields(Column)), f"column {name!r}")
+            found.append(Column(name, **tuples(told)))
+        own = rest.get("id") or ()
+        rest["id"] = (own,) if isinstance(own, str) else tuple(own)
+        for name in ("time", "group", "split"):
+            if not isinstance(rest.get(name), str | None):
+                raise ValueError(f"{name} is {rest[name]!r}; expected the name of a column")
+        return cls(tuple(found), **rest)
+
+    def to_toml(self) -> str:
+        """The schema as a file to be edited."""
+        lines = [f"id = [{', '.join(map(_quoted, self.id))}]"] if self.id else []
+        lines += [f"{name} = {_quoted(value)}" for name in ("time", "group", "split") if (value := getattr(self, name))]
+        for column in self.columns:
+            bare = re.fullmatch(r"[A-Za-z0-9_-]+", column.name)
+            lines += ["", f"[columns.{column.name if bare else _quoted(column.name)}]"]
+            lines += [f'role = "{column.role}"'] if column.role != "target" else []
+            lines += [f'family = "{column.family}"']
+            lines += [f"unit = {_quoted(column.unit)}"] if column.unit else []
+            lines += [f"classes = [{', '.join(map(_quoted, column.classes))}]"] if column.classes else []
+        return "\n".join(lines).strip() + "\n"
+
+    @classmethod
+    def from_toml(cls, text: str) -> Self:
+        """The schema of a file.
+
+        Raises:
+            ValueError: no TOML, or entries that are none.
+        """
+        return cls.from_config(tomllib.loads(text))
+
+
+def _refuse_others(given: Mapping[str, Any], known: Iterable[str], who: str) -> None:
+    names: Sequence[str] = list(known)
+    for name in given:
+        if name not in names:
+            raise ValueError(f"{who} has an entry {name!r}{nearest(name, names)}; known are {', '.join(names)}")
+
+
+def _quoted(text: str) -> str:
+    """A TOML string."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(each if each >= " " and each != "\x7f" else f"\\u{ord(each):04x}" for each in escaped) + '"'

@@ -1,0 +1,133 @@
+"""Panels as runs keep and reopen them: a file with its columns, or a data set by its name."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Self
+
+from ..options import check
+from .columns import Columns
+from .encoding import PanelSchema
+from .panel import Panel
+from .proposing import Told
+from .protocol import Cut
+from .reading import read_panel, schema_beside
+from .windows import PanelWindows
+
+
+@dataclass(frozen=True)
+class Tabled:
+    """Where a panel was, as a run keeps it.
+
+    Args:
+        path: the file as it was given.
+        fingerprint: SHA-256 of the sequences.
+    """
+
+    path: str
+    fingerprint: str
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True)
+class PanelData:
+    """A panel under a schema.
+
+    Args:
+        path: the file as it was given.
+        panel: its sequences.
+        schema: what models see of them.
+    """
+
+    kind: ClassVar[str] = "panel"
+    described: ClassVar[str] = PanelSchema.kind
+    source: ClassVar[type[Tabled]] = Tabled
+    onto: ClassVar[bool] = False
+
+    path: str
+    panel: Panel
+    schema: PanelSchema
+
+    @classmethod
+    def open(
+        cls,
+        path: str | os.PathLike[str],
+        columns: Columns | Sequence[str] = (),
+        cut: Cut | None = None,
+        **told: Any,
+    ) -> Self:
+        """Reads a file, by the schema that stands beside it, if there is one.
+
+        Args:
+            path: of a CSV, Parquet or npz file, or the name of a data set of `dvae.tables.domains`.
+            columns: what its columns are, in place of that schema: one, or the targets in words, see `Told`.
+            cut: how sequences are divided and cut; by default what the schema says, or what suits them.
+            **told: further fields of `Told` and of `Cut`.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: a file or a schema that cannot be read.
+        """
+        name = os.fspath(path)
+        how = {field.name: told.pop(field.name) for field in fields(Cut) if field.name in told}
+        beside, beside_cut = schema_beside(name)
+        if not isinstance(columns, Columns):
+            words = Told(tuple(columns), **told)
+            columns = beside if words == Told() and beside is not None else words  # type: ignore[assignment]
+        panel = read_panel(name, columns)  # type: ignore[arg-type]
+        cut = replace(cut or beside_cut or suited(panel), **how)
+        return cls(name, panel, PanelSchema.under(panel, cut))
+
+    @classmethod
+    def of(cls, data: Any, columns: Any = None, cut: Cut | None = None, name: str = "panel") -> Self:
+        """A panel in memory, see `Panel.of`; a run that is fitted to it cannot find it again by a path."""
+        panel = Panel.of(data, columns, name)
+        return cls(name, panel, PanelSchema.under(panel, cut or suited(panel)))
+
+    def windows(self, split: str) -> PanelWindows:
+        """The windows of "train", "validation", "test" or "train+validation"."""
+        return PanelWindows(self.panel, self.schema, split)
+
+    @property
+    def location(self) -> str:
+        """Where the file is, as any process finds it."""
+        return os.path.abspath(self.path)
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the sequences."""
+        return self.panel.fingerprint()
+
+    @property
+    def protocol(self) -> Cut:
+        """How sequences are divided and cut."""
+        return self.schema.cut
+
+    def recorded(self) -> Tabled:
+        """Where it is; `reopened` reads it."""
+        return Tabled(self.path, self.fingerprint)
+
+    @classmethod
+    def reopened(cls, source: Tabled, schema: PanelSchema, path: str | os.PathLike[str] | None = None) -> Self:
+        """The panel that was recorded, from there or from another path, whatever it is now, under the run's schema.
+
+        Raises:
+            FileNotFoundError, ValueError: see `open`.
+        """
+        name = os.fspath(path or source.path)
+        return cls(name, read_panel(name, schema.columns), schema)
+
+
+def suited(panel: Panel) -> Cut:
+    """How a panel is divided where nobody says: few sequences by time, and whole where they are many and short.
+
+    A fifth of the median sequence, and 24 steps at most, is to be forecast, from three times as many.
+    """
+    lengths = sorted(len(one) for one in panel.series)
+    few = len(panel) < 10 and not any(one.split for one in panel.series)
+    horizon = max(min(lengths[len(lengths) // 2] // 10, 24), 1)
+    return Cut(3 * horizon, horizon, split="time" if few else "sequence")

@@ -1,0 +1,251 @@
+"""What models see of a panel: targets as coordinates of x, covariates as context, in units taken from training data.
+
+| variable | what | shape |
+|---|---|---|
+| x | targets; a category in a coordinate for each class | (B, T, D) |
+| c | covariates, known in the future or ending with the present, without unit; indicators | (B, T, C) |
+| s | covariates with one value a sequence, likewise | (B, S) |
+| d | time since the step before, in median steps, where steps are not evenly spaced | (B, T, 1) |
+
+A covariate that lacks an entry has its last value, or before any the mean of the training data, and its indicator is 0
+there; one that ends with the present has its last value after that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from typing_extensions import override
+
+from ..laws.base import LawSpec
+from ..laws.family import FAMILIES
+from ..laws.product import Product
+from ..options import tuples
+from ..schema import Schema
+from ..views import Offered, View
+from .columns import WHOLE_STEPS, Column, Columns
+from .panel import COUNTS, Panel, Series
+from .protocol import Cut
+
+COVARIATES, STATICS, GAPS = "c", "s", "d"
+"""Names of context in batches."""
+EVEN = 1.3
+"""Longest gap over the median up to which steps are evenly spaced: months are."""
+CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
+SCALED = ("positive", "log-normal", "power", *COUNTS)
+
+
+@dataclass(frozen=True)
+class PanelSchema(Schema):
+    """What a model must know of a panel; see the file.
+
+    Args:
+        columns: of the table.
+        cut: how it is divided and cut.
+        means, scales: of the columns that have a unit, over the training data.
+        lacking: names of covariates that have an indicator.
+        step: median time from one step to the next; 0 where steps are evenly spaced.
+    """
+
+    kind: ClassVar[str] = "panel"
+
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    columns: Columns = field(default_factory=lambda: Columns((Column("x"),)))
+    cut: Cut = field(default_factory=Cut)
+    means: Mapping[str, float] = field(default_factory=dict)
+    scales: Mapping[str, float] = field(default_factory=dict)
+    lacking: tuple[str, ...] = ()
+    step: float = 0.0
+
+    def __post_init__(self) -> None:
+        found = {"x": len(self.coordinates)}
+        for name, roles in ((COVARIATES, ("known", "past")), (STATICS, ("static",))):
+            covariates = self.columns.of(*roles)
+            if covariates:
+                lacking = sum(column.name in self.lacking for column in covariates)
+                found[name] = sum(len(column.coordinates) for column in covariates) + lacking
+        if self.step:
+            found[GAPS] = 1
+        for name, value in (("sizes", found), ("length", self.cut.length), ("observed", self.cut.observed)):
+            object.__setattr__(self, name, value)  # they follow
+        super().__post_init__()
+
+    @classmethod
+    def under(cls, panel: Panel, cut: Cut) -> Self:
+        """The schema of a panel, whose units are those of its training sequences."""
+        train = [
+            panel.series[place].values[low : high + (cut.length or 10**9)]
+            for place, low, high in cut.starts(panel, "train")
+        ]
+        if not train:
+            raise ValueError(
+                f"{panel.name} has no training window of {cut.name}: its sequences have "
+                f"{min(map(len, panel.series))} to {max(map(len, panel.series))} steps"
+            )
+        known = np.concatenate(train)
+        means, scales, lacking = {}, {}, []
+        for place, column in enumerate(panel.columns.columns):
+            values = known[:, place]
+            values = values[~np.isnan(values)]
+            if not len(values):
+                raise ValueError(f"column {column.name!r} has no value in the training part of {panel.name}")
+            if column.family in CENTRED:
+                means[column.name], scales[column.name] = float(values.mean()), float(values.std()) or 1.0
+            elif column.family in SCALED:
+                means[column.name], scales[column.name] = 0.0, float(values.mean()) or 1.0
+            if column.role == "past" or (column.role != "target" and np.isnan(known[:, place]).any()):
+                lacking.append(column.name)
+        gaps = np.concatenate([np.diff(one.times) for one in panel.series if one.times is not None] or [np.empty(0)])
+        uneven = len(gaps) > 0 and gaps.max() > EVEN * np.median(gaps)
+        step = float(np.median(gaps)) if uneven else 0.0
+        return cls(columns=panel.columns, cut=cut, means=means, scales=scales, lacking=tuple(lacking), step=step)
+
+    @property
+    def protocol(self) -> Cut:
+        """How it is divided and cut."""
+        return self.cut
+
+    @property
+    def coordinates(self) -> list[str]:
+        """Names of the coordinates of x."""
+        return [name for column in self.columns.targets for name in column.coordinates]
+
+    @property
+    @override
+    def view(self) -> View:
+        """The data as they are, and the context of the sequences for whoever reads it."""
+        return Offered(tuple(name for name in self.sizes if name != "x"))
+
+    @property
+    @override
+    def emission(self) -> LawSpec:
+        """The families of the targets: one law where they are alike, else a product."""
+        parts: dict[Any, list[int]] = {}
+        place = 0
+        for column in self.columns.targets:
+            places = list(range(place, place + len(column.coordinates)))
+            place += len(places)
+            parts.setdefault(column.name if column.family == "category" else column.family, []).extend(places)
+        laws = {key: "category" if key in self._categories else key for key in parts}
+        if len(parts) == 1:
+            return FAMILIES[next(iter(laws.values()))]
+        return Product(tuple((tuple(places), FAMILIES[laws[key]]) for key, places in parts.items()))
+
+    @property
+    def _categories(self) -> set[str]:
+        return {column.name for column in self.columns.targets if column.family == "category"}
+
+    @property
+    @override
+    def covariates(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Covariates and gaps, and what is static."""
+        local = tuple(name for name in (COVARIATES, GAPS) if name in self.sizes)
+        return local, ((STATICS,) if STATICS in self.sizes else ())
+
+    @property
+    @override
+    def units(self) -> Mapping[str, tuple[Sequence[float], Sequence[float]]]:
+        """Of x."""
+        names = [column.name for column in self.columns.targets for _ in column.coordinates]
+        return {"x": ([self.means.get(n, 0.0) for n in names], [self.scales.get(n, 1.0) for n in names])}
+
+    @cached_property
+    def places(self) -> dict[str, int]:
+        """Of the columns in `Series.values`."""
+        return {name: place for place, name in enumerate(self.columns.names)}
+
+    def targets(self, one: Series) -> np.ndarray:
+        """x (T, D) of a sequence, NaN where missing."""
+        parts = [_encoded(one.values[:, self.places[column.name]], column) for column in self.columns.targets]
+        return np.concatenate(parts, 1)
+
+    def context(self, one: Series) -> np.ndarray:
+        """c (T, C) of a sequence, of which what ends with the present goes on."""
+        return self._filled(one.values, self.columns.of("known", "past"))
+
+    def static(self, one: Series) -> np.ndarray:
+        """s (S,) of a sequence.
+
+        Raises:
+            ValueError: a column that changes within it.
+        """
+        columns, values = self.columns.of("static"), one.values[:1].copy()
+        for column in columns:
+            place = self.places[column.name]
+            known = one.values[:, place][~np.isnan(one.values[:, place])]
+            if len(known) and (known != known[0]).any():
+                raise ValueError(
+                    f"column {column.name!r} is static, but changes within sequence {one.name!r}; it is known or past"
+                )
+            values[0, place] = known[0] if len(known) else np.nan
+        (found,) = self._filled(values, columns)
+        return np.asarray(found)
+
+    def gaps(self, one: Series) -> np.ndarray:
+        """d (T, 1) of a sequence, 1 at its first step."""
+        if one.times is None:
+            return np.ones((len(one), 1))
+        return np.concatenate([[1.0], np.diff(one.times) / self.step])[:, None]
+
+    def _filled(self, values: np.ndarray, columns: Sequence[Column]) -> np.ndarray:
+        """Covariates without unit and without gaps, each with its indicator, if it has one, behind it."""
+        parts = []
+        for column in columns:
+            own = values[:, self.places[column.name]]
+            known = ~np.isnan(own)
+            last = np.maximum.accumulate(np.where(known, np.arange(len(own)), -1))
+            filled = np.where(last >= 0, own[last], np.nan)
+            if column.family == "category":
+                part = _encoded(filled, column)
+                parts.append(np.nan_to_num(part))
+            else:
+                mean, scale = self.means[column.name], self.scales[column.name]
+                parts.append(((np.where(last >= 0, filled, mean) - mean) / scale)[:, None])
+            if column.name in self.lacking:
+                parts.append(known[:, None].astype(float))
+        return np.concatenate(parts, 1)
+
+    @cached_property
+    def ending(self) -> tuple[list[int], list[int]]:
+        """Coordinates of c that end with the present, and of their indicators."""
+        held: list[int] = []
+        indicators, place = [], 0
+        for column in self.columns.of("known", "past"):
+            width = len(column.coordinates)
+            if column.role == "past":
+                held += range(place, place + width)
+                indicators.append(place + width)
+            place += width + (column.name in self.lacking)
+        return held, indicators
+
+    @override
+    def config(self) -> dict[str, Any]:
+        """The schema in JSON's types."""
+        own = {"means": dict(self.means), "scales": dict(self.scales), "lacking": list(self.lacking), "step": self.step}
+        return {"columns": self.columns.config(), "cut": asdict(self.cut), **own}
+
+    @classmethod
+    @override
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """The schema that `config` wrote."""
+        own = tuples(config)
+        own |= {"columns": Columns.from_config(config["columns"]), "cut": Cut(**config["cut"])}
+        return cls(**own)
+
+
+def _encoded(values: np.ndarray, column: Column) -> np.ndarray:
+    """A column (T,) as coordinates (T, n); NaN where missing."""
+    if column.family != "category":
+        return np.asarray(values[:, None])
+    found = np.asarray(values[:, None] == np.arange(len(column.classes)), float)
+    found[np.isnan(values)] = np.nan
+    return found
+
+
+def whole(columns: Columns) -> bool:
+    """Whether steps are observed whole or not at all."""
+    return any(column.family in WHOLE_STEPS for column in columns.targets)

@@ -1,0 +1,173 @@
+"""Proposals: what the columns of a table that nobody described probably are, to be read and corrected by a person."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..options import nearest
+from .columns import Column, Columns, Role
+
+CLASSES = 20
+"""Most different texts of a category; more are an id, or a text."""
+SPREAD = 1.5
+"""Variance over mean above which counts vary more than Poisson's."""
+TIMES = re.compile(
+    r"(^|_)(time|date|datetime|timestamp|day|week|month|quarter|year|hour|minute|second|step|frame|t|ds)(_|$)"
+)
+IDS = re.compile(r"(^|_)(id|unique_id|series|sequence|subject|station|store|item|patient|name|key)(_|$)")
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a person says of columns in words; a column is "name", "name:family" or "name:family:unit".
+
+    Args:
+        columns: targets; all that are nothing else, if none is named.
+        covariates: known in the future too, as a plan or a calendar.
+        past: covariates that end with the present.
+        static: covariates with one value a sequence.
+        id: columns that tell sequences apart.
+        time: column of dates or numbers.
+        group: column that is the same within a sequence.
+    """
+
+    columns: tuple[str, ...] = ()
+    covariates: tuple[str, ...] = ()
+    past: tuple[str, ...] = ()
+    static: tuple[str, ...] = ()
+    id: tuple[str, ...] = ()
+    time: str | None = None
+    group: str | None = None
+
+    def of(self, frame: Any) -> Columns:
+        """The columns of a frame, with what is not told as it is proposed.
+
+        Raises:
+            ValueError: columns that the frame does not have, or families that there are not.
+        """
+        known = [str(name) for name in frame.columns]
+        roles: dict[str, tuple[Role, str]] = {}
+        said: dict[Role, tuple[str, ...]]
+        said = {"target": self.columns, "known": self.covariates, "past": self.past, "static": self.static}
+        for role, words in said.items():
+            for word in words:
+                name = word if word in known else word.partition(":")[0]
+                if name in roles:
+                    raise ValueError(f"column {name!r} is named twice")
+                roles[name] = (role, word[len(name) + 1 :])
+        for name in (*roles, *self.id, *filter(None, (self.time, self.group))):
+            if name not in known:
+                raise ValueError(f"no column {name!r}{nearest(name, known)}; there are {', '.join(known[:20])}")
+        found = proposed(frame, self.time, self.id)
+        layout: dict[str, Any] = {"id": found.id, "time": found.time, "group": self.group}
+        aside = {*layout["id"], *filter(None, (layout["time"], self.group))}
+        own = {column.name: column for column in found.columns if column.name not in aside}
+        names = list(roles) if self.columns else [*(name for name in own if name not in roles), *roles]
+        columns = []
+        for name in names:
+            role, said_of_it = roles.get(name, (own[name].role, "")) if name in own else roles[name]
+            family, _, unit = said_of_it.partition(":")
+            columns.append(_told(name, role, family, unit, frame[name], own.get(name)))
+        return Columns(tuple(columns), **layout)
+
+
+def _told(name: str, role: Role, family: str, unit: str, values: Any, guess: Column | None) -> Column:
+    """A column of which a role, and perhaps family and unit, are told."""
+    family = family or (guess.family if guess else "real")
+    if role != "target" and family != "category":
+        family = "real"
+    classes = tuple(sorted(values.dropna().astype(str).unique())) if family == "category" else ()
+    return Column(name, role, family, unit, classes)
+
+
+def proposed(frame: Any, time: str | None = None, id: tuple[str, ...] = ()) -> Columns:
+    """What a pandas frame in the long form probably is.
+
+    The first column of dates, or with the name of a time, is that. Columns of texts that repeat, and of whole numbers
+    with the name of an id, tell sequences apart where that leaves no two rows at one time. What is the same within each
+    of several sequences is static. All other columns are targets: whole numbers from 0 are counts, two values a binary,
+    few texts a category, numbers above 0 that vary by more than half their mean positive.
+
+    Args:
+        frame: whose columns are looked at.
+        time: the column of the times, if it is known.
+        id: the columns that tell sequences apart, if they are known.
+
+    Raises:
+        ValueError: no column that could be a target.
+    """
+    names = [str(name) for name in frame.columns]
+    if time is None:
+        time = next((name for name in names if _is_date(frame[name])), None)
+    if time is None:
+        time = next((name for name in names if TIMES.search(name.lower()) and _is_number(frame[name])), None)
+    rest = [name for name in names if name != time]
+    ids = list(id)
+    if not ids and time is not None and frame[time].duplicated().any():
+        texts = [n for n in rest if not _is_number(frame[n]) and frame[n].nunique() < len(frame)]
+        numbers = [n for n in rest if _is_whole(frame[n]) and IDS.search(n.lower())]
+        for name in (*numbers, *texts):
+            left = frame.duplicated([*ids, time]).sum()
+            if not left:
+                break
+            if frame.duplicated([*ids, name, time]).sum() < left:
+                ids.append(name)
+    found = [column for name in rest if name not in ids and (column := _column(name, frame[name])) is not None]
+    if ids and len(groups := frame.groupby(ids, observed=True)) > 1:
+        changing = groups[[column.name for column in found]].nunique().max() > 1
+        found = [column if changing[column.name] else _static(column) for column in found]
+    if not found:
+        raise ValueError(f"none of the columns {', '.join(names[:20])} holds numbers or a few classes")
+    return Columns(tuple(found), tuple(ids), time)
+
+
+def _column(name: str, values: Any) -> Column | None:
+    """What a column probably holds; None for what is no target, as texts that are all different."""
+    known = values.dropna()
+    if not len(known):
+        return None
+    if not _is_number(known):
+        classes = sorted(known.astype(str).unique())
+        return Column(name, family="category", classes=tuple(classes)) if 2 <= len(classes) <= CLASSES else None
+    numbers = known.to_numpy(np.float64)
+    if set(np.unique(numbers)) == {0.0, 1.0}:
+        return Column(name, family="binary")
+    if (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2:
+        return Column(name, family="overdispersed" if numbers.var() > SPREAD * numbers.mean() else "count")
+    if (numbers > 0).all() and numbers.std() > 0.5 * numbers.mean():
+        return Column(name, family="positive")
+    return Column(name)
+
+
+def _static(column: Column) -> Column:
+    family = "category" if column.family == "category" else "real"
+    return replace(column, role="static", family=family)
+
+
+def _is_number(values: Any) -> bool:
+    import pandas as pd
+
+    return bool(pd.api.types.is_numeric_dtype(values))
+
+
+def _is_whole(values: Any) -> bool:
+    return _is_number(values) and bool((values.dropna() % 1 == 0).all())
+
+
+def _is_date(values: Any) -> bool:
+    import pandas as pd
+
+    if pd.api.types.is_datetime64_any_dtype(values):
+        return True
+    known = values.dropna()
+    if _is_number(values) or not len(known):
+        return False
+    some = known.astype(str).iloc[:: max(len(known) // 50, 1)]
+    return bool(
+        some.str.contains(r"\d{4}|\d[-/:]\d").all()
+        and pd.to_datetime(some, errors="coerce", format="mixed").notna().all()
+    )

@@ -1,0 +1,111 @@
+"""How sequences of a table are divided and cut into windows."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ..options import Delay, Frames, Positive, Share, check
+from .panel import Panel, Series
+
+
+@dataclass(frozen=True)
+class Cut:
+    """How sequences become windows for training, validation and test.
+
+    Args:
+        observed: O, steps that a forecast is given; None for whole sequences, of which there are bounds, no forecasts.
+        horizon: H, steps to be forecast.
+        stride: steps from the start of one test window to the next; None for the horizon, so that no step is forecast
+            twice.
+        split: what is divided: "sequence", each as a whole; "time", the last steps of every sequence; "group", all
+            sequences of a group. Sequences that say their split are where they say.
+        validation, test: shares of them.
+        seed: of the division of sequences or groups.
+        multimodal_threshold: distance below which two last observed steps are alike, in deviations.
+
+    Raises:
+        ValueError: steps without a horizon, or the other way round; shares that leave nothing to train on.
+    """
+
+    observed: Frames | None = None
+    horizon: Frames | None = None
+    stride: Frames | None = None
+    split: Literal["sequence", "time", "group"] = "sequence"
+    validation: Share = 0.1
+    test: Share = 0.2
+    seed: Delay = 0
+    multimodal_threshold: Positive = 0.5
+
+    def __post_init__(self) -> None:
+        check(self)
+        if (self.observed is None) != (self.horizon is None):
+            raise ValueError(f"observed is {self.observed} and horizon {self.horizon}; windows have both, or neither")
+        if self.split == "time" and self.observed is None:
+            raise ValueError(
+                "sequences are divided by time into windows; say how many steps are observed, and a horizon"
+            )
+        if self.validation + self.test >= 1:
+            raise ValueError(f"validation {self.validation} and test {self.test} leave nothing to train on")
+
+    @property
+    def length(self) -> int | None:
+        """T, steps of a window."""
+        return None if self.observed is None or self.horizon is None else self.observed + self.horizon
+
+    @property
+    def name(self) -> str:
+        """For titles."""
+        return "whole sequences" if self.length is None else f"{self.observed} + {self.horizon} steps"
+
+    def starts(self, panel: Panel, split: str) -> list[tuple[int, int, int]]:
+        """(sequence, first start, last start) of the windows of a split, or (sequence, 0, 0) of whole ones.
+
+        By time, a window is in the split in which its future is; what it observes may lie before. "all" is of all
+        sequences, wherever they are.
+        """
+        found = []
+        parts = None if self.split == "time" or split == "all" else self._parts(panel)
+        for place, one in enumerate(panel.series):
+            low, high = 0, len(one)
+            if parts is not None and parts[place] not in split.split("+"):
+                continue
+            if parts is None and split != "all":
+                low, high = self._between(one, split)
+            if self.length is None:
+                found.append((place, 0, 0))
+            elif high - low >= self.length:
+                found.append((place, low, high - self.length))
+        return found
+
+    def _between(self, one: Series, split: str) -> tuple[int, int]:
+        """First and last step of the windows of a sequence that is divided by time."""
+        assert self.observed is not None
+        total = len(one)
+        first, second = (round(total * (1 - share)) for share in (self.validation + self.test, self.test))
+        bounds = {"train": (0, first), "validation": (first - self.observed, second)}
+        bounds |= {"test": (second - self.observed, total), "train+validation": (0, second)}
+        low, high = bounds[split]
+        return max(low, 0), high
+
+    def _parts(self, panel: Panel) -> list[str]:
+        """The split of every sequence."""
+        units = [one.group if self.split == "group" else one.name for one in panel.series]
+        said = {unit: one.split for unit, one in zip(units, panel.series, strict=True) if one.split}
+        if said and len({one.split == "" for one in panel.series}) > 1:
+            raise ValueError(f"some sequences of {panel.name} say their split and others do not; let all, or none")
+        if said:
+            return [one.split for one in panel.series]
+        names = sorted(dict.fromkeys(units), key=lambda name: hashlib.sha256(f"{self.seed} {name}".encode()).digest())
+        test, validation = (int(np.ceil(share * len(names))) for share in (self.test, self.validation))
+        if len(names) < 3:
+            raise ValueError(
+                f"{panel.name} has {len(names)} {self.split}s, too few to train, choose and test on some of them each; "
+                'divide them by time: split="time", with observed and horizon'
+            )
+        parts = ["test"] * test + ["validation"] * validation + ["train"] * len(names)
+        places = dict(zip(names, parts, strict=False))
+        return [places[unit] for unit in units]

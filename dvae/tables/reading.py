@@ -1,0 +1,163 @@
+"""Files of tables: CSV, Parquet and npz, and the schema that stands beside them.
+
+A schema beside `riders.csv` is `riders.toml`, or `schema.toml` in the same folder: columns, see `dvae.tables.columns`,
+and how sequences are divided and cut:
+
+    [cut]
+    observed = 48
+    horizon = 24
+    split = "time"
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+import zipfile
+from dataclasses import fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import files
+from ..options import nearest
+from .columns import Columns
+from .panel import Panel
+from .proposing import Told
+from .protocol import Cut
+
+SEPARATORS = {".csv": ",", ".tsv": "\t"}
+SUFFIXES = (*SEPARATORS, ".parquet", ".npz")
+LARGEST = 2 * 10**9
+"""Bytes of a file, or of what it holds."""
+LARGEST_SCHEMA = 10**6
+
+
+def read_frame(path: str | os.PathLike[str]) -> Any:
+    """A pandas frame of a CSV, TSV, Parquet or npz file.
+
+    An npz holds an array (N, T, D), or (T, D) of one sequence, named "x" or alone, and perhaps "lengths" (N,); its
+    columns are x0, x1, … beside "sequence" and "step".
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: no table, or one of another kind or size.
+    """
+    import pandas as pd
+
+    place = Path(path)
+    suffix = place.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"{place} is no table; tables end in {', '.join(SUFFIXES)}")
+    content = files.read(place, LARGEST, links=True)
+    if suffix == ".npz":
+        return _of_arrays(place, content)
+    try:
+        return _parquet(content) if suffix == ".parquet" else pd.read_csv(BytesIO(content), sep=SEPARATORS[suffix])
+    except ImportError as error:
+        raise ValueError(f"{place} is Parquet, which needs pyarrow: pip install 'pyro-dvae[parquet]'") from error
+    except Exception as error:  # of parsers, which fail in many ways
+        raise ValueError(f"{place} cannot be read as {suffix[1:].upper()}: {str(error)[:300]}") from error
+
+
+def _parquet(content: bytes) -> Any:
+    import pyarrow.parquet as parquet
+
+    file = parquet.ParquetFile(BytesIO(content))
+    sizes = (file.metadata.row_group(n).total_byte_size for n in range(file.metadata.num_row_groups))
+    if (size := sum(sizes)) > LARGEST:
+        raise ValueError(f"it holds {size} bytes; at most {LARGEST} are read")
+    return file.read().to_pandas()
+
+
+def _of_arrays(place: Path, content: bytes) -> Any:
+    """The frame of an npz."""
+    import pandas as pd
+
+    arrays = _arrays(place, content)
+    name = "x" if "x" in arrays else next(iter(arrays))
+    values = arrays[name]
+    if values.ndim not in (2, 3) or values.dtype.kind not in "fiub" or not values.size:
+        raise ValueError(
+            f"{name!r} of {place} is {values.dtype} {values.shape}; expected numbers (sequences, steps, columns)"
+        )
+    values = values if values.ndim == 3 else values[None]
+    most = values.shape[1]
+    lengths = arrays.get("lengths", np.full(len(values), most))
+    whole = lengths.shape == (len(values),) and lengths.dtype.kind in "iu"
+    if not whole or not ((lengths >= 1) & (lengths <= most)).all():
+        raise ValueError(f"'lengths' of {place} are {lengths.shape}; expected whole numbers (N,) from 1 to {most}")
+    valid = np.arange(most) < lengths[:, None]
+    frame = pd.DataFrame(values[valid], columns=[f"x{n}" for n in range(values.shape[2])])
+    sequence, step = np.nonzero(valid)
+    return frame.assign(sequence=sequence, step=step)
+
+
+def read_panel(path: str | os.PathLike[str], columns: Columns | Told | None = None) -> Panel:
+    """The sequences of a file.
+
+    Args:
+        path: of the file.
+        columns: what its columns are, or what is told of them; the rest is proposed.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: no table, or columns that it does not have.
+    """
+    frame = read_frame(path)
+    return Panel.of(frame, columns if isinstance(columns, Columns) else (columns or Told()).of(frame), Path(path).stem)
+
+
+def _arrays(place: Path, content: bytes) -> dict[str, np.ndarray]:
+    try:
+        with zipfile.ZipFile(BytesIO(content)) as archive:
+            if (size := sum(entry.file_size for entry in archive.infolist())) > LARGEST:
+                raise ValueError(f"it holds {size} bytes; at most {LARGEST} are read")
+        with np.load(BytesIO(content), allow_pickle=False) as loaded:
+            found = {name: loaded[name] for name in loaded.files if name in ("x", "lengths") or len(loaded.files) == 1}
+    except Exception as error:
+        raise ValueError(f"{place} cannot be read as npz: {str(error)[:300]}") from error
+    if not set(found) - {"lengths"}:
+        raise ValueError(f"{place} holds {', '.join(loaded.files) or 'nothing'}; expected an array 'x', or one alone")
+    return found
+
+
+def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | None, Cut | None]:
+    """What the schema beside a file says, None where there is none.
+
+    Raises:
+        ValueError: a schema that cannot be read, saying where.
+    """
+    place = Path(path)
+    for file in (place.with_suffix(".toml"), place.parent / "schema.toml"):
+        if file.is_file():
+            try:
+                return read_schema(files.read(file, LARGEST_SCHEMA, links=True).decode())
+            except (UnicodeDecodeError, ValueError, TypeError) as error:
+                raise ValueError(f"{file} is no schema of a table: {error}") from error
+    return None, None
+
+
+def read_schema(text: str) -> tuple[Columns | None, Cut | None]:
+    """Columns and cut of a schema; None for what it does not say."""
+    told = tomllib.loads(text)
+    cut = told.pop("cut", None)
+    if cut is not None:
+        if not isinstance(cut, dict):
+            raise ValueError("cut is a table: [cut]")
+        known = [field.name for field in fields(Cut)]
+        for name in cut:
+            if name not in known:
+                raise ValueError(f"[cut] has an entry {name!r}{nearest(name, known)}; known are {', '.join(known)}")
+    return Columns.from_config(told) if told else None, None if cut is None else Cut(**cut)
+
+
+def written_schema(columns: Columns, cut: Cut) -> str:
+    """A schema as a file to be edited."""
+    lines = ["[cut]"]
+    lines += [f"observed = {cut.observed}", f"horizon = {cut.horizon}"] if cut.length else []
+    lines += [f"stride = {cut.stride}"] if cut.stride else []
+    lines += [f'split = "{cut.split}"', f"validation = {cut.validation}", f"test = {cut.test}"]
+    return columns.to_toml() + "\n" + "\n".join(lines) + "\n"

@@ -1,0 +1,183 @@
+"""Latents that groups share: one value for a group, its density once, and the evidence of the group as a whole."""
+
+import math
+
+import pyro
+import pytest
+import torch
+from pyro import poutine
+from pyro.infer import Trace_ELBO
+
+import dvae
+from dvae.laws import FixedNormal
+from dvae.networks import Linear, Recurrent
+from dvae.program.groups import Groups
+from dvae.testing import FactorizationContract
+
+EQUATIONS = (
+    "p(g) p(w | g) p(z_t | z_{t-1}, w) p(x_t | z_t, g)",
+    "q(g | x_{1:T}) q(w | x_{1:T}, g) q(z_t | z_{t-1}, x_{1:T}, w)",
+)
+SIZES = {"g": 2, "w": 2, "z": 2, "x": 3}
+INDEX = torch.tensor([7, 3, 7, 7, 3, 9])
+
+
+def build(**more):
+    return dvae.DynamicalVAE(*EQUATIONS, SIZES, Recurrent(4), grouped=("g",), **more).double()
+
+
+def data(**more):
+    return {"x": torch.randn(6, 4, 3).double(), "group": INDEX, **more}
+
+
+class TestGrouped(FactorizationContract):
+    """Without groups in the batch every sequence is one, and the contract is that of any model."""
+
+    def build(self, size):
+        sizes = dict.fromkeys(SIZES, size)
+        return dvae.DynamicalVAE(*EQUATIONS, sizes, Recurrent(4, hidden=(4,)), grouped=("g",))
+
+
+def test_groups_of_an_index():
+    groups = Groups.of(INDEX)
+    assert groups.place.tolist() == [1, 0, 1, 1, 0, 2]
+    assert groups.first.tolist() == [1, 0, 5]
+    assert groups.count.tolist() == [3, 2, 3, 3, 2, 1]
+    values = torch.arange(6.0)[:, None]
+    assert groups.shared(values).flatten().tolist() == [0, 1, 0, 0, 1, 5]
+    torch.testing.assert_close(groups.pooled(values).flatten(), torch.tensor([5 / 3, 2.5, 5 / 3, 5 / 3, 2.5, 5]))
+    torch.testing.assert_close(groups.dealt(groups.summed(values.flatten())).sum(), values.sum())
+    twice = groups.again(2)
+    assert twice.place.tolist() == [1, 0, 1, 1, 0, 2, 4, 3, 4, 4, 3, 5]
+    assert twice.first.tolist() == [1, 0, 5, 7, 6, 11]
+    with pytest.raises(ValueError, match=r"group is torch.float32 \(6,\); expected whole numbers"):
+        Groups.of(INDEX.float())
+
+
+def test_a_group_has_one_value_and_its_density_once():
+    model, batch = build(), data()
+    trace = poutine.trace(model.guide).get_trace(batch)
+    g = trace.nodes["g"]["value"]
+    assert len(g.unique(dim=0)) == 3
+    assert torch.equal(g, Groups.of(INDEX).shared(g))
+    trace.compute_log_prob()
+    fn = trace.nodes["g"]["fn"]
+    one = fn.base.log_prob(g)[Groups.of(INDEX).first].sum()
+    torch.testing.assert_close(trace.nodes["g"]["log_prob"].sum(), one)
+    assert not torch.equal(model.guide(batch)["w"][0], model.guide(batch)["w"][2])
+
+
+def test_a_group_of_one_is_a_sequence():
+    model, batch = build(), data()
+    torch.manual_seed(0)
+    alone = dvae.SequenceELBO().terms(model, {**batch, "group": torch.arange(6)})
+    torch.manual_seed(0)
+    without = dvae.SequenceELBO().terms(model, {"x": batch["x"]})
+    torch.testing.assert_close(alone.bound, without.bound)
+
+
+def test_order_and_names_of_groups_do_not_matter():
+    model, batch = build(), data()
+    model.eval()
+    order = torch.tensor([5, 2, 0, 4, 3, 1])
+    moved = {"x": batch["x"][order], "group": -INDEX[order]}
+    means = [poutine.trace(model.guide).get_trace(each).nodes["g"]["fn"].base.mean for each in (batch, moved)]
+    torch.testing.assert_close(means[1], means[0][order])
+
+
+def test_pyros_own_bound_is_ours():
+    model, batch = build(), data()
+    torch.manual_seed(0)
+    ours = dvae.SequenceELBO(num_particles=300).terms(model, batch).bound.sum()
+    theirs = -torch.tensor([Trace_ELBO().loss(model.model, model.guide, batch) for _ in range(100)])
+    assert abs(theirs.mean() - ours) < 5 * theirs.std() / 100**0.5 + 0.2
+    pyro.clear_param_store()
+
+
+def linear(count, steps, exact=True):
+    """A linear-Gaussian panel of one group, and its evidence as one dense normal."""
+    laws = {
+        "default": FixedNormal(0.7, project=False),
+        "p(g)": dvae.laws.StandardNormal(),
+        "q": FixedNormal(1.0, learned=True, project=False),
+    }
+    pair = "p(g) p(w | g) p(x_t | w)", "q(g | x_{1:T}) q(w | x_{1:T}, g)"
+    model = dvae.DynamicalVAE(*pair, dict.fromkeys("gwx", 1), Linear(steps=steps), laws, grouped=("g",)).double()
+    with torch.no_grad():
+        for parameter in model.generator.parameters():
+            parameter.copy_(torch.randn_like(parameter) * 0.3 + 0.6)
+    x = torch.randn(count, steps, 1).double()
+
+    def mean(g, w_noise):
+        w = model.generator["w"]({"g": g}, len(g), steps)[0] + w_noise
+        return model.generator["x"]({"w": w}, len(g), steps)[0]
+
+    zero, one = torch.zeros(1, 1).double(), torch.ones(1, 1).double()
+    bias = mean(zero, zero).flatten()
+    of_g, of_w = mean(one, zero).flatten() - bias, mean(zero, one).flatten() - bias
+    own = 0.49 * torch.outer(of_w, of_w) + 0.49 * torch.eye(steps).double()
+    whole = torch.block_diag(*[own] * count) + torch.outer(of_g.repeat(count), of_g.repeat(count))
+    evidence = torch.distributions.MultivariateNormal(bias.repeat(count), whole.detach()).log_prob(x.flatten())
+    return model, x, evidence.detach()
+
+
+def test_the_bound_of_a_group_arrives_at_its_evidence():
+    """The guide reads the mean of a group's sequences, which tells all that they say of g."""
+    model, x, evidence = linear(3, 4)
+    batch = {"x": x, "group": torch.zeros(3, dtype=torch.long)}
+    optimiser = torch.optim.LBFGS(
+        list(model.encoder.parameters()), max_iter=500, line_search_fn="strong_wolfe", tolerance_grad=1e-9
+    )
+
+    def closure():
+        optimiser.zero_grad()
+        torch.manual_seed(0)
+        loss = -dvae.SequenceELBO(num_particles=16).terms(model, batch).bound.sum()
+        loss.backward()
+        return loss
+
+    assert -closure() < evidence - 0.1
+    for _ in range(3):
+        optimiser.step(closure)
+    bounds = torch.stack(
+        [dvae.SequenceELBO(num_particles=16).terms(model, batch).bound.sum() for _ in range(50)]
+    ).detach()
+    assert abs(bounds.mean() - evidence) < 5 * bounds.std() / 50**0.5 + 1e-2
+    weighted = dvae.importance_bound(model, batch, particles=2000).bound
+    torch.testing.assert_close(weighted.sum(), evidence, atol=2e-2, rtol=0)
+    torch.testing.assert_close(weighted, (weighted.sum() / 3).expand(3))
+
+
+def test_the_importance_bound_is_of_groups():
+    model, x, evidence = linear(2, 3)
+    batch = {"x": x, "group": torch.zeros(2, dtype=torch.long)}
+    found = torch.stack([dvae.importance_bound(model, batch, particles=4000).bound.sum() for _ in range(10)])
+    apart = torch.stack([dvae.importance_bound(model, {"x": x}, particles=4000).bound.sum() for _ in range(10)])
+    error = (found.var() / 10 + apart.var() / 10).sqrt()
+    assert abs(found.mean() - evidence) < 5 * found.std() / 10**0.5 + 1e-2
+    assert abs(apart.mean() - evidence) > 10 * error  # the sequences tell of each other
+
+
+def test_forecasts_of_a_group_share_a_draw_in_each_sample():
+    model, batch = build(), data()
+    out = model.forecast(batch, 2, samples=5, chunk=2)
+    g = out["g"]
+    assert g.shape == (5, 6, 2)
+    assert torch.equal(g[:, 0], g[:, 2])
+    assert len(g[:, 0].unique(dim=0)) == 5
+    assert model.reconstruct(batch, 3)["x"].shape == (3, 6, 4, 3)
+
+
+def test_what_is_not_of_a_group_is_refused():
+    with pytest.raises(ValueError, match="groups share static latents, and 'z' is none"):
+        dvae.DynamicalVAE(*EQUATIONS, SIZES, Recurrent(4), grouped=("z",))
+    with pytest.raises(ValueError, match=r"p\(w \| g\) reads g, which sequences of a group have each their own"):
+        dvae.DynamicalVAE(*EQUATIONS, SIZES, Recurrent(4), grouped=("w",))
+    model = build()
+    with pytest.raises(
+        ValueError, match="particles are of one sequence each, but groups share g; use importance_bound"
+    ):
+        dvae.particle_bound(model, data(), particles=3)
+    with pytest.raises(ValueError, match=r"group is torch.float64"):
+        model.guide(data(group=INDEX.float()))
+    assert math.isfinite(float(dvae.particle_bound(model, {"x": data()["x"]}, particles=3).bound.sum()))
