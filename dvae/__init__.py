@@ -24,7 +24,7 @@ if sys.flags.optimize > 1:  # Pyro fills in its docstrings as it is imported
     raise ImportError("dvae needs Pyro, which needs docstrings: run python without -OO (PYTHONOPTIMIZE=2); -O is fine")
 
 if TYPE_CHECKING:
-    from . import laws, motion, networks, views
+    from . import laws, motion, networks, tables, views
     from .data import ArrayWindows
     from .graph import Audit, audit
     from .inference import schedules
@@ -86,6 +86,7 @@ __all__ = [
     "predictive_checks",
     "price",
     "schedules",
+    "tables",
     "traverse",
     "twin",
     "views",

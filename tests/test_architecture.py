@@ -31,6 +31,8 @@ MOTION = re.compile(
     r"dvae\.motion\b|dvae\.models\.(energies|gsps|hit_dvae|poses|trajectories|trajevae|cvae_rnn|mix_and_match|motion_latent)$"
     r"|dvae\.cli\.(data|fitting|futures|judging|report|segments)$"
 )
+# Tables likewise, but that any method is fitted to them.
+TABLES = re.compile(r"dvae\.tables\b|dvae\.cli\.(data|fitting|futures|judging|tables)$")
 
 
 @cache
@@ -78,7 +80,13 @@ def test_imports_run_one_way():
 def test_motion_is_imported_by_its_own_methods_and_commands_alone():
     for module, path in sources().items():
         if module != "dvae.__init__" and not MOTION.match(module):
-            assert not [target for target in imports(module, path) if layer(target) == LAYERS["dvae.motion"]], module
+            assert not [target for target in imports(module, path) if target.startswith("dvae.motion")], module
+
+
+def test_tables_are_imported_by_commands_alone():
+    for module, path in sources().items():
+        if module != "dvae.__init__" and not TABLES.match(module):
+            assert not [target for target in imports(module, path) if target.startswith("dvae.tables")], module
 
 
 def words(path):

@@ -142,6 +142,9 @@ class DataOptions:
         ((kind, name),) = kinds.items()
         if kind == "motion" and (is_table(self.data) or any(getattr(self, each) for each in OF_KINDS["panel"])):
             kind = "panel"
+            if self.data == SIMULATED:
+                told = next(each for each in OF_KINDS["panel"] if getattr(self, each))
+                raise UsageError(f"--{told} is about tables; name one by --data")
         given = {option: value for option, value in vars(self).items() if value != getattr(DataOptions, option)}
         for other, options in OF_KINDS.items():
             if other != kind and (strange := (given.keys() & {*options}) - {*OF_KINDS[kind]}):

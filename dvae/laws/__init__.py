@@ -5,7 +5,7 @@
 """
 
 from .base import Law, LawSpec, Shape, renamed
-from .families import Delta, Directions, FixedNormal, Normal, StandardNormal, StudentT
+from .families import Delta, Directions, FixedNormal, KnownNoise, Normal, StandardNormal, StudentT
 from .family import FAMILIES, Family, LowRankNormal, NormalMixture
 from .flow import FlowDistribution, QRFlow
 from .priors import Flow, Mixture, Vamp
@@ -21,6 +21,7 @@ __all__ = [
     "FixedNormal",
     "Flow",
     "FlowDistribution",
+    "KnownNoise",
     "Law",
     "LawSpec",
     "LowRankNormal",

@@ -142,6 +142,42 @@ class FixedNormalLaw(Gaussian):
 
 
 @dataclass(frozen=True)
+class KnownNoise:
+    """A normal whose scale is given: the last D of its features, behind those that `networks.WithNoise` makes.
+
+    Args:
+        residual: see `Law`.
+    """
+
+    residual: float = False
+
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
+        if shape.features <= shape.size:
+            raise ValueError(f"KnownNoise has its scale from networks.WithNoise, as a network of p({shape.name} | ...)")
+        return KnownNoiseLaw(self, shape)
+
+
+class KnownNoiseLaw(Gaussian):
+    """What `KnownNoise` describes."""
+
+    def __init__(self, spec: KnownNoise, shape: Shape):
+        super().__init__(spec.residual)
+        self.size = shape.size
+        self.out = self.projection(shape.features - shape.size, shape.size, shape.size)
+
+    @override
+    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+        """The scale is in the variable's own unit."""
+        return torch.addcmul(mean, parameters[0], scale), parameters[1]
+
+    @override
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        features, scale = features[..., : -self.size], features[..., -self.size :]
+        return self.moved(self.out(features), previous), scale
+
+
+@dataclass(frozen=True)
 class StudentT:
     """A Student t, for observations with outliers.
 

@@ -10,6 +10,7 @@ from .cosine import CosineDecoder, CosineEncoder
 from .dense import Dense
 from .graphconv import GraphConv
 from .graphs import FrameGraph, NodeGraph
+from .known import WithNoise
 from .linear import Linear
 from .recurrent import Recurrent
 from .sde import LinearSDE, LinearSDEGuide
@@ -33,4 +34,5 @@ __all__ = [
     "SelfAttention",
     "WholeDecoder",
     "WholeEncoder",
+    "WithNoise",
 ]

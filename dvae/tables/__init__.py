@@ -8,6 +8,8 @@
 """
 
 from .columns import Column, Columns
+from .dataset import PanelData
 from .panel import Panel, Series
+from .protocol import Cut
 
-__all__ = ["Column", "Columns", "Panel", "Series"]
+__all__ = ["Column", "Columns", "Cut", "Panel", "PanelData", "Series"]
