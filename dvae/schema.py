@@ -53,8 +53,8 @@ class Schema:
         return (), ()
 
     @property
-    def units(self) -> Mapping[str, tuple[Sequence[float], Sequence[float]]]:
-        """Variable to means and scales of its coordinates, by which networks read and make it without unit."""
+    def units(self) -> Mapping[str, tuple[Sequence[float], Sequence[float], Sequence[float]]]:
+        """Variable to means, scales and typical values of its coordinates, see `Units.set`."""
         return {}
 
     def size(self, name: str) -> int:

@@ -26,17 +26,20 @@ class Units(nn.Module):
 
     mean: Tensor
     scale: Tensor
+    typical: Tensor
 
     def __init__(self, size: int, columns: bool = False):
         super().__init__()
         self.register_buffer("mean", torch.zeros(size))
         self.register_buffer("scale", torch.ones(size if columns else ()))
+        if columns:
+            self.register_buffer("typical", torch.zeros(size))
 
     @torch.no_grad()
-    def set(self, mean: Sequence[float], scale: Sequence[float]) -> None:
-        """Takes a mean and a scale for each coordinate; it must have been made for `columns`."""
-        self.mean.copy_(self.mean.new_tensor(mean))
-        self.scale.copy_(self.scale.new_tensor(scale))
+    def set(self, mean: Sequence[float], scale: Sequence[float], typical: Sequence[float]) -> None:
+        """Takes a mean, a scale and a typical value for each coordinate; it must have been made for `columns`."""
+        for buffer, values in ((self.mean, mean), (self.scale, scale), (self.typical, typical)):
+            buffer.copy_(buffer.new_tensor(values))
 
     @torch.no_grad()
     def fit(self, values: Tensor) -> None:
@@ -52,8 +55,14 @@ class Units(nn.Module):
                 f"{'' if rows.shape[1:] != self.mean.shape else ' without variance'}"
             )
         self.mean.copy_(rows.mean(0))
+        self.filling.copy_(self.mean)
         variance = rows.var(0)
         self.scale.copy_((variance if self.scale.dim() else variance.mean()).sqrt())
+
+    @property
+    def filling(self) -> Tensor:
+        """(D,) what stands for missing values."""
+        return self.typical if self.scale.dim() else self.mean
 
     def forward(self, values: Tensor) -> Tensor:
         """Values (..., D) without unit."""

@@ -127,10 +127,15 @@ class LikelihoodMethod(Method):
         described = self.described({name: size for name, size in schema.sizes.items() if name in names})
         described |= {"generative": generative, "inference": inference}
         if schema.emission is not None and self.emission is None:
+            if self.residual:
+                raise ValueError(
+                    f"residual is {self.residual}, and the columns of the data say the law of x, {schema.emission}; say "
+                    "another, which a previous value can be added to, by emission"
+                )
             described["laws"]["p(x)"] = schema.emission
         model = kind(**described, view=schema.view)
-        for name, (mean, scale) in schema.units.items():
-            model.standardise(name, columns=True).set(mean, scale)
+        for name, units in schema.units.items():
+            model.standardise(name, columns=True).set(*units)
         return model
 
     @override

@@ -312,7 +312,7 @@ def compare(
         contrasts: windows among which the information of latents is measured; 0 leaves it out.
         samples: forecasts of each window.
         forecasts: score forecasts too, which takes longest.
-        draw_emission: forecast draws of x, or its means; by default means, but of discrete data.
+        draw_emission: forecast draws of x, or its means; by default means, but of tables and discrete data.
         stride: frames between the starts of test windows, in place of the protocol's: more is faster.
         seed: of the draws.
         batch_size: windows scored at once.
@@ -337,7 +337,7 @@ def compare(
         estimates=estimates,
         contrasts=contrasts,
         samples=samples if forecasts else 0,
-        draw_emission=draw_emission,
+        draw_emission=True if draw_emission is None and kind == "panel" else draw_emission,
         seed=seed,
         batch_size=batch_size,
         configs={name: opening.config_without_seed(row[0]) for name, row in shown.items()},

@@ -487,7 +487,7 @@ class DynamicalVAE(nn.Module):
         Raises:
             ValueError: names that the model does not have, a mask of nothing, or data that the view cannot show.
         """
-        means = {name: units.mean for name, units in self.units.items()}
+        means = {name: units.filling for name, units in self.units.items()}
         # by guide and model both, but for what they share
         data = dict(once(self, [batch], lambda: self.reader.read(batch, like(self).dtype, means)))
         one = {name: data.pop(name) for name in self.shared if name in data and data[name].dim() == 1}

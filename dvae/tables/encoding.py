@@ -148,10 +148,14 @@ class PanelSchema(Schema):
 
     @property
     @override
-    def units(self) -> Mapping[str, tuple[Sequence[float], Sequence[float]]]:
-        """Of x."""
-        names = [column.name for column in self.columns.targets for _ in column.coordinates]
-        return {"x": ([self.means.get(n, 0.0) for n in names], [self.scales.get(n, 1.0) for n in names])}
+    def units(self) -> Mapping[str, tuple[Sequence[float], Sequence[float], Sequence[float]]]:
+        """Of x; where a column that is only scaled is missing, its mean, which is its scale, stands for it."""
+        columns = [column for column in self.columns.targets for _ in column.coordinates]
+        means, scales = (
+            [own.get(c.name, rest) for c in columns] for own, rest in ((self.means, 0.0), (self.scales, 1.0))
+        )
+        typical = [s if c.family in SCALED else m for c, m, s in zip(columns, means, scales, strict=True)]
+        return {"x": (means, scales, typical)}
 
     @cached_property
     def places(self) -> dict[str, int]:

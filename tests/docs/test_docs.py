@@ -10,7 +10,7 @@ import dvae  # noqa: F401  its settings are Pyro's from here on, and not from an
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
-EXAMPLES = ("bodies", "families", "latent_space", "new_method", "own_data", "rotations", "walk")
+EXAMPLES = ("bodies", "families", "latent_space", "new_method", "own_data", "rotations", "tables", "walk")
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -40,7 +40,13 @@ def test_the_commands_on_any_table_run(monkeypatch, tmp_path, capsys):
         found = [str(path) for word in words for path in (sorted(tmp_path.glob(word)) if "*" in word else [word])]
         assert main([name, *found, *shlex.split(SMALL[name])]) == 0, capsys.readouterr().err
     judged = capsys.readouterr().out
-    for said in ("importance bound", "climatology", "CRPS, lifeExp ↓ (years)", "CRPS, gdpPercap ↓ ($)", "coverage 90 %"):
+    for said in (
+        "importance bound",
+        "climatology",
+        "CRPS, lifeExp ↓ (years)",
+        "CRPS, gdpPercap ↓ ($)",
+        "coverage 90 %",
+    ):
         assert said in section
         assert said in judged
     table = (tmp_path / "next.csv").read_text(encoding="utf-8").splitlines()
