@@ -1,0 +1,77 @@
+"""Domains: real data by name, each taken from a package that somebody else publishes, and nothing of them is kept here.
+
+| name | from | of |
+|---|---|---|
+| chorales | music21 | 382 chorales by Bach, 88 keys, a step a quarter note |
+| speech | Debian's asterisk-core-sounds-en-wav | power spectra of 22 minutes of one speaker |
+| japanese-vowels | aeon | 640 utterances of two vowels by 9 speakers |
+| basic-motions | aeon | 80 recordings of a wrist in 4 activities |
+| macrodata | statsmodels | the economy of the United States by quarter, 1959 to 2009 |
+
+Motion has files of its own, and a simulator, in `dvae.motion`.
+
+>>> panel = dvae.tables.domains.load("chorales")  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+from ...options import nearest
+from ..panel import Panel
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Where a domain comes from.
+
+    Args:
+        place: "module:function" that loads it.
+        said: what it is, in a sentence.
+    """
+
+    place: str
+    said: str
+
+
+DOMAINS: Mapping[str, Domain] = {
+    "chorales": Domain(
+        "dvae.tables.domains.chorales:chorales", "382 four-part chorales by Bach as rolls of 88 keys, by quarter note."
+    ),
+    "speech": Domain(
+        "dvae.tables.domains.speech:speech", "Power spectra, 129 bands every 16 ms, of 22 minutes of one speaker."
+    ),
+    "japanese-vowels": Domain(
+        "dvae.tables.domains.series:japanese_vowels", "640 utterances of /ae/ by 9 speakers, 12 cepstral coefficients."
+    ),
+    "basic-motions": Domain(
+        "dvae.tables.domains.series:basic_motions", "80 recordings of a wrist in 4 activities, 6 axes, 10 seconds each."
+    ),
+    "macrodata": Domain(
+        "dvae.tables.domains.series:macrodata", "The economy of the United States by quarter, 1959 to 2009, 8 rates."
+    ),
+}
+"""Domains by name."""
+
+
+def load(name: str, **options: Any) -> Panel:
+    """A domain by its name.
+
+    Args:
+        name: one of `DOMAINS`.
+        options: of the function that loads it.
+
+    Raises:
+        ValueError: an unknown name.
+        ImportError: the package that it comes from is not installed; the message says how to.
+    """
+    if name == "motion":
+        raise ValueError("motion has files of its own: dvae.motion.read_motion, or dvae.motion.simulate")
+    if name not in DOMAINS:
+        raise ValueError(f"no domain {name!r}{nearest(name, DOMAINS)}; known: {', '.join(DOMAINS)}")
+    module, _, function = DOMAINS[name].place.partition(":")
+    found: Panel = getattr(import_module(module), function)(**options)
+    return found

@@ -1,0 +1,263 @@
+"""Domains: what is read from each package is what it is said to be; where one is not installed, a sentence says so."""
+
+import json
+import sys
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from scipy.io import wavfile
+
+from dvae.tables import domains
+from dvae.tables.domains.chorales import NAMES, SIZES, VOICES, changes, chorales, different, roll, sampled, to_c, tonic
+from dvae.tables.domains.series import read_ts
+from dvae.tables.domains.speech import (
+    FLOOR,
+    HOP,
+    PLACE,
+    RATE,
+    WINDOW,
+    power,
+    recordings,
+    resynthesised,
+    si_sdr,
+    sound,
+    spectrum,
+    speech,
+)
+
+NEEDED = {"chorales": "music21", "japanese-vowels": "aeon", "basic-motions": "aeon", "macrodata": "statsmodels"}
+CADENCE = np.array([[72, 67, 64, 48], [74, 67, 65, 43], [71, 67, 62, 43], [72, 67, 64, 48]])
+"""C major, G with a seventh, G, C major, from soprano to bass."""
+
+
+def load(name):
+    if find_spec(NEEDED[name]) is None:
+        pytest.skip(f"{NEEDED[name]} is not installed")
+    return domains.load(name)
+
+
+@pytest.mark.parametrize("name", NEEDED)
+def test_a_package_that_is_not_there_is_named_and_how_to_get_it(monkeypatch, name):
+    monkeypatch.setitem(sys.modules, NEEDED[name], None)
+    with pytest.raises(ImportError, match=rf"the package {NEEDED[name]}: pip install 'pyro-dvae\["):
+        domains.load(name)
+
+
+def test_a_name_that_is_none_is_answered_with_the_nearest():
+    with pytest.raises(ValueError, match=r"no domain 'choral'.*chorales.*known: chorales, speech"):
+        domains.load("choral")
+    with pytest.raises(ValueError, match="motion has files of its own"):
+        domains.load("motion")
+
+
+# Chorales
+
+
+def test_keys_are_named_from_a0_to_c8():
+    assert [NAMES[n] for n in (0, 1, 39, 87)] == ["A0", "A#0", "C4", "C8"]  # middle C is the fortieth key
+
+
+def test_a_roll_has_each_sounding_key_and_no_other():
+    keys = roll(np.array([[72, 67, 67, 0]]))
+    assert [NAMES[n] for n in np.flatnonzero(keys[0])] == ["G4", "C5"]
+
+
+def test_notes_sound_on_the_quarters_that_begin_within_them():
+    melody = [(0.0, 1.5, 60), (1.5, 0.5, 62), (3.0, 0.5, 64), (3.5, 0.5, 65)]
+    np.testing.assert_array_equal(sampled([melody, [(0.0, 4.0, 48)]]), [[60, 48], [60, 48], [0, 48], [64, 48]])
+
+
+@pytest.mark.parametrize("up", range(-6, 7))
+def test_any_key_comes_to_c(up):
+    assert tonic(CADENCE + up) == up % 12
+    moved = to_c(CADENCE + up)
+    assert tonic(moved) == 0
+    np.testing.assert_array_equal(np.diff(moved, axis=0), np.diff(CADENCE, axis=0))
+    assert abs(moved - CADENCE - up).max() <= 6
+
+
+def test_rests_are_not_transposed():
+    voices = CADENCE + 2
+    voices[1, 0] = 0
+    np.testing.assert_array_equal(to_c(voices) == 0, voices == 0)
+
+
+def test_a_setting_that_comes_again_in_another_key_or_with_a_repeat_is_left_out():
+    again, other = np.concatenate([CADENCE, CADENCE])[1:] + 3, np.cumsum(CADENCE % 5, 0) + 40
+    assert changes(CADENCE + 3) == changes(CADENCE)
+    assert different({"a": CADENCE, "b": again, "c": other}) == ["a", "c"]
+
+
+def test_a_cache_of_something_else_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("dvae.tables.domains.chorales.folder", lambda *_: tmp_path)
+    monkeypatch.setattr("dvae.tables.domains.chorales.version", lambda _: "1")
+    for content in ("[1]", '{"a": [[1, 2]]}', '{"a": [[300, 50, 50, 50]]}', "{", '{"a": 1e999}'):
+        (tmp_path / "chorales-1.json").write_text(content)
+        with pytest.raises(ValueError, match=r"chorales-1.json does not hold the pitches of chorales; delete it"):
+            chorales(cache=tmp_path)
+
+
+def test_a_corpus_that_is_too_small_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("dvae.tables.domains.chorales.folder", lambda *_: tmp_path)
+    monkeypatch.setattr("dvae.tables.domains.chorales.version", lambda _: "1")
+    (tmp_path / "chorales-1.json").write_text(json.dumps({"a": CADENCE.tolist()}))
+    with pytest.raises(ValueError, match="music21 has 1 different settings, of 382"):
+        chorales(cache=tmp_path)
+
+
+def test_chorales_are_four_voices_on_88_keys_in_the_sizes_of_the_benchmark():
+    panel = load("chorales")
+    parts = [one.split for one in panel]
+    assert {split: parts.count(split) for split in SIZES} == SIZES
+    assert len({one.values.tobytes() for one in panel}) == len(panel) == 382
+    down = np.concatenate([one.values for one in panel])
+    assert down.shape[1] == 88
+    assert {column.family for column in panel.columns.targets} == {"binary"}
+    assert down.sum(1).min() >= 1
+    assert down.sum(1).max() == len(VOICES)
+    low, high = (NAMES[n] for n in np.flatnonzero(down.any(0))[[0, -1]])
+    assert (low, high) == ("G1", "C6")  # C2 to A5 of the voices, and up to six semitones
+
+
+def test_a_chorale_begins_as_it_is_printed():
+    """BWV 66.6, as music21's documentation shows its chords: an upbeat, in which two voices share a key."""
+    if find_spec("music21") is None:
+        pytest.skip("music21 is not installed")
+    (own,) = (one for one in chorales(transposed=False) if one.name == "bwv66.6")
+    chords = [[NAMES[n] for n in np.flatnonzero(keys)] for keys in own.values[:2]]
+    assert chords == [["A3", "E4", "C#5"], ["F#3", "C#4", "F#4", "A4"]]
+    assert len(own) == 36  # nine bars of four quarters
+
+
+def test_transposed_chorales_have_the_same_intervals():
+    if find_spec("music21") is None:
+        pytest.skip("music21 is not installed")
+    for one, other in zip(chorales(), chorales(transposed=False), strict=True):
+        up = np.flatnonzero(one.values[0])[0] - np.flatnonzero(other.values[0])[0]
+        np.testing.assert_array_equal(np.roll(other.values, up, 1), one.values)
+
+
+# Speech
+
+
+def tone(seconds=0.5, hertz=440.0, seed=0):
+    time = np.arange(int(seconds * RATE)) / RATE
+    return 0.5 * np.sin(2 * np.pi * hertz * time) + 0.05 * np.random.default_rng(seed).normal(size=len(time))
+
+
+def write(path, samples, rate=RATE, kind=np.int16):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    wavfile.write(path, rate, np.asarray(2.0**15 * samples).clip(-(2**15), 2**15 - 1).astype(kind))
+
+
+@pytest.mark.parametrize("samples", [WINDOW, WINDOW + 1, 10 * HOP, 4001])
+def test_spectra_become_the_signal_again(samples):
+    x = tone()[:samples] if samples <= 4000 else tone(1)[:samples]
+    np.testing.assert_allclose(sound(spectrum(x), samples), x, atol=1e-12)
+    assert spectrum(x).shape[1] == 129
+
+
+def test_a_tone_has_its_power_in_its_band():
+    bands = power(tone(hertz=20 * RATE / WINDOW))
+    assert (bands[2:-2].argmax(1) == 20).all()
+
+
+def test_power_of_a_signal_that_is_rounded_to_16_bits_is_off_by_the_floor():
+    x = np.random.default_rng(0).uniform(-0.5, 0.5, 80 * RATE)
+    noise = power(x - np.round(x * 2**15) / 2**15) - FLOOR
+    assert noise[2:-2, 1:-1].mean() == pytest.approx(FLOOR, rel=0.02)
+
+
+def test_resynthesis_with_the_observed_power_is_the_signal():
+    x = tone()
+    assert si_sdr(x, resynthesised(power(x) - FLOOR, x)) > 150
+    assert si_sdr(x, resynthesised(power(x), x)) > 60
+    with pytest.raises(ValueError, match="the power has shape"):
+        resynthesised(power(x)[1:], x)
+
+
+def test_si_sdr_heeds_no_scale_and_is_the_ratio_to_what_is_orthogonal():
+    x, rest = np.zeros(8), np.zeros(8)
+    x[:4], rest[4:] = 1.0, 0.1
+    assert si_sdr(x, x + rest) == pytest.approx(20.0, abs=1e-9)
+    assert si_sdr(3 * x, -7 * (x + rest)) == pytest.approx(20.0, abs=1e-9)
+    assert si_sdr(x, 2 * x) == np.inf
+    assert si_sdr(x, rest) == -np.inf
+    with pytest.raises(ValueError, match="two signals of one length, not silent"):
+        si_sdr(0 * x, x)
+
+
+def test_silence_around_recordings_is_cut_and_recordings_of_silence_are_left_out(tmp_path):
+    quiet = np.zeros(RATE // 2)
+    write(tmp_path / "a.wav", np.concatenate([quiet, tone(), quiet]))
+    write(tmp_path / "silence" / "1.wav", quiet)
+    found = recordings(tmp_path)
+    assert list(found) == ["a"]
+    assert np.abs(found["a"]).max() == 1.0
+    assert len(tone()) <= len(found["a"]) <= len(tone()) + 2 * WINDOW
+
+
+def test_speech_says_where_it_comes_from(tmp_path):
+    with pytest.raises(FileNotFoundError, match="apt install asterisk-core-sounds-en-wav"):
+        speech(tmp_path)
+    write(tmp_path / "b.wav", tone(), rate=16000)
+    with pytest.raises(ValueError, match=r"16000 Hz, int16, .*; expected mono, 16 bits, 8 kHz"):
+        speech(tmp_path)
+
+
+def test_speech_is_spectra_of_the_recordings(tmp_path):
+    for n in range(40):
+        write(tmp_path / f"{n}.wav", tone(seed=n))
+    panel, signals = speech(tmp_path), recordings(tmp_path)
+    for one in panel:
+        np.testing.assert_array_equal(one.values, power(signals[one.name]))
+    assert {one.split for one in panel} == {"train", "validation", "test"}
+    assert [column.name for column in panel.columns.targets][::64] == ["0 Hz", "2000 Hz", "4000 Hz"]
+
+
+@pytest.mark.skipif(not PLACE.exists(), reason="asterisk-core-sounds-en-wav is not installed")
+def test_prompts_are_22_minutes():
+    panel = speech()
+    assert len(panel) == 558
+    assert 21 < sum(map(len, panel.series)) * HOP / RATE / 60 < 23
+
+
+# Series
+
+
+def test_files_of_the_archive_are_dimensions_and_a_class(tmp_path):
+    path = tmp_path / "x.ts"
+    path.write_text("# about\n@problemName x\n@data\n1,2,3:4,5,6:b\n7:8:a\n")
+    (first, b), (second, a) = read_ts(path)
+    np.testing.assert_array_equal(first, [[1, 4], [2, 5], [3, 6]])
+    np.testing.assert_array_equal(second, [[7, 8]])
+    assert (b, a) == ("b", "a")
+
+
+def test_japanese_vowels_are_640_utterances_by_nine_speakers():
+    panel = load("japanese-vowels")
+    lengths = [len(one) for one in panel]
+    parts = [one.split for one in panel]
+    assert (len(panel), min(lengths), max(lengths), len(panel.groups)) == (640, 7, 29, 9)
+    assert {part: parts.count(part) for part in sorted(set(parts))} == {"test": 370, "train": 216, "validation": 54}
+    held = [one.group for one in panel if one.split == "validation"]
+    assert {held.count(group) for group in panel.groups} == {6}
+
+
+def test_basic_motions_are_ten_recordings_of_each_activity_in_each_part():
+    panel = load("basic-motions")
+    assert panel.groups == ["Badminton", "Running", "Standing", "Walking"]
+    assert {one.values.shape for one in panel} == {(100, 6)}
+    for group in panel.groups:
+        parts = [one.split for one in panel if one.group == group]
+        assert [parts.count(part) for part in ("train", "validation", "test")] == [8, 2, 10]
+
+
+def test_macrodata_are_rates_of_202_quarters():
+    (one,) = load("macrodata")
+    dates = one.times.astype("datetime64[s]")
+    assert [str(dates[n])[:10] for n in (0, -1)] == ["1959-04-01", "2009-07-01"]
+    growth = one.values[:, 0].sum()  # logarithms add up
+    assert growth == pytest.approx(100 * np.log(12990.341 / 2710.349))
+    assert one.values.shape == (202, 8)
