@@ -9,7 +9,7 @@ import pytest
 from scipy.io import wavfile
 
 from dvae.tables import domains
-from dvae.tables.domains.chorales import NAMES, SIZES, VOICES, changes, chorales, different, roll, sampled, to_c, tonic
+from dvae.tables.domains.chorales import NAMES, SIZES, VOICES, changes, chorales, different, quarters, roll, to_c, tonic
 from dvae.tables.domains.series import read_ts
 from dvae.tables.domains.speech import (
     FLOOR,
@@ -34,21 +34,21 @@ CADENCE = np.array([[72, 67, 64, 48], [74, 67, 65, 43], [71, 67, 62, 43], [72, 6
 def load(name):
     if find_spec(NEEDED[name]) is None:
         pytest.skip(f"{NEEDED[name]} is not installed")
-    return domains.load(name)
+    return domains.domain(name)
 
 
 @pytest.mark.parametrize("name", NEEDED)
 def test_a_package_that_is_not_there_is_named_and_how_to_get_it(monkeypatch, name):
     monkeypatch.setitem(sys.modules, NEEDED[name], None)
     with pytest.raises(ImportError, match=rf"the package {NEEDED[name]}: pip install 'pyro-dvae\["):
-        domains.load(name)
+        domains.domain(name)
 
 
 def test_a_name_that_is_none_is_answered_with_the_nearest():
     with pytest.raises(ValueError, match=r"no domain 'choral'.*chorales.*known: chorales, speech"):
-        domains.load("choral")
+        domains.domain("choral")
     with pytest.raises(ValueError, match="motion has files of its own"):
-        domains.load("motion")
+        domains.domain("motion")
 
 
 # Chorales
@@ -65,7 +65,7 @@ def test_a_roll_has_each_sounding_key_and_no_other():
 
 def test_notes_sound_on_the_quarters_that_begin_within_them():
     melody = [(0.0, 1.5, 60), (1.5, 0.5, 62), (3.0, 0.5, 64), (3.5, 0.5, 65)]
-    np.testing.assert_array_equal(sampled([melody, [(0.0, 4.0, 48)]]), [[60, 48], [60, 48], [0, 48], [64, 48]])
+    np.testing.assert_array_equal(quarters([melody, [(0.0, 4.0, 48)]]), [[60, 48], [60, 48], [0, 48], [64, 48]])
 
 
 @pytest.mark.parametrize("up", range(-6, 7))

@@ -10,7 +10,7 @@
 
 Motion has files of its own, and a simulator, in `dvae.motion`.
 
->>> panel = dvae.tables.domains.load("chorales")  # doctest: +SKIP
+>>> panel = dvae.tables.domains.domain("chorales")  # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ DOMAINS: Mapping[str, Domain] = {
 """Domains by name."""
 
 
-def load(name: str, **options: Any) -> Panel:
+def domain(name: str, **options: Any) -> Panel:
     """A domain by its name.
 
     Args:

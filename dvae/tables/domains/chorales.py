@@ -150,7 +150,7 @@ def _settings() -> dict[str, np.ndarray]:
         beats = {signature.denominator for signature in score.recurse().getElementsByClass("TimeSignature")}
         parts = [[part for part in score.parts if (part.partName or "").startswith(voice)] for voice in VOICES]
         if all(len(own) == 1 for own in parts) and beats <= {2, 4}:
-            found[path.stem] = sampled([_notes(own[0]) for own in parts])
+            found[path.stem] = quarters([_notes(own[0]) for own in parts])
     return found
 
 
@@ -159,7 +159,7 @@ def _notes(part: Any) -> list[tuple[float, float, int]]:
     return [(float(note.offset), float(note.quarterLength), note.pitches[-1].midi) for note in part.flatten().notes]
 
 
-def sampled(voices: Sequence[Sequence[tuple[float, float, int]]]) -> np.ndarray:
+def quarters(voices: Sequence[Sequence[tuple[float, float, int]]]) -> np.ndarray:
     """What sounds at every quarter note: (T, V) MIDI numbers, 0 where a voice rests.
 
     Args:
