@@ -23,9 +23,8 @@ from torch import Tensor
 
 import dvae
 from dvae.data import each
-from dvae.inference.checkpoints import Run
+from dvae.inference.checkpoints import Run, load_weights
 from dvae.inference.comparison import Crossed, Estimate
-from dvae.inference.held import plain
 from dvae.runs.directory import Config
 from dvae.tables.dataset import PanelData
 from dvae.tables.domains import domain, speech
@@ -37,8 +36,8 @@ from .pages import DOCS, table, write
 PARTICLES = 100
 PARTS = ("validation", "test")
 BASELINE = "autoregressive"
-AT_ONCE = 2**14
-"""Steps of sequences, padding included, to score at once; times particles in chunks of its own."""
+AT_ONCE, HELD = 2**14, 2**17
+"""Steps of sequences, padding included, to score at once, and to hold times particles."""
 BOUND, ELBO, SDR, KHAT = "importance bound", "ELBO", "SI-SDR", "k-hat"
 
 
@@ -163,8 +162,34 @@ class Data:
         return speech.recordings(**self.options)
 
 
+class Alike:
+    """Sequences of like lengths in a batch, so that little of it is padding; all are as likely."""
+
+    def __init__(self, windows: Any):
+        self.windows, self.batch = windows, windows.all()
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the sequences."""
+        return self.windows.fingerprint  # type: ignore[no-any-return]
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Any]:
+        """A batch of neighbours in an order of lengths that chance has disturbed by a fifth."""
+        lengths = self.batch["lengths"]
+        order = (lengths.log() + 0.2 * torch.randn(len(lengths), generator=generator)).argsort()
+        start = int(torch.randint(1 - batch_size, len(order), (), generator=generator))
+        return trimmed(self.batch, order[max(start, 0) : start + batch_size])
+
+
+def trimmed(batch: Mapping[str, Any], some: Tensor) -> dict[str, Any]:
+    """Rows of a batch, without what is padding in all of them."""
+    part = dict(each(batch, lambda value: value[some]))
+    longest = int(part["lengths"].max()) if "lengths" in part else None
+    return {name: value[:, :longest] if value.dim() == 3 else value for name, value in part.items()}
+
+
 def pieces(batch: Mapping[str, Any]) -> Iterator[tuple[Tensor, dict[str, Any]]]:
-    """Rows of a batch, shortest first, and they themselves without what is padding in all of them."""
+    """Rows of a batch, shortest first, and they themselves."""
     x = batch["x"]
     lengths = batch.get("lengths", torch.full((len(x),), x.shape[1]))
     order, start = lengths.argsort(), 0
@@ -172,10 +197,7 @@ def pieces(batch: Mapping[str, Any]) -> Iterator[tuple[Tensor, dict[str, Any]]]:
         stop = start + 1
         while stop < len(order) and (stop + 1 - start) * int(lengths[order[stop]]) <= AT_ONCE:
             stop += 1
-        some = order[start:stop]
-        part = dict(each(batch, lambda value, some=some: value[some]))
-        longest = int(lengths[some].max())
-        yield some, {name: value[:, :longest] if value.dim() == 3 else value for name, value in part.items()}
+        yield order[start:stop], trimmed(batch, order[start:stop])
         start = stop
 
 
@@ -192,7 +214,7 @@ def measured(model: Any, data: Data, part: str, seed: int) -> dict[str, Any]:
     torch.manual_seed(seed)
     keys = windows.keys
     for rows, some in pieces(batch):
-        bound = dvae.importance_bound(model, some, particles=PARTICLES)
+        bound = dvae.importance_bound(model, some, particles=PARTICLES, chunk=HELD // some["x"].shape[1])
         with torch.no_grad():
             terms = dvae.SequenceELBO(num_particles=10 if model.latents else 1).terms(model, some)
         scores[BOUND][rows], scores[KHAT][rows] = bound.bound.double(), bound.khat.double()
@@ -204,7 +226,24 @@ def measured(model: Any, data: Data, part: str, seed: int) -> dict[str, Any]:
             for row, own in zip(rows.tolist(), made, strict=True):
                 sound = data.sounds[keys[row][1]]
                 scores[SDR][row] = speech.si_sdr(sound, speech.resynthesised(own[: int(lengths[row])], sound))
-    return {"steps": lengths.tolist(), "clips": [key[1] for key in keys], "scores": plain(scores)}
+    return {
+        "steps": lengths.tolist(),
+        "clips": [key[1] for key in keys],
+        "scores": {name: own.tolist() for name, own in scores.items()},
+    }
+
+
+def built(method: Any, data: PanelData) -> Any:
+    """The model of a method, whose networks read zeros and ones as other numbers too: without mean and unit.
+
+    Most keys are rarely down, so that a network that reads them as they are sees next to nothing. It learns late, and
+    latents are given up before it has.
+    """
+    model = method.build(data.schema)
+    if all(column.family == "binary" for column in data.panel.columns.targets):
+        train = [torch.as_tensor(one.values).float() for one in data.panel if one.split == "train"]
+        model.standardise("x").fit(torch.cat(train))
+    return model
 
 
 def run(name: str, case: str, seed: int, out: Path, data: Data, part: str) -> None:
@@ -217,13 +256,15 @@ def run(name: str, case: str, seed: int, out: Path, data: Data, part: str) -> No
     method, training = dvae.method(chosen.method, **chosen.options), dvae.Training(seed=seed, progress=False, **options)
     schema = data.training.schema
     torch.manual_seed(seed)
-    model = method.build(schema)
+    model = built(method, data.training)
     start, resumed = time.process_time(), Run(out).exists
-    if resumed and Run(out).state["status"] in ("finished", "stopped early"):
-        model = dvae.load(out).model
+    if (out / "fitted.json").exists():
+        load_weights(model, out)
         seconds = json.loads((out / "fitted.json").read_text())["seconds"]
     else:
-        recipe = method.train(data.training.windows("train"), data.training.windows("validation"), training.steps)
+        windows = data.training.windows("train")
+        source = Alike(windows) if "lengths" in windows.all() else windows
+        recipe = method.train(source, data.training.windows("validation"), training.steps)
         config = Config(method, schema, data.training.kind, data.training.recorded(), training).written()
         recipe.fit(model, out=out, resume=resumed, config=config, **vars(training))
         seconds = None if resumed else time.process_time() - start  # of a run that was not stopped
@@ -302,7 +343,7 @@ def tables(runs: Path, part: str) -> list[str]:
             continue
         first = next(iter(cases.values())).runs[0]
         seconds = [run["seconds"] or np.nan for case in cases.values() for run in case.runs]
-        intro = f"{len(set(first['clips']))} sequences, {sum(first['steps'])} steps; {len(first['scores'])} scores. "
+        intro = f"{len(set(first['clips']))} sequences, {sum(first['steps'])} steps. "
         intro += f"Fits took {np.nanmin(seconds):.0f} to {np.nanmax(seconds):.0f} s of processor time.\n"
         parts += [f"## {name.capitalize()}, {part}\n", intro, scored(cases, section.unit)]
     return parts
