@@ -80,16 +80,21 @@ PLAIN: dict[str, Any] = {"embed": 0, "hidden": ()}
 heart."""
 CHORALES = Section(
     {
-        BASELINE: Case(BASELINE, {"width": 128, **PLAIN}, {"steps": 1000, "learning_rate": 5e-3}),
-        "dkf": Case(
-            "dkf", {"latent": 32, "width": 128, **PLAIN, "embed_latent": (), "decoder": (128,), "warm_up": 1500}
+        BASELINE: Case(
+            BASELINE, {"width": 128, **PLAIN}, {"steps": 1000, "learning_rate": 5e-3, "decay": 0.5, "weight_decay": 0.1}
         ),
-        "srnn": Case("srnn", {"latent": 32, "width": 64, **PLAIN, "decoder": (128,), "warm_up": 1000}, {"steps": 2500}),
+        "dkf": Case(
+            "dkf",
+            {"latent": 32, "width": 128, **PLAIN, "embed_latent": (), "decoder": (200,), "warm_up": 1500},
+            {"steps": 5500, "decay": 0.6, "weight_decay": 0.03},
+        ),
+        "srnn": Case(
+            "srnn",
+            {"latent": 32, "width": 32, **PLAIN, "decoder": (128,), "warm_up": 600},
+            {"steps": 1200, "decay": 0.7, "weight_decay": 0.2},
+        ),
     },
-    {
-        **{"steps": 4000, "batch_size": 16, "learning_rate": 6e-3, "decay": 0.5, "validate_every": 100},
-        **{"optimizer": "adamw", "weight_decay": 0.1},
-    },
+    {"batch_size": 16, "learning_rate": 6e-3, "validate_every": 50, "optimizer": "adamw"},
     unit="quarter note",
 )
 SIZE: dict[str, Any] = {"latent": 16, "warm_up": 300}
