@@ -129,8 +129,8 @@ class LikelihoodMethod(Method):
         if schema.emission is not None and self.emission is None:
             if self.residual:
                 raise ValueError(
-                    f"residual is {self.residual}, and the columns of the data say the law of x, {schema.emission}; say "
-                    "another, which a previous value can be added to, by emission"
+                    f"residual is {self.residual}, but the law of x is that of its columns, which adds no previous "
+                    'value; say another by emission, such as "normal"'
                 )
             described["laws"]["p(x)"] = schema.emission
         model = kind(**described, view=schema.view)

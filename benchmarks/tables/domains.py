@@ -185,7 +185,8 @@ class Alike:
     @property
     def fingerprint(self) -> str:
         """Of the sequences."""
-        return self.windows.fingerprint  # type: ignore[no-any-return]
+        found: str = self.windows.fingerprint
+        return found
 
     def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Any]:
         """A batch of neighbours in an order of lengths that chance has disturbed by a fifth."""
