@@ -26,8 +26,10 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from reprlib import repr as brief
 from typing import Any, Literal, Self
 
 from ..laws.family import FAMILIES
@@ -38,6 +40,8 @@ WHOLE_STEPS = ("correlated",)
 """Families whose columns are one event together."""
 MOST = 4096
 """Columns, and classes of one."""
+_CHAIN = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"(?:\\.|[^"\\\n])*+"|'[^'\n]*+')\s*\.\s*){64}""")
+"""A dotted key deeper than any, of which `tomllib` takes the square of the time."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +79,10 @@ class Column:
                 f"column {self.name!r} is of family {self.family!r} and has {len(self.classes)} classes; a category, "
                 'and nothing else, has classes = ["…", "…"]'
             )
-        if len(set(self.classes)) < len(self.classes) or len(self.classes) == 1:
+        if len(set(self.classes)) < len(self.classes) or len(self.classes) == 1 or len(self.classes) > MOST:
             raise ValueError(
-                f"column {self.name!r} has the classes {', '.join(self.classes)}; two or more, all different"
+                f"column {self.name!r} has {len(self.classes)} classes, {brief(self.classes)}; they are 2 to {MOST}, "
+                "all different"
             )
 
     @property
@@ -108,15 +113,15 @@ class Columns:
     split: str | None = None
 
     def __post_init__(self) -> None:
-        if not self.targets:
-            raise ValueError(
-                f"no column is a target; given are {', '.join(each.name for each in self.columns) or 'none'}"
-            )
-        names = [*(each.name for each in self.columns), *self.id, *filter(None, (self.time, self.split))]
-        if twice := {name for name in names if names.count(name) > 1}:
-            raise ValueError(f"{', '.join(sorted(twice))} has two parts to play; every column has one")
+        names = [*self.names, *self.id, *(each for each in (self.time, self.split) if each is not None)]
+        if "" in (*names, self.group):
+            raise ValueError("a column has no name; give it one")
         if len(names) > MOST:
             raise ValueError(f"{len(names)} columns; at most {MOST} are read")
+        if not self.targets:
+            raise ValueError(f"no column is a target; given are {', '.join(self.names[:20]) or 'none'}")
+        if twice := [name for name, count in Counter(names).items() if count > 1]:
+            raise ValueError(f"column {twice[0]!r} has two parts to play; every column has one")
 
     def of(self, *roles: Role) -> list[Column]:
         """The columns that play one of these roles."""
@@ -156,20 +161,22 @@ class Columns:
         rest = {**config}
         columns = rest.pop("columns", {})
         if not isinstance(columns, Mapping):
-            raise ValueError(f"columns is {columns!r}; expected a table for each column, such as [columns.riders]")
+            raise ValueError(f"columns is {brief(columns)}; expected a table for each column, such as [columns.riders]")
         _refuse_others(rest, (field.name for field in fields(cls)), "the schema")
         found = []
         for name, told in columns.items():
             if not isinstance(told, Mapping):
-                raise ValueError(f"column {name!r} is {told!r}; expected a table, [columns.{name}]")
-            _refuse_others(told, (field.name for field in fields(Column)), f"column {name!r}")
+                raise ValueError(f"column {name!r} is {brief(told)}; expected a table, [columns.{name}]")
+            _refuse_others(told, (field.name for field in fields(Column)[1:]), f"column {name!r}")
             found.append(Column(name, **tuples(told)))
-        own = rest.get("id") or ()
-        rest["id"] = (own,) if isinstance(own, str) else tuple(own)
+        own = rest.pop("id", ())
+        own = [own] if isinstance(own, str) else own
+        if not isinstance(own, list | tuple) or not all(isinstance(each, str) for each in own):
+            raise ValueError(f"id is {brief(own)}; expected names of columns")
         for name in ("time", "group", "split"):
             if not isinstance(rest.get(name), str | None):
-                raise ValueError(f"{name} is {rest[name]!r}; expected the name of a column")
-        return cls(tuple(found), **rest)
+                raise ValueError(f"{name} is {brief(rest[name])}; expected the name of a column")
+        return cls(tuple(found), tuple(own), **rest)
 
     def to_toml(self) -> str:
         """The schema as a file to be edited."""
@@ -191,7 +198,21 @@ class Columns:
         Raises:
             ValueError: no TOML, or entries that are none.
         """
-        return cls.from_config(tomllib.loads(text))
+        return cls.from_config(parsed(text))
+
+
+def parsed(text: str) -> dict[str, Any]:
+    """What a TOML file of a stranger says.
+
+    Raises:
+        ValueError: no TOML, or tables within tables without end.
+    """
+    try:
+        if _CHAIN.search(text):
+            raise RecursionError
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("it has tables within tables, deeper than any schema") from None
 
 
 def _refuse_others(given: Mapping[str, Any], known: Iterable[str], who: str) -> None:

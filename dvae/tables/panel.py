@@ -21,6 +21,8 @@ import torch
 
 from ..options import nearest
 from .columns import Column, Columns
+from .parsing import is_number, numbers, texts, times
+from .proposing import LARGEST, TIMES, Told, is_date
 
 SPLITS = ("train", "validation", "test")
 COUNTS = ("count", "overdispersed", "sparse", "sparse-overdispersed")
@@ -86,16 +88,10 @@ class Panel:
                 )
             if one.times is not None and (one.times.shape != (len(one),) or not (np.diff(one.times) > 0).all()):
                 raise ValueError(f"{who} has times that do not increase, or two rows of one time")
-            if np.isinf(one.values).any():
-                raise ValueError(f"{who} has infinite values in {self._first(np.isinf(one.values))}")
         for place, column in enumerate(self.columns.columns):
-            self._check(place, column)
+            self._check(np.concatenate([one.values[:, place] for one in self.series]), column)
 
-    def _first(self, wrong: np.ndarray) -> str:
-        row, place = np.argwhere(wrong)[0]
-        return f"row {row} of column {self.columns.names[place]!r}"
-
-    def _check(self, place: int, column: Column) -> None:
+    def _check(self, values: np.ndarray, column: Column) -> None:
         """Refuses what the family of a column does not have."""
         tests = {
             "category": (lambda v: _counts(v) & (v < len(column.classes)), "the places of its classes"),
@@ -104,19 +100,22 @@ class Panel:
             **dict.fromkeys(("positive", "log-normal"), (lambda v: v > 0, "numbers above 0")),
             "power": (lambda v: v >= 0, "numbers from 0"),
             "share": (lambda v: (v > 0) & (v < 1), "numbers above 0 and below 1"),
-            "angle": (lambda v: np.abs(v) <= np.pi + 1e-9, "radians from -pi to pi"),
+            "angle": (lambda v: np.abs(v) <= np.pi + 1e-6, "radians from -pi to pi"),
         }
-        if column.family not in tests:
-            return
-        right, said = tests[column.family]
-        for one in self.series:
-            values = one.values[:, place]
-            wrong = ~right(values) & ~np.isnan(values)
-            if wrong.any():
-                raise ValueError(
-                    f"sequence {one.name!r} of {self.name} has {values[wrong][0]:g} in row {np.argmax(wrong)} of "
-                    f"column {column.name!r}, and the family {column.family!r} is of {said}; give it another family"
-                )
+        right, said = tests.get(column.family, (np.isfinite, "numbers"))
+        with np.errstate(invalid="ignore", over="ignore"):
+            seen = right(values.astype(np.float32))  # as models compute
+        wrong = ~(seen & (np.abs(values) < LARGEST)) & ~np.isnan(values)
+        if wrong.any():
+            row = first = int(np.argmax(wrong))
+            for one in self.series:
+                if row < len(one):
+                    break
+                row -= len(one)
+            raise ValueError(
+                f"sequence {one.name!r} of {self.name} has {values[first]:g} in row {row} of column {column.name!r}, "
+                f"and the family {column.family!r} is of {said} below {LARGEST:g}; give it another family"
+            )
 
     def __len__(self) -> int:
         return len(self.series)
@@ -162,12 +161,13 @@ class Panel:
         return replace(self, series=[own[name] for name in names])
 
     @classmethod
-    def of(cls, data: Any, columns: Columns | Sequence[str] | None = None, name: str = "panel") -> Panel:
+    def of(cls, data: Any, columns: Columns | Told | Sequence[str] | None = None, name: str = "panel") -> Panel:
         """A table of whatever holds one; see the file.
 
         Args:
             data: a pandas frame in the long form, arrays, a list of arrays, or an xarray `Dataset`.
-            columns: what the columns are: a schema; names, of real targets; or nothing, for names x0, x1, …
+            columns: what the columns are: a schema, or targets in words, see `Told`, and the rest as it is proposed; of
+                arrays a schema; names, of real targets; or nothing, for names x0, x1, …
             name: for titles.
 
         Raises:
@@ -177,27 +177,27 @@ class Panel:
         if isinstance(data, Panel):
             return data
         kind = type(data).__module__.partition(".")[0]
-        if kind == "xarray":
-            data, kind = data.to_dataframe().reset_index(), "pandas"
-        if kind == "pandas":
-            if not isinstance(columns, Columns):
-                from .proposing import Told
-
-                columns = Told(columns=tuple(columns or ())).of(data)
-            dates = columns.time is not None and not _is_number(data[columns.time])
-            return cls(list(_of_frame(data, columns)), columns, name, dates)
+        if kind in ("pandas", "xarray"):
+            if not isinstance(columns, Columns | Told):
+                columns = Told(columns=tuple(columns or ()))
+            if kind == "xarray":
+                data, columns = _of_grid(data, columns)
+            frame = _named(data)
+            columns = columns.of(frame) if isinstance(columns, Told) else columns
+            series = list(_of_frame(frame, columns))
+            return cls(series, columns, name, columns.time is not None and not is_number(frame[columns.time]))
         arrays = [data] if hasattr(data, "ndim") and data.ndim == 2 else data
         if not isinstance(arrays, np.ndarray | torch.Tensor | list | tuple):
             raise TypeError(
                 f"a table is made of a pandas frame, an xarray Dataset, arrays (N, T, D) or a list of arrays (T, D), "
                 f"not of {type(data).__name__}"
             )
-        found = [np.asarray(each, np.float64) for each in arrays]
+        found = [np.asarray(each, np.float64).copy() for each in arrays]
         if not found or any(each.ndim != 2 for each in found):
             raise ValueError(f"sequences are (T, D); got {', '.join(str(each.shape) for each in found[:3]) or 'none'}")
         if not isinstance(columns, Columns):
-            names = columns or [f"x{place}" for place in range(found[0].shape[1])]
-            columns = Columns(tuple(map(Column, names)))
+            named = columns.columns if isinstance(columns, Told) else columns
+            columns = Columns(tuple(map(Column, named or [f"x{place}" for place in range(found[0].shape[1])])))
         return cls([Series(str(place), each) for place, each in enumerate(found)], columns, name)
 
     @classmethod
@@ -209,21 +209,49 @@ class Panel:
             column: what all of them hold; a real target named "value", if not given.
             name: for titles.
         """
-        times = None if data.index.dtype == object else _times(data.index.to_series())
+        index, when = data.index.to_series(), None
+        if is_number(index) or is_date(index):
+            when = times(index)
+            data, when = data.iloc[np.argsort(when, kind="stable")], np.sort(when)
         own = column or Column("value")
         series = []
-        for each in data.columns:
-            values = _numbers(data[each], own)
+        for each, held in data.items():
+            values = numbers(held, own)
             known = np.flatnonzero(~np.isnan(values))  # columns may begin and end at different times
             if len(known):
                 part = slice(known[0], known[-1] + 1)
-                series.append(Series(str(each), values[part, None], None if times is None else times[part]))
-        return cls(series, Columns((own,)), name, times is not None and not _is_number(data.index.to_series()))
+                series.append(Series(str(each), values[part, None], None if when is None else when[part]))
+        return cls(series, Columns((own,)), name, when is not None and not is_number(index))
 
 
 def _counts(values: np.ndarray) -> np.ndarray:
     found: np.ndarray = (values >= 0) & (values % 1 == 0)
     return found
+
+
+def _named(data: Any) -> Any:
+    """A frame whose columns have names.
+
+    Raises:
+        ValueError: two of one name.
+    """
+    frame = data.to_frame() if data.ndim == 1 else data
+    names = [str(name) for name in frame.columns]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the table has two columns {twice!r}; rename one")
+    return frame.set_axis(names, axis=1)
+
+
+def _of_grid(data: Any, columns: Columns | Told) -> tuple[Any, Columns | Told]:
+    """An xarray as a frame; where nothing is told of them, its dimensions are time, and what parts sequences."""
+    data = data if hasattr(data, "data_vars") else data.to_dataset(name=data.name or "x")
+    frame, dims = data.to_dataframe().reset_index(), [str(name) for name in data.dims]
+    if isinstance(columns, Told) and dims:
+        dated = [name for name in dims if frame[name].dtype.kind == "M" or TIMES.search(name.lower())]
+        time = columns.time or (dated or dims)[-1]
+        columns = replace(columns, time=time, id=columns.id or tuple(name for name in dims if name != time))
+    return frame, columns
 
 
 def _of_frame(frame: Any, columns: Columns) -> Iterator[Series]:
@@ -236,79 +264,31 @@ def _of_frame(frame: Any, columns: Columns) -> Iterator[Series]:
         )
     if not len(frame):
         raise ValueError("the table has no rows")
-    values = np.stack([_numbers(frame[column.name], column) for column in columns.columns], 1)
-    times = None if columns.time is None else _times(frame[columns.time])
-    labels = {name: frame[own].astype(str).to_numpy() for name in ("group", "split") if (own := getattr(columns, name))}
-    rows = [(("0",), np.arange(len(frame)))]
+    values = np.stack([numbers(frame[column.name], column) for column in columns.columns], 1)
+    when = None if columns.time is None else times(frame[columns.time])
+    told = {name: own for name in ("group", "split") if (own := getattr(columns, name))}
+    labels = {name: texts(frame[own]).fillna("").to_numpy() for name, own in told.items()}
+    rows, names = [np.arange(len(frame))], ["0"]
     if columns.id:
-        found = frame.groupby(list(columns.id), sort=False, observed=True, dropna=False).indices
-        rows = [(key if isinstance(key, tuple) else (key,), np.sort(places)) for key, places in found.items()]
-    for key, places in rows:
-        name = "/".join(map(str, key))
-        if times is not None:
-            places = places[np.argsort(times[places], kind="stable")]
-            if (twice := np.diff(times[places]) == 0).any():
-                when = frame[columns.time].iloc[places[np.argmax(twice)]]
+        found = frame.groupby(list(columns.id), sort=True, observed=True, dropna=False).indices
+        rows = [np.sort(places) for places in found.values()]
+        firsts = frame.iloc[[places[0] for places in rows]]
+        names = ["/".join(key) for key in zip(*(texts(firsts[own]).fillna("") for own in columns.id), strict=True)]
+    for name, places in zip(names, rows, strict=True):
+        if when is not None:
+            places = places[np.argsort(when[places], kind="stable")]
+            if (twice := np.diff(when[places]) == 0).any():
+                moment = frame[columns.time].iloc[places[np.argmax(twice)]]
                 raise ValueError(
-                    f"sequence {name!r} has two rows at {columns.time} {when}; name the id columns that part them"
+                    f"sequence {name!r} has two rows at {columns.time} {moment}; name the id columns that part them"
                 )
         own = {}
         for what, all_labels in labels.items():
             if len(said := set(all_labels[places])) > 1:
                 raise ValueError(
-                    f"sequence {name!r} has several values of {what}: {', '.join(sorted(said)[:3])}; it has one"
+                    f"sequence {name!r} has several values of {told[what]}: {', '.join(sorted(said)[:3])}; it has one"
                 )
             own[what] = said.pop()
         if own.get("split") and own["split"] not in SPLITS:
             raise ValueError(f"sequence {name!r} is of split {own['split']!r}; expected one of {', '.join(SPLITS)}")
-        yield Series(name, values[places], None if times is None else times[places], **own)
-
-
-def _is_number(column: Any) -> bool:
-    import pandas as pd
-
-    return bool(pd.api.types.is_numeric_dtype(column))
-
-
-def _times(column: Any) -> np.ndarray:
-    """Seconds since 1970 of dates, or the numbers that they are."""
-    import pandas as pd
-
-    if _is_number(column):
-        found = column.to_numpy(np.float64)
-    else:
-        try:
-            found = pd.to_datetime(column, utc=True).to_numpy("datetime64[ns]").astype("int64") / 1e9
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"the times of column {column.name!r} are neither numbers nor dates: {error}") from error
-    if (bad := ~np.isfinite(found) | (found < -9e9)).any():
-        raise ValueError(f"row {int(np.argmax(bad))} of column {column.name!r} has no time")
-    return found  # type: ignore[no-any-return]
-
-
-def _numbers(column: Any, told: Column) -> np.ndarray:
-    """The values of a pandas column as numbers, of a category as the place of its class."""
-    import pandas as pd
-
-    if told.family == "category":
-        places = {each: place for place, each in enumerate(told.classes)}
-        texts = column.astype(str).where(column.notna())
-        unknown = texts.notna() & ~texts.isin(list(places))
-        if unknown.any():
-            value = texts[unknown].iloc[0]
-            raise ValueError(
-                f"column {told.name!r} has {value!r}{nearest(value, places)}, which is none of its classes: "
-                f"{', '.join(told.classes[:10])}"
-            )
-        return texts.map(places).to_numpy(np.float64)  # type: ignore[no-any-return]
-    if pd.api.types.is_bool_dtype(column):
-        column = column.astype(float)
-    try:
-        return pd.to_numeric(column).to_numpy(np.float64, na_value=np.nan)  # type: ignore[no-any-return]
-    except (TypeError, ValueError) as error:
-        texts = column.astype(str)
-        wrong = pd.to_numeric(texts, errors="coerce").isna() & column.notna()
-        value = texts[wrong].iloc[0] if wrong.any() else "?"
-        raise ValueError(
-            f"column {told.name!r} holds {value!r}, which is no number; leave it out, or give it the family 'category'"
-        ) from error
+        yield Series(name, values[places], None if when is None else when[places], **own)

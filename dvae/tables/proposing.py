@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,11 +12,14 @@ import numpy as np
 
 from ..options import nearest
 from .columns import Column, Columns, Role
+from .parsing import dates, is_number, texts
 
 CLASSES = 20
 """Most different texts of a category; more are an id, or a text."""
 SPREAD = 1.5
 """Variance over mean above which counts vary more than Poisson's."""
+LARGEST = 1e30
+"""Of all values; models compute in float32."""
 TIMES = re.compile(
     r"(^|_)(time|date|datetime|timestamp|day|week|month|quarter|year|hour|minute|second|step|frame|t|ds)(_|$)"
 )
@@ -62,7 +67,7 @@ class Told:
         for name in (*roles, *self.id, *filter(None, (self.time, self.group))):
             if name not in known:
                 raise ValueError(f"no column {name!r}{nearest(name, known)}; there are {', '.join(known[:20])}")
-        found = proposed(frame, self.time, self.id)
+        found = proposed(frame, self.time, self.id, roles)
         layout: dict[str, Any] = {"id": found.id, "time": found.time, "group": self.group}
         aside = {*layout["id"], *filter(None, (layout["time"], self.group))}
         own = {column.name: column for column in found.columns if column.name not in aside}
@@ -80,11 +85,11 @@ def _told(name: str, role: Role, family: str, unit: str, values: Any, guess: Col
     family = family or (guess.family if guess else "real")
     if role != "target" and family != "category":
         family = "real"
-    classes = tuple(sorted(values.dropna().astype(str).unique())) if family == "category" else ()
+    classes = tuple(sorted(texts(values).dropna().unique())) if family == "category" else ()
     return Column(name, role, family, unit, classes)
 
 
-def proposed(frame: Any, time: str | None = None, id: tuple[str, ...] = ()) -> Columns:
+def proposed(frame: Any, time: str | None = None, id: tuple[str, ...] = (), others: Collection[str] = ()) -> Columns:
     """What a pandas frame in the long form probably is.
 
     The first column of dates, or with the name of a time, is that. Columns of texts that repeat, and of whole numbers
@@ -96,27 +101,34 @@ def proposed(frame: Any, time: str | None = None, id: tuple[str, ...] = ()) -> C
         frame: whose columns are looked at.
         time: the column of the times, if it is known.
         id: the columns that tell sequences apart, if they are known.
+        others: columns that are neither.
 
     Raises:
         ValueError: no column that could be a target.
     """
     names = [str(name) for name in frame.columns]
+    free = [name for name in names if name not in others]
     if time is None:
-        time = next((name for name in names if _is_date(frame[name])), None)
+        time = next((name for name in free if is_date(frame[name])), None)
     if time is None:
-        time = next((name for name in names if TIMES.search(name.lower()) and _is_number(frame[name])), None)
-    rest = [name for name in names if name != time]
+        time = next((name for name in free if TIMES.search(name.lower()) and is_number(frame[name])), None)
+    rest, free = ([name for name in part if name != time] for part in (names, free))
     ids = list(id)
     if not ids and time is not None and frame[time].duplicated().any():
-        texts = [n for n in rest if not _is_number(frame[n]) and frame[n].nunique() < len(frame)]
-        numbers = [n for n in rest if _is_whole(frame[n]) and IDS.search(n.lower())]
-        for name in (*numbers, *texts):
+        named = [n for n in free if _is_whole(frame[n]) and IDS.search(n.lower())]
+        for name in (*named, *(n for n in free if not is_number(frame[n]) and frame[n].nunique() < len(frame))):
             left = frame.duplicated([*ids, time]).sum()
             if not left:
                 break
             if frame.duplicated([*ids, name, time]).sum() < left:
                 ids.append(name)
+        for name in tuple(ids):  # those before the one that alone suffices
+            fewer = [other for other in ids if other != name]
+            ids = ids if frame.duplicated([*fewer, time]).any() else fewer
     found = [column for name in rest if name not in ids and (column := _column(name, frame[name])) is not None]
+    if not ids:  # a panel of one sequence
+        ids = [name for name in free if IDS.search(name.lower()) and frame[name].nunique(dropna=False) == 1]
+        found = [column for column in found if column.name not in ids]
     if ids and len(groups := frame.groupby(ids, observed=True)) > 1:
         changing = groups[[column.name for column in found]].nunique().max() > 1
         found = [column if changing[column.name] else _static(column) for column in found]
@@ -127,15 +139,17 @@ def proposed(frame: Any, time: str | None = None, id: tuple[str, ...] = ()) -> C
 
 def _column(name: str, values: Any) -> Column | None:
     """What a column probably holds; None for what is no target, as texts that are all different."""
-    known = values.dropna()
+    known = values.dropna().infer_objects()  # true and false, where some are missing
     if not len(known):
         return None
-    if not _is_number(known):
-        classes = sorted(known.astype(str).unique())
+    if not is_number(known):
+        classes = sorted(texts(known).unique())
         return Column(name, family="category", classes=tuple(classes)) if 2 <= len(classes) <= CLASSES else None
     numbers = known.to_numpy(np.float64)
     if set(np.unique(numbers)) == {0.0, 1.0}:
         return Column(name, family="binary")
+    if not (np.abs(numbers) < LARGEST).all():
+        return Column(name)  # which reading refuses
     if (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2:
         return Column(name, family="overdispersed" if numbers.var() > SPREAD * numbers.mean() else "count")
     if (numbers > 0).all() and numbers.std() > 0.5 * numbers.mean():
@@ -148,26 +162,22 @@ def _static(column: Column) -> Column:
     return replace(column, role="static", family=family)
 
 
-def _is_number(values: Any) -> bool:
-    import pandas as pd
-
-    return bool(pd.api.types.is_numeric_dtype(values))
-
-
 def _is_whole(values: Any) -> bool:
-    return _is_number(values) and bool((values.dropna() % 1 == 0).all())
+    return is_number(values) and bool((values.dropna() % 1 == 0).all())
 
 
-def _is_date(values: Any) -> bool:
+def is_date(values: Any) -> bool:
+    """Whether a column holds dates, or texts of them."""
     import pandas as pd
 
     if pd.api.types.is_datetime64_any_dtype(values):
         return True
     known = values.dropna()
-    if _is_number(values) or not len(known):
+    if is_number(values) or not len(known):
         return False
     some = known.astype(str).iloc[:: max(len(known) // 50, 1)]
-    return bool(
-        some.str.contains(r"\d{4}|\d[-/:]\d").all()
-        and pd.to_datetime(some, errors="coerce", format="mixed").notna().all()
-    )
+    if not some.str.contains(r"\d{4}|\d[-/:]\d").all():
+        return False
+    with suppress(TypeError, ValueError):
+        return bool(dates(some).notna().all())
+    return False

@@ -11,11 +11,13 @@ and how sequences are divided and cut:
 
 from __future__ import annotations
 
+import csv
+import math
 import os
-import tomllib
+import warnings
 import zipfile
-from dataclasses import fields
-from io import BytesIO
+from dataclasses import asdict, fields
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ import numpy as np
 
 from .. import files
 from ..options import nearest
-from .columns import Columns
+from .columns import MOST, Columns, parsed
 from .panel import Panel
 from .proposing import Told
 from .protocol import Cut
@@ -33,6 +35,7 @@ SUFFIXES = (*SEPARATORS, ".parquet", ".npz")
 LARGEST = 2 * 10**9
 """Bytes of a file, or of what it holds."""
 LARGEST_SCHEMA = 10**6
+LARGEST_HEADER = 2**20
 
 
 def read_frame(path: str | os.PathLike[str]) -> Any:
@@ -45,8 +48,6 @@ def read_frame(path: str | os.PathLike[str]) -> Any:
         FileNotFoundError: there is no such file.
         ValueError: no table, or one of another kind or size.
     """
-    import pandas as pd
-
     place = Path(path)
     suffix = place.suffix.lower()
     if suffix not in SUFFIXES:
@@ -55,17 +56,37 @@ def read_frame(path: str | os.PathLike[str]) -> Any:
     if suffix == ".npz":
         return _of_arrays(place, content)
     try:
-        return _parquet(content) if suffix == ".parquet" else pd.read_csv(BytesIO(content), sep=SEPARATORS[suffix])
+        return _parquet(content) if suffix == ".parquet" else _separated(content, SEPARATORS[suffix])
     except ImportError as error:
         raise ValueError(f"{place} is Parquet, which needs pyarrow: pip install 'pyro-dvae[parquet]'") from error
     except Exception as error:  # of parsers, which fail in many ways
         raise ValueError(f"{place} cannot be read as {suffix[1:].upper()}: {str(error)[:300]}") from error
 
 
+def _separated(content: bytes, separator: str) -> Any:
+    """The frame of a CSV, of whose rows none is longer than the header."""
+    import pandas as pd
+
+    head = StringIO(content[:LARGEST_HEADER].decode("utf-8-sig", "replace"), newline=None)
+    if max(map(len, csv.reader(head, delimiter=separator)), default=0) > MOST:
+        raise ValueError(f"it has more than {MOST} columns")
+    if b"\0" in content:
+        raise ValueError("it has bytes of 0, which are no text")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", pd.errors.ParserWarning)
+        try:
+            frame = pd.read_csv(BytesIO(content), sep=separator, index_col=False, low_memory=False)
+        except pd.errors.ParserWarning as error:
+            raise ValueError("some of its rows have more entries than its header") from error
+    return frame
+
+
 def _parquet(content: bytes) -> Any:
     import pyarrow.parquet as parquet
 
     file = parquet.ParquetFile(BytesIO(content))
+    if file.metadata.num_columns > MOST:
+        raise ValueError(f"it has {file.metadata.num_columns} columns; at most {MOST} are read")
     sizes = (file.metadata.row_group(n).total_byte_size for n in range(file.metadata.num_row_groups))
     if (size := sum(sizes)) > LARGEST:
         raise ValueError(f"it holds {size} bytes; at most {LARGEST} are read")
@@ -84,13 +105,15 @@ def _of_arrays(place: Path, content: bytes) -> Any:
             f"{name!r} of {place} is {values.dtype} {values.shape}; expected numbers (sequences, steps, columns)"
         )
     values = values if values.ndim == 3 else values[None]
+    if values.shape[2] > MOST:
+        raise ValueError(f"{name!r} of {place} has {values.shape[2]} columns; at most {MOST} are read")
     most = values.shape[1]
     lengths = arrays.get("lengths", np.full(len(values), most))
     whole = lengths.shape == (len(values),) and lengths.dtype.kind in "iu"
     if not whole or not ((lengths >= 1) & (lengths <= most)).all():
         raise ValueError(f"'lengths' of {place} are {lengths.shape}; expected whole numbers (N,) from 1 to {most}")
     valid = np.arange(most) < lengths[:, None]
-    frame = pd.DataFrame(values[valid], columns=[f"x{n}" for n in range(values.shape[2])])
+    frame = pd.DataFrame(values[valid].astype(np.float64), columns=[f"x{n}" for n in range(values.shape[2])])
     sequence, step = np.nonzero(valid)
     return frame.assign(sequence=sequence, step=step)
 
@@ -106,8 +129,7 @@ def read_panel(path: str | os.PathLike[str], columns: Columns | Told | None = No
         FileNotFoundError: there is no such file.
         ValueError: no table, or columns that it does not have.
     """
-    frame = read_frame(path)
-    return Panel.of(frame, columns if isinstance(columns, Columns) else (columns or Told()).of(frame), Path(path).stem)
+    return Panel.of(read_frame(path), columns, Path(path).stem)
 
 
 def _arrays(place: Path, content: bytes) -> dict[str, np.ndarray]:
@@ -115,13 +137,30 @@ def _arrays(place: Path, content: bytes) -> dict[str, np.ndarray]:
         with zipfile.ZipFile(BytesIO(content)) as archive:
             if (size := sum(entry.file_size for entry in archive.infolist())) > LARGEST:
                 raise ValueError(f"it holds {size} bytes; at most {LARGEST} are read")
+            entries = archive.namelist()
+            for entry in entries if len(entries) == 1 else {"x.npy", "lengths.npy"}.intersection(entries):
+                with archive.open(entry) as member:
+                    _check_header(entry, member)
         with np.load(BytesIO(content), allow_pickle=False) as loaded:
             found = {name: loaded[name] for name in loaded.files if name in ("x", "lengths") or len(loaded.files) == 1}
     except Exception as error:
         raise ValueError(f"{place} cannot be read as npz: {str(error)[:300]}") from error
     if not set(found) - {"lengths"}:
-        raise ValueError(f"{place} holds {', '.join(loaded.files) or 'nothing'}; expected an array 'x', or one alone")
+        raise ValueError(
+            f"{place} holds {', '.join(loaded.files[:20]) or 'nothing'}; expected an array 'x', or one alone"
+        )
     return found
+
+
+def _check_header(name: str, member: Any) -> None:
+    """Refuses an array of more numbers than are read, before room is made for it."""
+    reads = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(member)
+    if version not in reads:
+        raise ValueError(f"{name} is no array of numbers")
+    shape, _, _ = reads[version](member)
+    if 8 * math.prod(shape) > LARGEST:
+        raise ValueError(f"{name} is {shape}; at most {LARGEST // 8} numbers are read")
 
 
 def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | None, Cut | None]:
@@ -142,7 +181,7 @@ def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | None, Cut | N
 
 def read_schema(text: str) -> tuple[Columns | None, Cut | None]:
     """Columns and cut of a schema; None for what it does not say."""
-    told = tomllib.loads(text)
+    told = parsed(text)
     cut = told.pop("cut", None)
     if cut is not None:
         if not isinstance(cut, dict):
@@ -156,8 +195,10 @@ def read_schema(text: str) -> tuple[Columns | None, Cut | None]:
 
 def written_schema(columns: Columns, cut: Cut) -> str:
     """A schema as a file to be edited."""
-    lines = ["[cut]"]
-    lines += [f"observed = {cut.observed}", f"horizon = {cut.horizon}"] if cut.length else []
-    lines += [f"stride = {cut.stride}"] if cut.stride else []
-    lines += [f'split = "{cut.split}"', f"validation = {cut.validation}", f"test = {cut.test}"]
+    told = {name: value for name, value in asdict(cut).items() if value != getattr(Cut, name)}
+    lines = [
+        "[cut]",
+        f'split = "{told.pop("split", cut.split)}"',
+        *(f"{name} = {value}" for name, value in told.items()),
+    ]
     return columns.to_toml() + "\n" + "\n".join(lines) + "\n"

@@ -1,0 +1,148 @@
+"""What columns are told to be comes back as it was written, and what is no schema is refused in a sentence."""
+
+import json
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dvae.laws.family import FAMILIES
+from dvae.tables import Column, Columns
+from dvae.tables.columns import MOST, parsed
+from dvae.tables.protocol import Cut
+from dvae.tables.reading import read_schema, written_schema
+
+NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=12) | st.sampled_from(
+    [
+        "",
+        ".",
+        "a.b",
+        'say "x"',
+        "\\",
+        "\n\r\t\0\x7f\x85",
+        "'''",
+        '"""',
+        "[columns.x]",
+        "columns",
+        "é",
+        "🚲",
+        "# no",
+        "id",
+    ]
+)
+
+
+@st.composite
+def column(draw, name, role):
+    families = list(FAMILIES) if role == "target" else ["real", "category"]
+    family = draw(st.sampled_from(families))
+    classes = draw(st.lists(NAMES, min_size=2, max_size=4, unique=True)) if family == "category" else ()
+    return Column(name, role, family, draw(NAMES), tuple(classes))
+
+
+@st.composite
+def schemas(draw):
+    names = iter(draw(st.lists(NAMES.filter(bool), min_size=7, max_size=9, unique=True)))
+    told = {"id": (next(names), next(names))[: draw(st.integers(0, 2))]}
+    told |= {name: draw(st.none() | st.just(next(names))) for name in ("time", "group", "split")}
+    roles = ["target", *draw(st.lists(st.sampled_from(["target", "known", "past", "static"]), max_size=3))]
+    return Columns(tuple(draw(column(name, role)) for name, role in zip(names, roles, strict=False)), **told)
+
+
+@given(schemas())
+def test_a_schema_comes_back_from_toml_and_from_json(columns):
+    assert Columns.from_toml(columns.to_toml()) == columns
+    assert Columns.from_config(json.loads(json.dumps(columns.config()))) == columns
+
+
+@given(
+    schemas(),
+    st.builds(
+        Cut,
+        observed=st.just(7),
+        horizon=st.integers(1, 9),
+        stride=st.none() | st.integers(1, 9),
+        split=st.sampled_from(["sequence", "time", "group"]),
+        validation=st.floats(0, 0.4),
+        test=st.floats(0, 0.5),
+        seed=st.integers(0, 9),
+        multimodal_threshold=st.floats(0.1, 2),
+    )
+    | st.just(Cut()),
+)
+def test_a_schema_beside_a_file_comes_back_with_its_cut(columns, cut):
+    assert read_schema(written_schema(columns, cut)) == (columns, cut)
+
+
+def test_columns_are_real_targets_where_nothing_is_said():
+    assert Columns.from_toml("[columns.a]\n[columns.b]\nrole = 'known'") == Columns((Column("a"), Column("b", "known")))
+    assert Columns.from_toml("id = 's'\n[columns.a]").id == ("s",)
+    assert read_schema("[columns.a]")[1] is None
+    assert read_schema("[cut]\ntest = 0.3") == (None, Cut(test=0.3))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tme = 'x'\n[columns.a]", r"entry 'tme' \(did you mean 'time'\?\)"),
+        ("[columns.a]\nfamly = 'count'", r"column 'a' has an entry 'famly' \(did you mean 'family'\?\)"),
+        ("[columns.a]\nname = 'b'", "column 'a' has an entry 'name'"),
+        ("[columns.a]\nrole = 'knwn'", r"unknown role 'knwn' \(did you mean 'known'\?\)"),
+        ("[columns.a]\nfamily = 'cont'", r"family 'cont' \(did you mean 'count'\?\); a target has one of real"),
+        ("[columns.a]\n[columns.b]\nrole = 'past'\nfamily = 'count'", "a past has one of real, category"),
+        ("[columns.a]\nfamily = 'category'", "0 classes; a category, and nothing else, has classes"),
+        ("[columns.a]\nclasses = ['u', 'v']", "'real' and has 2 classes"),
+        ("[columns.a]\nfamily = 'category'\nclasses = ['u', 'u']", "has 2 classes, .* all different"),
+        ("[columns.a]\nrole = 'known'", "no column is a target; given are a"),
+        ("id = 5\n[columns.a]", "id is 5; expected names of columns"),
+        ("id = [5]\n[columns.a]", r"id is \[5\]; expected names"),
+        ("time = 5\n[columns.a]", "time is 5; expected the name of a column"),
+        ("time = 'a'\n[columns.a]", "column 'a' has two parts to play"),
+        ("time = ''\n[columns.a]", "a column has no name"),
+        ("columns = 3", "columns is 3; expected a table for each column"),
+        ("[columns]\na = 3", "column 'a' is 3; expected a table"),
+        ("cut = 3", "cut is a table"),
+        ("[cut]\nobservd = 3", r"entry 'observd' \(did you mean 'observed'\?\)"),
+        ("[cut]\nobserved = 3", "windows have both, or neither"),
+        ("[cut]\nsplit = 'time'", "say how many steps are observed"),
+        ("[cut]\nsplit = 'tme'", r"unknown split 'tme' \(did you mean 'time'\?\)"),
+        ("[cut]\nvalidation = 0.5\ntest = 0.5", "leave nothing to train on"),
+        ("\n".join(f"[columns.a{n}]" for n in range(MOST + 1)), f"at most {MOST} are read"),
+    ],
+)
+def test_what_is_no_schema_is_refused_in_a_sentence(text, said):
+    with pytest.raises(ValueError, match=said):
+        read_schema(text)
+
+
+def test_a_category_has_so_many_classes_at_most():
+    with pytest.raises(ValueError, match=f"2 to {MOST}") as error:
+        Column("a", family="category", classes=tuple(map(str, range(MOST + 1))))
+    assert len(str(error.value)) < 300
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a = " + "[" * 100_000,
+        "a = " + "{b=" * 100_000,
+        ".".join("a" * 400_000) + " = 1",
+        "[" + " . ".join("a" * 200_000) + "]",
+        ".".join(['"a.b"'] * 100_000) + " = 1",
+        ".".join(["'a'"] * 100_000) + " = 1",
+        'x = {"a" = "\\"", ' + ".".join("a" * 300_000) + " = 1}",
+    ],
+    ids=["lists", "tables", "key", "header", "quoted", "literal", "within"],
+)
+def test_tables_within_tables_without_end_are_refused_before_they_take_time(text):
+    start = time.process_time()
+    with pytest.raises(ValueError, match="deeper than any schema"):
+        parsed(text)
+    assert time.process_time() - start < 5  # without a bound, minutes
+
+
+def test_dots_in_names_and_classes_are_none_of_keys():
+    classes = tuple(f"A{n}.{n}" for n in range(300))
+    columns = Columns((Column("a.b.c", family="category", classes=classes),))
+    assert Columns.from_toml(columns.to_toml()) == columns

@@ -1,0 +1,323 @@
+"""A panel is the same whatever held its numbers, and says what it cannot hold."""
+
+from decimal import Decimal
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dvae.laws.family import FAMILIES
+from dvae.tables import Column, Columns, Panel, Series
+
+pd = pytest.importorskip("pandas")
+xr = pytest.importorskip("xarray")
+
+XY = (Column("x0"), Column("x1"))
+LONG = Columns(XY, id=("s",), time="t")
+
+
+def values(panel):
+    return {one.name: one.values for one in panel}
+
+
+def same(one, other):
+    assert one.keys() == other.keys()
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name])
+
+
+def grid(n=3, t=5, seed=0):
+    numbers = np.random.default_rng(seed).normal(size=(n, t, 2))
+    numbers[1, 2, 0] = np.nan
+    return numbers
+
+
+def long(numbers):
+    n, t, _ = numbers.shape
+    frame = pd.DataFrame(numbers.reshape(-1, 2), columns=["x0", "x1"])
+    return frame.assign(s=np.repeat(np.arange(n), t), t=np.tile(np.arange(t), n))
+
+
+def test_the_same_numbers_from_everywhere_are_the_same_panel():
+    numbers = grid()
+    wanted = {str(n): each for n, each in enumerate(numbers)}
+    same(values(Panel.of(numbers)), wanted)
+    same(values(Panel.of(list(numbers))), wanted)
+    same(values(Panel.of([torch.from_numpy(each) for each in numbers])), wanted)
+    same(values(Panel.of(torch.from_numpy(numbers))), wanted)
+    same(values(Panel.of(long(numbers), LONG)), wanted)
+    dataset = xr.Dataset({name: (("s", "t"), numbers[..., n]) for n, name in enumerate(("x0", "x1"))})
+    same(values(Panel.of(dataset, LONG)), wanted)
+    same(values(Panel.of(dataset)), wanted)
+    same(values(Panel.of(dataset.transpose("t", "s"), ["x0", "x1"])), wanted)
+    first = {name: each[:, :1] for name, each in wanted.items()}
+    same(values(Panel.of(dataset["x0"])), first)
+    wide = pd.DataFrame(numbers[..., 0].T, columns=list("012"))
+    same(values(Panel.wide(wide)), first)
+    same(values(Panel.wide(wide.set_axis(pd.date_range("2024", periods=5, tz="Asia/Tokyo")))), first)
+
+
+def test_one_sequence_needs_no_name():
+    numbers = grid()[0]
+    same(values(Panel.of(numbers)), {"0": numbers})
+    same(values(Panel.of(pd.DataFrame(numbers))), {"0": numbers})
+    assert Panel.of(pd.DataFrame(numbers)).columns.names == ["0", "1"]
+    same(values(Panel.of(pd.Series(numbers[:, 0], name="a"))), {"0": numbers[:, :1]})
+
+
+def test_what_changes_later_elsewhere_does_not_change_a_panel():
+    numbers = grid()
+    panel, wanted = Panel.of(numbers), numbers[0].copy()
+    numbers[:] = 0
+    np.testing.assert_array_equal(panel.series[0].values, wanted)
+
+
+@given(st.permutations(range(15)))
+def test_the_order_of_rows_does_not_matter(order):
+    frame = long(grid())
+    panel, other = Panel.of(frame, LONG), Panel.of(frame.iloc[list(order)], LONG)
+    assert [one.name for one in panel] == [one.name for one in other]
+    same(values(panel), values(other))
+    assert panel.fingerprint() == other.fingerprint()
+    wide = pd.DataFrame(grid()[..., 0].T)
+    rows = [place for place in order if place < 5]
+    assert Panel.wide(wide.iloc[rows]).fingerprint() == Panel.wide(wide).fingerprint()
+
+
+def test_wide_rows_without_times_stay_as_they_are_and_columns_begin_and_end_when_they_do():
+    frame = pd.DataFrame({"a": [np.nan, 1.0, np.nan, 3.0], "b": [5.0, 6.0, np.nan, np.nan]}, index=list("zyxw"))
+    panel = Panel.wide(frame)
+    same(values(panel), {"a": np.array([[1.0], [np.nan], [3.0]]), "b": np.array([[5.0], [6.0]])})
+    assert panel.series[0].times is None
+    timed = Panel.wide(frame.set_axis([0.0, 1.0, 2.5, 3.0]))
+    np.testing.assert_array_equal(timed.series[0].times, [1.0, 2.5, 3.0])
+
+
+def of(column, family="real", classes=()):
+    """The values of a column of a frame."""
+    frame = pd.DataFrame({"y": column})
+    return Panel.of(frame, Columns((Column("y", family=family, classes=classes),))).series[0].values[:, 0]
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        [1.0, np.nan, 0.0],
+        [1, None, 0],
+        np.array([1, None, 0], object),
+        np.array([1, pd.NA, 0], object),
+        np.array([1, float("nan"), 0], object),
+        np.array([True, None, False], object),
+        np.array([Decimal(1), None, Decimal(0)], object),
+        pd.array([1, None, 0], "Int64"),
+        pd.array([1, None, 0], "Float32"),
+        pd.array([True, None, False], "boolean"),
+        pd.Categorical([1, None, 0]),
+        ["1", None, "0"],
+    ],
+    ids=str,
+)
+def test_missing_values_of_every_kind_are_missing(column):
+    np.testing.assert_array_equal(of(column), [1.0, np.nan, 0.0])
+
+
+def test_true_and_false_are_1_and_0():
+    np.testing.assert_array_equal(of([True, False], "binary"), [1, 0])
+
+
+def test_classes_are_texts_and_whole_numbers_are_written_alike_whether_some_are_missing():
+    np.testing.assert_array_equal(of(["v", None, "u"], "category", ("u", "v")), [1, np.nan, 0])
+    np.testing.assert_array_equal(of([2, 1], "category", ("1", "2")), [1, 0])
+    np.testing.assert_array_equal(of([2, None, 1], "category", ("1", "2")), [1, np.nan, 0])
+    np.testing.assert_array_equal(of(pd.Categorical(["b", None]), "category", ("a", "b")), [1, np.nan])
+    np.testing.assert_array_equal(of([1.5, None], "category", ("1.5", "2")), [0, np.nan])
+    np.testing.assert_array_equal(of([None, None], "category", ("1", "2")), [np.nan, np.nan])
+    with pytest.raises(ValueError, match=r"'y' has 'rian' \(did you mean 'rain'\?\), which is none of its classes"):
+        of(["rian"], "category", ("rain", "sun"))
+
+
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        ([1.0, "a few", 2], "column 'y' holds 'a few', which is no number"),
+        (["x", None], "column 'y' holds 'x'"),
+        (pd.to_datetime(["2024", None]), r"column 'y' holds datetime64\[.s\], which are no numbers"),
+        (pd.to_timedelta([1, 2], "s"), "column 'y' holds timedelta"),
+        ([1j, 2], "column 'y' holds complex128"),
+        ([10**400, 1], "column 'y' holds something, which is no number"),
+    ],
+    ids=["mixed", "text", "dates", "spans", "complex", "huge"],
+)
+def test_what_holds_no_numbers_is_named(column, said):
+    with pytest.raises(ValueError, match=said):
+        of(column)
+
+
+GOOD = {
+    "binary": [0, 1],
+    "category": [0, 1],
+    "share": [0.25, 0.75],
+    "angle": [-np.pi, np.pi],
+    "positive": [0.5, 3],
+    "log-normal": [0.5, 3],
+    "power": [0, 2.5],
+    **{key: [0, 70] for key in ("count", "overdispersed", "sparse", "sparse-overdispersed")},
+}
+BAD = {
+    "binary": [0.5, 2, -1],
+    "category": [2, -1, 0.5],
+    "share": [0, 1, 1 - 1e-12, 1e-50],
+    "angle": [3.2, -4],
+    "positive": [0, -1, 1e-50],
+    "log-normal": [0, -1],
+    "power": [-0.1],
+    **{key: [0.5, -1] for key in ("count", "overdispersed", "sparse", "sparse-overdispersed")},
+}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_values_are_of_their_family_as_models_see_them(family):
+    columns = Columns((Column("a"), Column("y", family=family, classes=("u", "v") if family == "category" else ())))
+
+    def panel(value):
+        told = [Series("p", np.array([[0.0, np.nan]])), Series("q", np.array([[0.0, np.nan], [0.0, value]]))]
+        return Panel(told, columns, "riders")
+
+    for value in GOOD.get(family, [-3.5, 0.0]):
+        panel(value)
+    for value in [*BAD.get(family, []), np.inf, 1e31]:
+        with pytest.raises(ValueError, match=r"sequence 'q' of riders has .* in row 1 of column 'y', and the family"):
+            panel(value)
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        pd.date_range("2020-03-28", periods=3, tz="Europe/Berlin"),
+        ["2020-03-28T00:00+01:00", "2020-03-29T00:00+01:00", "2020-03-30T00:00+02:00"],
+        pd.to_datetime(["2020-03-27 23:00", "2020-03-28 23:00", "2020-03-29 22:00"]),
+    ],
+    ids=["zone", "texts", "utc"],
+)
+def test_dates_with_time_zones_are_moments(column):
+    frame = pd.DataFrame({"t": column, "y": [1.0, 2.0, 3.0]})
+    panel = Panel.of(frame)
+    assert panel.columns.time == "t"
+    assert panel.dates
+    np.testing.assert_array_equal(np.diff(panel.series[0].times) / 3600, [24, 23])  # summer time
+    assert panel.series[0].times[0] == 1585350000
+
+
+@pytest.mark.parametrize(
+    "column",
+    [["2020-01-01", "2020-01-01 12:00", "2020-01-02"], pd.period_range("2020-01-01", periods=3, freq="12h")],
+    ids=["of several lengths", "periods"],
+)
+def test_dates_are_read_as_they_are_written(column):
+    times = Panel.of(pd.DataFrame({"t": column, "y": [1.0, 2, 3]}), Columns((Column("y"),), time="t")).series[0].times
+    np.testing.assert_array_equal(np.diff(times), [43200, 43200])
+
+
+def test_dates_before_1970_are_times_too():
+    frame = pd.DataFrame({"t": ["1500-01-01", "1500-01-02", "1969-12-31"], "y": [1.0, 2, 3]})
+    times = Panel.of(frame, Columns((Column("y"),), time="t")).series[0].times
+    assert times[1] - times[0] == 86400
+    assert times[2] == -86400
+
+
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        ([0, 1, 1], "sequence '0' has two rows at t 1; name the id columns"),
+        (["2020", "2021", "2021"], "sequence '0' has two rows at t 2021"),
+        ([0, None, 1], "row 1 of column 't' has no time"),
+        (["2020", None, "2021"], "row 1 of column 't' has no time"),
+        (["a", "b", "c"], "times of column 't' are neither numbers nor dates"),
+        (["1/2/2020", "13/2/2020", "2/2/2020"], "times of column 't' are neither numbers nor dates"),
+    ],
+)
+def test_rows_without_a_time_of_their_own_are_refused(column, said):
+    frame = pd.DataFrame({"t": column, "y": [1.0, 2, 3]})
+    with pytest.raises(ValueError, match=said):
+        Panel.of(frame, Columns((Column("y"),), time="t"))
+
+
+def test_sequences_are_told_apart_by_all_their_ids():
+    frame = pd.DataFrame({"a": [1, 1, 2, 2], "b": ["u", "v", "u", None], "t": [0, 0, 0, 0], "y": [1.0, 2, 3, 4]})
+    panel = Panel.of(frame, Columns((Column("y"),), id=("a", "b"), time="t"))
+    assert {one.name: one.values.item() for one in panel} == {"1/u": 1, "1/v": 2, "2/u": 3, "2/": 4}
+    numbered = frame.assign(a=[10, 10, 2, 2])
+    assert next(iter(Panel.of(numbered, Columns((Column("y"),), id=("a", "b"), time="t")))).name == "2/u"
+
+
+def test_groups_and_splits_are_of_sequences():
+    told = Columns((Column("y"),), id=("s",), group="g", split="p")
+    frame = pd.DataFrame({"s": list("aabb"), "g": [1, 1, 2, 2], "p": ["train"] * 3 + ["test"], "y": range(4)})
+    with pytest.raises(ValueError, match="sequence 'b' has several values of p: test, train"):
+        Panel.of(frame, told)
+    panel = Panel.of(frame.assign(p=["train"] * 2 + ["test"] * 2), told)
+    assert [(one.group, one.split) for one in panel] == [("1", "train"), ("2", "test")]
+    assert panel.groups == ["1", "2"]
+    with pytest.raises(ValueError, match="sequence 'a' is of split 'tst'"):
+        Panel.of(frame.assign(p="tst"), told)
+    with pytest.raises(ValueError, match="sequence 'b' has several values of g: , 2"):
+        Panel.of(frame.assign(p="train", g=[1, 1, 2, None]), told)
+
+
+def test_the_wrong_column_has_the_nearest_named():
+    with pytest.raises(ValueError, match=r"no column 'x00' \(did you mean 'x0'\?\); there are x0, x1, s, t"):
+        Panel.of(long(grid()), Columns((Column("x00"),)))
+    with pytest.raises(ValueError, match=r"no sequence '21' \(did you mean '2'\?\)"):
+        Panel.of(grid()).only(["21"])
+    assert [one.name for one in Panel.of(grid()).only(["2", "0"])] == ["2", "0"]
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ([], "sequences are .T, D.; got none"),
+        ([1.0, 2.0], r"got \(\), \(\)"),
+        ([np.zeros((3, 2)), np.zeros((4, 3))], r"sequence '1' of panel has shape \(4, 3\); expected rows of 2 columns"),
+        (np.zeros((2, 0, 3)), r"shape \(0, 3\)"),
+        (pd.DataFrame(np.zeros((2, 2)), columns=["a", "a"]), "two columns 'a'"),
+        (pd.DataFrame({"a": [1.0]}).iloc[:0], "none of the columns a holds numbers"),
+    ],
+)
+def test_what_holds_no_sequences_is_refused(data, said):
+    with pytest.raises(ValueError, match=said):
+        Panel.of(data)
+
+
+def test_data_of_another_kind_are_refused():
+    for data in ("abc", {"a": [1]}, 3):
+        with pytest.raises(TypeError, match=r"not of (str|dict|int)"):
+            Panel.of(data)
+
+
+def test_sequences_are_checked():
+    one = np.zeros((2, 1))
+    told = Columns((Column("y"),))
+    with pytest.raises(ValueError, match="two sequences 'a'"):
+        Panel([Series("a", one), Series("a", one)], told)
+    with pytest.raises(ValueError, match="times that do not increase"):
+        Panel([Series("a", one, np.array([1.0, 1.0]))], told)
+    with pytest.raises(ValueError, match="has no sequences"):
+        Panel([], told)
+
+
+def test_every_part_of_a_panel_has_a_share_in_its_fingerprint():
+    told = Columns((Column("y"),))
+    base = Series("a", np.zeros((2, 1)), np.array([0.0, 1.0]), "g", "train")
+    changes = [
+        Series("b", base.values, base.times, "g", "train"),
+        Series("a", base.values + 1, base.times, "g", "train"),
+        Series("a", base.values, base.times + 1, "g", "train"),
+        Series("a", base.values, None, "g", "train"),
+        Series("a", base.values, base.times, "h", "train"),
+        Series("a", base.values, base.times, "g", "test"),
+    ]
+    prints = {Panel([each], told).fingerprint() for each in (base, *changes)}
+    prints.add(Panel([base], Columns((Column("z"),))).fingerprint())
+    assert len(prints) == 8

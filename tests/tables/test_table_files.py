@@ -1,0 +1,210 @@
+"""Files of tables, read as they are meant or refused in a sentence, before they take time or room."""
+
+import io
+import os
+import resource
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvae.tables import Column, Columns
+from dvae.tables.columns import MOST
+from dvae.tables.dataset import PanelData
+from dvae.tables.protocol import Cut
+from dvae.tables.reading import read_frame, read_panel, schema_beside
+
+pd = pytest.importorskip("pandas")
+
+
+def put(path, content):
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def rows(seed=0):
+    rng = np.random.default_rng(seed)
+    frame = pd.DataFrame(
+        {"day": np.tile(np.arange(30), 5), "riders": rng.poisson(4, 150), "temp": rng.normal(size=150)}
+    )
+    return frame.assign(station=np.repeat(list("abcde"), 30))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "a,b\n1,2\n3,4\n",
+        "a,b\r\n1,2\r\n3,4\r\n",
+        "a,b\r1,2\r3,4\r",
+        "\ufeffa,b\n1,2\n3,4\n",
+        "a,b\n1,2,\n3,4,\n",
+        "\n\na,b\n\n1,2\n3,4",
+        '"a","b"\n"1","2"\n3,4\n',
+    ],
+    ids=["unix", "windows", "mac", "mark", "commas", "blank", "quotes"],
+)
+def test_csv_is_read_however_it_is_written(tmp_path, content):
+    frame = read_frame(put(tmp_path / "a.csv", content))
+    assert frame.to_dict("list") == {"a": [1, 3], "b": [2, 4]}
+    table = read_frame(put(tmp_path / "A.TSV", content.replace(",", "\t")))
+    assert table.equals(frame)
+
+
+def test_an_npz_is_sequences(tmp_path):
+    x = np.arange(24.0).reshape(2, 4, 3)
+    np.savez(tmp_path / "a.npz", x=x, other=np.zeros(3))
+    panel = read_panel(tmp_path / "a.npz")
+    np.testing.assert_array_equal([one.values for one in panel], x)
+    assert panel.columns.id == ("sequence",)
+    np.savez(tmp_path / "b.npz", anything=x[0].astype(">i2"))
+    (one,) = read_panel(tmp_path / "b.npz")
+    np.testing.assert_array_equal(one.values, x[0])  # and no column of the sequence's number
+    np.savez(tmp_path / "c.npz", x=x, lengths=np.array([2, 4]))
+    panel = read_panel(tmp_path / "c.npz")
+    for one, own, length in zip(panel, x, (2, 4), strict=True):
+        np.testing.assert_array_equal(one.values, own[:length])
+
+
+def test_parquet_is_read_or_asks_for_what_reads_it(tmp_path):
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        with pytest.raises(ValueError, match=r"a.parquet is Parquet, which needs pyarrow: pip install"):
+            read_frame(put(tmp_path / "a.parquet", b"PAR1"))
+        return
+    rows().to_parquet(tmp_path / "a.parquet")
+    assert read_frame(tmp_path / "a.parquet").equals(rows())
+    with pytest.raises(ValueError, match=r"b.parquet cannot be read as PARQUET"):
+        read_frame(put(tmp_path / "b.parquet", b"PAR1 is none"))
+
+
+def npz(**arrays):
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    return content.getvalue()
+
+
+def forged(shape, dtype="'<f8'", data=bytes(48)):
+    """An npz whose header says what it likes."""
+    said = f"{{'descr': {dtype}, 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr("x.npy", b"\x93NUMPY\x01\x00" + len(said).to_bytes(2, "little") + said + data)
+    return content.getvalue()
+
+
+WIDE = ",".join(map(str, range(10**6)))
+
+
+HOSTILE = {
+    "empty": ("a.csv", b"", "No columns"),
+    "header": ("a.csv", "a,b\n", None),
+    "zeros": ("a.csv", b"a,b\n1,\0\n", "bytes of 0, which are no text"),
+    "latin": ("a.csv", b"a,b\n1,\xe9\n", "can't decode"),
+    "long row": ("a.csv", "a,b\n1,2\n1,2,3\n", "Expected 2 fields in line 3, saw 3"),
+    "shifted": ("a.csv", "a,b\n1,2,3\n4,5,6\n", "rows have more entries than its header"),
+    "quote": ("a.csv", 'a,"b\n1,2\n', "EOF inside string"),
+    "wide": ("a.csv", WIDE, f"more than {MOST} columns"),
+    "wide behind blanks": ("a.csv", "  \n\t\n" + WIDE, f"more than {MOST} columns"),
+    "wide row": ("a.csv", "a,b\n" + WIDE, f"more than {MOST} columns"),
+    "wide row at the end": ("a.csv", "a,b\n" + "1,2\n" * 300_000 + WIDE, "Expected 2 fields"),
+    "one field": ("a.csv", "a,b\n1," + "x" * 10**7, "field larger"),
+    "no zip": ("a.npz", b"abc", "not a zip file"),
+    "no array": ("a.npz", npz(), "holds nothing"),
+    "other arrays": ("a.npz", npz(a=np.zeros(2), b=np.zeros(2)), "holds a, b; expected an array 'x', or one alone"),
+    "pickle": ("a.npz", npz(x=np.array([{}], object)), "allow_pickle"),
+    "texts": ("a.npz", npz(x=np.array([["a"]])), "expected numbers"),
+    "a vector": ("a.npz", npz(x=np.zeros(3)), "expected numbers"),
+    "no rows": ("a.npz", npz(x=np.zeros((0, 3))), "expected numbers"),
+    "wide array": ("a.npz", npz(x=np.zeros((2, MOST + 1))), f"at most {MOST} are read"),
+    "lengths": ("a.npz", npz(x=np.zeros((2, 3, 1)), lengths=np.array([1, 4])), "whole numbers .N,. from 1 to 3"),
+    "bomb": ("a.npz", forged("(300, 1000, 1000)", "'|i1'"), "at most 250000000 numbers are read"),
+    "forged": ("a.npz", forged("(10, 10000000000, 2)"), "at most 250000000 numbers are read"),
+    "forged a little": ("a.npz", forged("(3, 10000000, 2)"), "EOF"),
+    "forged below nothing": ("a.npz", forged("(-1, 3)"), "negative"),
+    "forged objects": ("a.npz", forged("(2, 3)", "[('a', '<f8'), ('b', 'O')]"), "allow_pickle"),
+    "another kind": ("a.txt", b"a,b\n1,2\n", "is no table; tables end in .csv, .tsv, .parquet, .npz"),
+}
+
+
+@pytest.mark.parametrize("which", HOSTILE)
+def test_hostile_files_are_refused_in_a_sentence_in_no_time_and_little_room(tmp_path, which):
+    name, content, said = HOSTILE[which]
+    path = put(tmp_path / name, content)
+    size, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    if said is None:
+        assert not len(read_frame(path))
+    else:
+        with pytest.raises(ValueError, match=said) as error:
+            read_frame(path)
+        assert str(path) in str(error.value)
+        assert len(str(error.value)) < 500
+    assert time.process_time() - start < 5
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - size
+    assert grown * (1 if sys.platform == "darwin" else 1024) < 600e6
+
+
+def test_what_is_no_plain_file_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.csv")
+    (tmp_path / "b.csv").mkdir()
+    for name in ("a.csv", "b.csv"):
+        with pytest.raises(ValueError, match=f"{name} is no file but"):
+            read_frame(tmp_path / name)
+    with pytest.raises(FileNotFoundError):
+        read_frame(tmp_path / "c.csv")
+    put(tmp_path / "d.csv", "a\n1\n")
+    (tmp_path / "e.csv").symlink_to(tmp_path / "d.csv")  # as the user typed it
+    assert len(read_frame(tmp_path / "e.csv")) == 1
+    os.mkfifo(tmp_path / "d.toml")
+    assert schema_beside(tmp_path / "d.csv") == (None, None)
+
+
+def test_the_schema_beside_a_file_is_the_one_of_its_name_or_of_its_folder(tmp_path):
+    path = tmp_path / "riders.csv"
+    rows().to_csv(path, index=False)
+    assert schema_beside(path) == (None, None)
+    put(tmp_path / "schema.toml", "[columns.temp]")
+    assert schema_beside(path) == (Columns((Column("temp"),)), None)
+    put(tmp_path / "riders.toml", "id = 'station'\ntime = 'day'\n[columns.riders]\n[cut]\nobserved = 3\nhorizon = 2")
+    own = Columns((Column("riders"),), ("station",), "day")
+    assert schema_beside(path) == (own, Cut(3, 2))
+    data = PanelData.open(path)
+    assert (data.panel.columns, data.protocol) == (own, Cut(3, 2))
+    assert PanelData.open(path, horizon=1, split="time").protocol == Cut(3, 1, split="time")
+    told = PanelData.open(path, ["temp"])
+    assert told.panel.columns.names == ["temp"]
+    assert told.panel.columns.id == ("station",)
+    for content in ("[columns.temp", "a = " + "[" * 10**5, "famly = 3", b"\xff", "[cut]\nobserved = 'a'\nhorizon = 2"):
+        put(tmp_path / "riders.toml", content)
+        with pytest.raises(ValueError, match=r"riders.toml is no schema of a table: "):
+            schema_beside(path)
+    put(tmp_path / "riders.toml", "#" * (10**6 + 1))
+    with pytest.raises(ValueError, match=r"riders.toml has 1000001 bytes"):
+        schema_beside(path)
+
+
+def test_data_come_back_from_what_a_run_keeps_of_them(tmp_path, monkeypatch):
+    rows().to_csv(tmp_path / "riders.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    data = PanelData.open("riders.csv", ["riders"], past=("temp",), observed=4, horizon=2)
+    again = PanelData.reopened(data.recorded(), data.schema)
+    assert again.fingerprint == data.fingerprint == data.recorded().fingerprint
+    assert data.recorded().path == "riders.csv"
+    assert Path(data.location) == tmp_path / "riders.csv"
+    assert again.windows("test").fingerprint == data.windows("test").fingerprint
+    rows(1).to_csv(tmp_path / "other.csv", index=False)
+    other = PanelData.reopened(data.recorded(), data.schema, "other.csv")
+    assert other.schema == data.schema
+    assert other.fingerprint != data.fingerprint
+    shuffled = rows().sample(frac=1, random_state=0)
+    shuffled.to_csv(tmp_path / "riders.csv", index=False)
+    assert PanelData.reopened(data.recorded(), data.schema).fingerprint == data.fingerprint
+
+
+def test_a_panel_in_memory_is_data_too():
+    data = PanelData.of(rows(), ["riders"], Cut(4, 2), "mine")
+    assert repr(data.windows("train")).startswith("PanelWindows(mine train: ")
+    assert data.panel.columns.id == ("station",)
