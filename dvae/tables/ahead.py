@@ -30,7 +30,7 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
         raise ValueError("whole sequences have no horizon; fit with observed and horizon steps to forecast")
     targets = [schema.places[column.name] for column in schema.columns.targets]
     known = schema.columns.of("known")
-    found = []
+    found = []  # with all of the past, of which covariates may have their last value
     for one in panel:
         present = int(np.flatnonzero(~np.isnan(one.values[:, targets]).all(1)).max(initial=-1)) + 1
         if present < observed:
@@ -47,18 +47,17 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
             )
         if len(future) < steps:
             future = np.concatenate([future, np.full((steps - len(future), future.shape[1]), np.nan)])
-        values = np.concatenate([one.values[present - observed : present], future])
-        values[observed:, targets] = np.nan
-        found.append(Series(one.name, values, _times(one, present - observed, len(values)), one.group))
+        values = np.concatenate([one.values[:present], future])
+        found.append(Series(one.name, values, _times(one, len(values)), one.group))
     cut = replace(schema.cut, horizon=steps, split="sequence")
-    return PanelWindows(replace(panel, series=found), replace(schema, cut=cut), "all")
+    return PanelWindows(replace(panel, series=found), replace(schema, cut=cut), "last")
 
 
-def _times(one: Series, first: int, count: int) -> np.ndarray | None:
+def _times(one: Series, count: int) -> np.ndarray | None:
     """Times of so many steps, behind the last one as far apart as the median of them all."""
     if one.times is None:
         return None
-    times = one.times[first : first + count]
+    times = one.times[:count]
     lacking = count - len(times)
     step = np.median(np.diff(one.times)) if len(one) > 1 else 1.0
     return np.concatenate([times, times[-1] + step * np.arange(1, lacking + 1)])

@@ -123,9 +123,9 @@ class PanelData:
 
 
 def suited(panel: Panel) -> Cut:
-    """How a panel is divided where nobody says: few sequences by time, and whole where they are many and short.
+    """How a panel is divided where nobody says: few sequences by time, and by sequence where they are many.
 
-    A fifth of the median sequence, and 24 steps at most, is to be forecast, from three times as many.
+    A tenth of the median sequence, and 24 steps at most, is to be forecast, from three times as many.
     """
     lengths = sorted(len(one) for one in panel.series)
     few = len(panel) < 10 and not any(one.split for one in panel.series)

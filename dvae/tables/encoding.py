@@ -7,8 +7,8 @@
 | s | covariates with one value a sequence, likewise | (B, S) |
 | d | time since the step before, in median steps, where steps are not evenly spaced | (B, T, 1) |
 
-A covariate that lacks an entry has its last value, or before any the mean of the training data, and its indicator is 0
-there; one that ends with the present has its last value after that.
+A covariate that lacks an entry has its last value, or before any the mean of the training data (of a category, no
+class), and its indicator is 0 there; one that ends with the present has its last value after that.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from typing_extensions import override
@@ -24,7 +24,7 @@ from typing_extensions import override
 from ..laws.base import LawSpec
 from ..laws.family import FAMILIES
 from ..laws.product import Product
-from ..options import tuples
+from ..options import Amount, Positive, Range, tuples
 from ..schema import Schema
 from ..views import Offered, View
 from .columns import WHOLE_STEPS, Column, Columns
@@ -34,7 +34,9 @@ from .protocol import Cut
 COVARIATES, STATICS, GAPS = "c", "s", "d"
 """Names of context in batches."""
 EVEN = 1.3
-"""Longest gap over the median up to which steps are evenly spaced: months are."""
+"""Longest gap over the median, and median over the shortest, up to which steps are evenly spaced: months are."""
+LEAST = 1e-7
+"""Of a deviation, as a share of the mean: below it is what rounding leaves of a constant."""
 CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
 SCALED = ("positive", "log-normal", "power", *COUNTS)
 
@@ -56,10 +58,10 @@ class PanelSchema(Schema):
     sizes: Mapping[str, int] = field(default_factory=dict)
     columns: Columns = field(default_factory=lambda: Columns((Column("x"),)))
     cut: Cut = field(default_factory=Cut)
-    means: Mapping[str, float] = field(default_factory=dict)
-    scales: Mapping[str, float] = field(default_factory=dict)
+    means: Mapping[str, Annotated[float, Range()]] = field(default_factory=dict)
+    scales: Mapping[str, Positive] = field(default_factory=dict)
     lacking: tuple[str, ...] = ()
-    step: float = 0.0
+    step: Amount = 0.0
 
     def __post_init__(self) -> None:
         found = {"x": len(self.coordinates)}
@@ -73,20 +75,23 @@ class PanelSchema(Schema):
         for name, value in (("sizes", found), ("length", self.cut.length), ("observed", self.cut.observed)):
             object.__setattr__(self, name, value)  # they follow
         super().__post_init__()
+        covariates = self.columns.of("known", "past", "static")
+        if lost := {c.name for c in covariates if c.family == "real"} - (self.means.keys() & self.scales.keys()):
+            raise ValueError(f"no mean and scale of {', '.join(sorted(lost))}, by which models read it without unit")
+        if lost := {c.name for c in self.columns.of("past")} - {*self.lacking}:
+            raise ValueError(f"no indicator of {', '.join(sorted(lost))}, which ends with the present")
 
     @classmethod
     def under(cls, panel: Panel, cut: Cut) -> Self:
         """The schema of a panel, whose units are those of its training sequences."""
-        train = [
-            panel.series[place].values[low : high + (cut.length or 10**9)]
-            for place, low, high in cut.starts(panel, "train")
-        ]
-        if not train:
+        starts = cut.starts(panel, "train")
+        parts = [(panel.series[place], slice(low, high + (cut.length or 10**9))) for place, low, high in starts]
+        if not parts:
             raise ValueError(
                 f"{panel.name} has no training window of {cut.name}: its sequences have "
                 f"{min(map(len, panel.series))} to {max(map(len, panel.series))} steps"
             )
-        known = np.concatenate(train)
+        known = np.concatenate([one.values[part] for one, part in parts])
         means, scales, lacking = {}, {}, []
         for place, column in enumerate(panel.columns.columns):
             values = known[:, place]
@@ -94,14 +99,17 @@ class PanelSchema(Schema):
             if not len(values):
                 raise ValueError(f"column {column.name!r} has no value in the training part of {panel.name}")
             if column.family in CENTRED:
-                means[column.name], scales[column.name] = float(values.mean()), float(values.std()) or 1.0
+                mean, scale = float(values.mean()), float(values.std())
+                means[column.name], scales[column.name] = mean, scale if scale > LEAST * abs(mean) else 1.0
             elif column.family in SCALED:
                 means[column.name], scales[column.name] = 0.0, float(values.mean()) or 1.0
             if column.role == "past" or (column.role != "target" and np.isnan(known[:, place]).any()):
                 lacking.append(column.name)
-        gaps = np.concatenate([np.diff(one.times) for one in panel.series if one.times is not None] or [np.empty(0)])
-        uneven = len(gaps) > 0 and gaps.max() > EVEN * np.median(gaps)
-        step = float(np.median(gaps)) if uneven else 0.0
+        gaps = np.concatenate(
+            [np.diff(one.times[part]) if one.times is not None else np.empty(0) for one, part in parts]
+        )
+        middle = float(np.median(gaps)) if len(gaps) else 0.0
+        step = middle if len(gaps) and (gaps.max() > EVEN * middle or middle > EVEN * gaps.min()) else 0.0
         return cls(columns=panel.columns, cut=cut, means=means, scales=scales, lacking=tuple(lacking), step=step)
 
     @property
@@ -124,20 +132,17 @@ class PanelSchema(Schema):
     @override
     def emission(self) -> LawSpec:
         """The families of the targets: one law where they are alike, else a product."""
-        parts: dict[Any, list[int]] = {}
+        parts: dict[tuple[str, str], list[int]] = {}
         place = 0
         for column in self.columns.targets:
             places = list(range(place, place + len(column.coordinates)))
             place += len(places)
-            parts.setdefault(column.name if column.family == "category" else column.family, []).extend(places)
-        laws = {key: "category" if key in self._categories else key for key in parts}
+            own = column.name if column.family == "category" else ""  # each category is an event of its own
+            parts.setdefault((column.family, own), []).extend(places)
         if len(parts) == 1:
-            return FAMILIES[next(iter(laws.values()))]
-        return Product(tuple((tuple(places), FAMILIES[laws[key]]) for key, places in parts.items()))
-
-    @property
-    def _categories(self) -> set[str]:
-        return {column.name for column in self.columns.targets if column.family == "category"}
+            ((family, _),) = parts
+            return FAMILIES[family]
+        return Product(tuple((tuple(places), FAMILIES[family]) for (family, _), places in parts.items()))
 
     @property
     @override

@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import files
 from ..inference.result import canvas
+from ..options import nearest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,7 +59,7 @@ class PanelForecasts:
         found["ahead"] = step + 1
         found["column"] = np.array(list(self.columns), object)[place]
         found["unit"] = np.array(list(self.columns.values()), object)[place]
-        found["mean"] = self.draws.mean(0).ravel()
+        found["mean"] = self.draws.mean(0, dtype=np.float64).ravel()
         quantiles = np.quantile(self.draws, QUANTILES, axis=0).reshape(len(QUANTILES), -1)
         found |= {f"q{1000 * level:03.0f}": values for level, values in zip(QUANTILES, quantiles, strict=True)}
         return pd.DataFrame({**found, "truth": self.truth.ravel()})
@@ -79,7 +80,10 @@ class PanelForecasts:
             raise ValueError(f"{path} ends in none of {', '.join(FORMATS)}")
         with files.written(path) as file:
             if suffix == ".csv":
-                self.table().to_csv(file, index=False, float_format="%.6g")
+                table = self.table()
+                if "time" in table and not self.dates:
+                    table["time"] = table["time"].map("{:.15g}".format)
+                table.to_csv(file, index=False, float_format="%.9g")
             elif suffix == ".parquet":
                 try:
                     self.table().to_parquet(file)
@@ -105,8 +109,14 @@ class PanelForecasts:
             window: which.
             columns: which coordinates; the first ones, if not given.
             most: panels.
+
+        Raises:
+            ValueError: coordinates that there are not.
         """
         names = list(self.columns)
+        for name in columns or ():
+            if name not in names:
+                raise ValueError(f"no column {name!r}{nearest(name, names)}; there are {', '.join(names[:20])}")
         chosen = [names.index(name) for name in columns or names][:most]
         across = min(2, len(chosen))
         down = -(-len(chosen) // across)
@@ -135,6 +145,8 @@ class PanelForecasts:
                 axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
         for axis in panels[len(chosen) :]:
             axis.set_axis_off()
+        for axis in panels[max(len(chosen) - across, 0) : len(chosen)]:  # below which there is none
+            axis.tick_params(labelbottom=True)
         known = [axis.get_legend_handles_labels() for axis in panels[: len(chosen)]]
         handles, labels = max(known, key=lambda entry: len(entry[1]))
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)

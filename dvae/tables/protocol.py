@@ -65,20 +65,21 @@ class Cut:
         """(sequence, first start, last start) of the windows of a split, or (sequence, 0, 0) of whole ones.
 
         By time, a window is in the split in which its future is; what it observes may lie before. "all" is of all
-        sequences, wherever they are.
+        sequences, wherever they are, and "last" of the end of each.
         """
         found = []
-        parts = None if self.split == "time" or split == "all" else self._parts(panel)
+        everywhere = split in ("all", "last")
+        parts = None if self.split == "time" or everywhere else self._parts(panel)
         for place, one in enumerate(panel.series):
             low, high = 0, len(one)
             if parts is not None and parts[place] not in split.split("+"):
                 continue
-            if parts is None and split != "all":
+            if parts is None and not everywhere:
                 low, high = self._between(one, split)
             if self.length is None:
                 found.append((place, 0, 0))
             elif high - low >= self.length:
-                found.append((place, low, high - self.length))
+                found.append((place, high - self.length if split == "last" else low, high - self.length))
         return found
 
     def _between(self, one: Series, split: str) -> tuple[int, int]:

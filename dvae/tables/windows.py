@@ -24,7 +24,7 @@ class PanelWindows:
     Args:
         panel: the sequences.
         schema: what models see of them.
-        split: "train", "validation", "test" or "train+validation".
+        split: "train", "validation", "test" or "train+validation"; "all", or "last" for the end of each sequence.
 
     Raises:
         ValueError: a split without windows.
@@ -33,6 +33,8 @@ class PanelWindows:
     def __init__(self, panel: Panel, schema: PanelSchema, split: str):
         self.panel, self.schema, self.split = panel, schema, split
         self._ranges = schema.cut.starts(panel, split)
+        if schema.columns.group:  # those of a group are drawn together
+            self._ranges.sort(key=lambda each: panel.series[each[0]].group)
         self.skipped = (
             [] if schema.cut.length is None else [one.name for one in panel.series if len(one) < schema.cut.length]
         )
@@ -41,16 +43,19 @@ class PanelWindows:
                 f"{panel.name} has no {split} window of {schema.cut.name}; its {len(panel)} sequences have "
                 f"{min(map(len, panel.series))} to {max(map(len, panel.series))} steps"
             )
-        used = sorted({place for place, _, _ in self._ranges})
-        lengths = torch.tensor([len(panel.series[place]) for place in used])
-        self._lengths = dict(zip(used, lengths.tolist(), strict=True))
-        self._first = dict(zip(used, (lengths.cumsum(0) - lengths).tolist(), strict=True))
-        some = [panel.series[place] for place in used]
+        some = [panel.series[place] for place, _, _ in self._ranges]
+        self._lengths = torch.tensor([len(one) for one in some])
+        self._first = self._lengths.cumsum(0) - self._lengths
+        self._low, self._last = torch.tensor([ends for _, *ends in self._ranges]).unbind(1)
         self._x = _joined([schema.targets(one) for one in some])
         self._mask = self._x.isfinite()
         if whole(schema.columns):
             self._mask = self._mask.all(-1, keepdim=True).expand_as(self._x)
-        self._missing = not bool(self._mask.all())
+        spans = zip(self._first.tolist(), self._low.tolist(), self._last.tolist(), strict=True)
+        parts = (
+            slice(one + low, one + last + schema.cut.length if schema.cut.length else None) for one, low, last in spans
+        )
+        self._missing = not all(bool(self._mask[part].all()) for part in parts)
         self._x = self._x.nan_to_num(0.0)
         self._context = {}
         for name, make in ((COVARIATES, schema.context), (GAPS, schema.gaps)):
@@ -58,11 +63,8 @@ class PanelWindows:
                 self._context[name] = _joined([make(one) for one in some])
         self._static = None
         if STATICS in schema.sizes:
-            self._static = dict(zip(used, (torch.as_tensor(schema.static(one)).float() for one in some), strict=True))
-        if schema.columns.group:
-            self._ranges.sort(key=lambda each: panel.series[each[0]].group)
-        counts = torch.tensor([last - low + 1 for _, low, last in self._ranges], dtype=torch.float64)
-        self._weights = counts.cumsum(0)
+            self._static = torch.from_numpy(np.stack([schema.static(one) for one in some])).float()
+        self._weights = (self._last - self._low + 1).double().cumsum(0)
 
     @property
     def length(self) -> int | None:
@@ -75,7 +77,7 @@ class PanelWindows:
         return self.schema.cut
 
     def __len__(self) -> int:
-        return len(self._listed())
+        return len(self._listed()[0])
 
     def __repr__(self) -> str:
         return f"PanelWindows({self.panel.name} {self.split}: {len(self)} of {self.protocol.name})"
@@ -83,7 +85,10 @@ class PanelWindows:
     @property
     def keys(self) -> list[tuple[str, str, int]]:
         """(split, sequence, first step) of the listed windows."""
-        return [(self.split, self.panel.series[place].name, start) for place, start in self._listed()]
+        names = [self.panel.series[place].name for place, _, _ in self._ranges]
+        return [
+            (self.split, names[place], start) for place, start in zip(*map(Tensor.tolist, self._listed()), strict=True)
+        ]
 
     @property
     def description(self) -> dict[str, Any]:
@@ -103,34 +108,32 @@ class PanelWindows:
         In a panel with groups they are of so few groups that each has several.
         """
         if self.schema.columns.group:
-            return self._cut(self._of_groups(batch_size, generator))
+            return self._cut(*self._of_groups(batch_size, generator))
         if self.length is None:
-            chosen = torch.randperm(len(self._ranges), generator=generator)[:batch_size].tolist()
-            return self._cut([(self._ranges[n][0], 0) for n in chosen])
+            chosen = torch.randperm(len(self._ranges), generator=generator)[:batch_size]
+            return self._cut(chosen, torch.zeros_like(chosen))
         which, where = torch.rand(2, batch_size, dtype=torch.float64, generator=generator)
-        found = torch.searchsorted(self._weights, which * self._weights[-1], right=True).tolist()
-        drawn = zip(found, where.tolist(), strict=True)
-        starts = [self._ranges[n][1] + int(w * (self._ranges[n][2] - self._ranges[n][1] + 1)) for n, w in drawn]
-        return self._cut([(self._ranges[n][0], start) for n, start in zip(found, starts, strict=True)])
+        found = torch.searchsorted(self._weights, which * self._weights[-1], right=True)
+        low, last = self._low[found], self._last[found]
+        return self._cut(found, low + (where * (last - low + 1)).long())
 
-    def _of_groups(self, batch_size: int, generator: torch.Generator) -> list[tuple[int, int]]:
-        """Windows of some groups, drawn as often as they have windows."""
+    def _of_groups(self, batch_size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Range and first step of windows of some groups, drawn as often as they have windows."""
         names = [self.panel.series[place].group for place, _, _ in self._ranges]
         below = torch.cat([self._weights.new_zeros(1), self._weights])
         first = torch.tensor([n for n, name in enumerate(names) if n == 0 or names[n - 1] != name])
-        bounds = torch.stack([below[first], below[torch.cat([first[1:], torch.tensor([len(names)])])]], 1)
-        count = -(-batch_size // GROUPED)
-        which, where, start = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
-        drawn = torch.searchsorted(bounds[:, 1].contiguous(), which[:count] * below[-1], right=True)
-        low, high = bounds[drawn.repeat_interleave(GROUPED)[:batch_size]].unbind(1)
-        found = torch.searchsorted(self._weights, low + where * (high - low), right=True).tolist()
-        ranges = [self._ranges[n] for n in found]
-        starts = (int(low + s * (last - low + 1)) for (_, low, last), s in zip(ranges, start.tolist(), strict=True))
-        return [(place, each) for (place, _, _), each in zip(ranges, starts, strict=True)]
+        start, end = below[first], below[torch.cat([first[1:], torch.tensor([len(names)])])]
+        which, among, where = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
+        drawn = torch.searchsorted(end, which[: -(-batch_size // GROUPED)] * below[-1], right=True)
+        group = drawn.repeat_interleave(GROUPED)[:batch_size]
+        chosen = start[group] + among * (end - start)[group]
+        found = torch.searchsorted(self._weights, chosen, right=True)
+        low, last = self._low[found], self._last[found]
+        return found, low + (where * (last - low + 1)).long()
 
     def all(self) -> dict[str, Any]:
         """The listed windows, as `keys` has them."""
-        return self._cut(self._listed())
+        return self._cut(*self._listed())
 
     def times(self, horizon: int) -> tuple[np.ndarray, bool] | None:
         """Times (N, O + horizon) of the listed windows, and whether they are dates; None where rows have none.
@@ -139,8 +142,8 @@ class PanelWindows:
         """
         observed = self.protocol.observed or 0
         found = []
-        for place, start in self._listed():
-            one = self.panel.series[place]
+        for place, start in zip(*map(Tensor.tolist, self._listed()), strict=True):
+            one = self.panel.series[self._ranges[place][0]]
             if one.times is None:
                 return None
             own = one.times[start : start + observed + horizon]
@@ -148,45 +151,44 @@ class PanelWindows:
             found.append(np.concatenate([own, own[-1] + step * np.arange(1, observed + horizon - len(own) + 1)]))
         return np.stack(found), self.panel.dates
 
-    def _listed(self) -> list[tuple[int, int]]:
-        """(sequence, first step): test windows so far apart as the protocol says, all others by half a horizon."""
+    def _listed(self) -> tuple[Tensor, Tensor]:
+        """Range and first step: test windows so far apart as the protocol says, all others by half a horizon."""
         cut = self.schema.cut
         if cut.length is None:
-            return [(place, 0) for place, _, _ in self._ranges]
-        assert cut.horizon is not None
-        stride = cut.stride or cut.horizon if self.split == "test" else max(cut.horizon // 2, 1)
-        return [(place, start) for place, low, last in self._ranges for start in range(low, last + 1, stride)]
+            stride = 1
+        else:
+            assert cut.horizon is not None
+            stride = cut.stride or cut.horizon if self.split == "test" else max(cut.horizon // 2, 1)
+        counts = (self._last - self._low) // stride + 1
+        which = torch.arange(len(counts)).repeat_interleave(counts)
+        place = torch.arange(len(which)) - (counts.cumsum(0) - counts)[which]
+        return which, self._low[which] + stride * place
 
-    def _cut(self, windows: list[tuple[int, int]]) -> dict[str, Any]:
-        sizes = [self._lengths[place] if self.length is None else self.length for place, _ in windows]
-        longest = max(sizes)
-        first = torch.tensor([self._first[place] + start for place, start in windows])
-        lengths = torch.tensor(sizes)
-        steps = torch.minimum(torch.arange(longest), lengths[:, None] - 1)  # padding repeats the last step
-        rows = first[:, None] + steps
+    def _cut(self, which: Tensor, starts: Tensor) -> dict[str, Any]:
+        """The windows of ranges that start at these steps of their sequences."""
+        lengths = self._lengths[which] if self.length is None else torch.full_like(which, self.length)
+        steps = torch.minimum(torch.arange(int(lengths.max())), lengths[:, None] - 1)  # padding repeats the last step
+        rows = (self._first[which] + starts)[:, None] + steps
         batch: dict[str, Any] = {"x": self._x[rows]}
-        if len(set(sizes)) > 1:
+        if (lengths != lengths[0]).any():
             batch["lengths"] = lengths
         if self._missing:
             batch["mask"] = self._mask[rows]
         for name, values in self._context.items():
             batch[name] = values[rows]
-        if GAPS in batch:
-            begins = torch.tensor([start == 0 for _, start in windows])
-            batch[GAPS][begins, 0] = 1.0
         if COVARIATES in batch and (observed := self.schema.cut.observed) is not None:
             batch[COVARIATES] = held(batch[COVARIATES], observed, self.schema)
         if self.schema.columns.group:
-            batch[GROUP] = torch.tensor(self._grouped(windows))
+            batch[GROUP] = torch.tensor(self._grouped(which.tolist(), starts.tolist()))
         if self._static is not None:
-            batch[STATICS] = torch.stack([self._static[place] for place, _ in windows])
+            batch[STATICS] = self._static[which]
         return batch
 
-    def _grouped(self, windows: list[tuple[int, int]]) -> list[int]:
+    def _grouped(self, which: list[int], starts: list[int]) -> list[int]:
         """The group of each window: with those that have the same present, or one would tell another's future."""
         observed, found, known = self.schema.cut.observed, [], dict[Any, int]()
-        for place, start in windows:
-            one = self.panel.series[place]
+        for place, start in zip(which, starts, strict=True):
+            one = self.panel.series[self._ranges[place][0]]
             present: Any = None
             if observed is not None and self.split != "train":
                 last = start + observed - 1

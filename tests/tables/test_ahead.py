@@ -1,0 +1,99 @@
+"""What comes after the end of a table: one window for each sequence, with all that is known of its past and future."""
+
+import numpy as np
+import pytest
+
+from dvae.tables import Column, Columns, Panel, Series
+from dvae.tables.ahead import ahead
+from dvae.tables.encoding import PanelSchema
+from dvae.tables.protocol import Cut
+from dvae.tables.windows import PanelWindows
+
+NAN = np.nan
+PLAIN = Columns((Column("y"), Column("price", "past")))
+PLANNED = Columns((Column("y"), Column("price", "past"), Column("plan", "known"), Column("holiday", "known")))
+CUT = Cut(4, 3, test=0.25)
+
+
+def table(told, future=0, lengths=(12, 9, 15, 10), uneven=False):
+    rng = np.random.default_rng(0)
+    made = []
+    for n, t in enumerate(lengths):
+        values = rng.normal(size=(t + future, len(told.columns)))
+        values[t:, :2] = NAN
+        times = np.cumsum(rng.choice([1.0, 2.0, 2.0, 5.0], t + future)) if uneven else np.arange(t + future) * 10.0
+        made.append(Series(f"s{n}", values, times))
+    return Panel(made, told)
+
+
+def test_the_future_is_behind_the_last_target():
+    panel = table(PLAIN)
+    schema = PanelSchema.under(panel, CUT)
+    windows = ahead(panel, schema)
+    batch = windows.all()
+    for n, one in enumerate(panel):
+        np.testing.assert_array_equal(batch["x"][n, :4, 0], one.values[-4:, 0].astype(np.float32))
+        assert windows.keys[n][1:] == (one.name, len(one) - 4)
+    assert batch["mask"][:, :4].all()
+    assert not batch["mask"][:, 4:].any()
+    times, _ = windows.times(3)
+    np.testing.assert_array_equal(times[0], np.arange(8, 15) * 10.0)
+
+
+def test_it_may_be_longer_or_shorter_than_that_of_the_run():
+    panel = table(PLAIN)
+    schema = PanelSchema.under(panel, CUT)
+    for horizon in (1, 7):
+        assert ahead(panel, schema, horizon).all()["x"].shape == (4, 4 + horizon, 1)
+
+
+def test_the_past_is_that_of_test_windows():
+    """Also what lies before the window: the last value of a covariate, and the first gap."""
+    panel = table(PLANNED, future=3, uneven=True)
+    for one in panel:
+        one.values[3:-3, 1:3] = NAN
+    schema = PanelSchema.under(panel, CUT)
+    batch = ahead(panel, schema).all()
+    shown = Panel([Series(one.name, np.nan_to_num(one.values), one.times) for one in panel], PLANNED)
+    for one, other in zip(shown, panel, strict=True):
+        one.values[:, 1:] = other.values[:, 1:]
+    test = PanelWindows(shown, schema, "last").all()
+    np.testing.assert_array_equal(batch["c"], test["c"])
+    np.testing.assert_array_equal(batch["d"], test["d"])
+    assert (batch["d"][:, 0] != 1).any()
+    assert (batch["c"][:, 0, 0] != 0).any()  # the last value, from before the window, and not the mean
+
+
+def test_known_covariates_are_those_of_the_rows_behind():
+    panel = table(PLANNED, future=3)
+    schema = PanelSchema.under(panel, CUT)
+    batch = ahead(panel, schema).all()
+    for n, one in enumerate(panel):
+        plan = (one.values[-7:, 2] - schema.means["plan"]) / schema.scales["plan"]
+        np.testing.assert_allclose(batch["c"][n, :, 2], plan, rtol=1e-5)
+    assert ahead(panel, schema, 2).all()["c"].shape[1] == 6
+
+
+@pytest.mark.parametrize("future", [0, 2])
+def test_a_future_that_lacks_them_says_which_and_of_which_sequence(future):
+    panel = table(PLANNED, future)
+    with pytest.raises(
+        ValueError,
+        match=f"forecast of 3 steps needs plan, holiday, known in the future too, and sequence 's0' has {future} rows "
+        "after its last target at row 11; append rows with these",
+    ):
+        ahead(panel, PanelSchema.under(panel, CUT))
+    panel = table(PLANNED, 3)
+    panel.series[2].values[-1, 3] = NAN
+    with pytest.raises(ValueError, match=r"needs holiday, known .* sequence 's2' has 3 rows .* append rows with it"):
+        ahead(panel, PanelSchema.under(panel, CUT))
+
+
+def test_what_cannot_be_forecast_is_refused():
+    panel = table(PLAIN)
+    with pytest.raises(ValueError, match="whole sequences have no horizon"):
+        ahead(panel, PanelSchema.under(panel, Cut()))
+    schema = PanelSchema.under(panel, CUT)
+    panel.series[1].values[3:, 0] = NAN
+    with pytest.raises(ValueError, match="sequence 's1' has 3 steps up to its last target, and 4 are to be observed"):
+        ahead(panel, schema)

@@ -1,0 +1,285 @@
+"""What models see of a table, and that nothing of it is of what they are tested on."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dvae.laws import FAMILIES
+from dvae.laws.product import Product
+from dvae.tables import Column, Columns, Panel, Series
+from dvae.tables.encoding import PanelSchema
+from dvae.tables.protocol import Cut
+from dvae.tables.windows import PanelWindows
+
+NAN = np.nan
+KINDS = ("u", "v", "w")
+TOLD = Columns(
+    (
+        Column("riders", family="count", unit="people"),
+        Column("plan", "known"),
+        Column("kind", family="category", classes=KINDS),
+        Column("weather", "past", "category", classes=("rain", "sun")),
+        Column("temp", unit="°C"),
+        Column("price", "past"),
+        Column("height", "static"),
+        Column("open", family="binary"),
+        Column("town", "static", "category", classes=("a", "b")),
+        Column("sunny", "known", "category", classes=("no", "yes")),
+    )
+)
+
+
+def table(n=6, t=12, seed=0, missing=True, times=None):
+    rng = np.random.default_rng(seed)
+    made = []
+    for one in range(n):
+        columns = {
+            "riders": rng.poisson(4, t),
+            "plan": rng.normal(3, 2, t),
+            "kind": rng.integers(0, 3, t),
+            "weather": rng.integers(0, 2, t),
+            "temp": rng.normal(20, 5, t),
+            "price": rng.normal(-3, 0.1, t),
+            "height": np.full(t, rng.normal()),
+            "open": rng.integers(0, 2, t),
+            "town": np.full(t, one % 2),
+            "sunny": rng.integers(0, 2, t),
+        }
+        values = np.stack([columns[name] for name in TOLD.names], 1).astype(float)
+        if missing:
+            free = [place for place, name in enumerate(TOLD.names) if name not in ("height", "town", "sunny")]
+            values[:, free] = np.where(rng.random((t, len(free))) < 0.2, NAN, values[:, free])
+        made.append(Series(f"s{one}", values, times))
+    return Panel(made, TOLD)
+
+
+CUT = Cut(5, 3)
+
+
+def column(panel, name, parts):
+    held = np.concatenate([panel.series[n].values[:, TOLD.names.index(name)] for n in parts])
+    return held[~np.isnan(held)]
+
+
+def test_units_are_those_of_the_training_sequences():
+    panel = table()
+    schema = PanelSchema.under(panel, CUT)
+    parts = [place for place, _, _ in CUT.starts(panel, "train")]
+    assert 0 < len(parts) < len(panel)
+    for name in ("plan", "temp", "price", "height"):
+        known = column(panel, name, parts)
+        assert schema.means[name] == pytest.approx(known.mean(), rel=1e-12)
+        assert schema.scales[name] == pytest.approx(known.std(), rel=1e-12)
+    assert (schema.means["riders"], schema.scales["riders"]) == (
+        0,
+        pytest.approx(column(panel, "riders", parts).mean()),
+    )
+    means, scales = schema.units["x"]
+    names = ["riders", "kind", "kind", "kind", "temp", "open"]
+    assert means == [schema.means.get(name, 0) for name in names]
+    assert scales == [schema.scales.get(name, 1) for name in names]
+    assert schema.coordinates == ["riders", "kind=u", "kind=v", "kind=w", "temp", "open"]
+    assert schema.sizes == {"x": 6, "c": 1 + 1 + 2 + 1 + 1 + 1 + 2, "s": 1 + 2}
+    assert schema.lacking == ("plan", "weather", "price")
+
+
+def altered(panel, split, cut):
+    """The panel with other values, classes, times and gaps wherever it is only tested."""
+    rng = np.random.default_rng(9)
+    trained = [set(), {}]
+    for place, low, last in cut.starts(panel, split):
+        trained[0].add(place)
+        trained[1][place] = low, last + cut.length
+    series = []
+    for place, one in enumerate(panel.series):
+        values = one.values.copy()
+        low, high = trained[1].get(place, (0, 0))
+        later = np.arange(len(one)) >= high
+        for name in ("riders", "plan", "temp", "price"):
+            values[later, TOLD.names.index(name)] = rng.integers(50, 90, later.sum())
+        for name in ("kind", "weather", "open", "sunny"):
+            values[later, TOLD.names.index(name)] = np.where(rng.random(later.sum()) < 0.5, NAN, 1)
+        times = one.times.copy()
+        times[later] = times[later] + 100 * np.cumsum(rng.random(later.sum()))
+        series.append(replace(one, values=values, times=times))
+    return replace(panel, series=series)
+
+
+@pytest.mark.parametrize("cut", [CUT, Cut(5, 3, split="time", test=0.3)], ids=lambda cut: cut.split)
+@pytest.mark.parametrize("missing", [False, True])
+def test_nothing_of_what_is_tested_is_in_what_is_trained_on(cut, missing):
+    panel = table(t=40, missing=missing, times=np.arange(40.0))
+    other = altered(panel, "train", cut)
+    assert other.fingerprint() != panel.fingerprint()
+    schema = PanelSchema.under(panel, cut)
+    assert PanelSchema.under(other, cut) == schema
+    windows, others = (PanelWindows(each, schema, "train") for each in (panel, other))
+    assert windows.keys == others.keys
+    batch, again = windows.all(), others.all()
+    assert batch.keys() == again.keys()
+    assert all(torch.equal(batch[name], again[name]) for name in batch)
+
+
+def test_a_constant_has_no_unit_whatever_rounding_leaves_of_it():
+    values = np.where(np.arange(80).reshape(40, 2) % 4 < 2, 0.3, 0.1 + 0.2)
+    assert values[:, 0].std() > 0
+    told = Columns((Column("y"), Column("plan", "known")))
+    schema = PanelSchema.under(Panel([Series(f"s{n}", values) for n in range(5)], told), CUT)
+    assert schema.scales == {"y": 1.0, "plan": 1.0}
+
+
+def by_hand(one, schema):
+    """c, row by row, as the file says."""
+    last, rows = {}, []
+    for row in one.values:
+        found = []
+        for place, told in enumerate(schema.columns.columns):
+            if told.role not in ("known", "past"):
+                continue
+            value, known = row[place], not np.isnan(row[place])
+            last[told.name] = value if known else last.get(told.name, NAN)
+            held = last[told.name]
+            if told.family == "category":
+                found += [float(held == n) for n in range(len(told.classes))]
+            else:
+                mean = schema.means[told.name]
+                found.append(((mean if np.isnan(held) else held) - mean) / schema.scales[told.name])
+            if told.name in schema.lacking:
+                found.append(float(known))
+        rows.append(found)
+    return np.array(rows)
+
+
+def test_covariates_have_their_last_value_or_before_any_the_mean():
+    panel = table(seed=3)
+    for place in (0, 1):  # nothing at first, and nothing at all
+        panel.series[place].values[: (4, 12)[place], [1, 3, 5]] = NAN
+    schema = PanelSchema.under(panel, CUT)
+    for one in panel:
+        np.testing.assert_allclose(schema.context(one), by_hand(one, schema), rtol=1e-12, atol=1e-12)
+
+
+def test_targets_are_coordinates_and_classes_are_one_of_several():
+    panel = table()
+    schema = PanelSchema.under(panel, CUT)
+    for one in panel:
+        x = schema.targets(one)
+        np.testing.assert_array_equal(x[:, [0, 4, 5]], one.values[:, [0, 4, 7]])
+        kinds = one.values[:, 2]
+        assert (np.isnan(x[:, 1:4]) == np.isnan(kinds)[:, None]).all()
+        known = ~np.isnan(kinds)
+        np.testing.assert_array_equal(x[known, 1:4], np.eye(3)[kinds[known].astype(int)])
+
+
+def test_what_is_static_is_of_the_sequence():
+    panel = table()
+    height, town = TOLD.names.index("height"), TOLD.names.index("town")
+    panel.series[0].values[:5, height] = NAN
+    panel.series[1].values[:, [height, town]] = NAN
+    schema = replace(PanelSchema.under(panel, CUT), lacking=("weather", "price", "plan", "height"))
+    mean, scale = schema.means["height"], schema.scales["height"]
+    np.testing.assert_allclose(
+        schema.static(panel.series[0]), [(panel.series[0].values[-1, height] - mean) / scale, 1, 1, 0]
+    )
+    np.testing.assert_allclose(schema.static(panel.series[1]), [0, 0, 0, 0])
+    panel.series[2].values[3, height] += 1
+    with pytest.raises(ValueError, match="'height' is static, but changes within sequence 's2'"):
+        schema.static(panel.series[2])
+
+
+@pytest.mark.parametrize(
+    ("times", "step"),
+    [
+        (None, 0),
+        (np.arange(24.0) * 7, 0),
+        (np.arange("2020-01", "2022-01", dtype="datetime64[M]").astype("datetime64[s]").astype(float), 0),
+        (np.arange("1996", "2020", dtype="datetime64[Y]").astype("datetime64[s]").astype(float), 0),
+        (np.cumsum([1.0, 2, 2, 4] * 6), 2),
+        (np.cumsum([2.0] * 23 + [0.01]), 2),
+        (np.cumsum([1.0, 1, 1, 1, 3, 1] * 4), 1),
+    ],
+    ids=["none", "weeks", "months", "years", "uneven", "near", "weekends"],
+)
+def test_gaps_are_there_where_steps_are_uneven(times, step):
+    panel = table(t=24, times=times)
+    schema = PanelSchema.under(panel, CUT)
+    assert schema.step == step
+    assert ("d" in schema.sizes) == bool(step)
+    if step:
+        gaps = schema.gaps(panel.series[0])
+        assert gaps.shape == (24, 1)
+        np.testing.assert_allclose(gaps[1:, 0], np.diff(times) / step)
+        assert gaps[0] == 1
+
+
+def test_a_schema_comes_back_from_json():
+    panel = table(times=np.cumsum([1.0, 3, 1] * 4))
+    for cut in (CUT, Cut(), Cut(3, 2, split="time"), Cut(5, 3, stride=2, seed=4)):
+        schema = PanelSchema.under(panel, cut)
+        again = PanelSchema.from_config(json.loads(json.dumps(schema.config())))
+        assert again == schema
+        assert again.sizes == schema.sizes
+        assert (again.length, again.observed) == (cut.length, cut.observed)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"means": {}}, "no mean and scale of height, plan, price"),
+        ({"scales": {"plan": 1.0}}, "no mean and scale of height, price"),
+        (
+            {"scales": {"plan": 0.0, "height": 1.0, "price": 1.0}},
+            r"scales\['plan'\] is 0.0; it must be finite and above 0",
+        ),
+        ({"means": {"plan": float("inf"), "height": 0.0, "price": 0.0}}, r"means\['plan'\] is inf; it must be finite"),
+        ({"lacking": ()}, "no indicator of price, weather"),
+        ({"step": -1.0}, "step is -1.0"),
+    ],
+)
+def test_a_schema_that_lacks_what_it_needs_is_refused(change, said):
+    with pytest.raises(ValueError, match=said):
+        replace(PanelSchema.under(table(), CUT), **change)
+
+
+def test_every_family_has_the_law_of_its_columns():
+    told = Columns(
+        (
+            Column("a"),
+            Column("n", family="count"),
+            Column("k", family="category", classes=KINDS),
+            Column("b"),
+            Column("l", family="category", classes=("u", "v")),
+            Column("m", family="count"),
+        )
+    )
+    law = PanelSchema(columns=told).emission
+    assert isinstance(law, Product)
+    assert dict(law.parts) == {
+        (0, 5): FAMILIES["real"],
+        (1, 8): FAMILIES["count"],
+        (2, 3, 4): FAMILIES["category"],
+        (6, 7): FAMILIES["category"],
+    }
+    for family, spec in FAMILIES.items():
+        classes = ("u", "v") if family == "category" else ()
+        assert PanelSchema(columns=Columns((Column("y", family=family, classes=classes),))).emission == spec
+
+
+def test_a_category_may_have_the_name_of_a_family():
+    told = Columns((Column("real", family="category", classes=KINDS), Column("y"), Column("count", family="count")))
+    law = PanelSchema(columns=told).emission
+    assert [places for places, _ in law.parts] == [(0, 1, 2), (3,), (4,)]
+    assert [spec for _, spec in law.parts] == [FAMILIES["category"], FAMILIES["real"], FAMILIES["count"]]
+
+
+def test_a_column_without_values_to_train_on_is_refused():
+    panel = table()
+    for place, _, _ in CUT.starts(panel, "train"):
+        panel.series[place].values[:, TOLD.names.index("temp")] = NAN
+    with pytest.raises(ValueError, match="column 'temp' has no value in the training part"):
+        PanelSchema.under(panel, CUT)
+    with pytest.raises(ValueError, match=r"no training window of 50 \+ 3 steps: its sequences have 12 to 12 steps"):
+        PanelSchema.under(panel, Cut(50, 3))

@@ -1,0 +1,260 @@
+"""Every method of the family on a table of several kinds of columns, and what is written of its forecasts."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import dvae
+from dvae.cli.tables import drawn, scores
+from dvae.data import past_of
+from dvae.inference.checkpoints import CheckpointError
+from dvae.models.registry import methods
+from dvae.runs import directory as runs
+from dvae.tables import Column, Columns, Panel
+from dvae.tables.ahead import ahead
+from dvae.tables.dataset import PanelData
+from dvae.tables.encoding import PanelSchema
+from dvae.tables.forecasts import QUANTILES, PanelForecasts
+from dvae.tables.protocol import Cut
+
+pd = pytest.importorskip("pandas")
+
+NAN = np.nan
+SMALL = {"latent": 2, "warm_up": 1}
+METHODS = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae", "autoregressive")
+TOLD = Columns(
+    (
+        Column("riders", family="overdispersed", unit="people"),
+        Column("temp", unit="°C"),
+        Column("kind", family="category", classes=("a", "b", "c")),
+        Column("open", family="binary"),
+        Column("share", family="share"),
+        Column("plan", "known"),
+        Column("weather", "past", "category", classes=("rain", "sun")),
+        Column("height", "static"),
+    ),
+    ("station",),
+    "day",
+)
+
+
+def frame(count=6, t=14):
+    rng = np.random.default_rng(0)
+    made = []
+    for n in range(count):
+        columns = {
+            "riders": rng.poisson(4, t),
+            "temp": rng.normal(20, 5, t),
+            "kind": rng.choice(["a", "b", "c"], t),
+            "open": rng.integers(0, 2, t),
+            "share": rng.uniform(0.1, 0.9, t),
+            "plan": rng.normal(size=t),
+            "weather": rng.choice(["rain", "sun"], t),
+        }
+        part = pd.DataFrame(columns).astype(object)
+        part = part.mask(rng.random(part.shape) < 0.15)
+        made.append(part.assign(station=f"s{n}", day=np.cumsum(rng.choice([1, 1, 3], t)), height=rng.normal()))
+    return pd.concat(made, ignore_index=True)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """A table with missing targets and covariates, and uneven steps."""
+    path = tmp_path_factory.mktemp("tables") / "riders.csv"
+    frame().to_csv(path, index=False)
+    return PanelData.open(path, TOLD, Cut(5, 3))
+
+
+def options(name):
+    return {} if name == "autoregressive" else SMALL
+
+
+def test_every_method_that_is_not_of_motion_is_tested():
+    motion = {"hit-dvae", "gsps", "trajevae", "cvae-rnn", "mix-and-match", "motion-latent", "equations"}
+    assert {*METHODS} == {*methods()} - motion
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_is_fitted_to_a_table_forecasts_it_and_does_not_see_what_is_missing(data, name):
+    windows = data.windows("train")
+    assert windows.schema.sizes == {"x": 7, "c": 1 + 1 + 2 + 1, "s": 1, "d": 1}
+    method = dvae.method(name, **options(name)).suited(windows)
+    model = method.build(data.schema)
+    recipe = method.train(windows, data.windows("validation"), 2)
+    recipe.fit(model, steps=2, batch_size=4, validate_every=2, progress=False)
+    model.eval()
+    assert {"c", "s", "d"} <= {*model.context}
+    batch = data.windows("test").all()
+    made = model.forecast(past_of(batch, 5), 3, samples=4, draw_emission=True)["x"]
+    assert made.shape == (4, len(batch["x"]), 3, 7)
+    assert made.isfinite().all()
+    assert not made[..., [0, 2, 3, 4, 5]].frac().any()  # counts, a class and a binary
+    assert (made[..., 2:5].sum(-1) == 1).all()
+    assert ((made[..., 6] > 0) & (made[..., 6] < 1)).all()
+    model.double()
+    double = {key: value.double() if value.is_floating_point() else value for key, value in batch.items()}
+    bounds = []
+    for other in (0.0, 1.0):  # in the support of all families but one, whose entries do not count either
+        x = torch.where(double["mask"], double["x"], other)
+        torch.manual_seed(0)
+        bounds.append(dvae.importance_bound(model, {**double, "x": x}, particles=3).bound)
+    assert (~double["mask"]).any()
+    torch.testing.assert_close(*bounds, rtol=0, atol=0)
+
+
+def test_equations_read_covariates_and_gaps_where_they_name_them(data):
+    guide = "q(z_t | z_{t-1}, x_{1:T}, c_t)"
+    given = {"generative": "p(z_t | z_{t-1}, d_t, s) p(x_t | z_t, c_t)", "inference": guide, **SMALL}
+    model = dvae.method("equations", **given).build(data.schema)
+    assert str(model.generative) == str(dvae.Factorization.parse(given["generative"]))
+    assert str(model.inference) == str(dvae.Factorization.parse(guide))
+    batch = data.windows("test").all()
+
+    def bound(batch):
+        torch.manual_seed(0)
+        return dvae.importance_bound(model, batch, particles=2).bound
+
+    for name in ("c", "d", "s"):
+        assert not torch.equal(bound({**batch, name: batch[name] + 1}), bound(batch))
+    plain = dvae.method("equations", **SMALL).build(data.schema)
+    assert not plain.context
+    model = plain
+    for name in ("c", "d", "s"):
+        assert torch.equal(bound({**batch, name: batch[name] + 1}), bound(batch))
+    with pytest.raises(ValueError, match="sizes missing for e"):
+        dvae.method("equations", generative="p(x_t | x_{t-1}, e_t)", inference="").build(data.schema)
+
+
+def test_a_run_is_fitted_loaded_resumed_and_refused_where_it_was_tampered_with(data, tmp_path):
+    out = tmp_path / "run"
+    training = dvae.Training(steps=2, batch_size=4, validate_every=2, progress=False)
+    runs.fit_run(dvae.method("vrnn", **SMALL), data, out, training)
+    loaded = runs.load(out)
+    assert loaded.schema == data.schema
+    assert loaded.data.fingerprint == data.fingerprint
+    assert runs.resume(out, steps=4, progress=False).step == 4
+    test = loaded.data.windows("test")
+    result = dvae.evaluate({"vrnn": loaded.model}, test, samples=2, scores=scores)
+    assert {"CRPS", "CRPS, riders"} <= result["vrnn"].keys()
+    config = json.loads((out / "config.json").read_text())
+    for change in (
+        {"means": {}},
+        {"scales": {"temp": 0.0, "plan": 1.0, "height": 1.0}},
+        {"lacking": []},
+        {"step": "much"},
+        {"step": -1},
+        {"columns": {"columns": {}}},
+        {"columns": 3},
+        {"columns": {"columns": {"riders": {"family": "cout"}}}},
+        {"cut": {"observed": 10**9, "horizon": 1}},
+        {"cut": {"unknown": 3}},
+        {"unknown": 3},
+        {"kind": "sequences"},
+    ):
+        (out / "config.json").write_text(json.dumps({**config, "schema": {**config["schema"], **change}}))
+        with pytest.raises(CheckpointError, match=r"config.json") as error:
+            runs.load(out)
+        assert len(str(error.value)) < 1000
+    (out / "config.json").write_text(json.dumps(config))
+    with open(data.path, "a") as file:
+        file.write("1,2.5,a,1,.5,1,sun,s9,1,.3\n")
+    with pytest.raises(CheckpointError, match=r"riders.csv has changed since"):
+        runs.load(out).data.windows("test")
+
+
+def forecasts(times=None, dates=False):
+    rng = np.random.default_rng(0)
+    draws = rng.normal(1e6, 1, size=(50, 2, 3, 2)).astype(np.float32)
+    draws[..., 1] = rng.integers(0, 2, draws.shape[:-1])
+    past, truth = rng.normal(size=(2, 4, 2)), rng.normal(size=(2, 3, 2))
+    truth[0, 1, 0] = past[1, 2, 0] = NAN
+    return PanelForecasts(draws, past, truth, {"y": "m", "open": ""}, [("a", 4), ("b", 9)], times, dates)
+
+
+def test_the_table_has_a_row_for_each_window_step_and_column():
+    found = forecasts()
+    table = found.table()
+    assert len(table) == 2 * 3 * 2
+    assert [*table.columns[:5]] == ["sequence", "step", "ahead", "column", "unit"]
+    for _, row in table.iterrows():
+        window, place = "ab".index(row["sequence"]), ["y", "open"].index(row["column"])
+        own = found.draws[:, window, row["ahead"] - 1, place]
+        assert row["step"] == (4, 9)[window] + row["ahead"] - 1
+        assert row["unit"] == ("m", "")[place]
+        assert row["mean"] == own.mean(dtype=np.float64)
+        names = [f"q{1000 * level:03.0f}" for level in QUANTILES]
+        np.testing.assert_array_equal(row[names].astype(float), np.quantile(own, QUANTILES).astype(float))
+        np.testing.assert_equal(row["truth"], found.truth[window, row["ahead"] - 1, place])
+    assert names == ["q025", "q050", "q100", "q250", "q500", "q750", "q900", "q950", "q975"]
+
+
+@pytest.mark.parametrize("times", [20240101.0 + np.arange(14).reshape(2, 7), 1.7e9 + 0.5 * np.arange(14).reshape(2, 7)])
+def test_times_that_are_numbers_keep_all_their_digits(tmp_path, times):
+    forecasts(times).save(tmp_path / "a.csv")
+    table = pd.read_csv(tmp_path / "a.csv")
+    np.testing.assert_array_equal(table["time"], times[:, 4:].reshape(-1).repeat(2))
+
+
+def test_dates_are_dates(tmp_path):
+    days = pd.date_range("2024-02-25", periods=7).astype("datetime64[s]").astype("int64").to_numpy(float)
+    forecasts(np.stack([days, days]), True).save(tmp_path / "a.csv")
+    table = pd.read_csv(tmp_path / "a.csv")
+    assert [*dict.fromkeys(table["time"])] == ["2024-02-29", "2024-03-01", "2024-03-02"]
+
+
+def test_npz_holds_the_draws(tmp_path):
+    times = np.arange(14.0).reshape(2, 7)
+    found = forecasts(times)
+    found.save(tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as held:
+        for name in ("draws", "past", "truth", "times"):
+            np.testing.assert_array_equal(held[name], getattr(found, name))
+        assert [held[name].tolist() for name in ("sequence", "step", "columns")] == [["a", "b"], [4, 9], ["y", "open"]]
+
+
+def test_parquet_is_written_or_asks_for_what_writes_it(tmp_path):
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        with pytest.raises(ValueError, match="needs pyarrow: pip install"):
+            forecasts().save(tmp_path / "a.parquet")
+        assert not [*tmp_path.iterdir()]
+    else:
+        forecasts().save(tmp_path / "a.parquet")
+        assert pd.read_parquet(tmp_path / "a.parquet").equals(forecasts().table())
+    with pytest.raises(ValueError, match=r"a.xls ends in none of .csv, .parquet, .npz"):
+        forecasts().save(tmp_path / "a.xls")
+
+
+def test_fans_hold_the_quantiles():
+    found = forecasts()
+    figure = found.plot(1)
+    fan, share = figure.axes[:2]
+    low, high = np.quantile(found.draws[:, 1, :, 0], [0.025, 0.975], axis=0)
+    edges = fan.collections[0].get_paths()[0].vertices
+    assert {*np.float32(low), *np.float32(high)} <= {*np.float32(edges[:, 1])}
+    np.testing.assert_allclose(share.lines[0].get_ydata(), found.draws[:, 1, :, 1].mean(0))
+    assert [axis.get_title() for axis in figure.axes] == ["y (m)", "open"]
+    assert len(found.plot(columns=["open"]).axes) == 1
+    with pytest.raises(ValueError, match=r"no column 'opn' \(did you mean 'open'\?\); there are y, open"):
+        found.plot(columns=["opn"])
+
+
+def test_draws_beyond_the_end_are_of_the_last_window_and_of_the_seed():
+    told = replace(TOLD, columns=tuple(each for each in TOLD.columns if each.role != "known"))
+    panel = Panel.of(frame(), told)
+    schema = PanelSchema.under(panel, Cut(5, 3))
+    model = dvae.method("dkf", **SMALL).build(schema).eval()
+    loaded = runs.Loaded(None, None, model)
+    one, other, third = (drawn(loaded, ahead(panel, schema, 4), 6, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.draws, other.draws)
+    assert (one.draws != third.draws).any()
+    assert one.draws.shape == (6, 6, 4, 7)
+    assert np.isnan(one.truth).all()
+    for (name, step), sequence in zip(one.keys, panel, strict=True):
+        lacking = np.isnan(sequence.values[:, :5]).all(1)
+        assert (name, step) == (sequence.name, len(lacking) - np.argmin(lacking[::-1]))
+    np.testing.assert_allclose(one.times[:, 5] - one.times[:, 4], 1)

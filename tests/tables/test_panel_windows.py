@@ -1,0 +1,208 @@
+"""Windows hold what the table holds at their keys, drawn or listed, and nothing that is not known yet."""
+
+import numpy as np
+import pytest
+import torch
+
+from dvae.data import HeldOutWindows, Source
+from dvae.tables import Column, Columns, Panel, Series
+from dvae.tables.encoding import PanelSchema
+from dvae.tables.protocol import Cut
+from dvae.tables.windows import PanelWindows
+
+NAN = np.nan
+TOLD = Columns(
+    (
+        Column("y"),
+        Column("n", family="count"),
+        Column("plan", "known"),
+        Column("price", "past"),
+        Column("weather", "past", "category", classes=("rain", "sun")),
+        Column("height", "static"),
+    )
+)
+
+
+def table(lengths=(9, 14, 30, 8, 21, 17, 12, 25, 13, 10), missing=True, told=TOLD, seed=0):
+    rng = np.random.default_rng(seed)
+    made = []
+    for n, t in enumerate(lengths):
+        values = np.stack([rng.normal(size=t), rng.poisson(3, t), rng.normal(size=t), rng.normal(size=t)], 1)
+        values = np.concatenate([values, rng.integers(0, 2, (t, 1)), np.full((t, 1), rng.normal())], 1)
+        if missing:
+            values[:, :5][rng.random((t, 5)) < 0.2] = NAN
+        made.append(Series(f"s{n}", values, np.cumsum(rng.choice([1.0, 1.0, 3.0], t))))
+    return Panel(made, told)
+
+
+def rows(batch, n):
+    """One window of a batch."""
+    return {name: value[n] for name, value in batch.items()}
+
+
+def wanted(panel, schema, name, start, length):
+    """A window, from the table alone."""
+    (one,) = panel.only([name])
+    part = slice(start, start + length)
+    x, c = schema.targets(one)[part], schema.context(one)[part].copy()
+    if (observed := schema.cut.observed) is not None:
+        # plan and its indicator; price and its indicator; weather in two coordinates, and its indicator
+        price = c.shape[1] - 5
+        c[observed:, [price, price + 2, price + 3]] = c[observed - 1, [price, price + 2, price + 3]]
+        c[observed:, [price + 1, price + 4]] = 0
+    return {"x": np.nan_to_num(x), "mask": ~np.isnan(x), "c": c, "s": schema.static(one), "d": schema.gaps(one)[part]}
+
+
+def assert_same(found, expected):
+    for name in expected:
+        np.testing.assert_allclose(found[name].numpy(), expected[name].astype(np.float32), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("cut", [Cut(5, 3), Cut(5, 3, split="time"), Cut(4, 1, stride=2, test=0.5)], ids=str)
+@pytest.mark.parametrize("split", ["train", "validation", "test", "train+validation", "all", "last"])
+def test_listed_windows_hold_the_table_at_their_keys(cut, split):
+    panel = table()
+    schema = PanelSchema.under(panel, cut)
+    windows = PanelWindows(panel, schema, split)
+    batch, keys = windows.all(), windows.keys
+    assert len(windows) == len(keys) == len(set(keys)) == len(batch["x"])
+    for n, (part, name, start) in enumerate(keys):
+        assert part == split
+        assert_same(rows(batch, n), wanted(panel, schema, name, start, cut.length))
+    assert isinstance(windows, Source)
+    assert isinstance(windows, HeldOutWindows)
+
+
+@pytest.mark.parametrize("cut", [Cut(5, 3), Cut(5, 3, split="time")], ids=str)
+def test_drawn_windows_are_all_of_them_and_each_alike(cut):
+    panel = table()
+    schema = PanelSchema.under(panel, cut)
+    windows = PanelWindows(panel, schema, "train")
+    every = {}
+    for place, low, last in cut.starts(panel, "train"):
+        for start in range(low, last + 1):
+            window = wanted(panel, schema, panel.series[place].name, start, cut.length)
+            every[np.float32(window["d"]).tobytes() + np.float32(window["x"]).tobytes()] = window
+    counts = dict.fromkeys(every, 0)
+    total = 400 * len(every)
+    batch = windows.sample(total, torch.Generator().manual_seed(0))
+    for n in range(total):
+        key = batch["d"][n].numpy().tobytes() + batch["x"][n].numpy().tobytes()
+        if not counts[key]:
+            assert_same(rows(batch, n), every[key])
+        counts[key] += 1
+    deviation = (np.array([*counts.values()]) - 400) / 400**0.5
+    assert abs(deviation).max() < 5
+    assert deviation.std() == pytest.approx(1, abs=0.25)
+
+
+def test_draws_are_those_of_the_generator():
+    windows = PanelWindows(table(), PanelSchema.under(table(), Cut(5, 3)), "train")
+    one, other, third = (windows.sample(7, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert not torch.equal(one["x"], third["x"])
+
+
+def test_whole_sequences_are_padded():
+    panel = table()
+    schema = PanelSchema.under(panel, Cut())
+    windows = PanelWindows(panel, schema, "all")
+    batch = windows.all()
+    assert batch["lengths"].tolist() == [len(one) for one in panel]
+    for n, (_, name, start) in enumerate(windows.keys):
+        length = int(batch["lengths"][n])
+        found = {key: value[n] if value.dim() < 3 else value[n, :length] for key, value in batch.items()}
+        assert start == 0
+        assert_same(found, wanted(panel, schema, name, 0, length))
+    some = PanelWindows(panel, schema, "train").sample(4, torch.Generator().manual_seed(0))
+    assert len(some["x"]) == 4
+    assert some["x"].shape[1] == some["lengths"].max()
+    assert len(PanelWindows(panel, schema, "test").sample(50, torch.Generator())["x"]) == 2
+    even = table((9, 9, 9, 9))
+    assert "lengths" not in PanelWindows(even, PanelSchema.under(even, Cut()), "all").all()
+
+
+def test_what_ends_with_the_present_changes_nothing_after_it_and_what_is_known_does():
+    def batch(panel):
+        return PanelWindows(panel, schema, "all").all()
+
+    panel = table((8, 8, 8, 8), missing=False)
+    schema = PanelSchema.under(panel, Cut(5, 3))
+    before = batch(panel)
+    for place, column in enumerate(TOLD.columns):
+        if column.role not in ("known", "past"):
+            continue
+        other = table((8, 8, 8, 8), missing=False)
+        for one in other:
+            one.values[5:, place] = 1 - one.values[5:, place]
+        after = batch(other)
+        assert torch.equal(before["c"], after["c"]) == (column.role == "past")
+        assert all(torch.equal(before[name], after[name]) for name in before.keys() - {"c"})
+        for one in other:
+            one.values[4, place] = 1 - one.values[4, place]
+        assert not torch.equal(before["c"], batch(other)["c"])
+
+
+def test_there_is_a_mask_where_something_of_these_windows_is_missing():
+    panel = table((20,) * 5, missing=False)
+    schema = PanelSchema.under(panel, Cut(5, 3, split="time"))
+    assert "mask" not in PanelWindows(panel, schema, "train").all()
+    panel.series[0].values[18, 1] = NAN
+    assert "mask" not in PanelWindows(panel, schema, "train").all()
+    test = PanelWindows(panel, schema, "test").all()
+    assert (~test["mask"]).sum() == 1
+    assert test["x"][~test["mask"]].item() == 0
+
+
+def test_columns_that_are_one_event_are_observed_whole_or_not():
+    told = Columns((Column("a", family="correlated"), Column("b", family="correlated"), *TOLD.columns[2:]))
+    panel = table(told=told)
+    windows = PanelWindows(panel, PanelSchema.under(panel, Cut(5, 3)), "train")
+    mask = windows.all()["mask"]
+    assert torch.equal(mask[..., 0], mask[..., 1])
+    assert not mask.all()
+
+
+def test_held_out_windows_are_a_stride_apart():
+    panel = table((30,) * 10)
+    schema = PanelSchema.under(panel, Cut(5, 4))
+    starts = {
+        split: [start for _, name, start in PanelWindows(panel, schema, split).keys] for split in ("test", "train")
+    }
+    assert starts["test"][:6] == [0, 4, 8, 12, 16, 20]
+    assert starts["train"][:4] == [0, 2, 4, 6]
+    assert PanelWindows(panel, PanelSchema.under(panel, Cut(5, 4, stride=9)), "test").keys[1][2] == 9
+
+
+def test_times_go_on_behind_the_end():
+    panel = table((9, 9, 9))
+    windows = PanelWindows(panel, PanelSchema.under(panel, Cut(5, 3)), "all")
+    times, dates = windows.times(6)
+    assert not dates
+    for (_, name, start), found in zip(windows.keys, times, strict=True):
+        (one,) = panel.only([name])
+        own = one.times[start : start + 11]
+        np.testing.assert_array_equal(found[: len(own)], own)
+        np.testing.assert_allclose(np.diff(found[len(own) - 1 :]), own[-1] - own[-2])
+
+
+def test_windows_are_told_apart_by_their_fingerprint():
+    panel, other = table(), table(seed=1)
+    schema = PanelSchema.under(panel, Cut(5, 3))
+    made = [(panel, schema, "train"), (panel, schema, "test"), (other, schema, "train")]
+    made.append((panel, PanelSchema.under(panel, Cut(5, 2)), "train"))
+    assert len({PanelWindows(*each).fingerprint for each in made}) == 4
+    assert PanelWindows(*made[0]).fingerprint == PanelWindows(table(), schema, "train").fingerprint
+
+
+def test_a_part_without_windows_is_refused():
+    panel = table()
+    with pytest.raises(
+        ValueError, match=r"panel has no validation window of 5 \+ 3 steps; its 10 sequences have 8 to 30"
+    ):
+        PanelWindows(panel, PanelSchema.under(panel, Cut(5, 3, validation=0)), "validation")
+
+
+def test_sequences_that_are_too_short_are_listed():
+    panel = table()
+    assert PanelWindows(panel, PanelSchema.under(panel, Cut(8, 3)), "all").skipped == ["s0", "s3", "s9"]
