@@ -98,7 +98,7 @@ class DataOptions:
             riders:count:people. Without it, all that is nothing else; a schema beside the file says the same.
         covariates: of a table: columns that forecasts are given for the future too, such as a calendar.
         past: of a table: columns that forecasts are given up to the present.
-        static: of a table: columns with one value a sequence.
+        attributes: of a table: columns with one value a sequence.
         id: of a table: columns that tell sequences apart.
         time: of a table: column of dates or numbers.
         group: of a table: column that is the same within a sequence.
@@ -120,7 +120,7 @@ class DataOptions:
     columns: tuple[str, ...] = ()
     covariates: tuple[str, ...] = ()
     past: tuple[str, ...] = ()
-    static: tuple[str, ...] = ()
+    attributes: tuple[str, ...] = ()
     id: tuple[str, ...] = ()
     time: str | None = None
     group: str | None = None
@@ -148,7 +148,11 @@ class DataOptions:
         given = {option: value for option, value in vars(self).items() if value != getattr(DataOptions, option)}
         for other, options in OF_KINDS.items():
             if other != kind and (strange := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
-                raise UsageError(f"--{min(strange)} is about {other}, and {name} is fitted on {kind}")
+                raise UsageError(
+                    f"--{min(strange).replace('_', '-')} is about {SAID[other]}, and {name} is fitted on {SAID[kind]}"
+                )
+        if attributes := given.pop("attributes", ()):  # a method may have a `static` of its own
+            given["static"] = attributes
         with arguments() if kind == "panel" else nullcontext():  # of which columns are arguments
             return DATA[kind].open(given.pop("data", SIMULATED), **given)
 
@@ -157,11 +161,12 @@ OF_KINDS = {
     "motion": ("protocol", "representation", "missing", "skip_bad"),
     "segments": ("cut", "scaling", "warped", "bodies", "skip_bad"),
     "panel": (
-        *("columns", "covariates", "past", "static", "id", "time", "group"),
+        *("columns", "covariates", "past", "attributes", "id", "time", "group"),
         *("observed", "horizon", "stride", "split"),
     ),
 }
 """Options by the kind of data that has them."""
+SAID = {"motion": "motion", "segments": "segments of motion", "panel": "a table"}
 
 
 def fit(

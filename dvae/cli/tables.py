@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from operator import itemgetter
@@ -17,6 +18,7 @@ from ..inference.scores import CRPS, Measure, by_column, calibrated
 from ..runs import directory as runs
 from ..tables.ahead import ahead
 from ..tables.dataset import PanelData
+from ..tables.encoding import PanelSchema
 from ..tables.forecasts import FORMATS, PanelForecasts
 from ..tables.reading import SUFFIXES, schema_beside, written_schema
 from ..tables.windows import PanelWindows
@@ -37,8 +39,13 @@ def is_table(path: str) -> bool:
             head = file.read(4096).decode("utf-8", "replace").splitlines()[:1]
         names = {name.strip().strip('"') for name in (head or [""])[0].split(",")}
         return not any({f"{name[:-2]}_{axis}" for axis in "xyz"} <= names for name in names if name.endswith("_x"))
-    with np.load(place, allow_pickle=False) as arrays:
-        return "x" in arrays.files or len(arrays.files) == 1
+    try:
+        with files.open_plain(place, links=True) as file, zipfile.ZipFile(file) as archive:
+            held = [entry.removesuffix(".npy") for entry in archive.namelist()]
+    except zipfile.BadZipFile:
+        return False
+    of_motion = "positions_3d" in held or place.with_name("skeleton.json").is_file()
+    return not of_motion and ("x" in held or len(held) == 1)
 
 
 def scores(windows: HeldOutWindows) -> list[Measure]:
@@ -47,15 +54,20 @@ def scores(windows: HeldOutWindows) -> list[Measure]:
     return [*found, *(by_column(CRPS, columns) if 1 < len(columns) <= 12 else [])]
 
 
-def windows(loaded: runs.Loaded, opened: PanelData, split: str = "test") -> PanelWindows:
-    """Windows to forecast.
+def windows(loaded: runs.Loaded, opened: PanelData, horizon: int | None = None) -> PanelWindows:
+    """Test windows to forecast, so many steps if not those of the run.
 
     Raises:
         UsageError: whole sequences, of which nothing is forecast.
     """
     if opened.schema.cut.length is None:
         raise UsageError(f"{loaded.path} was fitted on whole sequences; fit with --observed and --horizon to forecast")
-    return opened.windows(split)
+    return PanelWindows(opened.panel, _longer(opened.schema, horizon), "test")
+
+
+def _longer(schema: PanelSchema, horizon: int | None) -> PanelSchema:
+    """The schema with another horizon, if one is given."""
+    return schema if horizon is None else replace(schema, cut=replace(schema.cut, horizon=horizon))
 
 
 def forecast(
@@ -73,26 +85,25 @@ def forecast(
     check_files(out, figure, *FORMATS)
     loaded = load_run(path, data, "panel")
     opened = data_of(data, loaded)
+    panel = opened.panel if sequence is None else opened.panel.only([sequence])
     if beyond:
-        held = ahead(opened.panel if sequence is None else opened.panel.only([sequence]), opened.schema, horizon)
-    elif sequence is not None:
-        held = PanelWindows(opened.panel.only([sequence]), opened.schema, "all")
+        held = ahead(panel, opened.schema, horizon)
     else:
-        held = windows(loaded, opened)
-    found = drawn(loaded, held, samples, seed, horizon)
+        held = windows(loaded, opened, horizon)
+        held = held if sequence is None else PanelWindows(panel, held.schema, "all")
+    found = drawn(loaded, held, samples, seed)
     found.save(out)
     ERROR.print(f"wrote {out}: {samples} futures of {found.draws.shape[2]} steps for each of {len(found.keys)} windows")
     if figure is not None:
         save_figure(found.plot(), figure)
 
 
-def drawn(
-    loaded: runs.Loaded, held: PanelWindows, samples: int, seed: int = 0, horizon: int | None = None
-) -> PanelForecasts:
+def drawn(loaded: runs.Loaded, held: PanelWindows, samples: int, seed: int = 0) -> PanelForecasts:
     """Draws of the futures of windows."""
-    observed = held.protocol.observed
+    observed, steps = held.protocol.observed, held.protocol.horizon
     assert observed is not None
-    batch, steps = held.all(), horizon or held.protocol.horizon or 1
+    assert steps is not None
+    batch = held.all()
     past = past_of(batch, observed)
     parts = []
     with torch.random.fork_rng():
@@ -100,15 +111,14 @@ def drawn(
         for some in Sequences(past).split(64):
             parts.append(loaded.model.forecast(some, steps, samples, draw_emission=True)["x"].numpy())
     known = gapped(batch).numpy()
-    truth = known[:, observed : observed + steps]
-    if truth.shape[1] < steps:
-        truth = np.pad(truth, ((0, 0), (0, steps - truth.shape[1]), (0, 0)), constant_values=np.nan)
     keys = [(name, start + observed) for _, name, start in held.keys]
     columns = columns_of(held) or {}
     whole = held.times(steps)
     times = None if whole is None else whole[0]
     dates = whole is not None and whole[1]
-    return PanelForecasts(np.concatenate(parts, 1), known[:, :observed], truth, columns, keys, times, dates)
+    return PanelForecasts(
+        np.concatenate(parts, 1), known[:, :observed], known[:, observed:], columns, keys, times, dates
+    )
 
 
 def impute(path: Path, out: Path, samples: int, seed: int, data: str | None) -> None:

@@ -1,0 +1,285 @@
+"""The command line on a table that nobody prepared."""
+
+import json
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+import dvae
+from dvae import motion
+from dvae.cli import main
+from dvae.cli.fitting import DataOptions
+from dvae.cli.tables import is_table
+from dvae.inference.training import Training
+from dvae.models.registry import judges, methods
+
+pd = pytest.importorskip("pandas")
+
+SMALL = ["--steps", "2", "--batch-size", "4", "--validate-every", "2"]
+LATENT = ["--latent", "2", "--warm-up", "1"]
+TOLD = ["--columns", "riders:count:people", "temp:real:°C", "--covariates", "plan", "--past", "weather"]
+TOLD += [
+    "--attributes",
+    "height",
+    "--id",
+    "station",
+    "--time",
+    "day",
+    "--observed",
+    "5",
+    "--horizon",
+    "3",
+    "--split",
+    "sequence",
+]
+
+
+def frame(t=20, future=0):
+    """Six stations, with what they lack; of the future only what is known of it."""
+    rng = np.random.default_rng(0)
+    made = []
+    for n in range(6):
+        count = t + future
+        columns = {"riders": rng.poisson(4, count), "temp": rng.normal(20, 5, count), "plan": rng.normal(size=count)}
+        part = pd.DataFrame(columns).astype(float)
+        part.iloc[3:6, n % 2] = np.nan
+        part.iloc[t:, :2] = np.nan
+        part["weather"] = np.where(rng.random(count) < 0.5, "rain", "sun")
+        days = pd.date_range("2024-01-01", periods=count)
+        made.append(part.assign(station=f"s{n}", day=days.strftime("%Y-%m-%d"), height=rng.normal()))
+    return pd.concat(made, ignore_index=True)
+
+
+def failure(capsys, *arguments, code=1):
+    """The sentence with which a command fails."""
+    assert main([str(each) for each in arguments]) == code
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert "looks like a bug" not in error
+    return " ".join(error.split())
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    path = tmp_path_factory.mktemp("table") / "riders.csv"
+    frame().to_csv(path, index=False)
+    return path
+
+
+@pytest.fixture(scope="module")
+def tabled(table, tmp_path_factory):
+    """Runs of two methods; nobody writes to their weights."""
+    out = tmp_path_factory.mktemp("tabled")
+    for name in ("vae", "autoregressive"):
+        own = LATENT if name == "vae" else []
+        assert main(["fit", name, "--out", str(out / name), "--data", str(table), *SMALL, *own, *TOLD]) == 0
+    return out
+
+
+def test_options_of_data_and_of_methods_have_names_of_their_own():
+    data = {field.name for field in fields(DataOptions)}
+    assert not data & {field.name for field in fields(Training)}
+    for name, kind in {**methods(), **judges()}.items():
+        assert not data & {field.name for field in fields(kind)}, name
+
+
+def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
+    path = tmp_path / "riders.csv"
+    path.write_bytes(table.read_bytes())
+    assert main(["data", "info", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert "6 sequences of 20 steps" in printed
+    assert 'id = ["station"]' in printed
+    schema = tmp_path / "riders.toml"
+    assert main(["data", "info", str(path), "--out", str(schema)]) == 0
+    assert "correct it" in capsys.readouterr().err
+    assert schema.read_text() in printed
+    schema.write_text(schema.read_text().replace('family = "count"', 'family = "overdispersed"\nunit = "people"'))
+    assert main(["data", "info", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert "overdispersed" in printed
+    assert "people" in printed
+    schema.write_text(schema.read_text().replace("unit", "unt"))
+    assert "riders.toml is no schema of a table: column 'riders' has an entry 'unt' (did you mean 'unit'?)" in failure(
+        capsys, "data", "info", path
+    )
+    assert "--out takes the schema of one table" in failure(
+        capsys, "data", "info", table, table, "--out", schema, code=2
+    )
+
+
+def test_five_commands_on_a_file_that_nobody_prepared(table, capsys, tmp_path):
+    path, run = tmp_path / "riders.csv", tmp_path / "run"
+    path.write_bytes(table.read_bytes())
+    assert main(["data", "info", str(path)]) == 0
+    assert main(["fit", "dkf", "--out", str(run), "--data", str(path), *SMALL, *LATENT]) == 0
+    assert f"dvae evaluate {run}" in capsys.readouterr().out
+    assert main(["evaluate", str(run), "--samples", "3", "--figure", str(tmp_path / "scores.png")]) == 0
+    assert "CRPS, riders" in capsys.readouterr().out
+    assert "rows" in json.loads((run / "evaluation.json").read_text())
+    out, fans = tmp_path / "futures.csv", tmp_path / "fans.png"
+    assert main(["forecast", str(run), "--out", str(out), "--figure", str(fans)]) == 0
+    assert fans.read_bytes().startswith(b"\x89PNG")
+    table = pd.read_csv(out)
+    assert {"sequence", "step", "time", "ahead", "column", "mean", "q025", "q500", "q975", "truth"} <= {*table.columns}
+    assert {*table["column"]} == {"riders", "temp", "plan", "weather=rain", "weather=sun"}
+    assert main(["impute", str(run), "--out", str(tmp_path / "filled.csv")]) == 0
+    assert len(pd.read_csv(tmp_path / "filled.csv")) == 6 * 3
+
+
+def test_quantiles_are_those_of_the_draws_of_the_same_seed(tabled, tmp_path):
+    for name in ("a.csv", "a.npz"):
+        assert (
+            main(["forecast", str(tabled / "vae"), "--out", str(tmp_path / name), "--seed", "3", "--samples", "9"]) == 0
+        )
+    table = pd.read_csv(tmp_path / "a.csv")
+    with np.load(tmp_path / "a.npz") as held:
+        draws, truth = held["draws"].reshape(9, -1), held["truth"].ravel()
+    for level in (0.025, 0.5, 0.9):
+        wanted = np.quantile(draws, level, axis=0)
+        np.testing.assert_array_equal(table[f"q{1000 * level:03.0f}"].astype("float32"), wanted)
+    np.testing.assert_allclose(table["mean"], draws.mean(0, dtype=float), rtol=1e-8)
+    np.testing.assert_allclose(table["truth"], truth, rtol=1e-6)
+    assert table["truth"].isna().any()
+
+
+def test_what_is_written_stands_beside_the_rows_that_it_is_about(tabled, table, tmp_path):
+    out = tmp_path / "a.csv"
+    assert main(["forecast", str(tabled / "vae"), "--out", str(out), "--samples", "2"]) == 0
+    there = pd.read_csv(table).assign(step=lambda each: each.groupby("station").cumcount())
+    there = there.set_index(["station", "step"])
+    for _, row in pd.read_csv(out).iterrows():
+        own = there.loc[(row["sequence"], row["step"])]
+        assert row["time"] == own["day"]
+        np.testing.assert_allclose(row["truth"], own[row["column"]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("horizon", [2, 6])
+def test_another_horizon_is_of_windows_of_that_length(tabled, tmp_path, horizon):
+    out = tmp_path / "a.npz"
+    assert main(["forecast", str(tabled / "vae"), "--out", str(out), "--horizon", str(horizon), "--samples", "2"]) == 0
+    with np.load(out) as held:
+        assert held["draws"].shape[2] == held["truth"].shape[1] == horizon
+        assert not np.isnan(held["truth"]).all()
+        assert held["times"].shape[1] == 5 + horizon
+
+
+def test_one_sequence_by_its_name(tabled, tmp_path, capsys):
+    run, out = tabled / "autoregressive", tmp_path / "a.csv"
+    assert main(["forecast", str(run), "--out", str(out), "--clip", "s4"]) == 0
+    assert {*pd.read_csv(out)["sequence"]} == {"s4"}
+    assert "no sequence 's44' (did you mean 's4'?)" in failure(capsys, "forecast", run, "--out", out, "--clip", "s44")
+
+
+def test_beyond_the_end_of_the_table(tabled, table, tmp_path, capsys):
+    run, out = tabled / "vae", tmp_path / "a.csv"
+    said = failure(capsys, "forecast", run, "--out", out, "--beyond")
+    assert "a forecast of 3 steps needs plan, known in the future too, and sequence 's0' has 0 rows after" in said
+    longer = tmp_path / "longer.csv"
+    frame(future=3).to_csv(longer, index=False)
+    assert main(["forecast", str(run), "--out", str(out), "--beyond", "--data", str(longer)]) == 0
+    made = pd.read_csv(out)
+    assert len(made) == 6 * 3 * 2
+    assert {*made["step"]} == {20, 21, 22}
+    assert {*made["time"]} == {"2024-01-21", "2024-01-22", "2024-01-23"}
+    assert made["truth"].isna().all()
+
+
+def test_runs_are_compared_criticised_resumed_and_swept(tabled, table, tmp_path, capsys):
+    both = [str(tabled / name) for name in ("vae", "autoregressive")]
+    few = ["--particles", "2", "--samples", "2", "--contrasts", "0", "--stride", "4"]
+    assert main(["compare", *both, *few, "--out", str(tmp_path / "a.json")]) == 0
+    assert {*json.loads((tmp_path / "a.json").read_text())["rows"]} == {"vae", "autoregressive"}
+    assert main(["criticise", both[1], "--samples", "19"]) == 0
+    error = capsys.readouterr().err
+    assert "no calibration" in error
+    assert main(["resume", both[0], "--steps", "3"]) == 0
+    out = str(tmp_path / "sweep")
+    assert main(["sweep", "autoregressive", "--out", out, "--seeds", "0", "--data", str(table), *SMALL, *TOLD]) == 0
+    assert dvae.load(tmp_path / "sweep" / "autoregressive-seed0").schema.cut.horizon == 3
+    assert "which is of a table" in failure(capsys, "animate", both[0], "--out", tmp_path / "a.html")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--columns", "ridrs"], "no column 'ridrs' (did you mean 'riders'?)"),
+        (["--columns", "riders:cout"], "family 'cout' (did you mean 'count'?)"),
+        (["--covariates", "pln"], "no column 'pln' (did you mean 'plan'?)"),
+        (["--id", "staton"], "no column 'staton' (did you mean 'station'?)"),
+        (["--time", "dya"], "no column 'dya' (did you mean 'day'?)"),
+        (["--columns", "temp:count"], "the family 'count' is of whole numbers from 0"),
+        (["--observed", "500", "--horizon", "3"], "no training window of 500 + 3 steps"),
+        (["--split", "group"], "too few to train, choose and test on"),
+        (["--skip-bad"], "--skip-bad is about motion, and vae is fitted on a table"),
+        (["--protocol", "cmu8"], "--protocol is about motion, and vae is fitted on a table"),
+        (["--cut", "clips"], "--cut is about segments of motion, and vae is fitted on a table"),
+    ],
+)
+def test_what_does_not_fit_the_table_is_a_wrong_argument(table, tmp_path, capsys, arguments, said):
+    assert said in failure(capsys, "fit", "vae", "--out", tmp_path / "run", "--data", table, *arguments, code=2)
+    assert not (tmp_path / "run").exists()
+
+
+def test_options_of_tables_are_not_those_of_motion(people, tabled, tmp_path, capsys):
+    out = ["--out", tmp_path / "run"]
+    segments = failure(capsys, "fit", "motion-latent", *out, "--data", people, "--columns", "a", code=2)
+    assert "--columns is about a table, and motion-latent is fitted on segments of motion" in segments
+    assert "is no table" in failure(capsys, "fit", "vae", *out, "--observed", "3", code=2)
+    assert "people.npz holds" in failure(capsys, "fit", "vae", *out, "--data", people, "--horizon", "3", code=2)
+    for option in (["--joints", "LWrist"], ["--pose-prior", "a"], ["--missing"]):
+        assert "is about motion" in failure(capsys, "evaluate", tabled / "vae", *option, code=2)
+    assert "--fix is about motion" in failure(capsys, "forecast", tabled / "vae", *out, "--fix", "lower", code=2)
+    assert "needs to know what poses are" in failure(
+        capsys, "fit", "gsps", *out, "--data", next(tabled.parent.glob("table*/riders.csv")), code=1
+    )
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
+def test_motion_is_still_motion(people, run, tmp_path, capsys):
+    assert not is_table(str(people))
+    assert "--beyond is about tables" in failure(
+        capsys, "forecast", run, "--out", tmp_path / "a.npz", "--beyond", code=2
+    )
+    clip = motion.simulate(clips=1, frames=60).clips[0]
+    alone = tmp_path / "alone" / "motion.npz"
+    alone.parent.mkdir()
+    motion.save(alone, motion.MotionSet([clip], motion.WALKER))
+    with np.load(alone) as held:
+        assert len(held.files) == 1
+    assert not is_table(str(alone))
+    assert main(["data", "info", str(alone)]) == 0
+    assert "17 joints" in capsys.readouterr().out
+    motion.write_motion(tmp_path / "walk.csv", motion.MotionSet([clip], motion.WALKER), "csv")
+    assert not is_table(str(tmp_path / "walk.csv"))
+    np.savez(tmp_path / "archive.npz", positions_3d=np.array({}, object))
+    assert not is_table(str(tmp_path / "archive.npz"))
+    (tmp_path / "broken.npz").write_bytes(b"PK")
+    assert not is_table(str(tmp_path / "broken.npz"))
+    assert not is_table("simulated")
+    assert not is_table(str(tmp_path))
+
+
+def test_tables_are_tables(table, tmp_path):
+    np.savez(tmp_path / "a.npz", x=np.zeros((2, 3, 1)), lengths=np.array([3, 3]))
+    np.savez(tmp_path / "b.npz", anything=np.zeros((3, 1)))
+    (tmp_path / "wind.csv").write_text("day,wind_x,wind_y\n1,2,3\n")
+    for path in (table, tmp_path / "a.npz", tmp_path / "b.npz", tmp_path / "wind.csv", tmp_path / "no.parquet"):
+        assert is_table(str(path))
+    (tmp_path / "joint.csv").write_text("hip_x,hip_y,hip_z\n1,2,3\n")
+    assert not is_table(str(tmp_path / "joint.csv"))
+    (tmp_path / "joint.toml").write_text("[columns.hip_x]")
+    assert is_table(str(tmp_path / "joint.csv"))
+
+
+def test_names_that_steer_a_terminal_are_shown_and_not_sent(tmp_path, capsys):
+    path = tmp_path / "a.csv"
+    path.write_text("day,\x1b[2Jy,[red]z\n" + "".join(f"{n},{n % 3}.5,{n % 2}.25\n" for n in range(40)))
+    assert main(["data", "info", str(path)]) == 0
+    printed = capsys.readouterr()
+    assert "\x1b" not in printed.out + printed.err
+    assert "[red]z" in printed.out
+    assert "\x1b" not in failure(
+        capsys, "fit", "vae", "--out", tmp_path / "r", "--data", path, "--columns", "\x1b[2J", code=2
+    )
