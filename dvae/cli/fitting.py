@@ -26,7 +26,7 @@ from ..models.registry import judges, methods
 from ..models.trajectories import TrajectoryMethod
 from ..motion.dataset import SIMULATED
 from ..motion.protocols import Representation
-from ..motion.segments.dataset import Cut
+from ..motion.segments.dataset import Segmentation
 from ..options import Amount
 from ..runs import directory as runs
 from ..runs.kinds import DATA
@@ -113,7 +113,7 @@ class DataOptions:
     protocol: ProtocolName | None = None
     representation: Representation = "positions"
     missing: Missing = False
-    cut: Cut = "gait"
+    cut: Segmentation = "gait"
     scaling: Literal["identity", "deviation"] = "identity"
     warped: bool = False
     bodies: Amount = 1.0

@@ -20,7 +20,7 @@ from ..tables.ahead import ahead
 from ..tables.dataset import PanelData
 from ..tables.encoding import PanelSchema
 from ..tables.forecasts import FORMATS, PanelForecasts
-from ..tables.reading import SUFFIXES, schema_beside, written_schema
+from ..tables.reading import SUFFIXES, is_domain, schema_beside, written_schema
 from ..tables.windows import PanelWindows
 from .console import ERROR, OUT, UsageError, check_files, save_figure
 from .opening import data_of, load_run
@@ -28,6 +28,8 @@ from .opening import data_of, load_run
 
 def is_table(path: str) -> bool:
     """Whether a path leads to a table rather than to motion."""
+    if is_domain(path):
+        return True
     place = Path(path)
     suffix = place.suffix.lower()
     if suffix not in SUFFIXES or not place.is_file():

@@ -28,11 +28,10 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
     observed, steps = schema.cut.observed, horizon or schema.cut.horizon
     if observed is None or steps is None:
         raise ValueError("whole sequences have no horizon; fit with observed and horizon steps to forecast")
-    targets = [schema.places[column.name] for column in schema.columns.targets]
     known = schema.columns.of("known")
     found = []  # with all of the past, of which covariates may have their last value
     for one in panel:
-        present = int(np.flatnonzero(~np.isnan(one.values[:, targets]).all(1)).max(initial=-1)) + 1
+        present = panel.present(one)
         if present < observed:
             raise ValueError(
                 f"sequence {one.name!r} has {present} steps up to its last target, and {observed} are to be observed"

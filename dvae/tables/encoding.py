@@ -103,8 +103,13 @@ class PanelSchema(Schema):
                 means[column.name], scales[column.name] = mean, scale if scale > LEAST * abs(mean) else 1.0
             elif column.family in SCALED:
                 means[column.name], scales[column.name] = 0.0, float(values.mean()) or 1.0
+            elif column.family == "binary":
+                means[column.name] = float(values.mean())
             if column.role == "past" or (column.role != "target" and np.isnan(known[:, place]).any()):
                 lacking.append(column.name)
+        shares = np.array([means[c.name] for c in panel.columns.targets if c.family == "binary"])
+        spread = float(np.sqrt((shares * (1 - shares)).mean())) if len(shares) else 0.0
+        scales |= {c.name: spread or 1.0 for c in panel.columns.targets if c.family == "binary"}  # one: some are rare
         gaps = np.concatenate(
             [np.diff(one.times[part]) if one.times is not None else np.empty(0) for one, part in parts]
         )

@@ -21,7 +21,7 @@ import torch
 
 from ..options import nearest
 from .columns import Column, Columns
-from .parsing import is_number, numbers, texts, times
+from .parsing import is_number, numeric, texts, times
 from .proposing import LARGEST, TIMES, Told, is_date
 
 SPLITS = ("train", "validation", "test")
@@ -143,6 +143,11 @@ class Panel:
         places = [place for place, column in enumerate(self.columns.columns) if column.role == "target"]
         return any(bool(np.isnan(one.values[:, places]).any()) for one in self.series)
 
+    def present(self, one: Series) -> int:
+        """Steps of a sequence up to the last one that has a target; rows behind it are of the future."""
+        places = [place for place, column in enumerate(self.columns.columns) if column.role == "target"]
+        return int(np.flatnonzero(~np.isnan(one.values[:, places]).all(1)).max(initial=-1)) + 1
+
     @property
     def groups(self) -> list[str]:
         """Names of the groups, in order."""
@@ -216,7 +221,7 @@ class Panel:
         own = column or Column("value")
         series = []
         for each, held in data.items():
-            values = numbers(held, own)
+            values = numeric(held, own)
             known = np.flatnonzero(~np.isnan(values))  # columns may begin and end at different times
             if len(known):
                 part = slice(known[0], known[-1] + 1)
@@ -264,7 +269,7 @@ def _of_frame(frame: Any, columns: Columns) -> Iterator[Series]:
         )
     if not len(frame):
         raise ValueError("the table has no rows")
-    values = np.stack([numbers(frame[column.name], column) for column in columns.columns], 1)
+    values = np.stack([numeric(frame[column.name], column) for column in columns.columns], 1)
     when = None if columns.time is None else times(frame[columns.time])
     told = {name: own for name in ("group", "split") if (own := getattr(columns, name))}
     labels = {name: texts(frame[own]).fillna("").to_numpy() for name, own in told.items()}

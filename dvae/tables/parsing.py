@@ -70,7 +70,7 @@ def times(column: Any) -> np.ndarray:
     return np.asarray(found)
 
 
-def numbers(column: Any, told: Column) -> np.ndarray:
+def numeric(column: Any, told: Column) -> np.ndarray:
     """The values as numbers, NaN where missing, of a category as the place of its class.
 
     Raises:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..options import Delay, Frames, Positive, Share, check
-from .panel import Panel, Series
+from .panel import Panel
 
 
 @dataclass(frozen=True)
@@ -65,27 +65,26 @@ class Cut:
         """(sequence, first start, last start) of the windows of a split, or (sequence, 0, 0) of whole ones.
 
         By time, a window is in the split in which its future is; what it observes may lie before. "all" is of all
-        sequences, wherever they are, and "last" of the end of each.
+        sequences, wherever they are, and "last" of the end of each, rows without targets included.
         """
         found = []
         everywhere = split in ("all", "last")
         parts = None if self.split == "time" or everywhere else self._parts(panel)
         for place, one in enumerate(panel.series):
-            low, high = 0, len(one)
+            low, high = 0, len(one) if split == "last" else panel.present(one)
             if parts is not None and parts[place] not in split.split("+"):
                 continue
             if parts is None and not everywhere:
-                low, high = self._between(one, split)
+                low, high = self._between(high, split)
             if self.length is None:
                 found.append((place, 0, 0))
             elif high - low >= self.length:
                 found.append((place, high - self.length if split == "last" else low, high - self.length))
         return found
 
-    def _between(self, one: Series, split: str) -> tuple[int, int]:
-        """First and last step of the windows of a sequence that is divided by time."""
+    def _between(self, total: int, split: str) -> tuple[int, int]:
+        """First and last step of the windows of a sequence of so many that is divided by time."""
         assert self.observed is not None
-        total = len(one)
         first, second = (round(total * (1 - share)) for share in (self.validation + self.test, self.test))
         bounds = {"train": (0, first), "validation": (first - self.observed, second)}
         bounds |= {"test": (second - self.observed, total), "train+validation": (0, second)}

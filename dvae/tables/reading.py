@@ -18,6 +18,7 @@ import warnings
 import zipfile
 from dataclasses import asdict, fields
 from io import BytesIO, StringIO
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ import numpy as np
 from .. import files
 from ..options import nearest
 from .columns import MOST, Columns, parsed
+from .domains import DOMAINS, domain
 from .panel import Panel
 from .proposing import Told
 from .protocol import Cut
@@ -75,10 +77,18 @@ def _separated(content: bytes, separator: str) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
-            frame = pd.read_csv(BytesIO(content), sep=separator, index_col=False, low_memory=False)
+            frame = pd.read_csv(
+                BytesIO(content), sep=separator, index_col=False, low_memory=False, skiprows=_comments(content)
+            )
         except pd.errors.ParserWarning as error:
             raise ValueError("some of its rows have more entries than its header") from error
     return frame
+
+
+def _comments(content: bytes) -> int:
+    """How many lines before the header begin with #."""
+    lines = iter(content[:LARGEST_SCHEMA].splitlines())
+    return sum(1 for _ in takewhile(lambda line: line.lstrip().startswith(b"#"), lines))
 
 
 def _parquet(content: bytes) -> Any:
@@ -119,17 +129,28 @@ def _of_arrays(place: Path, content: bytes) -> Any:
 
 
 def read_panel(path: str | os.PathLike[str], columns: Columns | Told | None = None) -> Panel:
-    """The sequences of a file.
+    """The sequences of a file, or of one of `dvae.tables.domains`.
 
     Args:
-        path: of the file.
+        path: of the file, or the name of the domain.
         columns: what its columns are, or what is told of them; the rest is proposed.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: no table, or columns that it does not have.
     """
+    name = os.fspath(path)
+    if is_domain(name):
+        panel = domain(name)
+        if columns not in (None, Told(), panel.columns):
+            raise ValueError(f"{name} has columns of its own: {', '.join(panel.columns.names[:10])}, …")
+        return panel
     return Panel.of(read_frame(path), columns, Path(path).stem)
+
+
+def is_domain(name: str) -> bool:
+    """Whether a path is no file but a name of `dvae.tables.domains`."""
+    return name in DOMAINS and not Path(name).exists()
 
 
 def _arrays(place: Path, content: bytes) -> dict[str, np.ndarray]:

@@ -38,11 +38,13 @@ class PanelWindows:
         self.skipped = (
             [] if schema.cut.length is None else [one.name for one in panel.series if len(one) < schema.cut.length]
         )
+        steps = [panel.present(one) for one in panel]
+        none = (
+            f"{panel.name} has no {split} window of {schema.cut.name}; up to their last targets its {len(panel)} "
+            f"sequences have {min(steps)} to {max(steps)} steps"
+        )
         if not self._ranges:
-            raise ValueError(
-                f"{panel.name} has no {split} window of {schema.cut.name}; its {len(panel)} sequences have "
-                f"{min(map(len, panel.series))} to {max(map(len, panel.series))} steps"
-            )
+            raise ValueError(none)
         some = [panel.series[place] for place, _, _ in self._ranges]
         self._lengths = torch.tensor([len(one) for one in some])
         self._first = self._lengths.cumsum(0) - self._lengths
@@ -64,6 +66,9 @@ class PanelWindows:
         self._static = None
         if STATICS in schema.sizes:
             self._static = torch.from_numpy(np.stack([schema.static(one) for one in some])).float()
+        self._windows = self._listed()
+        if not len(self):
+            raise ValueError(none)
         self._weights = (self._last - self._low + 1).double().cumsum(0)
 
     @property
@@ -77,7 +82,7 @@ class PanelWindows:
         return self.schema.cut
 
     def __len__(self) -> int:
-        return len(self._listed()[0])
+        return len(self._windows[0])
 
     def __repr__(self) -> str:
         return f"PanelWindows({self.panel.name} {self.split}: {len(self)} of {self.protocol.name})"
@@ -87,7 +92,7 @@ class PanelWindows:
         """(split, sequence, first step) of the listed windows."""
         names = [self.panel.series[place].name for place, _, _ in self._ranges]
         return [
-            (self.split, names[place], start) for place, start in zip(*map(Tensor.tolist, self._listed()), strict=True)
+            (self.split, names[place], start) for place, start in zip(*map(Tensor.tolist, self._windows), strict=True)
         ]
 
     @property
@@ -133,7 +138,7 @@ class PanelWindows:
 
     def all(self) -> dict[str, Any]:
         """The listed windows, as `keys` has them."""
-        return self._cut(*self._listed())
+        return self._cut(*self._windows)
 
     def times(self, horizon: int) -> tuple[np.ndarray, bool] | None:
         """Times (N, O + horizon) of the listed windows, and whether they are dates; None where rows have none.
@@ -142,7 +147,7 @@ class PanelWindows:
         """
         observed = self.protocol.observed or 0
         found = []
-        for place, start in zip(*map(Tensor.tolist, self._listed()), strict=True):
+        for place, start in zip(*map(Tensor.tolist, self._windows), strict=True):
             one = self.panel.series[self._ranges[place][0]]
             if one.times is None:
                 return None
@@ -162,7 +167,13 @@ class PanelWindows:
         counts = (self._last - self._low) // stride + 1
         which = torch.arange(len(counts)).repeat_interleave(counts)
         place = torch.arange(len(which)) - (counts.cumsum(0) - counts)[which]
-        return which, self._low[which] + stride * place
+        starts = self._low[which] + stride * place
+        if cut.length is None or self.split in ("all", "last"):
+            return which, starts
+        known = torch.cat([torch.zeros(1).long(), self._mask.any(-1).cumsum(0)])
+        ends = self._first[which] + starts + cut.length
+        told = known[ends] > known[ends - (cut.horizon or 0)]  # something of its future was observed
+        return which[told], starts[told]
 
     def _cut(self, which: Tensor, starts: Tensor) -> dict[str, Any]:
         """The windows of ranges that start at these steps of their sequences."""

@@ -226,7 +226,8 @@ def test_options_of_tables_are_not_those_of_motion(people, tabled, tmp_path, cap
     out = ["--out", tmp_path / "run"]
     segments = failure(capsys, "fit", "motion-latent", *out, "--data", people, "--columns", "a", code=2)
     assert "--columns is about a table, and motion-latent is fitted on segments of motion" in segments
-    assert "is no table" in failure(capsys, "fit", "vae", *out, "--observed", "3", code=2)
+    said = failure(capsys, "fit", "vae", *out, "--observed", "3", code=2)
+    assert "--observed is about tables; name one by --data" in said
     assert "people.npz holds" in failure(capsys, "fit", "vae", *out, "--data", people, "--horizon", "3", code=2)
     for option in (["--joints", "LWrist"], ["--pose-prior", "a"], ["--missing"]):
         assert "is about motion" in failure(capsys, "evaluate", tabled / "vae", *option, code=2)

@@ -77,10 +77,13 @@ def test_units_are_those_of_the_training_sequences():
         0,
         pytest.approx(column(panel, "riders", parts).mean()),
     )
-    means, scales = schema.units["x"]
+    means, scales, typical = schema.units["x"]
     names = ["riders", "kind", "kind", "kind", "temp", "open"]
     assert means == [schema.means.get(name, 0) for name in names]
     assert scales == [schema.scales.get(name, 1) for name in names]
+    assert typical == [scales[0], *means[1:]]
+    share = column(panel, "open", parts).mean()
+    assert (means[-1], scales[-1]) == (share, pytest.approx((share * (1 - share)) ** 0.5))
     assert schema.coordinates == ["riders", "kind=u", "kind=v", "kind=w", "temp", "open"]
     assert schema.sizes == {"x": 6, "c": 1 + 1 + 2 + 1 + 1 + 1 + 2, "s": 1 + 2}
     assert schema.lacking == ("plan", "weather", "price")

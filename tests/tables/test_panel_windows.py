@@ -198,9 +198,41 @@ def test_windows_are_told_apart_by_their_fingerprint():
 def test_a_part_without_windows_is_refused():
     panel = table()
     with pytest.raises(
-        ValueError, match=r"panel has no validation window of 5 \+ 3 steps; its 10 sequences have 8 to 30"
+        ValueError, match=r"panel has no validation window of 5 \+ 3 steps; up to their last targets its 10"
     ):
         PanelWindows(panel, PanelSchema.under(panel, Cut(5, 3, validation=0)), "validation")
+
+
+@pytest.mark.parametrize("split", ["time", "sequence"])
+def test_rows_behind_the_last_target_are_of_no_part(split):
+    panel, cut = table((30,) * 6), Cut(5, 3, split=split)
+    longer = [np.concatenate([one.values, np.full((7, 6), NAN)]) for one in panel]
+    for values in longer:
+        values[30:, 2] = 4.0  # of the future, its plan is known
+        values[:, 5] = values[0, 5]
+    times = [np.concatenate([one.times, one.times[-1] + np.arange(1.0, 8)]) for one in panel]
+    grown = Panel([Series(f"s{n}", *both) for n, both in enumerate(zip(longer, times, strict=True))], TOLD)
+    schema = PanelSchema.under(panel, cut)
+    assert PanelSchema.under(grown, cut) == schema
+    for part in ("train", "validation", "test", "all"):
+        windows, others = (PanelWindows(each, schema, part) for each in (panel, grown))
+        assert windows.keys == others.keys
+        batch, again = windows.all(), others.all()
+        assert all(torch.equal(batch[name], again[name]) for name in batch)
+
+
+def test_windows_of_whose_future_nothing_is_known_are_not_listed():
+    panel = table((40,) * 6)
+    schema = PanelSchema.under(panel, Cut(5, 4))
+    before = PanelWindows(panel, schema, "test").keys
+    (one,) = panel.only([before[2][1]])
+    start = before[2][2]
+    one.values[start + 5 : start + 9, :2] = NAN
+    assert PanelWindows(panel, schema, "test").keys == before[:2] + before[3:]
+    for one in panel:
+        one.values[5:-1, :2] = NAN
+    with pytest.raises(ValueError, match=r"no test window of 5 \+ 4 steps"):
+        PanelWindows(panel, schema, "test")
 
 
 def test_sequences_that_are_too_short_are_listed():

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvae.tables import Column, Columns
+from dvae.tables import Column, Columns, Panel, reading
 from dvae.tables.columns import MOST
 from dvae.tables.dataset import PanelData
 from dvae.tables.protocol import Cut
@@ -208,3 +208,19 @@ def test_a_panel_in_memory_is_data_too():
     data = PanelData.of(rows(), ["riders"], Cut(4, 2), "mine")
     assert repr(data.windows("train")).startswith("PanelWindows(mine train: ")
     assert data.panel.columns.id == ("station",)
+
+
+def test_lines_before_the_header_are_comments(tmp_path):
+    path = tmp_path / "told.csv"
+    path.write_text("# source: somebody\n# a, b\nday,a\n1,2.5\n2,3.5\n")
+    assert read_panel(path).columns.names == ["a"]
+
+
+def test_a_domain_is_read_by_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frame = pd.DataFrame({"a": [1.0, 2.0]})
+    monkeypatch.setitem(reading.DOMAINS, "own", reading.DOMAINS["chorales"])
+    monkeypatch.setattr(reading, "domain", lambda name: Panel.of(frame, ["a"], name))
+    assert read_panel("own").name == "own"
+    with pytest.raises(ValueError, match="own has columns of its own: a"):
+        read_panel("own", Columns((Column("b"),)))

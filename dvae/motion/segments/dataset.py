@@ -22,7 +22,7 @@ from .embodied import Segments, SegmentSchema
 from .frames import TimedFrames
 from .gait import Cycles, gait_cycles, reference_cycles
 
-Cut = Literal["gait", "clips"]
+Segmentation = Literal["gait", "clips"]
 """How motion becomes segments: gait cycles, or clips as they are, where they last as long as a cycle may."""
 
 VALIDATION = 0.1
@@ -48,7 +48,7 @@ class Takes:
 
     path: str
     fingerprint: str
-    cut: Cut = "gait"
+    cut: Segmentation = "gait"
     skip_bad: bool = False
     bodies: Amount = 1.0
 
@@ -82,7 +82,7 @@ class SegmentData:
 
     path: str
     motion: MotionSet
-    cut: Cut = "gait"
+    cut: Segmentation = "gait"
     skip_bad: bool = False
     scaling: Literal["identity", "deviation"] = "identity"
     warped: bool = False

@@ -37,7 +37,7 @@ class Domain:
     said: str
 
 
-DOMAINS: Mapping[str, Domain] = {
+DOMAINS: dict[str, Domain] = {
     "chorales": Domain(
         "dvae.tables.domains.chorales:chorales", "382 four-part chorales by Bach as rolls of 88 keys, by quarter note."
     ),

@@ -1,0 +1,61 @@
+"""Panels with groups: batches have several windows of a group, and no window tells another's future."""
+
+import numpy as np
+import pandas as pd
+import torch
+
+import dvae
+from dvae.tables import Column, Columns, Cut, PanelData
+
+
+def panel(cut):
+    random = np.random.default_rng(0)
+    rows = [
+        {"region": f"r{g}", "unit": f"{g}-{n}", "day": t, "y": random.normal(g)}
+        for g in range(8)
+        for n in range(3)
+        for t in range(20)
+    ]
+    columns = Columns((Column("y"),), id=("unit",), time="day", group="region")
+    return PanelData.of(pd.DataFrame(rows), columns, cut)
+
+
+def test_windows_of_a_group_share_it_where_they_have_the_same_present():
+    data = panel(Cut(4, 4, split="group", validation=0.2, test=0.3))
+    test = data.windows("test")
+    groups = {one.name: one.group for one in data.panel.series}
+    keys = [(groups[name], start) for _, name, start in test.keys]
+    index = test.all()["group"].tolist()
+    assert all((index[a] == index[b]) == (keys[a] == keys[b]) for a in range(len(keys)) for b in range(len(keys)))
+    assert len({groups[name] for _, name, _ in test.keys}) == 3
+
+
+def test_batches_for_training_have_several_windows_of_a_group():
+    train = panel(Cut(4, 4, split="group", validation=0.2, test=0.3)).windows("train")
+    batch = train.sample(20, torch.Generator().manual_seed(0))
+    assert batch["group"].tolist() == sorted(batch["group"].tolist())
+    assert batch["group"].bincount().max() >= 8
+    means = torch.stack([batch["x"][batch["group"] == g].mean() for g in batch["group"].unique()])
+    assert means.diff().abs().min() > 0.3  # of which each has its own
+    again = train.sample(20, torch.Generator().manual_seed(0))
+    assert torch.equal(again["x"], batch["x"])
+
+
+def test_what_a_group_shares_is_learned_and_told_by_its_sequences(tmp_path):
+    data = panel(Cut(4, 4, split="group", validation=0.2, test=0.3))
+    method = dvae.method(
+        "equations",
+        generative="p(g) p(x_t | g)",
+        inference="q(g | x_{1:T})",
+        grouped=("g",),
+        latent=1,
+        width=8,
+        warm_up=None,
+    )
+    model = method.build(data.schema)
+    recipe = method.train(data.windows("train"), data.windows("validation"), 150)
+    recipe.fit(model, batch_size=32, learning_rate=1e-2, progress=False)
+    batch = data.windows("test").all()
+    together = dvae.importance_bound(model, batch, particles=200).bound.mean()
+    apart = dvae.importance_bound(model, {"x": batch["x"]}, particles=200).bound.mean()
+    assert together > apart + 0.1  # one latent to pay for, in place of several
