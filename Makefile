@@ -45,8 +45,8 @@ lint: venv
 	$(BIN)/mypy -p dvae
 
 test: lint
-	$(BIN)/pytest -n 2
-	ATEN_CPU_CAPABILITY=default $(BIN)/pytest -n 2 -m "not slow" $(addprefix tests/,$(NUMERICAL))
+	$(BIN)/pytest -n 2 --dist worksteal
+	ATEN_CPU_CAPABILITY=default $(BIN)/pytest -n 2 --dist worksteal -m "not slow" $(addprefix tests/,$(NUMERICAL))
 
 SECONDS := 600
 SEED := $(shell date +%s)

@@ -183,7 +183,7 @@ def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
 def _emission(model: Any, draw_emission: bool | None) -> str:
     """What a model forecasts, as `DynamicalVAE.forecast` decides where nobody says."""
     if draw_emission is None and isinstance(model, DynamicalVAE):
-        draw_emission = any(model.generator[name].discrete for name in model.observed)
+        draw_emission = any(map(model.drawn, model.observed))
     return "drawn" if draw_emission else "mean"
 
 

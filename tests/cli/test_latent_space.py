@@ -244,7 +244,7 @@ def test_a_run_that_forecasts_has_no_segments(capsys, fitted):
     ("arguments", "message"),
     [
         ("fit motion-latent --protocol cmu8 --out new", "--protocol is about motion, and motion-latent is fitted on"),
-        ("fit vae --cut clips --out new", "--cut is about segments, and vae is fitted on motion"),
+        ("fit vae --cut clips --out new", "--cut is about segments of motion, and vae is fitted on motion"),
         ("fit motion-latent --cut clip --out new", "did you mean 'clips'"),
         ("sweep motion-latent vae --out new", "motion-latent on segments and vae on motion; give those of one kind"),
         ("evaluate RUN --samples 3", "--samples is about forecasts"),
