@@ -5,7 +5,7 @@ Densities and all that a program returns stay in the variable's own unit.
 
 Units are no view of the data (`dvae.views`), though they are a bijection with the same way back and its determinant.
 Latents and context have them too, of which nothing is handed out in another unit. And a law is put into the data's
-unit where it is made (`Head.in_units`, the push-forward), so that given scales and every density are in that.
+unit where it is made (`Law.in_units`, the push-forward), so that given scales and every density are in that.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ class Units(nn.Module):
 
     Args:
         size: D.
-        columns: a scale for every coordinate, as of columns of a table.
+        columns: a scale for every coordinate, as of columns of a table, and a typical value that stands for a missing
+            one, where that is not the mean.
     """
 
     mean: Tensor

@@ -1,4 +1,4 @@
-"""Panels as runs keep and reopen them: a file with its columns, or a data set by its name."""
+"""Panels as runs keep and reopen them: a file with its columns, or one of `dvae.tables.domains` by its name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .encoding import PanelSchema
 from .panel import Panel
 from .proposing import Told
 from .protocol import Cut
-from .reading import read_panel, schema_beside
+from .reading import is_domain, read_panel, schema_beside
 from .windows import PanelWindows
 
 
@@ -94,8 +94,8 @@ class PanelData:
 
     @property
     def location(self) -> str:
-        """Where the file is, as any process finds it."""
-        return os.path.abspath(self.path)
+        """Where the file is, as any process finds it, or the name of a domain."""
+        return self.path if is_domain(self.path) else os.path.abspath(self.path)
 
     @property
     def fingerprint(self) -> str:

@@ -218,9 +218,10 @@ def test_lines_before_the_header_are_comments(tmp_path):
 
 def test_a_domain_is_read_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    frame = pd.DataFrame({"a": [1.0, 2.0]})
+    frame = pd.DataFrame({"a": np.arange(40.0)})
     monkeypatch.setitem(reading.DOMAINS, "own", reading.DOMAINS["chorales"])
     monkeypatch.setattr(reading, "domain", lambda name: Panel.of(frame, ["a"], name))
     assert read_panel("own").name == "own"
+    assert PanelData.open("own").location == "own"  # in any working directory
     with pytest.raises(ValueError, match="own has columns of its own: a"):
         read_panel("own", Columns((Column("b"),)))
