@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,27 +20,42 @@ import numpy as np
 import torch
 import tyro
 from torch import Tensor
-from typing_extensions import override
 
 import dvae
 from dvae.data import each
-from dvae.inference.checkpoints import Run, load_weights
+from dvae.inference.checkpoints import Run
 from dvae.inference.comparison import Crossed, Estimate
+from dvae.inference.evaluation import Row
+from dvae.inference.scores import CRPS, ENERGY, LEVELS, Measure, coverage_at
 from dvae.runs.directory import Config
 from dvae.tables.dataset import PanelData
-from dvae.tables.domains import domain, speech
+from dvae.tables.domains import speech
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
-from dvae.units import Units
 
 from .pages import DOCS, table, write
 
-PARTICLES = 100
+FORECASTS = 100
 PARTS = ("validation", "test")
 BASELINE = "autoregressive"
 AT_ONCE, HELD = 2**14, 2**17
 """Steps of sequences, padding included, to score at once, and to hold times particles."""
-BOUND, ELBO, SDR, KHAT = "importance bound", "ELBO", "SI-SDR", "k-hat"
+BOUND, ELBO, FIVO, SDR, KHAT = "importance bound", "ELBO", "FIVO", "SI-SDR", "k-hat"
+FORECAST = "forecasts.json"
+UNFILTERED = ("rvae-noncausal",)
+"""Whose observations read latents after them, so that no filter can run."""
+REVIEW = {
+    "srnn": 11.0,
+    "vrnn": 10.0,
+    "dkf": 9.3,
+    "dsae": 9.2,
+    "rvae-causal": 9.0,
+    "rvae-noncausal": 8.9,
+    "storn": 6.9,
+    "vae": 5.3,
+}
+"""SI-SDR of Girin et al. 2021, of other speech, at 16 kHz."""
+SHOWN = ("CRPS", "energy score", "coverage 50 %", "coverage 80 %", "coverage 90 %", "coverage 95 %")
 
 
 @dataclass(frozen=True)
@@ -48,12 +63,10 @@ class Case:
     """One model.
 
     Args:
-        method: its name.
-        options: of the method.
+        options: of the method that it is named after.
         training: of the run, beside those of the section.
     """
 
-    method: str
     options: Mapping[str, Any] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
 
@@ -63,117 +76,134 @@ class Section:
     """What is compared on one domain.
 
     Args:
-        cases: name to model; the one without latents is among them.
+        cases: method to model; the one without latents is among them.
         training: of all runs.
-        cut: of the sequences, for training and its validations; scores are of whole sequences.
+        forecast: of which steps, from which.
+        cut: of the sequences, for training and its validations; bounds are of whole sequences.
         unit: of a step.
+        season: of the reference that repeats.
+        particles: of bounds.
     """
 
     cases: Mapping[str, Case]
     training: Mapping[str, Any]
+    forecast: Cut
     cut: Cut = field(default_factory=Cut)
     unit: str = "step"
+    season: int | None = None
+    particles: int = 100
 
 
 PLAIN: dict[str, Any] = {"embed": 0, "hidden": ()}
 """Nothing between recurrent states and what is made of them: on few chorales a perceptron there learns late, and by
 heart."""
+FEW: dict[str, Any] = {"latent": 32, "warm_up": 600}
 CHORALES = Section(
     {
         BASELINE: Case(
-            BASELINE, {"width": 128, **PLAIN}, {"steps": 1000, "learning_rate": 5e-3, "decay": 0.5, "weight_decay": 0.1}
+            {"width": 128, **PLAIN}, {"steps": 1000, "learning_rate": 5e-3, "decay": 0.5, "weight_decay": 0.1}
         ),
+        "vae": Case({**FEW, "hidden": (200,)}),
         "dkf": Case(
-            "dkf",
-            {"latent": 32, "width": 128, **PLAIN, "embed_latent": (), "decoder": (200,), "warm_up": 1500},
+            {**FEW, "width": 128, **PLAIN, "embed_latent": (), "decoder": (200,), "warm_up": 1500},
             {"steps": 5500, "decay": 0.6, "weight_decay": 0.03},
         ),
-        "srnn": Case(
-            "srnn",
-            {"latent": 32, "width": 32, **PLAIN, "decoder": (128,), "warm_up": 600},
-            {"steps": 1200, "decay": 0.7, "weight_decay": 0.2},
-        ),
+        "storn": Case({**FEW, "width": 64, **PLAIN, "embed_latent": 0}),
+        "vrnn": Case({**FEW, "width": 64, "embed": (), "embed_latent": (), "hidden": ()}),
+        "srnn": Case({**FEW, "width": 32, **PLAIN, "decoder": (128,)}),
+        "rvae-causal": Case({**FEW, "width": 64}),
+        "rvae-noncausal": Case({**FEW, "width": 64}),
+        "dsae": Case({**FEW, "width": 64, "decoder": (200,)}),
     },
-    {"batch_size": 16, "learning_rate": 6e-3, "validate_every": 50, "optimizer": "adamw"},
+    {
+        "steps": 1200,
+        "batch_size": 16,
+        "learning_rate": 6e-3,
+        "decay": 0.7,
+        "weight_decay": 0.2,
+        "validate_every": 50,
+        "optimizer": "adamw",
+    },
+    Cut(observed=16, horizon=8),
     unit="quarter note",
 )
 SIZE: dict[str, Any] = {"latent": 16, "warm_up": 300}
 SPEECH = Section(
     {
-        BASELINE: Case(BASELINE, {"width": 128, "hidden": ()}),
-        "vae": Case("vae", {**SIZE, "hidden": (128, 64)}),
-        "dkf": Case("dkf", {**SIZE, "width": 128, **PLAIN, "embed_latent": (), "decoder": (128,)}),
-        "srnn": Case("srnn", {**SIZE, "width": 128, "embed": 128, "hidden": (64,), "decoder": (128,)}),
-        "rvae-causal": Case("rvae-causal", {**SIZE, "width": 128}),
-        "rvae-noncausal": Case("rvae-noncausal", {**SIZE, "width": 128}),
+        BASELINE: Case({"width": 128, "hidden": ()}),
+        "vae": Case({**SIZE, "hidden": (128, 64)}),
+        "dkf": Case({**SIZE, "width": 128, **PLAIN, "embed_latent": (), "decoder": (128,)}),
+        "storn": Case({**SIZE, "width": 128, "embed": 128, "hidden": (128,)}),
+        "vrnn": Case({**SIZE, "width": 128, "embed": (128,), "embed_latent": (32,), "hidden": (128,)}),
+        "srnn": Case({**SIZE, "width": 128, "embed": 128, "hidden": (64,), "decoder": (128,)}),
+        "rvae-causal": Case({**SIZE, "width": 128}),
+        "rvae-noncausal": Case({**SIZE, "width": 128}),
+        "dsae": Case({**SIZE, "width": 128, "decoder": (128,)}),
     },
-    {"steps": 1500, "batch_size": 32, "learning_rate": 3e-3, "decay": 0.5, "validate_every": 250},
+    {"steps": 800, "batch_size": 32, "learning_rate": 3e-3, "decay": 0.5, "validate_every": 100},
+    Cut(observed=32, horizon=16, stride=64),
     Cut(observed=32, horizon=32),
     "frame",
+    particles=20,
 )
+
+
+def family(width: int, latent: int, **options: Any) -> dict[str, Case]:
+    """All members with their own networks, of one width."""
+    names = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae")
+    sized = {name: {"width": width} for name in names if name not in ("vae", "kvae")}
+    cases = {name: Case({"latent": latent, **sized.get(name, {}), **options}) for name in names}
+    return {BASELINE: Case({"width": width}), **cases}
+
+
 SERIES: dict[str, Any] = {"batch_size": 32, "learning_rate": 2e-3, "decay": 0.5, "validate_every": 100}
 SECTIONS = {
     "chorales": CHORALES,
     "speech": SPEECH,
-    "japanese-vowels": Section(
-        {
-            BASELINE: Case(BASELINE, {"width": 64}),
-            "dkf": Case("dkf", {"latent": 16, "width": 64}),
-            "srnn": Case("srnn", {"latent": 16, "width": 64}),
-        },
-        {**SERIES, "steps": 1500},
-    ),
+    "japanese-vowels": Section(family(64, 16), {**SERIES, "steps": 750}, Cut(observed=5, horizon=2), unit="frame"),
     "basic-motions": Section(
-        {
-            BASELINE: Case(BASELINE, {"width": 64}),
-            "dkf": Case("dkf", {"latent": 8, "width": 64}),
-            "srnn": Case("srnn", {"latent": 8, "width": 64}),
-        },
-        {**SERIES, "steps": 1000, "batch_size": 16},
+        family(64, 8), {**SERIES, "steps": 1000, "batch_size": 16}, Cut(observed=50, horizon=10), season=None
     ),
     "macrodata": Section(
-        {
-            BASELINE: Case(BASELINE, {"width": 16, "hidden": (16,)}),
-            "dkf": Case("dkf", {"latent": 4, "width": 16}),
-            "srnn": Case("srnn", {"latent": 4, "width": 16}),
-        },
+        family(16, 4),
         {**SERIES, "steps": 600},
         Cut(observed=16, horizon=8, split="time"),
+        Cut(observed=16, horizon=8, split="time"),
         "quarter",
+        season=4,
     ),
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Data:
     """A domain, for training and for scores.
 
     Args:
         name: of the domain.
-        options: of what loads it.
     """
 
     name: str
-    options: Mapping[str, Any]
 
     @cached_property
     def training(self) -> PanelData:
         """Cut as its section says."""
-        return PanelData.of(domain(self.name, **self.options), cut=SECTIONS[self.name].cut, name=self.name)
+        return PanelData.open(self.name, cut=SECTIONS[self.name].cut)
+
+    def cut(self, cut: Cut) -> PanelData:
+        """Cut otherwise."""
+        panel = self.training.panel
+        return PanelData(self.name, panel, PanelSchema.under(panel, cut))
 
     @cached_property
     def whole(self) -> PanelData:
         """Whole sequences, if it is not divided by time."""
-        cut = SECTIONS[self.name].cut
-        if cut.split == "time":
-            return self.training
-        panel = self.training.panel
-        return PanelData(self.name, panel, PanelSchema.under(panel, Cut()))
+        return self.training if SECTIONS[self.name].cut.split == "time" else self.cut(Cut())
 
     @cached_property
     def sounds(self) -> dict[str, np.ndarray]:
         """Signals of speech, by name."""
-        return speech.recordings(**self.options)
+        return speech.recordings()
 
 
 class Alike:
@@ -216,9 +246,9 @@ def pieces(batch: Mapping[str, Any]) -> Iterator[tuple[Tensor, dict[str, Any]]]:
         start = stop
 
 
-def measured(model: Any, data: Data, part: str, seed: int) -> dict[str, Any]:
+def measured(model: Any, case: str, data: Data, part: str, seed: int) -> dict[str, Any]:
     """Scores of every sequence, bounds in nats of all of it, and how many steps it has."""
-    windows = data.whole.windows(part)
+    windows, particles = data.whole.windows(part), SECTIONS[data.name].particles
     batch = windows.all()
     count, steps = len(batch["x"]), batch["x"].shape[1]
     lengths = batch.get("lengths", torch.full((count,), steps))
@@ -226,16 +256,20 @@ def measured(model: Any, data: Data, part: str, seed: int) -> dict[str, Any]:
     scores = {name: torch.zeros(count, dtype=torch.float64) for name in names}
     if data.name == "speech":
         scores[SDR] = torch.zeros(count, dtype=torch.float64)
+    elif case not in UNFILTERED and model.latents:
+        scores[FIVO] = torch.zeros(count, dtype=torch.float64)
     torch.manual_seed(seed)
     keys = windows.keys
     for rows, some in pieces(batch):
-        bound = dvae.importance_bound(model, some, particles=PARTICLES, chunk=HELD // some["x"].shape[1])
+        bound = dvae.importance_bound(model, some, particles=particles, chunk=HELD // some["x"].shape[1])
         with torch.no_grad():
             terms = dvae.SequenceELBO(num_particles=10 if model.latents else 1).terms(model, some)
         scores[BOUND][rows], scores[KHAT][rows] = bound.bound.double(), bound.khat.double()
         scores[ELBO][rows] = terms.bound.double()
         for latent in model.latents:
             scores[f"KL {latent}"][rows] = terms.kl[latent].double()
+        if FIVO in scores:
+            scores[FIVO][rows] = dvae.particle_bound(model, some, particles, chunk=AT_ONCE).bound.double()
         if SDR in scores:
             made = model.reconstruct(some, samples=1)["x"][0].double().numpy()
             for row, own in zip(rows.tolist(), made, strict=True):
@@ -248,67 +282,57 @@ def measured(model: Any, data: Data, part: str, seed: int) -> dict[str, Any]:
     }
 
 
-class Decibels(Units):
-    """Units in which networks read the logarithm of a power, and make the power as they would."""
+def fitted(section: Section, data: Data, case: str, seed: int, out: Path) -> Any:
+    """The model of a case, fitted if it is not there yet, and the seconds that this took."""
+    chosen, file = section.cases[case], out / "fitted.json"
+    if not file.exists():
+        options = {**section.training, **chosen.training}
+        method, training = dvae.method(case, **chosen.options), dvae.Training(seed=seed, progress=False, **options)
+        torch.manual_seed(seed)
+        model = method.build(data.training.schema)
+        start, resumed = time.process_time(), Run(out).exists
+        windows = data.training.windows("train")
+        source = Alike(windows) if "lengths" in windows.all() else windows
+        recipe = method.train(source, data.training.windows("validation"), training.steps)
+        kept = Config(method, data.training.schema, data.training.kind, data.training.recorded(), training).written()
+        recipe.fit(model, out=out, resume=resumed, config=kept, **vars(training))
+        seconds = None if resumed else time.process_time() - start  # of a run that was not stopped
+        file.write_text(json.dumps({"seconds": seconds}))
+    return dvae.load(out).model, json.loads(file.read_text())["seconds"]
 
-    level: Tensor
-    spread: Tensor
 
-    def __init__(self, power: Tensor):
-        super().__init__(power.shape[-1], columns=True)
-        self.set([0.0] * power.shape[-1], power.mean(0).tolist())
-        self.register_buffer("level", power.log().mean(0))
-        self.register_buffer("spread", power.log().std(0).mean())
-
-    @override
-    def forward(self, values: Tensor) -> Tensor:
-        return (values.clamp(min=speech.FLOOR).log() - self.level) / self.spread
+def shown(windows: Any) -> list[Measure]:
+    """Those of the page, in the unit of the data."""
+    return [CRPS, ENERGY, *map(coverage_at, LEVELS)]
 
 
-def built(method: Any, data: PanelData) -> Any:
-    """The model of a method, whose networks read zeros and ones without mean and unit, and powers in decibels.
-
-    Most keys are rarely down, so that a network that reads them as they are sees next to nothing: it learns late, and
-    latents are given up before it has. Of a power, which goes over ten orders of magnitude, it sees the peaks alone.
-    """
-    model = method.build(data.schema)
-    families = {column.family for column in data.panel.columns.targets}
-    if not families & {"binary", "power"}:
-        return model
-    train = torch.cat([torch.as_tensor(one.values).float() for one in data.panel if one.split == "train"])
-    model.standardise("x").fit(train)
-    if families == {"power"}:
-        model.units["x"] = Decibels(train)
-        for conditional in (*model.generator.values(), *model.encoder.values()):
-            conditional.units["x"] = model.units["x"]
-    return model
+def forecasts(section: Section, case: str, seed: int, model: Any, data: Data) -> dvae.Evaluation:
+    """Of test windows; the references stand beside the first run of the model without latents."""
+    windows = data.cut(section.forecast).windows
+    return dvae.evaluate(
+        {case: model},
+        windows("test"),
+        scores=shown,
+        samples=FORECASTS,
+        seed=seed,
+        draw_emission=True,
+        references=case == BASELINE and seed == 0,
+        training_windows=windows("train"),
+        season=section.season,
+        progress=False,
+    )
 
 
 def run(name: str, case: str, seed: int, out: Path, data: Data, part: str) -> None:
     """Fits and scores what is not there yet."""
-    file = out / f"{part}.json"
+    file, section = out / f"{part}.json", SECTIONS[name]
     if file.exists():
         return
-    section, chosen = SECTIONS[name], SECTIONS[name].cases[case]
-    options = {**section.training, **chosen.training}
-    method, training = dvae.method(chosen.method, **chosen.options), dvae.Training(seed=seed, progress=False, **options)
-    schema = data.training.schema
-    torch.manual_seed(seed)
-    model = built(method, data.training)
-    start, resumed = time.process_time(), Run(out).exists
-    if (out / "fitted.json").exists():
-        load_weights(model, out)
-        seconds = json.loads((out / "fitted.json").read_text())["seconds"]
-    else:
-        windows = data.training.windows("train")
-        source = Alike(windows) if "lengths" in windows.all() else windows
-        recipe = method.train(source, data.training.windows("validation"), training.steps)
-        config = Config(method, schema, data.training.kind, data.training.recorded(), training).written()
-        recipe.fit(model, out=out, resume=resumed, config=config, **vars(training))
-        seconds = None if resumed else time.process_time() - start  # of a run that was not stopped
-        (out / "fitted.json").write_text(json.dumps({"seconds": seconds}))
-    weights = sum(p.numel() for p in model.parameters())
-    found = {"seconds": seconds, "parameters": weights, **measured(model.eval(), data, part, seed)}
+    model, seconds = fitted(section, data, case, seed, out)
+    weights = sum(parameter.numel() for parameter in model.parameters())
+    found = {"seconds": seconds, "parameters": weights, **measured(model, case, data, part, seed)}
+    if part == "test":
+        forecasts(section, case, seed, model, data).save(out / FORECAST)
     file.write_text(json.dumps(found))
     steps = sum(found["steps"])
     said = ", ".join(f"{score} {np.nansum(found['scores'][score]) / steps:.3f}" for score in (BOUND, ELBO))
@@ -317,9 +341,25 @@ def run(name: str, case: str, seed: int, out: Path, data: Data, part: str) -> No
 
 @dataclass(frozen=True)
 class Read:
-    """Scores of one case over seeds."""
+    """Scores of one case over seeds.
+
+    Args:
+        runs: what `measured` found, and how long fits took.
+        forecasts: rows of evaluations, each of one run, and the windows of every sequence.
+    """
 
     runs: list[dict[str, Any]]
+    forecasts: list[Row] = field(default_factory=list)
+    windows: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(cls, case: str, folders: Sequence[Path], part: str) -> Read:
+        """From the directories of its runs."""
+        runs = [json.loads((folder / f"{part}.json").read_text()) for folder in folders]
+        if part != "test":
+            return cls(runs)
+        evaluations = [dvae.Evaluation.load(folder / FORECAST) for folder in folders]
+        return cls(runs, [own.rows[case] for own in evaluations], np.array(list(evaluations[0].clips.values())))
 
     @cached_property
     def clips(self) -> tuple[np.ndarray, np.ndarray]:
@@ -328,7 +368,9 @@ class Read:
         return places, np.bincount(places, self.runs[0]["steps"])
 
     def crossed(self, score: str) -> Crossed:
-        """Of a score a step, by seeds and sequences; SI-SDR is of a sequence."""
+        """Of a score a step, by seeds and sequences; SI-SDR is of a sequence, and scores of forecasts of a window."""
+        if score in SHOWN:
+            return Crossed.of(np.array([row.clip_means[score] for row in self.forecasts]), self.windows)
         places, steps = self.clips
         values = np.array([run["scores"][score] for run in self.runs], float)
         if score == SDR:
@@ -336,39 +378,75 @@ class Read:
         sums = np.stack([np.bincount(places, own) for own in values])
         return Crossed.of(sums / steps, steps)
 
-    def __contains__(self, score: str) -> bool:
-        return score in self.runs[0]["scores"]
+    def said(self, score: str, other: Read | None = None, digits: int = 2) -> str:
+        """A score, or the paired difference to that of another case; "–" where there is none."""
+        if not all(score in (*own.runs[0]["scores"], *SHOWN) for own in (self, other or self)):
+            return "–"
+        return said(self.crossed(score).estimate(None if other is None else other.crossed(score)), digits)
 
-    def unreliable(self) -> float:
+    @property
+    def latents(self) -> list[str]:
+        """Names of the KL terms."""
+        return [score for score in self.runs[0]["scores"] if score.startswith("KL ")]
+
+    @property
+    def seconds(self) -> str:
+        """Of processor time, mean and longest fit."""
+        found = [run["seconds"] for run in self.runs if run["seconds"]]
+        return f"{np.mean(found):.0f}" if found else "–"
+
+    def unreliable(self) -> str:
         """Share of sequences whose k-hat is above 0.7."""
         khat = np.array([run["scores"][KHAT] for run in self.runs], float)
-        return float((khat > 0.7).mean())
+        return f"{100 * float((khat > 0.7).mean()):.0f} %" if self.latents else "–"
 
 
-def said(estimate: Estimate, digits: int = 3) -> str:
-    """Mean, and its errors over sequences and over seeds."""
+def said(estimate: Estimate, digits: int) -> str:
+    """Mean, and its errors over sequences and over seeds, those that there are."""
     values = (estimate.mean, estimate.sequences, estimate.seeds)
-    return " ± ".join("–" if np.isnan(value) else f"{value:.{digits}f}" for value in values)
+    return " ± ".join(f"{value:.{digits}f}" for value in values if not np.isnan(value))
 
 
-def scored(cases: Mapping[str, Read], unit: str) -> str:
-    """Cases down, best first, scores across."""
+def bounds(cases: Mapping[str, Read], section: Section) -> str:
+    """Cases down, best first, bounds across."""
     order = sorted(cases, key=lambda name: -cases[name].crossed(BOUND).mean)
-    sounding = any(SDR in case for case in cases.values())
-    header = ["", f"nats a {unit}, K = {PARTICLES}", f"minus {BASELINE}", "ELBO", "KL", "k-hat > 0.7", "weights"]
-    lines = []
+    header = [
+        "",
+        f"nats a {section.unit}, K = {section.particles}",
+        f"minus {BASELINE}",
+        "ELBO",
+        FIVO,
+        "KL",
+        "k-hat > 0.7",
+    ]
+    header += ["weights", "s a fit"]
+    rows = []
     for name in order:
         case = cases[name]
-        latents = [score for score in case.runs[0]["scores"] if score.startswith("KL ")]
-        less = "–"
-        if name != BASELINE and BASELINE in cases:
-            less = said(case.crossed(BOUND).estimate(cases[BASELINE].crossed(BOUND)))
-        line = [name, said(case.crossed(BOUND).estimate()), less, said(case.crossed(ELBO).estimate())]
-        line += [", ".join(f"{case.crossed(score).mean:.2f}" for score in latents) or "–"]
-        line += [f"{100 * case.unreliable():.0f} %" if latents else "–", f"{case.runs[0]['parameters']:,}"]
-        line += [said(case.crossed(SDR).estimate(), 2)] if sounding else []
-        lines.append(line)
-    return table([*header, "SI-SDR, dB"] if sounding else header, lines)
+        less = "–" if name == BASELINE or BASELINE not in cases else case.said(BOUND, cases[BASELINE])
+        row = [name, case.said(BOUND), less, *(case.said(score) for score in (ELBO, FIVO))]
+        row += [", ".join(f"{case.crossed(score).mean:.2f}" for score in case.latents) or "–", case.unreliable()]
+        rows.append([*row, f"{case.runs[0]['parameters']:,}", case.seconds])
+    return table(header, rows)
+
+
+def of_forecasts(cases: Mapping[str, Read], references: Mapping[str, Row]) -> str:
+    """Cases and references down, the best CRPS first, scores of forecasts across; only draws have intervals."""
+    windows = next(iter(cases.values())).windows
+    found = {**cases, **{name: Read([{"scores": {}}], [row], windows) for name, row in references.items()}}
+    order = sorted(found, key=lambda name: found[name].crossed("CRPS").mean)
+    rows = []
+    for name in order:
+        there = [score for score in SHOWN if score in found[name].forecasts[0].clip_means]
+        rows.append([name, *(found[name].said(score, digits=3) if score in there else "–" for score in SHOWN)])
+    return table(["", *SHOWN], rows)
+
+
+def sound(cases: Mapping[str, Read]) -> str:
+    """Cases by how well their resynthesis sounds."""
+    order = sorted(cases, key=lambda name: -cases[name].crossed(SDR).mean)
+    rows = [[name, cases[name].said(SDR), f"{REVIEW[name]:.1f}"] for name in order if cases[name].latents]
+    return table(["", "SI-SDR, dB", "the review's, of other speech"], rows)
 
 
 def tables(runs: Path, part: str) -> list[str]:
@@ -376,14 +454,25 @@ def tables(runs: Path, part: str) -> list[str]:
     parts = []
     for name, section in SECTIONS.items():
         found = {case: sorted((runs / name).glob(f"{case}-[0-9]*/{part}.json")) for case in section.cases}
-        cases = {case: Read([json.loads(file.read_text()) for file in files]) for case, files in found.items() if files}
+        cases = {case: Read.of(case, [file.parent for file in files], part) for case, files in found.items() if files}
         if not cases:
             continue
-        first = next(iter(cases.values())).runs[0]
-        seconds = [run["seconds"] or np.nan for case in cases.values() for run in case.runs]
-        intro = f"{len(set(first['clips']))} sequences, {sum(first['steps'])} steps. "
-        intro += f"Fits took {np.nanmin(seconds):.0f} to {np.nanmax(seconds):.0f} s of processor time.\n"
-        parts += [f"## {name.capitalize()}, {part}\n", intro, scored(cases, section.unit)]
+        first = next(iter(cases.values()))
+        seconds = sum(run["seconds"] or 0 for case in cases.values() for run in case.runs)
+        parts += [f"### {name.capitalize()}, {part}\n"]
+        parts += [
+            f"{len(first.clips[1])} sequences, {sum(first.clips[1]):.0f} steps; {len(first.runs)} seeds; all fits took "
+            f"{seconds / 60:.0f} minutes of processor time.\n"
+        ]
+        parts += [bounds(cases, section)]
+        if SDR in first.runs[0]["scores"]:
+            parts += ["Resynthesis from the posterior:\n", sound(cases)]
+        if first.forecasts:
+            cut, told = section.forecast, runs / name / f"{BASELINE}-0" / FORECAST
+            rows = dvae.Evaluation.load(told).rows if told.exists() else {}
+            references = {name: row for name, row in rows.items() if name != BASELINE}
+            parts += [f"Forecasts of {cut.horizon} steps from {cut.observed}, {FORECASTS} draws:\n"]
+            parts += [of_forecasts(cases, references)]
     return parts
 
 
@@ -394,7 +483,6 @@ def main(
     part: Literal["validation", "test"] = "validation",
     cases: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0,),
-    sounds: Path = speech.PLACE,
 ) -> None:
     """Fit, score, and write the tables.
 
@@ -405,11 +493,10 @@ def main(
         part: that is scored, and of which the tables are.
         cases: to fit, by name; all of a domain where none is named.
         seeds: of the runs to fit.
-        sounds: folder of the prompts.
     """
     torch.set_num_threads(1)
     for name in domains:
-        data = Data(name, {"folder": sounds} if name == "speech" else {})
+        data = Data(name)
         for seed, case in itertools.product(seeds, cases or SECTIONS[name].cases):
             run(name, case, seed, runs / name / f"{case}-{seed}", data, part)
     found = tables(runs, part)

@@ -1,0 +1,75 @@
+"""What makes the page of the domains, on little: it goes on where it was, and its tables are of what is there."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks.tables import domains
+from dvae import tables
+from dvae.inference.comparison import Crossed
+from dvae.tables import Column, Columns, Panel, Series, reading
+from dvae.tables.protocol import Cut
+
+CASES = {
+    domains.BASELINE: domains.Case({"width": 4, "hidden": ()}),
+    "dkf": domains.Case({"latent": 2, "width": 4, "warm_up": 1}),
+}
+SMALL = {"steps": 2, "batch_size": 4, "validate_every": 2}
+
+
+def panel():
+    rng = np.random.default_rng(0)
+    parts = ["train"] * 6 + ["validation"] * 2 + ["test"] * 3
+    columns = Columns((Column("a", family="power"), Column("b", family="count")))
+    series = [
+        Series(f"s{n}", np.stack([rng.gamma(1, 1, 9 + n), rng.poisson(3, 9 + n)], 1), split=part)
+        for n, part in enumerate(parts)
+    ]
+    return Panel(series, columns, "tiny")
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    monkeypatch.setitem(tables.domains.DOMAINS, "tiny", tables.domains.DOMAINS["chorales"])
+    monkeypatch.setattr(reading, "domain", lambda name: panel())
+    section = domains.Section(CASES, SMALL, Cut(4, 2), unit="day", particles=5)
+    monkeypatch.setattr(domains, "SECTIONS", {"tiny": section})
+    monkeypatch.setattr(domains, "FORECASTS", 40)
+    path = tmp_path / "page.md"
+    path.write_text("Before.\n<!-- tables -->\n<!-- end of tables -->\nAfter.\n")
+    return path
+
+
+def test_the_page_of_the_domains_is_of_the_runs_that_are_there(page, tmp_path, capsys):
+    runs = tmp_path / "runs"
+    domains.main(("tiny",), runs, page, "validation", seeds=(0, 1))
+    text = page.read_text()
+    for said in ("Before.\n", "### Tiny, validation", "2 sequences, 31 steps; 2 seeds", "nats a day"):
+        assert said in text
+    assert text.count("| dkf |") == 1
+    written = {path: path.stat().st_mtime_ns for path in runs.rglob("*")}
+    capsys.readouterr()
+    domains.main(("tiny",), runs, page, "validation", seeds=(0, 1))
+    assert {path: path.stat().st_mtime_ns for path in runs.rglob("*")} == written
+    assert page.read_text() == text
+    assert not capsys.readouterr().out
+    for case, there in (("dkf", False), (domains.BASELINE, True)):  # whose file has the references
+        domains.main(("tiny",), runs, page, "test", (case,))
+        assert "3 sequences, 54 steps; 1 seeds" in page.read_text()
+        assert page.read_text().count("| dkf |") == 2
+        assert ("climatology" in page.read_text()) == there
+
+
+def test_bounds_are_by_step_and_their_errors_over_sequences(page, tmp_path):
+    domains.main(("tiny",), tmp_path, page, "validation", (domains.BASELINE,), (0, 1))
+    folders = [tmp_path / "tiny" / f"{domains.BASELINE}-{seed}" for seed in (0, 1)]
+    found = [json.loads((folder / "validation.json").read_text()) for folder in folders]
+    steps = np.array([15.0, 16.0])
+    assert found[0]["steps"] == steps.tolist()
+    sums = np.array([own["scores"][domains.BOUND] for own in found])
+    expected = Crossed.of(sums / steps, steps).estimate()
+    read = domains.Read.of(domains.BASELINE, folders, "validation")
+    assert read.crossed(domains.BOUND).estimate() == expected
+    assert expected.mean == pytest.approx(sums.sum() / 62)
+    assert read.said(domains.BOUND) == f"{expected.mean:.2f} ± {expected.sequences:.2f} ± {expected.seeds:.2f}"
