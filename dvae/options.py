@@ -105,8 +105,8 @@ def problem(name: str, value: Any, hint: Any) -> Exception | None:
             return None
         meant = nearest(value, filter(lambda each: isinstance(each, str), arguments)) if isinstance(value, str) else ""
         return ValueError(f"unknown {name} {reprlib.repr(value)}{meant}; known: {', '.join(map(str, arguments))}")
-    if origin is tuple and arguments[1:] == (Ellipsis,):
-        return _problem_of_entries(name, value, arguments[0])
+    if origin is tuple:
+        return _problem_of_entries(name, value, arguments)
     if hint is int:
         if not isinstance(value, Integral) or isinstance(value, bool):
             return TypeError(f"{given}; it must be a whole number")
@@ -150,13 +150,17 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-def _problem_of_entries(name: str, value: Any, hint: Any) -> Exception | None:
+def _problem_of_entries(name: str, value: Any, hints: tuple[Any, ...]) -> Exception | None:
     if not isinstance(value, tuple | list):
         return TypeError(f"{name} is {reprlib.repr(value)}; it must be a tuple")
-    longest = LONGEST if hint is str else DEEPEST
-    if len(value) > longest:
-        return ValueError(f"{name} has {len(value)} entries; it must have {longest} at most")
-    problems = (problem(f"{name}[{place}]", each, hint) for place, each in enumerate(value))
+    if hints[1:] == (Ellipsis,):
+        longest = LONGEST if hints[0] is str else DEEPEST
+        if len(value) > longest:
+            return ValueError(f"{name} has {len(value)} entries; it must have {longest} at most")
+        hints = hints[:1] * len(value)
+    if len(value) != len(hints):
+        return ValueError(f"{name} is {reprlib.repr(value)}; it must have {len(hints)} entries")
+    problems = (problem(f"{name}[{place}]", *each) for place, each in enumerate(zip(value, hints, strict=True)))
     return next((found for found in problems if found is not None), None)
 
 

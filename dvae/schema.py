@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 
 from .laws.base import LawSpec
 from .options import Frames, Size, check
+from .units import Coordinate
 from .views import View
 
 
@@ -53,8 +54,8 @@ class Schema:
         return (), ()
 
     @property
-    def units(self) -> Mapping[str, tuple[Sequence[float], Sequence[float], Sequence[float]]]:
-        """Variable to means, scales and typical values of its coordinates, see `Units.set`."""
+    def units(self) -> Mapping[str, Sequence[Coordinate]]:
+        """Variable to how its coordinates are read and made."""
         return {}
 
     def size(self, name: str) -> int:

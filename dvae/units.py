@@ -3,17 +3,37 @@
 A network that must find them out first learns much more slowly where what varies is a tenth of what is always there.
 Densities and all that a program returns stay in the variable's own unit.
 
-Units are no view of the data (`dvae.views`), though they are a bijection with the same way back and its determinant.
-Latents and context have them too, of which nothing is handed out in another unit. And a law is put into the data's
-unit where it is made (`Law.in_units`, the push-forward), so that given scales and every density are in that.
+Units are no view of the data (`dvae.views`). Latents and context have them too, of which nothing is handed out in
+another unit. A law is put into the data's unit where it is made (`Law.in_units`, the push-forward), so that given
+scales and every density are in that. And positive data that go over orders of magnitude are read as logarithms, though
+made as a multiple of their mean: of the powers of a spectrum as they are, a network sees the peaks alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+
+
+class Coordinate(NamedTuple):
+    """How networks read a coordinate, such as a column of a table, and make it.
+
+    Args:
+        mean, scale: of the unit.
+        typical: what stands for a missing value.
+        floor: least value whose logarithm is read; 0 where values are read and not their logarithms.
+        level, spread: mean and standard deviation of the logarithms.
+    """
+
+    mean: float = 0.0
+    scale: float = 1.0
+    typical: float = 0.0
+    floor: float = 0.0
+    level: float = 0.0
+    spread: float = 1.0
 
 
 class Units(nn.Module):
@@ -21,26 +41,22 @@ class Units(nn.Module):
 
     Args:
         size: D.
-        columns: a scale for every coordinate, as of columns of a table, and a typical value that stands for a missing
-            one, where that is not the mean.
+        coordinates: those of a table, each with units of its own; nothing of them is fitted.
     """
 
     mean: Tensor
     scale: Tensor
     typical: Tensor
+    floor: Tensor
+    level: Tensor
+    spread: Tensor
 
-    def __init__(self, size: int, columns: bool = False):
+    def __init__(self, size: int, coordinates: Sequence[Coordinate] = ()):
         super().__init__()
-        self.register_buffer("mean", torch.zeros(size))
-        self.register_buffer("scale", torch.ones(size if columns else ()))
-        if columns:
-            self.register_buffer("typical", torch.zeros(size))
-
-    @torch.no_grad()
-    def set(self, mean: Sequence[float], scale: Sequence[float], typical: Sequence[float]) -> None:
-        """Takes a mean, a scale and a typical value for each coordinate; it must have been made for `columns`."""
-        for buffer, values in ((self.mean, mean), (self.scale, scale), (self.typical, typical)):
-            buffer.copy_(buffer.new_tensor(values))
+        found = dict(zip(Coordinate._fields, torch.tensor(coordinates).T, strict=True)) if coordinates else {}
+        for name, value in (found or {"mean": torch.zeros(size), "scale": torch.ones(())}).items():
+            self.register_buffer(name, value)
+        self.logarithms = any(each.floor for each in coordinates)
 
     @torch.no_grad()
     def fit(self, values: Tensor) -> None:
@@ -56,9 +72,7 @@ class Units(nn.Module):
                 f"{'' if rows.shape[1:] != self.mean.shape else ' without variance'}"
             )
         self.mean.copy_(rows.mean(0))
-        self.filling.copy_(self.mean)
-        variance = rows.var(0)
-        self.scale.copy_((variance if self.scale.dim() else variance.mean()).sqrt())
+        self.scale.copy_(rows.var(0).mean().sqrt())
 
     @property
     def filling(self) -> Tensor:
@@ -67,13 +81,9 @@ class Units(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         """Values (..., D) without unit."""
-        return (values - self.mean) / self.scale
-
-    def inverse(self, values: Tensor) -> Tensor:
-        """Values (..., D) in their unit again."""
-        return values * self.scale + self.mean
-
-    def log_det(self, values: Tensor) -> Tensor:
-        """(B,) log of the determinant of the Jacobian of `forward` at values (B, ..., D)."""
-        each: Tensor = -self.scale.log().mean() * values[0].numel()
-        return each.expand(len(values))
+        plain: Tensor = (values - self.mean) / self.scale
+        if not self.logarithms:
+            return plain
+        read = self.floor > 0
+        logarithms = values.clamp(min=torch.where(read, self.floor, 1.0)).log()  # finite where it is not read, too
+        return torch.where(read, (logarithms - self.level) / self.spread, plain)

@@ -134,8 +134,8 @@ class LikelihoodMethod(Method):
                 )
             described["laws"]["p(x)"] = schema.emission
         model = kind(**described, view=schema.view)
-        for name, units in schema.units.items():
-            model.standardise(name, columns=True).set(*units)
+        for name, coordinates in schema.units.items():
+            model.standardise(name, coordinates)
         return model
 
     @override

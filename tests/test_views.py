@@ -11,7 +11,6 @@ from dvae.inference.predictive import predictive_bound
 from dvae.models.trajectories import Rest
 from dvae.motion import HUMANEVA, WALKER, Bones, Heading, rotate_about_up
 from dvae.networks import Recurrent
-from dvae.units import Units
 from dvae.views import LOG_DET, History, Parts, Past, View, Views
 
 B, T, J = 3, 5, WALKER.joints
@@ -94,14 +93,6 @@ def test_views_keep_volume(view_and_data):
     rows = len(jacobian)
     _, log_det = torch.linalg.slogdet(jacobian.reshape(rows, rows))
     torch.testing.assert_close(log_det, view.log_det(data)[0], rtol=0, atol=1e-9)
-
-
-def test_units_have_their_determinant():
-    units, x = Units(3).double(), 4 + 0.1 * people(2, 4, 3)
-    units.fit(x)
-    torch.testing.assert_close(units.inverse(units(x)), x)
-    jacobian = torch.autograd.functional.jacobian(units, x[0]).reshape(12, 12)
-    torch.testing.assert_close(units.log_det(x), torch.linalg.slogdet(jacobian)[1].expand(2))
 
 
 @pytest.mark.parametrize("skeleton", [WALKER, HUMANEVA])

@@ -8,7 +8,7 @@ with different things known.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from itertools import accumulate
@@ -29,7 +29,7 @@ from ..networks.base import once
 from ..notation import Factor, Factorization, check_pair
 from ..relations import MaskFunction
 from ..turns import alone
-from ..units import Units
+from ..units import Coordinate, Units
 from ..views import LOG_DET, View, volume
 from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
@@ -190,8 +190,8 @@ class DynamicalVAE(nn.Module):
                         f"laws.Normal(), or name {name} as observed where it is data"
                     )
 
-    def standardise(self, name: str, columns: bool = False) -> Units:
-        """Has networks read a variable without unit, by a mean and a scale that `fit` or `set` of the result takes.
+    def standardise(self, name: str, coordinates: Sequence[Coordinate] = ()) -> Units:
+        """Has networks read a variable without unit, by a mean and a scale that `fit` of the result takes.
 
         They make it without unit too where its law is a location and a scale (`Law.location_scale`); probabilities
         and rates are made as they are. Densities and values stay in the variable's own unit; call it before the model
@@ -199,14 +199,14 @@ class DynamicalVAE(nn.Module):
 
         Args:
             name: of the variable.
-            columns: a scale for each coordinate, as of columns of a table, in place of one for all.
+            coordinates: how each is read and made, as of columns of a table, in place of what is fitted.
 
         Raises:
             ValueError: an unknown variable.
         """
         if name not in self.sizes:
             raise ValueError(f"no variable {name!r}; there are {', '.join(self.sizes)}")
-        self.units[name] = Units(self.sizes[name], columns)
+        self.units[name] = Units(self.sizes[name], coordinates)
         for conditional in (*self.generator.values(), *self.encoder.values()):
             conditional.units[name] = self.units[name]
         return self.units[name]

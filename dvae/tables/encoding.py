@@ -26,6 +26,7 @@ from ..laws.family import FAMILIES
 from ..laws.product import Product
 from ..options import Amount, Positive, Range, tuples
 from ..schema import Schema
+from ..units import Coordinate
 from ..views import Offered, View
 from .columns import WHOLE_STEPS, Column, Columns
 from .panel import COUNTS, Panel, Series
@@ -38,7 +39,9 @@ EVEN = 1.3
 LEAST = 1e-7
 """Of a deviation, as a share of the mean: below it is what rounding leaves of a constant."""
 CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
-SCALED = ("positive", "log-normal", "power", *COUNTS)
+LOGARITHMIC = ("positive", "log-normal", "power")
+"""Families that networks read the logarithms of."""
+SCALED = (*LOGARITHMIC, *COUNTS)
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,7 @@ class PanelSchema(Schema):
         columns: of the table.
         cut: how it is divided and cut.
         means, scales: of the columns that have a unit, over the training data.
+        logarithms: of those that are read as such, the least that is, and their mean and deviation.
         lacking: names of covariates that have an indicator.
         step: median time from one step to the next; 0 where steps are evenly spaced.
     """
@@ -60,6 +64,7 @@ class PanelSchema(Schema):
     cut: Cut = field(default_factory=Cut)
     means: Mapping[str, Annotated[float, Range()]] = field(default_factory=dict)
     scales: Mapping[str, Positive] = field(default_factory=dict)
+    logarithms: Mapping[str, tuple[Positive, Annotated[float, Range()], Positive]] = field(default_factory=dict)
     lacking: tuple[str, ...] = ()
     step: Amount = 0.0
 
@@ -92,7 +97,7 @@ class PanelSchema(Schema):
                 f"{min(map(len, panel.series))} to {max(map(len, panel.series))} steps"
             )
         known = np.concatenate([one.values[part] for one, part in parts])
-        means, scales, lacking = {}, {}, []
+        means, scales, logarithms, lacking = {}, {}, {}, []
         for place, column in enumerate(panel.columns.columns):
             values = known[:, place]
             values = values[~np.isnan(values)]
@@ -103,6 +108,10 @@ class PanelSchema(Schema):
                 means[column.name], scales[column.name] = mean, scale if scale > LEAST * abs(mean) else 1.0
             elif column.family in SCALED:
                 means[column.name], scales[column.name] = 0.0, float(values.mean()) or 1.0
+                if column.family in LOGARITHMIC and (values > 0).any():
+                    floor = values[values > 0].min()
+                    read = np.log(values.clip(floor))
+                    logarithms[column.name] = float(floor), float(read.mean()), float(read.std()) or 1.0
             elif column.family == "binary":
                 means[column.name] = float(values.mean())
             if column.role == "past" or (column.role != "target" and np.isnan(known[:, place]).any()):
@@ -115,7 +124,8 @@ class PanelSchema(Schema):
         )
         middle = float(np.median(gaps)) if len(gaps) else 0.0
         step = middle if len(gaps) and (gaps.max() > EVEN * middle or middle > EVEN * gaps.min()) else 0.0
-        return cls(columns=panel.columns, cut=cut, means=means, scales=scales, lacking=tuple(lacking), step=step)
+        units: dict[str, Any] = {"means": means, "scales": scales, "logarithms": logarithms}
+        return cls(columns=panel.columns, cut=cut, **units, lacking=tuple(lacking), step=step)
 
     @property
     def protocol(self) -> Cut:
@@ -158,14 +168,15 @@ class PanelSchema(Schema):
 
     @property
     @override
-    def units(self) -> Mapping[str, tuple[Sequence[float], Sequence[float], Sequence[float]]]:
+    def units(self) -> Mapping[str, Sequence[Coordinate]]:
         """Of x; where a column that is only scaled is missing, its mean, which is its scale, stands for it."""
-        columns = [column for column in self.columns.targets for _ in column.coordinates]
-        means, scales = (
-            [own.get(c.name, rest) for c in columns] for own, rest in ((self.means, 0.0), (self.scales, 1.0))
-        )
-        typical = [s if c.family in SCALED else m for c, m, s in zip(columns, means, scales, strict=True)]
-        return {"x": (means, scales, typical)}
+        found = []
+        for column in self.columns.targets:
+            mean, scale = self.means.get(column.name, 0.0), self.scales.get(column.name, 1.0)
+            typical = scale if column.family in SCALED else mean
+            own = Coordinate(mean, scale, typical, *self.logarithms.get(column.name, ()))
+            found += [own] * len(column.coordinates)
+        return {"x": found}
 
     @cached_property
     def places(self) -> dict[str, int]:
@@ -239,7 +250,8 @@ class PanelSchema(Schema):
     @override
     def config(self) -> dict[str, Any]:
         """The schema in JSON's types."""
-        own = {"means": dict(self.means), "scales": dict(self.scales), "lacking": list(self.lacking), "step": self.step}
+        own: dict[str, Any] = {name: dict(getattr(self, name)) for name in ("means", "scales", "logarithms")}
+        own |= {"lacking": list(self.lacking), "step": self.step}
         return {"columns": self.columns.config(), "cut": asdict(self.cut), **own}
 
     @classmethod
@@ -248,6 +260,7 @@ class PanelSchema(Schema):
         """The schema that `config` wrote."""
         own = tuples(config)
         own |= {"columns": Columns.from_config(config["columns"]), "cut": Cut(**config["cut"])}
+        own["logarithms"] = tuples(config["logarithms"])
         return cls(**own)
 
 

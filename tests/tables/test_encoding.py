@@ -77,7 +77,8 @@ def test_units_are_those_of_the_training_sequences():
         0,
         pytest.approx(column(panel, "riders", parts).mean()),
     )
-    means, scales, typical = schema.units["x"]
+    means, scales, typical, floor, _, _ = map(list, zip(*schema.units["x"], strict=True))
+    assert not any(floor)
     names = ["riders", "kind", "kind", "kind", "temp", "open"]
     assert means == [schema.means.get(name, 0) for name in names]
     assert scales == [schema.scales.get(name, 1) for name in names]
