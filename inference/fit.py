@@ -8,7 +8,7 @@ import os
 import signal
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +60,7 @@ class Fit:
         status: "finished", "stopped early" or "interrupted".
         run: the run directory, if there is one.
         per: what bounds are per: a frame, unless the model has another word in `per`.
+        model: what was fitted, with the best weights; None where only the log of a run was read.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -75,6 +76,7 @@ class Fit:
     status: str
     run: Path | None
     per: str = "frame"
+    model: Any = field(default=None, repr=False)
 
     @property
     def best(self) -> str:
@@ -233,7 +235,7 @@ def fit(
         if state.best is not None:
             model.load_state_dict(state.best)
     path, per = run.path if run else None, model.per if isinstance(model, Program) else Fit.per
-    result = Fit(history.rows, state.step, state.best_step, state.best_bound, state.status, path, per)
+    result = Fit(history.rows, state.step, state.best_step, state.best_bound, state.status, path, per, model)
     if state.status == "interrupted":
         raise Interrupted(result, signals.received or signal.SIGINT)
     return result

@@ -13,6 +13,7 @@ from torch import nn
 from ..data import Source
 from ..options import check
 from ..schema import Schema, SchemaError
+from ..turns import alone
 from .fit import Fit, fit, run_directory
 from .objectives import Objective
 from .schedules import Schedule
@@ -108,6 +109,32 @@ class Trainable:
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """How the model is trained on these data, in so many steps."""
         raise NotImplementedError
+
+    @alone
+    def fit(self, data: Any, *, steps: int = 2000, seed: int = 0, **options: Any) -> Fit:
+        """Builds the model for data and fits it to them: in one call, in memory.
+
+        `dvae.runs.directory.fit_run` keeps a run that can be loaded and resumed.
+
+        Args:
+            data: with a `schema`, and `windows` to train and to validate on, such as `dvae.tables.PanelData` or
+                `dvae.motion.MotionData`.
+            steps: optimiser steps in all.
+            seed: of initial weights, batches and draws.
+            **options: of `Recipe.fit`.
+
+        Returns:
+            The fit; its `model` has the best weights.
+
+        Raises:
+            ValueError: see `Recipe.fit`, or data without windows of these parts.
+        """
+        train = data.windows("train")
+        method = self.suited(train)
+        recipe = method.train(train, data.windows("validation"), steps)
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            return recipe.fit(method.build(data.schema), seed=seed, **options)
 
     def check(self) -> None:
         """Refuses options that do not fit together, before any data are read.

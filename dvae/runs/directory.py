@@ -17,8 +17,6 @@ from pathlib import Path
 from reprlib import repr as brief
 from typing import Any
 
-import torch
-
 from ..inference.checkpoints import CONFIG, CheckpointError, Run, at_most, load_weights
 from ..inference.fit import Callback, Fit
 from ..inference.recipe import Trainable
@@ -141,14 +139,9 @@ def fit_run(
             prior are longer than the windows.
     """
     training = training or Training()
-    train = data.windows("train")
-    method = method.suited(train)
-    recipe = method.train(train, data.windows("validation"), training.steps)
+    method = method.suited(data.windows("train"))
     config = Config(method, data.schema, data.kind, data.recorded(), training).written()
-    with torch.random.fork_rng():
-        torch.manual_seed(training.seed)
-        model = method.build(data.schema)
-        return recipe.fit(model, out=out, config=config, callbacks=callbacks, trackers=trackers, **vars(training))
+    return method.fit(data, out=out, config=config, callbacks=callbacks, trackers=trackers, **vars(training))
 
 
 @alone

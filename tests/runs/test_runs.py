@@ -135,6 +135,16 @@ def test_the_directory_that_the_user_names_may_be_a_link(run, tmp_path):
     assert runs.resume(tmp_path / "latest", steps=5, progress=False).step == 5
 
 
+def test_a_fit_in_memory_is_that_of_a_run_of_the_same_seed(fitted, people):
+    kept, before = dvae.load(fitted).model, torch.random.get_rng_state()
+    fit = METHOD.fit(MotionData.open(people), **vars(TRAINING))
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert not fit.model.training
+    assert fit.run is None
+    for name, value in kept.state_dict().items():
+        assert torch.equal(value, fit.model.state_dict()[name]), name
+
+
 def test_a_run_of_a_sweep_is_no_link(fitted, people, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
