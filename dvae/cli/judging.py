@@ -22,6 +22,7 @@ from ..inference.scores import proper
 from ..models.trajectories import TrajectoryModel
 from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
+from ..tables.scoring import panel_scores
 from . import opening, tables
 from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, note, save_figure
 from .futures import joint_names
@@ -183,7 +184,7 @@ def _tables(paths: Sequence[Path], data: str | None, how: Judged, **settings: An
     result = evaluate_models(
         {name: each.model for name, each in called.items()},
         tables.windows(loaded[0], opened),
-        scores=tables.scores,
+        scores=panel_scores,
         samples=how.samples,
         log_score_particles=how.log_score_particles,
         training_windows=opened.windows("train+validation") if opening.own(loaded[0], opened) else None,
@@ -348,10 +349,7 @@ def compare(
 def _compared(first: runs.Loaded, opened: Any, stride: int | None) -> tuple[Any, Any]:
     """Test windows, so far apart, and what forecasts of them are scored by."""
     if first.config.kind == "panel":
-        schema = (
-            opened.schema if stride is None else replace(opened.schema, cut=replace(opened.schema.cut, stride=stride))
-        )
-        return tables.windows(first, replace(opened, schema=schema)), proper
+        return tables.windows(first, opened, stride=stride), proper
     protocol = opened.protocol if stride is None else replace(opened.protocol, test_stride=stride)
     return motion.windows(opened.motion, protocol, "test"), motion.scores
 

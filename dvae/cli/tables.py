@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Sequence
-from dataclasses import replace
-from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from .. import files
-from ..data import HeldOutWindows, Sequences, columns_of, each, gapped, past_of
 from ..inference.result import Table
-from ..inference.scores import CRPS, Measure, by_column, calibrated
 from ..runs import directory as runs
-from ..tables.ahead import ahead
 from ..tables.dataset import PanelData
-from ..tables.encoding import PanelSchema
-from ..tables.forecasts import FORMATS, PanelForecasts
+from ..tables.forecasts import FORMATS
 from ..tables.reading import SUFFIXES, is_domain, schema_beside, written_schema
 from ..tables.windows import PanelWindows
-from .console import ERROR, OUT, UsageError, check_files, save_figure
+from .console import ERROR, OUT, UsageError, arguments, check_files, save_figure
 from .opening import data_of, load_run
 
 
@@ -50,26 +43,15 @@ def is_table(path: str) -> bool:
     return not of_motion and ("x" in held or len(held) == 1)
 
 
-def scores(windows: HeldOutWindows) -> list[Measure]:
-    """Proper scores and calibration, and the CRPS of each column in its unit where there are a few."""
-    found, columns = calibrated(windows), columns_of(windows) or {}
-    return [*found, *(by_column(CRPS, columns) if 1 < len(columns) <= 12 else [])]
-
-
-def windows(loaded: runs.Loaded, opened: PanelData, horizon: int | None = None) -> PanelWindows:
-    """Test windows to forecast, so many steps if not those of the run.
+def windows(loaded: runs.Loaded, opened: PanelData, split: str = "test", **cut: int | None) -> PanelWindows:
+    """Windows to forecast, cut as those of the run but for what is given of `Cut`.
 
     Raises:
         UsageError: whole sequences, of which nothing is forecast.
     """
     if opened.schema.cut.length is None:
         raise UsageError(f"{loaded.path} was fitted on whole sequences; fit with --observed and --horizon to forecast")
-    return PanelWindows(opened.panel, _longer(opened.schema, horizon), "test")
-
-
-def _longer(schema: PanelSchema, horizon: int | None) -> PanelSchema:
-    """The schema with another horizon, if one is given."""
-    return schema if horizon is None else replace(schema, cut=replace(schema.cut, horizon=horizon))
+    return opened.recut(**{name: steps for name, steps in cut.items() if steps is not None}).windows(split)
 
 
 def forecast(
@@ -87,81 +69,25 @@ def forecast(
     check_files(out, figure, *FORMATS)
     loaded = load_run(path, data, "panel")
     opened = data_of(data, loaded)
-    panel = opened.panel if sequence is None else opened.panel.only([sequence])
-    if beyond:
-        held = ahead(panel, opened.schema, horizon)
-    else:
-        held = windows(loaded, opened, horizon)
-        held = held if sequence is None else PanelWindows(panel, held.schema, "all")
-    found = drawn(loaded, held, samples, seed)
+    opened = opened if sequence is None else opened.only([sequence])
+    split = "test" if sequence is None else "all"
+    held = opened.ahead(horizon) if beyond else windows(loaded, opened, split, horizon=horizon)
+    found = held.forecast(loaded.model, samples, seed)
     found.save(out)
     ERROR.print(f"wrote {out}: {samples} futures of {found.draws.shape[2]} steps for each of {len(found.keys)} windows")
     if figure is not None:
         save_figure(found.plot(), figure)
 
 
-def drawn(loaded: runs.Loaded, held: PanelWindows, samples: int, seed: int = 0) -> PanelForecasts:
-    """Draws of the futures of windows."""
-    observed, steps = held.protocol.observed, held.protocol.horizon
-    assert observed is not None
-    assert steps is not None
-    batch = held.all()
-    past = past_of(batch, observed)
-    parts = []
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        for some in Sequences(past).split(64):
-            parts.append(loaded.model.forecast(some, steps, samples, draw_emission=True)["x"].numpy())
-    known = gapped(batch).numpy()
-    keys = [(name, start + observed) for _, name, start in held.keys]
-    columns = columns_of(held) or {}
-    whole = held.times(steps)
-    times = None if whole is None else whole[0]
-    dates = whole is not None and whole[1]
-    return PanelForecasts(
-        np.concatenate(parts, 1), known[:, :observed], known[:, observed:], columns, keys, times, dates
-    )
-
-
 def impute(path: Path, out: Path, samples: int, seed: int, data: str | None) -> None:
     """Fills what the sequences of a table lack, in a table of every missing entry."""
-    check_files(out, None, ".csv", ".parquet", ".npz")
+    check_files(out, None, *FORMATS)
     loaded = load_run(path, data, "panel")
-    opened = data_of(data, loaded)
-    schema = replace(opened.schema, cut=replace(opened.schema.cut, observed=None, horizon=None, split="sequence"))
-    held = PanelWindows(opened.panel, schema, "all")
-    batch, made = held.all(), []
-    if "mask" not in batch:
-        raise UsageError(f"nothing is missing in {opened.path}")
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        for some in torch.arange(len(held)).split(64):
-            made.append(loaded.model.impute(each(batch, itemgetter(some)), samples, draw=True)["x"].numpy())
-    values = np.concatenate(made, 1)
-    lengths = batch.get("lengths", torch.full((len(held),), values.shape[2]))
-    lacking = ~batch["mask"].numpy() & (np.arange(values.shape[2]) < lengths[:, None].numpy())[..., None]
-    rows = np.argwhere(lacking)
-    import pandas as pd
-
-    names, columns = [name for _, name, _ in held.keys], list(columns_of(held) or {})
-    found = values[:, rows[:, 0], rows[:, 1], rows[:, 2]]
-    frame = pd.DataFrame(
-        {
-            "sequence": [names[n] for n in rows[:, 0]],
-            "step": rows[:, 1],
-            "column": [columns[n] for n in rows[:, 2]],
-            "mean": found.mean(0),
-            **{f"q{100 * level:02.0f}": np.quantile(found, level, axis=0) for level in (0.05, 0.5, 0.95)},
-        }
-    )
-    with files.written(out) as file:
-        if out.suffix.lower() == ".csv":
-            frame.to_csv(file, index=False, float_format="%.6g")
-        elif out.suffix.lower() == ".parquet":
-            frame.to_parquet(file)
-        else:
-            np.savez_compressed(file, filled=values, observed=batch["mask"].numpy(), sequence=np.array(names))
-    ERROR.print(f"wrote {out}: {samples} fillings of {len(rows)} entries that {opened.path} lacks")
+    held = data_of(data, loaded).whole()
+    with arguments():
+        found = held.impute(loaded.model, samples, seed)
+    found.save(out)
+    ERROR.print(f"wrote {out}: {samples} fillings of {found.lacking.sum()} entries that {held.panel.name} lacks")
 
 
 def info(paths: Sequence[str], out: Path | None) -> None:

@@ -9,7 +9,24 @@
 
 from .columns import Column, Columns
 from .dataset import PanelData
+from .forecasts import PanelForecasts, PanelImputed
 from .panel import Panel, Series
+from .proposing import Told, proposed
 from .protocol import Cut
+from .scoring import panel_scores
+from .windows import PanelWindows
 
-__all__ = ["Column", "Columns", "Cut", "Panel", "PanelData", "Series"]
+__all__ = [
+    "Column",
+    "Columns",
+    "Cut",
+    "Panel",
+    "PanelData",
+    "PanelForecasts",
+    "PanelImputed",
+    "PanelWindows",
+    "Series",
+    "Told",
+    "panel_scores",
+    "proposed",
+]

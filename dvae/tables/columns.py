@@ -28,7 +28,7 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from reprlib import repr as brief
 from typing import Any, Literal, Self
 
@@ -141,6 +141,36 @@ class Columns:
     def needed(self) -> list[str]:
         """Names of all columns that a table must have."""
         return [*self.id, *filter(None, (self.time, self.group, self.split)), *self.names]
+
+    def but(self, name: str, **told: Any) -> Self:
+        """The same, but that one column is another: what a person corrects.
+
+        Args:
+            name: of the column.
+            **told: its fields that are others, such as family="count"; one that becomes a category needs its classes.
+
+        Raises:
+            ValueError: a column that is not there, or fields that do not fit together.
+        """
+        own = self._known(name)
+        if told.get("family", "category") != "category":
+            told = {"classes": (), **told}
+        return replace(self, columns=tuple(replace(each, **told) if each == own else each for each in self.columns))
+
+    def without(self, *names: str) -> Self:
+        """The same, but for columns that are not read.
+
+        Raises:
+            ValueError: a column that is not there, or no target left.
+        """
+        aside = [self._known(name) for name in names]
+        return replace(self, columns=tuple(each for each in self.columns if each not in aside))
+
+    def _known(self, name: str) -> Column:
+        """A column by its name."""
+        if name not in self.names:
+            raise ValueError(f"no column {name!r}{nearest(name, self.names)}; there are {', '.join(self.names[:20])}")
+        return self.columns[self.names.index(name)]
 
     def config(self) -> dict[str, Any]:
         """It in JSON's types; `from_config` reads it."""

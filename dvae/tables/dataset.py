@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
 from ..options import check
+from .ahead import ahead
 from .columns import Columns
 from .encoding import PanelSchema
 from .panel import Panel
@@ -88,9 +89,44 @@ class PanelData:
         panel = Panel.of(data, columns, name)
         return cls(name, panel, PanelSchema.under(panel, cut or suited(panel)))
 
+    def on(self, data: Any) -> Self:
+        """Other data, of what `Panel.of` takes, under this schema: the columns, cut and units that models know."""
+        return replace(self, panel=Panel.of(data, self.panel.columns, self.panel.name))
+
+    def only(self, sequences: Iterable[str]) -> Self:
+        """Some of the sequences, by their names.
+
+        Raises:
+            ValueError: one that is not there.
+        """
+        return replace(self, panel=self.panel.only(sequences))
+
+    def recut(self, **cut: Any) -> Self:
+        """The same, cut otherwise, such as with another horizon; units stay those that models know.
+
+        Args:
+            **cut: fields of `Cut`.
+        """
+        return replace(self, schema=replace(self.schema, cut=replace(self.schema.cut, **cut)))
+
     def windows(self, split: str) -> PanelWindows:
-        """The windows of "train", "validation", "test" or "train+validation"."""
+        """The windows of "train", "validation", "test" or "train+validation"; of "all", wherever they are."""
         return PanelWindows(self.panel, self.schema, split)
+
+    def ahead(self, horizon: int | None = None) -> PanelWindows:
+        """The end of each sequence, and what comes after it, see `dvae.tables.ahead`.
+
+        Args:
+            horizon: steps of the future; by default those of the schema.
+
+        Raises:
+            ValueError: whole sequences, sequences that are too short, or covariates that the future lacks.
+        """
+        return ahead(self.panel, self.schema, horizon)
+
+    def whole(self) -> PanelWindows:
+        """All sequences, uncut."""
+        return self.recut(observed=None, horizon=None, split="sequence").windows("all")
 
     @property
     def location(self) -> str:

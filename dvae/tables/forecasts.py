@@ -1,4 +1,4 @@
-"""Forecasts of a panel: draws of the future, their quantiles by column in a table, and fans of them in a picture."""
+"""Draws of what a panel does not say: of its future, and of entries that are missing; as tables and pictures."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from ..inference.result import canvas
 from ..options import nearest
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 QUANTILES = (0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975)
@@ -50,24 +51,12 @@ class PanelForecasts:
 
         count, horizon, size = self.draws.shape[1:]
         window, step, place = (index.ravel() for index in np.indices((count, horizon, size)))
-        found: dict[str, Any] = {
-            "sequence": np.array([name for name, _ in self.keys], object)[window],
-            "step": np.array([first for _, first in self.keys])[window] + step,
-        }
+        found = _rows(self.keys, window, step)
         if self.times is not None:
-            found["time"] = self._shown(self.times[:, -horizon:].reshape(-1).repeat(size))
+            found["time"] = _shown(self.times[:, -horizon:].reshape(-1).repeat(size), self.dates)
         found["ahead"] = step + 1
-        found["column"] = np.array(list(self.columns), object)[place]
-        found["unit"] = np.array(list(self.columns.values()), object)[place]
-        found["mean"] = self.draws.mean(0, dtype=np.float64).ravel()
-        quantiles = np.quantile(self.draws, QUANTILES, axis=0).reshape(len(QUANTILES), -1)
-        found |= {f"q{1000 * level:03.0f}": values for level, values in zip(QUANTILES, quantiles, strict=True)}
+        found |= _columns(self.columns, place) | _quantiles(self.draws.reshape(len(self.draws), -1))
         return pd.DataFrame({**found, "truth": self.truth.ravel()})
-
-    def _shown(self, times: np.ndarray) -> Any:
-        import pandas as pd
-
-        return pd.to_datetime(times, unit="s") if self.dates else times
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the table as CSV or Parquet, or the draws and all beside them as npz, whichever the name ends in.
@@ -75,30 +64,7 @@ class PanelForecasts:
         Raises:
             ValueError: another ending, or Parquet without pyarrow.
         """
-        suffix = Path(path).suffix.lower()
-        if suffix not in FORMATS:
-            raise ValueError(f"{path} ends in none of {', '.join(FORMATS)}")
-        with files.written(path) as file:
-            if suffix == ".csv":
-                table = self.table()
-                if "time" in table and not self.dates:
-                    table["time"] = table["time"].map("{:.15g}".format)
-                table.to_csv(file, index=False, float_format="%.9g")
-            elif suffix == ".parquet":
-                try:
-                    self.table().to_parquet(file)
-                except ImportError as error:
-                    raise ValueError(f"{path} needs pyarrow: pip install 'pyro-dvae[parquet]'") from error
-            else:
-                names, first = zip(*self.keys, strict=True)
-                arrays: dict[str, Any] = {"draws": self.draws, "past": self.past, "truth": self.truth}
-                arrays |= {
-                    "sequence": np.array(names),
-                    "step": np.array(first),
-                    "columns": np.array(list(self.columns)),
-                }
-                arrays |= {} if self.times is None else {"times": self.times}
-                np.savez_compressed(file, allow_pickle=False, **arrays)
+        _save(self, path, draws=self.draws, past=self.past, truth=self.truth)
 
     def plot(self, window: int = 0, columns: Sequence[str] | None = None, most: int = 8) -> Figure:
         """A fan for each coordinate: intervals of 50, 80 and 95 % and the median, after the past and beside the truth.
@@ -117,32 +83,16 @@ class PanelForecasts:
         for name in columns or ():
             if name not in names:
                 raise ValueError(f"no column {name!r}{nearest(name, names)}; there are {', '.join(names[:20])}")
-        chosen = [names.index(name) for name in columns or names][:most]
+        chosen = list(columns or names)[:most]
         across = min(2, len(chosen))
         down = -(-len(chosen) // across)
-        from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
-
         figure = canvas(5 * across, 1.9 * down + 0.4)
         panels = figure.subplots(down, across, squeeze=False, sharex=True).ravel()
-        observed, horizon = self.past.shape[1], self.draws.shape[2]
-        steps: Any = np.arange(observed + horizon) if self.times is None else self._shown(self.times[window])
-        before, after = steps[:observed], steps[observed:]
-        for axis, place in zip(panels, chosen, strict=False):
-            draws = self.draws[:, window, :, place]
-            if np.isin(self.draws[..., place], (0, 1)).all():  # no fan, but how many
-                axis.plot(after, draws.mean(0), "C0", linewidth=1.2)
-                axis.set_ylabel("share", fontsize=8)
-                axis.set_ylim(-0.05, 1.05)
-            else:
-                self._fan(axis, after, draws)
-            axis.plot(before, self.past[window, :, place], color="0.3", linewidth=1, marker=".", markersize=3)
-            axis.plot(after, self.truth[window, :, place], "k.", markersize=4, label="truth")
-            unit = self.columns[names[place]]
-            axis.set_title(names[place] + (f" ({unit})" if unit else ""), fontsize=9, parse_math=False)
+        for axis, name in zip(panels, chosen, strict=False):
+            self.fan(axis, window, name)
+            unit = self.columns[name]
+            axis.set_title(name + (f" ({unit})" if unit else ""), fontsize=9, parse_math=False)
             axis.tick_params(labelsize=7)
-            if self.dates:
-                axis.xaxis.set_major_locator(locator := AutoDateLocator(maxticks=6))
-                axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
         for axis in panels[len(chosen) :]:
             axis.set_axis_off()
         for axis in panels[max(len(chosen) - across, 0) : len(chosen)]:  # below which there is none
@@ -153,8 +103,112 @@ class PanelForecasts:
         figure.suptitle(f"{self.keys[window][0]} from step {self.keys[window][1]}", fontsize=9, parse_math=False)
         return figure
 
-    def _fan(self, axis: Any, steps: Any, draws: np.ndarray) -> None:
-        for level, shade in ((0.95, 0.15), (0.8, 0.3), (0.5, 0.5)):
-            low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
-            axis.fill_between(steps, low, high, color="C0", alpha=shade, linewidth=0, label=f"{level:.0%}")
-        axis.plot(steps, np.median(draws, 0), "C0", linewidth=1.2, label="median")
+    def fan(self, axis: Axes, window: int, column: str) -> None:
+        """Draws one coordinate of a window on axes of one's own, as `plot` does on its panels."""
+        place = list(self.columns).index(column)
+        observed, horizon = self.past.shape[1], self.draws.shape[2]
+        steps: Any = np.arange(observed + horizon) if self.times is None else _shown(self.times[window], self.dates)
+        before, after, draws = steps[:observed], steps[observed:], self.draws[:, window, :, place]
+        if np.isin(self.draws[..., place], (0, 1)).all():  # no fan, but how many
+            axis.plot(after, draws.mean(0), "C0", linewidth=1.2)
+            axis.set_ylabel("share", fontsize=8)
+            axis.set_ylim(-0.05, 1.05)
+        else:
+            for level, shade in ((0.95, 0.15), (0.8, 0.3), (0.5, 0.5)):
+                low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
+                axis.fill_between(after, low, high, color="C0", alpha=shade, linewidth=0, label=f"{level:.0%}")
+            axis.plot(after, np.median(draws, 0), "C0", linewidth=1.2, label="median")
+        axis.plot(before, self.past[window, :, place], color="0.3", linewidth=1, marker=".", markersize=3)
+        axis.plot(after, self.truth[window, :, place], "k.", markersize=4, label="truth")
+        if self.dates:
+            from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+            axis.xaxis.set_major_locator(locator := AutoDateLocator(maxticks=6))
+            axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+
+
+@dataclass(frozen=True, eq=False)
+class PanelImputed:
+    """Draws of what is missing in windows or sequences.
+
+    Args:
+        draws: (K, N, T, D) of the coordinates, in all of which what was observed is as it was.
+        lacking: (N, T, D), True where a coordinate is missing.
+        columns: coordinate to its unit.
+        keys: (sequence, first step) of each.
+        times: (N, T) of the steps, as in the table; None for steps.
+        dates: whether times are seconds since 1970.
+    """
+
+    draws: np.ndarray
+    lacking: np.ndarray
+    columns: Mapping[str, str]
+    keys: Sequence[tuple[str, int]]
+    times: np.ndarray | None = None
+    dates: bool = False
+
+    def table(self) -> Any:
+        """A pandas frame with a row for each missing entry: mean and quantiles."""
+        import pandas as pd
+
+        window, step, place = np.nonzero(self.lacking)
+        found = _rows(self.keys, window, step)
+        if self.times is not None:
+            found["time"] = _shown(self.times[window, step], self.dates)
+        return pd.DataFrame(found | _columns(self.columns, place) | _quantiles(self.draws[:, window, step, place]))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the table as CSV or Parquet, or the draws and all beside them as npz, whichever the name ends in.
+
+        Raises:
+            ValueError: another ending, or Parquet without pyarrow.
+        """
+        _save(self, path, filled=self.draws, observed=~self.lacking)
+
+
+def _shown(times: np.ndarray, dates: bool) -> Any:
+    import pandas as pd
+
+    return pd.to_datetime(times, unit="s") if dates else times
+
+
+def _rows(keys: Sequence[tuple[str, int]], window: np.ndarray, step: np.ndarray) -> dict[str, Any]:
+    """Sequences and steps by windows and steps in these."""
+    names, first = zip(*keys, strict=True)
+    return {"sequence": np.array(names, object)[window], "step": np.array(first)[window] + step}
+
+
+def _columns(columns: Mapping[str, str], place: np.ndarray) -> dict[str, np.ndarray]:
+    """Names and units of coordinates by their places."""
+    names, units = (np.array(list(each), object) for each in (columns, columns.values()))
+    return {"column": names[place], "unit": units[place]}
+
+
+def _quantiles(draws: np.ndarray) -> dict[str, np.ndarray]:
+    """Mean and quantiles of draws (K, N)."""
+    quantiles = np.quantile(draws, QUANTILES, axis=0)
+    named = {f"q{1000 * level:03.0f}": values for level, values in zip(QUANTILES, quantiles, strict=True)}
+    return {"mean": draws.mean(0, dtype=np.float64), **named}
+
+
+def _save(found: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **arrays: np.ndarray) -> None:
+    """Writes a table, or arrays with what says of which sequences, steps and columns they are."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in FORMATS:
+        raise ValueError(f"{path} ends in none of {', '.join(FORMATS)}")
+    with files.written(path) as file:
+        if suffix == ".csv":
+            table = found.table()
+            if "time" in table and not found.dates:
+                table["time"] = table["time"].map("{:.15g}".format)
+            table.to_csv(file, index=False, float_format="%.9g")
+        elif suffix == ".parquet":
+            try:
+                found.table().to_parquet(file)
+            except ImportError as error:
+                raise ValueError(f"{path} needs pyarrow: pip install 'pyro-dvae[parquet]'") from error
+        else:
+            names, first = zip(*found.keys, strict=True)
+            beside: dict[str, Any] = {"sequence": names, "step": first, "columns": list(found.columns)}
+            beside |= {} if found.times is None else {"times": found.times}
+            np.savez_compressed(file, allow_pickle=False, **arrays, **{n: np.array(own) for n, own in beside.items()})

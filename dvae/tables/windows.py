@@ -9,13 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..data import Sequences, columns_of, gapped, past_of
+from ..inference.held import on_device_of, reproducibly
 from ..program.groups import GROUP
+from ..program.model import DynamicalVAE
 from .encoding import COVARIATES, GAPS, STATICS, PanelSchema, whole
+from .forecasts import PanelForecasts, PanelImputed
 from .panel import Panel
 from .protocol import Cut
 
 GROUPED = 8
 """Windows of a group in a batch for training."""
+AT_ONCE = 64
+"""Windows that are forecast or filled at once."""
 
 
 class PanelWindows:
@@ -140,20 +146,69 @@ class PanelWindows:
         """The listed windows, as `keys` has them."""
         return self._cut(*self._windows)
 
-    def times(self, horizon: int) -> tuple[np.ndarray, bool] | None:
-        """Times (N, O + horizon) of the listed windows, and whether they are dates; None where rows have none.
+    def forecast(self, model: DynamicalVAE, samples: int = 100, seed: int = 0) -> PanelForecasts:
+        """Draws of the futures of the listed windows, each from what it observes and the covariates that are known.
+
+        Args:
+            model: as it was fitted, to the same schema.
+            samples: K, of each window.
+            seed: of the draws.
+
+        Raises:
+            ValueError: whole sequences, which have no future.
+        """
+        observed, horizon = self.protocol.observed, self.protocol.horizon
+        if observed is None or horizon is None:
+            raise ValueError("whole sequences have no future; cut them, with observed and horizon steps, to forecast")
+        batch = self.all()
+        past, known = past_of(batch, observed), gapped(batch).numpy()
+        with reproducibly(model, seed):
+            parts = [
+                model.forecast(on_device_of(model, part), horizon, samples, draw_emission=True)["x"].cpu().numpy()
+                for part in Sequences(past).split(AT_ONCE)
+            ]
+        keys = [(name, start + observed) for _, name, start in self.keys]
+        beside = known[:, :observed], known[:, observed:], columns_of(self), keys
+        return PanelForecasts(np.concatenate(parts, 1), *beside, *self.times(observed + horizon))
+
+    def impute(self, model: DynamicalVAE, samples: int = 100, seed: int = 0) -> PanelImputed:
+        """The listed windows with draws where entries of targets are missing.
+
+        Args:
+            model: as it was fitted, to the same schema.
+            samples: K, fillings of each.
+            seed: of the draws.
+
+        Raises:
+            ValueError: nothing is missing.
+        """
+        batch = self.all()
+        if "mask" not in batch:
+            raise ValueError(f"nothing is missing in {self.panel.name}")
+        with reproducibly(model, seed):
+            parts = [
+                model.impute(on_device_of(model, part), samples, draw=True)["x"].cpu().numpy()
+                for part in Sequences(batch).split(AT_ONCE)
+            ]
+        count, steps = batch["x"].shape[:2]
+        lengths = batch.get("lengths", torch.full((count,), steps))
+        lacking = ~batch["mask"].numpy() & (np.arange(steps) < lengths[:, None].numpy())[..., None]
+        keys = [(name, start) for _, name, start in self.keys]
+        return PanelImputed(np.concatenate(parts, 1), lacking, columns_of(self), keys, *self.times(steps))
+
+    def times(self, steps: int) -> tuple[np.ndarray | None, bool]:
+        """Times (N, steps) from the start of the listed windows, and whether they are dates; None where rows have none.
 
         Behind the end of a sequence they are as far apart as the last two.
         """
-        observed = self.protocol.observed or 0
         found = []
         for place, start in zip(*map(Tensor.tolist, self._windows), strict=True):
             one = self.panel.series[self._ranges[place][0]]
             if one.times is None:
-                return None
-            own = one.times[start : start + observed + horizon]
+                return None, False
+            own = one.times[start : start + steps]
             step = own[-1] - own[-2] if len(own) > 1 else 1.0
-            found.append(np.concatenate([own, own[-1] + step * np.arange(1, observed + horizon - len(own) + 1)]))
+            found.append(np.concatenate([own, own[-1] + step * np.arange(1, steps - len(own) + 1)]))
         return np.stack(found), self.panel.dates
 
     def _listed(self) -> tuple[Tensor, Tensor]:

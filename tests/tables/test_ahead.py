@@ -36,7 +36,7 @@ def test_the_future_is_behind_the_last_target():
         assert windows.keys[n][1:] == (one.name, len(one) - 4)
     assert batch["mask"][:, :4].all()
     assert not batch["mask"][:, 4:].any()
-    times, _ = windows.times(3)
+    times, _ = windows.times(7)
     np.testing.assert_array_equal(times[0], np.arange(8, 15) * 10.0)
 
 

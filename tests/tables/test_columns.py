@@ -146,3 +146,23 @@ def test_dots_in_names_and_classes_are_none_of_keys():
     classes = tuple(f"A{n}.{n}" for n in range(300))
     columns = Columns((Column("a.b.c", family="category", classes=classes),))
     assert Columns.from_toml(columns.to_toml()) == columns
+
+
+def test_a_column_is_corrected_alone_and_where_it_stands():
+    sky = Column("sky", family="category", classes=("clear", "rain"))
+    columns = Columns((sky, Column("riders"), Column("plan", "known")), ("station",), "day")
+    found = columns.but("riders", family="count", unit="people").but("sky", role="known")
+    assert found.columns[1:] == (Column("riders", family="count", unit="people"), Column("plan", "known"))
+    assert found.columns[0].classes == sky.classes
+    assert (found.id, found.time) == (columns.id, columns.time)
+    assert columns.but("sky", family="binary").columns[0] == Column("sky", family="binary")
+    assert columns.without("plan", "sky").names == ["riders"]
+    for wrong, said in [
+        (lambda: columns.but("ridrs", unit="people"), r"no column 'ridrs' \(did you mean 'riders'\?\)"),
+        (lambda: columns.but("riders", family="cout"), r"family 'cout' \(did you mean 'count'\?\)"),
+        (lambda: columns.but("riders", family="category"), "is of family 'category' and has 0 classes"),
+        (lambda: columns.without("sky", "riders"), "no column is a target"),
+        (lambda: columns.without("pln"), r"no column 'pln' \(did you mean 'plan'\?\)"),
+    ]:
+        with pytest.raises(ValueError, match=said):
+            wrong()

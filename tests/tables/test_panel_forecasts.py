@@ -1,24 +1,21 @@
 """Every method of the family on a table of several kinds of columns, and what is written of its forecasts."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 import dvae
-from dvae.cli.tables import drawn, scores
 from dvae.data import past_of
 from dvae.inference.checkpoints import CheckpointError
 from dvae.models.registry import methods
 from dvae.runs import directory as runs
 from dvae.tables import Column, Columns, Panel
-from dvae.tables.ahead import ahead
 from dvae.tables.dataset import PanelData
-from dvae.tables.encoding import PanelSchema
 from dvae.tables.forecasts import QUANTILES, PanelForecasts
 from dvae.tables.protocol import Cut
+from dvae.tables.scoring import panel_scores
 
 pd = pytest.importorskip("pandas")
 
@@ -137,7 +134,7 @@ def test_a_run_is_fitted_loaded_resumed_and_refused_where_it_was_tampered_with(d
     assert loaded.data.fingerprint == data.fingerprint
     assert runs.resume(out, steps=4, progress=False).step == 4
     test = loaded.data.windows("test")
-    result = dvae.evaluate({"vrnn": loaded.model}, test, samples=2, scores=scores)
+    result = dvae.evaluate({"vrnn": loaded.model}, test, samples=2, scores=panel_scores)
     assert {"CRPS", "CRPS, riders"} <= result["vrnn"].keys()
     config = json.loads((out / "config.json").read_text())
     for change in (
@@ -243,18 +240,84 @@ def test_fans_hold_the_quantiles():
         found.plot(columns=["opn"])
 
 
+@pytest.fixture(scope="module")
+def model(data):
+    return dvae.method("dkf", **SMALL).build(data.schema).eval()
+
+
 def test_draws_beyond_the_end_are_of_the_last_window_and_of_the_seed():
-    told = replace(TOLD, columns=tuple(each for each in TOLD.columns if each.role != "known"))
-    panel = Panel.of(frame(), told)
-    schema = PanelSchema.under(panel, Cut(5, 3))
-    model = dvae.method("dkf", **SMALL).build(schema).eval()
-    loaded = runs.Loaded(None, None, model)
-    one, other, third = (drawn(loaded, ahead(panel, schema, 4), 6, seed) for seed in (1, 1, 2))
+    told = TOLD.without("plan")
+    ours = PanelData.of(frame(), told, Cut(5, 3))
+    model = dvae.method("dkf", **SMALL).build(ours.schema).train()
+    one, other, third = (ours.ahead(4).forecast(model, 6, seed) for seed in (1, 1, 2))
+    assert model.training
     np.testing.assert_array_equal(one.draws, other.draws)
     assert (one.draws != third.draws).any()
     assert one.draws.shape == (6, 6, 4, 7)
     assert np.isnan(one.truth).all()
-    for (name, step), sequence in zip(one.keys, panel, strict=True):
+    for (name, step), sequence in zip(one.keys, ours.panel, strict=True):
         lacking = np.isnan(sequence.values[:, :5]).all(1)
         assert (name, step) == (sequence.name, len(lacking) - np.argmin(lacking[::-1]))
     np.testing.assert_allclose(one.times[:, 5] - one.times[:, 4], 1)
+
+
+def test_other_data_and_other_cuts_keep_the_units_that_models_know(data):
+    longer = frame(t=20)
+    longer["plan"] = 1000 * longer["plan"]
+    there = data.on(longer)
+    assert there.schema == data.schema
+    assert PanelData.of(longer, TOLD, data.protocol).schema != data.schema
+    np.testing.assert_array_equal(there.panel.series[0].values, Panel.of(longer, TOLD).series[0].values)
+    recut = data.recut(horizon=2)
+    assert (recut.schema.means, recut.schema.scales) == (data.schema.means, data.schema.scales)
+    assert recut.windows("test").all()["x"].shape[1] == 7
+    assert [one.name for one in data.only(["s3", "s1"]).panel] == ["s3", "s1"]
+
+
+def test_forecasts_are_what_the_model_draws(data, model):
+    test = data.windows("test")
+    found, batch = test.forecast(model, 4, seed=3), test.all()
+    torch.manual_seed(3)
+    draws = model.forecast(past_of(batch, 5), 3, samples=4, draw_emission=True)["x"]
+    np.testing.assert_array_equal(found.draws, draws)
+    np.testing.assert_array_equal(np.isnan(found.past), ~batch["mask"][:, :5])
+    assert found.keys == [(name, start + 5) for _, name, start in test.keys]
+    assert list(found.columns.values()) == ["people", "°C", "", "", "", "", ""]
+    with pytest.raises(ValueError, match="whole sequences have no future; cut them"):
+        data.whole().forecast(model)
+
+
+def test_every_missing_entry_of_a_table_is_filled(data, model, tmp_path):
+    whole = data.whole()
+    found, batch = whole.impute(model, 5), whole.all()
+    np.testing.assert_array_equal(found.lacking, ~batch["mask"])
+    for draw in found.draws:
+        np.testing.assert_array_equal(draw[~found.lacking], batch["x"][batch["mask"]])
+    table = found.table()
+    assert len(table) == found.lacking.sum() == sum(np.isnan(data.schema.targets(one)).sum() for one in data.panel)
+    series = {one.name: one for one in data.panel}
+    for _, row in table.iterrows():
+        one, place = series[row["sequence"]], data.schema.coordinates.index(row["column"])
+        assert np.isnan(data.schema.targets(one)[row["step"], place])
+        assert row["time"] == one.times[row["step"]]
+        assert row["q025"] <= row["q500"] <= row["q975"]
+    found.save(tmp_path / "a.csv")
+    assert len(pd.read_csv(tmp_path / "a.csv")) == len(table)
+    found.save(tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as held:
+        np.testing.assert_array_equal(held["filled"], found.draws)
+        np.testing.assert_array_equal(held["observed"], batch["mask"])
+
+
+def test_padding_is_not_filled(model, data):
+    ragged = frame().drop(index=[10, 11, 12, 13]).reset_index(drop=True)
+    found = data.on(ragged).whole().impute(model, 2)
+    assert not found.lacking[0, 10:].any()
+    assert found.lacking[0, :10].any()
+
+
+def test_nothing_is_filled_where_nothing_is_missing():
+    full = PanelData.of(np.random.default_rng(0).normal(size=(6, 12, 1)), ["y"], Cut(5, 3))
+    model = dvae.method("autoregressive").build(full.schema)
+    with pytest.raises(ValueError, match="nothing is missing in panel"):
+        full.whole().impute(model)
