@@ -72,8 +72,15 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
         """What else a record is to say of the data, in JSON's types, nothing of it being required.
 
         "title" lists phrases for titles; "columns" {name: unit} names the coordinates of x, in their order, in units
-        that tables print, "" for none; "season" is a period of the data, in frames, for a reference row.
+        that tables print, "" for none; "season" is a period of the data, in frames, for a reference row; "called" is
+        what a clip and a frame are called in tables, such as ["sequence", "step"].
         """
+
+
+def called(said: Mapping[str, Any]) -> tuple[str, str]:
+    """What a clip and a frame are called, by what windows say of themselves."""
+    clip, frame = said.get("called", ("clip", "frame"))
+    return clip, frame
 
 
 def columns_of(windows: HeldOutWindows) -> Mapping[str, str]:

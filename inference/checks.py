@@ -17,7 +17,7 @@ import torch
 from rich.text import Text
 from torch import Tensor
 
-from ..data import HeldOutWindows, gapped, mean_of_known, past_of
+from ..data import HeldOutWindows, called, gapped, mean_of_known, past_of
 from ..program.batch import repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
@@ -152,7 +152,7 @@ class Check:
 
 _SEAM = 2  # observed frames that are joined to a forecast, so that a jump counts
 PROGRAMS = {
-    "forecast": "free-running given the observed frames",
+    "forecast": "free-running given what was observed",
     "posterior": "free-running given latents inferred from the whole window",
 }
 
@@ -312,6 +312,7 @@ def predictive_checks(
         require_likelihood(each)
     held = hold(windows)
     truth = gapped(held.batch)
+    _, frame = called(windows.description)
     firsts = {"forecast": held.observed - min(_SEAM, held.observed), "posterior": 0}
     checks = {}
     with progress_bar(progress) as bar:
@@ -332,9 +333,8 @@ def predictive_checks(
                 for name, statistic in statistics.items():
                     values, replicated = real[name], torch.cat([part[name] for part in parts], 1)
                     kept = told[name]
-                    checks[label, program, name] = Check(
-                        values[kept].numpy(), replicated[:, kept].numpy(), statistic.unit
-                    )
+                    unit = statistic.unit.replace("frame", frame)
+                    checks[label, program, name] = Check(values[kept].numpy(), replicated[:, kept].numpy(), unit)
     return PredictiveChecks(
         checks={(m, p, s): checks[m, p, s] for m in models for p in firsts for s in statistics},
         data=held.description(),

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, HeldOutWindows, Listed, each, leaves, sequences
+from ..data import Batch, HeldOutWindows, Listed, called, each, leaves, sequences
 from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import require_likelihood
@@ -152,6 +152,7 @@ def compare(
             "sequences": len(keys),
             "frames": x.shape[1],
             "coordinates": x.shape[2],
+            **({"called": list(called(windows.description))} if windows and "called" in windows.description else {}),
         },
         protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
         particles=particles,

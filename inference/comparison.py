@@ -36,11 +36,12 @@ from rich.console import Group
 from scipy import special
 from typing_extensions import override
 
+from ..data import called
 from ..options import nearest
 from .bounds import KHAT_PARTICLES
 from .held import clip_places, plain
 from .result import Result, Table, as_they_are, canvas
-from .uncertainty import clustered_variance, linearised, student_interval
+from .uncertainty import clustered_variance, decimals, linearised, student_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -105,9 +106,8 @@ class Estimate:
         return (self.sequences, self.seeds, self.total)[place], self.freedom[place]
 
     def __str__(self) -> str:
-        known = [error for error in (self.sequences, self.seeds) if error > 0]
-        decimals = 4 if known and min(known) < 0.001 else 3
-        return " ± ".join(_number(value, decimals) for value in (self.mean, self.sequences, self.seeds))
+        places = decimals(self.mean, self.sequences, self.seeds)
+        return " ± ".join(_number(value, places) for value in (self.mean, self.sequences, self.seeds))
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +266,8 @@ class Comparison(Result):
                 panel.plot(estimate.mean, place, "o", markersize=5, color=colours[name], label=labels[name])
             panel.set_ylim(len(ranking) - 0.5, -0.5)
             panel.set_yticks(range(len(ranking)), labels.values(), parse_math=False)
-            panel.set_xlabel("nats a frame (95 %, thick: over sequences, thin: over seeds too)", fontsize=9)
+            each, _, frame = self._words
+            panel.set_xlabel(f"nats a {frame} (95 %, thick: over {each}s, thin: over seeds too)", fontsize=9)
             panel.grid(axis="x", alpha=0.3)
         panels[0].set_title(f"importance-weighted bound ↑ (K = {self.particles})")
         panels[1].set_title(f"difference to {ranking[0]}", parse_math=False)
@@ -414,18 +415,24 @@ class Comparison(Result):
 
     # Tables
 
+    @property
+    def _words(self) -> tuple[str, str, str]:
+        """What is scored, what it is cut from, and what it consists of."""
+        return ("window", *called(self.data)) if "called" in self.data else ("sequence", *called(self.data))
+
     def _title(self) -> str:
-        clips = len(set(self._clips))
-        parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} sequences of {clips} clips"]
+        each, clip, _ = self._words
+        parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} {each}s of {len(set(self._clips))} {clip}s"]
         parts += [f"seed {self.seed}"]
         parts += [f"data {self.data['fingerprint'][:12]}"] if "fingerprint" in self.data else []
         return " · ".join(part for part in parts if part)
 
     def _bound_table(self) -> Table:
+        each, clip, frame = self._words
         bounds = (f"importance bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
         table = _table(
-            f"{self._title()}\nteacher-forced, nats a frame",
-            "mean ± standard error over sequences (clustered by clip) ± over seeds\n"
+            f"{self._title()}\nteacher-forced, nats a {frame}",
+            f"mean ± standard error over {each}s (clustered by {clip}) ± over seeds\n"
             "95 %: from both, by Student's t, in brackets its degrees of freedom",
             ("seeds", *bounds, f"k-hat\n> {KHAT}"),
         )
@@ -444,7 +451,7 @@ class Comparison(Result):
         table = _table(
             "latents under the guide, teacher-forced",
             f"active: variance of the posterior mean over data above {ACTIVE}\ninformation {limit}",
-            ("latent", "KL\nnats a frame", "active\nunits", "information\nnats"),
+            ("latent", f"KL\nnats a {self._words[2]}", "active\nunits", "information\nnats"),
         )
         for name in self.ranking:
             row, scores = self.rows[name], self[name]
@@ -472,7 +479,9 @@ class Comparison(Result):
     def _free_running_table(self) -> Table:
         table = _table(
             f"free-running, K = {self.samples}, {self.emission} emission",
-            "\n".join(["mean ± standard error over windows (clustered by clip) ± over seeds", *self.notes]),
+            "\n".join(
+                [f"mean ± standard error over windows (clustered by {self._words[1]}) ± over seeds", *self.notes]
+            ),
             [f"{metric} ↓{f' ({unit})' if unit else ''}" for metric, unit in self.shown.items()],
         )
         for name in self.ranking:
@@ -537,8 +546,8 @@ class Crossed:
         return Estimate(mean, math.sqrt(over), math.sqrt(between), math.sqrt(total), freedom)
 
 
-def _number(value: float, decimals: int = 3) -> str:
-    return "–" if math.isnan(value) else f"{round(value, decimals) + 0.0:.{decimals}f}"  # no minus before a zero
+def _number(value: float, places: int = 3) -> str:
+    return "–" if math.isnan(value) else f"{round(value, places) + 0.0:.{places}f}"  # no minus before a zero
 
 
 def _interval(estimate: Estimate) -> str:

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..data import HeldOutWindows, columns_of
+from ..data import HeldOutWindows, called, columns_of
 from ..program.model import DynamicalVAE
 from ..program.protocols import Forecasting
 from ..turns import alone
@@ -257,8 +257,13 @@ class _Judge:
         """How the scores that rows have are read, in the order of the table."""
         found = {name for row in rows.values() for name in row.clip_means}
         latents = sorted(name for name in found if name.startswith("KL "))
-        order = {measure.name: measure.metric for measure in self.measures} | {"log score": LOG_SCORE} | TEACHER_FORCED
-        return {name: metric for name, metric in (order | dict.fromkeys(latents, KL)).items() if name in found}
+        _, frame = called(self.held.windows.description)
+        bounds = {"log score": LOG_SCORE, **TEACHER_FORCED, **dict.fromkeys(latents, KL)}
+        order = {measure.name: measure.metric for measure in self.measures}
+        order |= {
+            name: dataclasses.replace(each, unit=each.unit.replace("frame", frame)) for name, each in bounds.items()
+        }
+        return {name: metric for name, metric in order.items() if name in found}
 
     def _means(self, scores: dict[str, Tensor]) -> dict[str, tuple[float, ...]]:
         return {name: tuple(clip_means(values, self.held.places)) for name, values in scores.items()}

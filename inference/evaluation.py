@@ -13,13 +13,14 @@ import numpy as np
 from rich.text import Text
 from typing_extensions import override
 
+from ..data import called
 from ..options import nearest
 from .calibration import envelope
 from .held import plain
 from .references import multimodal_note
 from .result import Result, Table, canvas
 from .scores import Metric
-from .uncertainty import clustered_variance, effective_number, linearised, student_interval
+from .uncertainty import clustered_variance, decimals, effective_number, linearised, student_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,13 +49,11 @@ class Score:
         return student_interval(self.mean, self.standard_error, self.freedom, level)
 
     def __str__(self) -> str:
-        # Three decimals as in the papers, a fourth where the error needs it.
         if math.isnan(self.mean):
             return "–"
-        if not self.standard_error > 0:
-            return f"{self.mean:.3f}"
-        decimals = 4 if self.standard_error < 0.001 else 3
-        return f"{self.mean:.{decimals}f} ± {self.standard_error:.{decimals}f}"
+        places = decimals(self.mean, self.standard_error)
+        error = f" ± {self.standard_error:.{places}f}" if self.standard_error > 0 else ""
+        return f"{self.mean:.{places}f}{error}"
 
 
 @dataclass(frozen=True)
@@ -310,11 +309,12 @@ class Evaluation(Result):
 
     def _caption(self) -> str:
         freedom = f"{len(self.clips) - 1} degrees of freedom"
-        return "\n".join([f"mean ± standard error over windows, clustered by clip ({freedom})", *self.notes])
+        clip, _ = called(self.data)
+        return "\n".join([f"mean ± standard error over windows, clustered by {clip} ({freedom})", *self.notes])
 
     def _title(self) -> str:
         name = str(self.protocol.get("name", ""))
-        parts = [name, f"{self.data['windows']} windows of {len(self.clips)} clips"]
+        parts = [name, f"{self.data['windows']} windows of {len(self.clips)} {called(self.data)[0]}s"]
         parts += self.data.get("title", [])
         parts += [f"{name} {value}" for name, value in self.options.items()]
         parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, HeldOutWindows, each, gapped, mask_of, past_of
+from ..data import Batch, HeldOutWindows, called, each, gapped, mask_of, past_of
 from ..program.batch import rows
 from ..program.conditional import evaluating
 
@@ -107,9 +107,10 @@ def hold(windows: HeldOutWindows) -> Held:
     if held.mask is not None:
         for what, mask in (("past", held.mask[:, :observed]), ("future", held.mask[:, observed:])):
             if (empty := ~mask.flatten(1).any(1)).any():
-                split, clip, start = held.keys[int(empty.nonzero()[0])]
+                split, name, start = held.keys[int(empty.nonzero()[0])]
+                clip, frame = called(windows.description)
                 raise ValueError(
-                    f"nothing was observed in the {what} of the window at frame {start} of clip {clip!r} ({split}); "
+                    f"nothing was observed in the {what} of the window at {frame} {start} of {clip} {name!r} ({split}); "
                     "leave it out"
                 )
     return held

@@ -41,6 +41,16 @@ def effective_number(shares: np.ndarray, deviations: np.ndarray, most: float) ->
     return int(max(1.0, min(most, 1 / size if size else math.inf)))
 
 
+def decimals(mean: float, *errors: float) -> int:
+    """Of a mean and its errors in print: three as in the papers, a fourth where an error needs it, fewer where large.
+
+    From 1000 on, or with an error from 10 on, a decimal less for each further digit before the point.
+    """
+    known = [error for error in errors if 0 < error < math.inf]
+    largest = max([abs(mean) / 100, *known, 1.0] if math.isfinite(mean) else [1.0])
+    return max((4 if known and min(known) < 0.001 else 3) - math.floor(math.log10(largest)), 0)
+
+
 def student_interval(mean: float, error: float, freedom: float, level: float = 0.95) -> tuple[float, float]:
     """Two-sided interval of Student's t for a mean with a standard error of so many degrees of freedom.
 

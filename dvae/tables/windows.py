@@ -105,7 +105,7 @@ class PanelWindows:
     def description(self) -> dict[str, Any]:
         """Columns with their units, for the record."""
         columns = {name: column.unit for column in self.schema.columns.targets for name in column.coordinates}
-        return {"columns": columns, "title": [self.panel.name, self.split]}
+        return {"columns": columns, "called": ["sequence", "step"], "title": [self.panel.name, self.split]}
 
     @property
     def fingerprint(self) -> str:

@@ -1,6 +1,7 @@
 """The command line on a table that nobody prepared."""
 
 import json
+import re
 from dataclasses import fields
 
 import numpy as np
@@ -33,6 +34,9 @@ TOLD += [
     "--split",
     "sequence",
 ]
+
+
+OF_MOTION = re.compile(r".*\b(?:clips?|frames?)\b.*")
 
 
 def frame(t=20, future=0):
@@ -116,7 +120,10 @@ def test_five_commands_on_a_file_that_nobody_prepared(table, capsys, tmp_path):
     assert main(["fit", "dkf", "--out", str(run), "--data", str(path), *SMALL, *LATENT]) == 0
     assert f"dvae evaluate {run}" in capsys.readouterr().out
     assert main(["evaluate", str(run), "--samples", "3", "--figure", str(tmp_path / "scores.png")]) == 0
-    assert "CRPS, riders" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "CRPS, riders" in printed
+    assert "(nats/step)" in printed
+    assert not OF_MOTION.findall(printed)
     assert "rows" in json.loads((run / "evaluation.json").read_text())
     out, fans = tmp_path / "futures.csv", tmp_path / "fans.png"
     assert main(["forecast", str(run), "--out", str(out), "--figure", str(fans)]) == 0
@@ -192,8 +199,11 @@ def test_runs_are_compared_criticised_resumed_and_swept(tabled, table, tmp_path,
     assert main(["compare", *both, *few, "--out", str(tmp_path / "a.json")]) == 0
     assert {*json.loads((tmp_path / "a.json").read_text())["rows"]} == {"vae", "autoregressive"}
     assert main(["criticise", both[1], "--samples", "19"]) == 0
-    error = capsys.readouterr().err
-    assert "no calibration" in error
+    said = capsys.readouterr()
+    assert "no calibration" in said.err
+    assert "windows of 2 sequences" in said.out
+    assert "correlation length (steps)" in said.out
+    assert not OF_MOTION.findall(said.out)
     assert main(["resume", both[0], "--steps", "3"]) == 0
     out = str(tmp_path / "sweep")
     assert main(["sweep", "autoregressive", "--out", out, "--seeds", "0", "--data", str(table), *SMALL, *TOLD]) == 0

@@ -415,6 +415,10 @@ def test_table_and_plot_show_every_method_and_metric(model):
         (Score(0.0, 0.0), "0.000"),
         (Score(1.25, math.nan), "1.250"),
         (Score(math.nan, math.nan), "–"),
+        (Score(999.12345, 9.98765), "999.123 ± 9.988"),
+        (Score(2181.7243, 411.0123), "2181.7 ± 411.0"),
+        (Score(-12345.678, math.nan), "-12345.7"),
+        (Score(1234567.891, 12345.678), "1234568 ± 12346"),
     ],
 )
 def test_scores_print_as_in_the_papers(score, text):
