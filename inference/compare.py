@@ -161,6 +161,7 @@ def compare(
         emission=emission,
         seed=seed,
         shown={measure.name: measure.unit for measure in measures if measure.headline},
+        better={measure.name: measure.better for measure in measures if measure.headline},
         notes=list(dict.fromkeys(measure.note for measure in measures if measure.headline and measure.note)),
     )
 

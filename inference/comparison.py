@@ -39,6 +39,7 @@ from typing_extensions import override
 from ..data import called
 from ..options import nearest
 from .bounds import KHAT_PARTICLES
+from .evaluation import ARROWS
 from .held import clip_places, plain
 from .result import Result, Table, as_they_are, canvas
 from .uncertainty import clustered_variance, decimals, linearised, student_interval
@@ -49,6 +50,9 @@ if TYPE_CHECKING:
 
 ACTIVE = 0.01
 """Variance over the data above which the posterior mean of a latent's coordinate counts as active (Burda et al.)."""
+
+ACROSS = 6
+"""Scores that have room side by side; more stand below each other."""
 
 KHAT = 0.7
 """Pareto shape above which an importance-weighted bound is unreliable (Vehtari et al.)."""
@@ -178,6 +182,7 @@ class Comparison(Result):
         seed: of every model's draws.
         shown: free-running score to its unit, those of the table.
         notes: lines below that table on how scores are to be read.
+        better: by score of that table, "lower", "higher" or "".
 
     Example:
         >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
@@ -199,6 +204,7 @@ class Comparison(Result):
     seed: int
     shown: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    better: dict[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> dict[str, Estimate]:
         row = self._row(name)
@@ -477,15 +483,22 @@ class Comparison(Result):
         return f"{_number((weights * steps).sum() / weights.sum())} a step"
 
     def _free_running_table(self) -> Table:
+        scores = {name: self[name] for name in self.ranking}
+        lines = [["", *scores]]
+        for metric, unit in self.shown.items():
+            label = metric + ARROWS[self.better.get(metric, "lower")] + (f" ({unit})" if unit else "")
+            lines.append([label, *(str(score[metric]) for score in scores.values())])
+        if len(self.shown) <= ACROSS:
+            lines = [list(line) for line in zip(*lines, strict=True)]
         table = _table(
             f"free-running, K = {self.samples}, {self.emission} emission",
             "\n".join(
                 [f"mean ± standard error over windows (clustered by {self._words[1]}) ± over seeds", *self.notes]
             ),
-            [f"{metric} ↓{f' ({unit})' if unit else ''}" for metric, unit in self.shown.items()],
+            lines[0][1:],
         )
-        for name in self.ranking:
-            table.add_row(name, *(str(self[name][metric]) for metric in self.shown))
+        for line in lines[1:]:
+            table.add_row(*line)
         return table
 
 

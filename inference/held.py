@@ -110,8 +110,8 @@ def hold(windows: HeldOutWindows) -> Held:
                 split, name, start = held.keys[int(empty.nonzero()[0])]
                 clip, frame = called(windows.description)
                 raise ValueError(
-                    f"nothing was observed in the {what} of the window at {frame} {start} of {clip} {name!r} ({split}); "
-                    "leave it out"
+                    f"nothing was observed in the {what} of the window at {frame} {start} of {clip} {name!r} "
+                    f"({split}); leave it out"
                 )
     return held
 

@@ -143,12 +143,32 @@ CRPS = Measure("CRPS", paired(metrics.continuous_ranked_probability_score), head
 def proper(windows: HeldOutWindows) -> list[Measure]:
     """Proper scoring rules: of the future as one vector, of dependence between coordinates, of each number alone.
 
-    In the unit of the columns, if windows name them and they share one.
+    In the unit of the columns, if windows name them and they share one; else, where windows tell the scales of columns,
+    of numbers in these, which have no unit. A single column has no dependence to score.
     """
+    columns = columns_of(windows)
+    alone = (len(columns) or windows.all()["x"].shape[-1]) == 1
+    return [_of_all(measure, windows) for measure in (ENERGY, VARIOGRAM, CRPS) if not (alone and measure is VARIOGRAM)]
+
+
+def _of_all(measure: Measure, windows: HeldOutWindows) -> Measure:
+    """A score in the unit of the data, of all columns together."""
     units = dict.fromkeys(columns_of(windows).values())
+    scales = windows.description.get("scales")
+    if scales and len(columns_of(windows)) > 1 and (len(units) > 1 or "" in units):
+        note = "scores of all columns together are of numbers in the scales of their columns, in the training data"
+        return replace(measure, function=_in_scales(measure.function, scales), unit="scales", note=note)
     mixed = f"scores without a unit mix numbers in {', '.join(unit or '1' for unit in units)}; by_column has them apart"
     shared: dict[str, Any] = {"note": mixed} if len(units) > 1 else {"unit": next(iter(units), "")}
-    return [replace(measure, **shared) for measure in (ENERGY, VARIOGRAM, CRPS)]
+    return replace(measure, **shared)
+
+
+def _in_scales(function: Callable[..., Tensor], scales: Sequence[float]) -> Callable[..., Tensor]:
+    def scaled(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        by = torch.tensor(scales).to(truth)
+        return function(forecasts / by, truth / by, {**past, "x": past["x"] / by}, index)
+
+    return scaled
 
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
@@ -197,9 +217,8 @@ def calibrated(windows: HeldOutWindows) -> list[Measure]:
     Coverage at 50, 80, 90 and 95 %, width of the intervals of 90 %, mean and variance of the PIT, and its histogram,
     for `Evaluation.plot_calibration`. Coverage at 95 % needs 39 forecasts of a window.
     """
-    found = proper(windows)
-    width = replace(width_at(0.9), unit=found[0].unit, note=found[0].note)
-    return [*found, *map(coverage_at, LEVELS), width, PIT_MEAN, PIT_VARIANCE, PIT]
+    width = _of_all(width_at(0.9), windows)
+    return [*proper(windows), *map(coverage_at, LEVELS), width, PIT_MEAN, PIT_VARIANCE, PIT]
 
 
 def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:

@@ -18,7 +18,6 @@ from ..inference.checkpoints import CheckpointError, Run
 from ..inference.checks import STATISTICS, predictive_checks
 from ..inference.compare import compare as compare_models
 from ..inference.evaluate import evaluate as evaluate_models
-from ..inference.scores import proper
 from ..models.trajectories import TrajectoryModel
 from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
@@ -349,7 +348,7 @@ def compare(
 def _compared(first: runs.Loaded, opened: Any, stride: int | None) -> tuple[Any, Any]:
     """Test windows, so far apart, and what forecasts of them are scored by."""
     if first.config.kind == "panel":
-        return tables.windows(first, opened, stride=stride), proper
+        return tables.windows(first, opened, stride=stride), panel_scores
     protocol = opened.protocol if stride is None else replace(opened.protocol, test_stride=stride)
     return motion.windows(opened.motion, protocol, "test"), motion.scores
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ..data import HeldOutWindows, columns_of
 from ..inference.scores import CRPS, Measure, by_column, calibrated
 
@@ -12,7 +14,8 @@ FEW = 12
 def panel_scores(windows: HeldOutWindows) -> list[Measure]:
     """Proper scores and calibration, and the CRPS of each column in its unit where there are a few.
 
-    What the command line prints; of `dvae.evaluate(model, windows, scores=dvae.tables.panel_scores)`.
+    What the command line prints: `dvae.evaluate(model, windows, scores=dvae.tables.panel_scores)`.
     """
     columns = columns_of(windows)
-    return [*calibrated(windows), *(by_column(CRPS, columns) if 1 < len(columns) <= FEW else [])]
+    found = [*calibrated(windows), *(by_column(CRPS, columns) if 1 < len(columns) <= FEW else [])]
+    return [replace(measure, headline=True) for measure in found]

@@ -103,9 +103,11 @@ class PanelWindows:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Columns with their units, for the record."""
+        """Columns with their units and scales, for the record."""
         columns = {name: column.unit for column in self.schema.columns.targets for name in column.coordinates}
-        return {"columns": columns, "called": ["sequence", "step"], "title": [self.panel.name, self.split]}
+        scales = [coordinate.scale for coordinate in self.schema.units["x"]]
+        said = {"columns": columns, "scales": scales, "called": ["sequence", "step"]}
+        return {**said, "title": [self.panel.name, self.split]}
 
     @property
     def fingerprint(self) -> str:
