@@ -27,7 +27,7 @@ from ..models.trajectories import TrajectoryMethod
 from ..motion.dataset import SIMULATED
 from ..motion.protocols import Representation
 from ..motion.segments.dataset import Segmentation
-from ..options import Amount
+from ..options import Amount, Share
 from ..runs import directory as runs
 from ..runs.kinds import DATA
 from ..runs.sweep import sweep as sweep_methods
@@ -106,6 +106,8 @@ class DataOptions:
         horizon: of a table: steps to forecast.
         stride: of a table: steps from one test window to the next.
         split: of a table: what is divided into training, validation and test.
+        validation: of a table: share by which weights are chosen.
+        test: of a table: share to be judged on.
     """
 
     data: str = SIMULATED
@@ -128,6 +130,8 @@ class DataOptions:
     horizon: int | None = None
     stride: int | None = None
     split: Literal["sequence", "time", "group"] | None = None
+    validation: Share | None = None
+    test: Share | None = None
 
     def open(self, *methods: Trainable) -> Any:
         """The data on which methods are fitted, of one kind.
@@ -140,12 +144,12 @@ class DataOptions:
             said = " and ".join(f"{name} on {kind}" for kind, name in kinds.items())
             raise UsageError(f"methods are fitted on data of their kind, {said}; give those of one kind")
         ((kind, name),) = kinds.items()
-        if kind == "motion" and (is_table(self.data) or any(getattr(self, each) for each in OF_KINDS["panel"])):
+        given = {option: value for option, value in vars(self).items() if value != getattr(DataOptions, option)}
+        told = [option for option in OF_KINDS["panel"] if option in given]
+        if kind == "motion" and (is_table(self.data) or told):
             kind = "panel"
             if self.data == SIMULATED:
-                told = next(each for each in OF_KINDS["panel"] if getattr(self, each))
-                raise UsageError(f"--{told} is about tables; name one by --data")
-        given = {option: value for option, value in vars(self).items() if value != getattr(DataOptions, option)}
+                raise UsageError(f"--{told[0]} is about tables; name one by --data")
         for other, options in OF_KINDS.items():
             if other != kind and (strange := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
                 raise UsageError(
@@ -162,7 +166,7 @@ OF_KINDS = {
     "segments": ("cut", "scaling", "warped", "bodies", "skip_bad"),
     "panel": (
         *("columns", "covariates", "past", "attributes", "id", "time", "group"),
-        *("observed", "horizon", "stride", "split"),
+        *("observed", "horizon", "stride", "split", "validation", "test"),
     ),
 }
 """Options by the kind of data that has them."""

@@ -11,12 +11,17 @@ and how sequences are divided and cut:
 
 from __future__ import annotations
 
+import codecs
 import csv
 import math
 import os
+import re
 import warnings
 import zipfile
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, fields
+from functools import partial
 from io import BytesIO, StringIO
 from itertools import takewhile
 from pathlib import Path
@@ -32,7 +37,9 @@ from .panel import Panel
 from .proposing import Told
 from .protocol import Cut
 
-SEPARATORS = {".csv": ",", ".tsv": "\t"}
+SEPARATORS = {".csv": ",;\t", ".tsv": "\t"}
+"""What may stand between entries, the likeliest first: spreadsheets write what their country does."""
+DECIMAL_COMMA = re.compile(r"(?:^|[;\t])\s*[-+]?\d+,\d+\s*(?:[;\t]|$)", re.MULTILINE)
 SUFFIXES = (*SEPARATORS, ".parquet", ".npz")
 LARGEST = 2 * 10**9
 """Bytes of a file, or of what it holds."""
@@ -65,24 +72,48 @@ def read_frame(path: str | os.PathLike[str]) -> Any:
         raise ValueError(f"{place} cannot be read as {suffix[1:].upper()}: {str(error)[:300]}") from error
 
 
-def _separated(content: bytes, separator: str) -> Any:
+def _separated(content: bytes, separators: str) -> Any:
     """The frame of a CSV, of whose rows none is longer than the header."""
     import pandas as pd
 
-    head = StringIO(content[:LARGEST_HEADER].decode("utf-8-sig", "replace"), newline=None)
-    if max(map(len, csv.reader(head, delimiter=separator)), default=0) > MOST:
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        content = content.decode("utf-16").encode()
+    content = content.removeprefix(codecs.BOM_UTF8)
+    head = content[:LARGEST_HEADER].decode("utf-8", "replace")
+    separator = max(separators, key=lambda each: len(_header(head, each)))
+    if max(map(len, _rows(head, separator)), default=0) > MOST:
         raise ValueError(f"it has more than {MOST} columns")
     if b"\0" in content:
         raise ValueError("it has bytes of 0, which are no text")
+    point = "," if separator != "," and DECIMAL_COMMA.search(head) else "."
+    read = partial(pd.read_csv, sep=separator, decimal=point, index_col=False, low_memory=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
-            frame = pd.read_csv(
-                BytesIO(content), sep=separator, index_col=False, low_memory=False, skiprows=_comments(content)
-            )
+            return read(BytesIO(content), skiprows=_comments(content))
         except pd.errors.ParserWarning as error:
             raise ValueError("some of its rows have more entries than its header") from error
-    return frame
+        except UnicodeDecodeError as error:
+            try:
+                content.decode()
+            except UnicodeDecodeError as where:
+                line = content.count(b"\n", 0, where.start) + 1
+                raise ValueError(
+                    f"line {line} is no UTF-8, but perhaps Latin-1; save it as UTF-8, as a spreadsheet can, or "
+                    "`iconv -f latin1 -t utf-8`"
+                ) from error
+            raise
+
+
+def _rows(head: str, separator: str) -> Iterator[list[str]]:
+    return csv.reader(StringIO(head, newline=None), delimiter=separator)
+
+
+def _header(head: str, separator: str) -> list[str]:
+    """The first row that is neither empty nor a comment."""
+    with suppress(csv.Error):  # of a field that has no end, where this is no separator
+        return next((row for row in _rows(head, separator) if row and not row[0].lstrip().startswith("#")), [])
+    return []
 
 
 def _comments(content: bytes) -> int:

@@ -113,6 +113,13 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     )
 
 
+def test_shares_are_told_on_the_command_line(table):
+    shares = DataOptions(data=str(table), observed=5, horizon=3, split="time", validation=0.15, test=0.3)
+    windows = shares.open(dvae.method("vae")).windows
+    last = [max(start for _, _, start in windows(split).keys) + 8 for split in ("train", "validation", "test")]
+    assert last == [11, 14, 20]
+
+
 def test_five_commands_on_a_file_that_nobody_prepared(table, capsys, tmp_path):
     path, run = tmp_path / "riders.csv", tmp_path / "run"
     path.write_bytes(table.read_bytes())
@@ -221,6 +228,8 @@ def test_runs_are_compared_criticised_resumed_and_swept(tabled, table, tmp_path,
         (["--time", "dya"], "no column 'dya' (did you mean 'day'?)"),
         (["--columns", "temp:count"], "the family 'count' is of whole numbers from 0"),
         (["--observed", "500", "--horizon", "3"], "no training window of 500 + 3 steps"),
+        (["--test", "1.5"], "test is 1.5"),
+        (["--validation", "0.5", "--test", "0.5"], "validation 0.5 and test 0.5 leave nothing to train on"),
         (["--split", "group"], "too few to train, choose and test on"),
         (["--skip-bad"], "--skip-bad is about motion, and vae is fitted on a table"),
         (["--protocol", "cmu8"], "--protocol is about motion, and vae is fitted on a table"),
@@ -236,8 +245,9 @@ def test_options_of_tables_are_not_those_of_motion(people, tabled, tmp_path, cap
     out = ["--out", tmp_path / "run"]
     segments = failure(capsys, "fit", "motion-latent", *out, "--data", people, "--columns", "a", code=2)
     assert "--columns is about a table, and motion-latent is fitted on segments of motion" in segments
-    said = failure(capsys, "fit", "vae", *out, "--observed", "3", code=2)
-    assert "--observed is about tables; name one by --data" in said
+    for option in ("--observed", "--test"):
+        said = failure(capsys, "fit", "vae", *out, option, "0", code=2)
+        assert f"{option} is about tables; name one by --data" in said
     assert "people.npz holds" in failure(capsys, "fit", "vae", *out, "--data", people, "--horizon", "3", code=2)
     for option in (["--joints", "LWrist"], ["--pose-prior", "a"], ["--missing"]):
         assert "is about motion" in failure(capsys, "evaluate", tabled / "vae", *option, code=2)

@@ -53,6 +53,28 @@ def test_csv_is_read_however_it_is_written(tmp_path, content):
     assert table.equals(frame)
 
 
+@pytest.mark.parametrize("comment", ["", "# a, b; c\n"])
+@pytest.mark.parametrize(
+    ("content", "wanted"),
+    [
+        ("a;b\n1;2\n3;4\n", {"a": [1, 3], "b": [2, 4]}),
+        ("a\tb\n1\t2\n3\t4\n", {"a": [1, 3], "b": [2, 4]}),
+        ("a;b\n1,5;x\n-3,25;y,z\n", {"a": [1.5, -3.25], "b": ["x", "y,z"]}),
+        ("a;b\n1;0,5\n3;\n", {"a": [1, 3], "b": [0.5, np.nan]}),
+        ("a;b\n1.5;x\n2;y\n", {"a": [1.5, 2], "b": ["x", "y"]}),
+        ('"a, of b";c\n1;2\n', {"a, of b": [1], "c": [2]}),
+        ("a,b\n1;5,x\n", {"a": ["1;5"], "b": ["x"]}),
+    ],
+    ids=["semicolon", "tab", "decimal comma", "comma at the end", "decimal point", "comma in a name", "comma"],
+)
+def test_what_other_countries_write_is_read_as_they_mean_it(tmp_path, comment, content, wanted):
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        found = read_frame(put(tmp_path / "a.csv", (comment + content).encode(encoding))).to_dict("list")
+        assert found.keys() == wanted.keys()
+        for name, values in wanted.items():
+            np.testing.assert_array_equal(found[name], values)
+
+
 def test_an_npz_is_sequences(tmp_path):
     x = np.arange(24.0).reshape(2, 4, 3)
     np.savez(tmp_path / "a.npz", x=x, other=np.zeros(3))
@@ -103,7 +125,9 @@ HOSTILE = {
     "empty": ("a.csv", b"", "No columns"),
     "header": ("a.csv", "a,b\n", None),
     "zeros": ("a.csv", b"a,b\n1,\0\n", "bytes of 0, which are no text"),
-    "latin": ("a.csv", b"a,b\n1,\xe9\n", "can't decode"),
+    "latin": ("a.csv", b"a,b\n1,2\n1,\xe9\n", "line 3 is no UTF-8, but perhaps Latin-1; save it as UTF-8"),
+    "half of UTF-16": ("a.csv", b"\xff\xfea\0,\0b", "truncated data"),
+    "no text behind a mark": ("a.csv", b"\xff\xfe" + bytes(10), "bytes of 0"),
     "long row": ("a.csv", "a,b\n1,2\n1,2,3\n", "Expected 2 fields in line 3, saw 3"),
     "shifted": ("a.csv", "a,b\n1,2,3\n4,5,6\n", "rows have more entries than its header"),
     "quote": ("a.csv", 'a,"b\n1,2\n', "EOF inside string"),
