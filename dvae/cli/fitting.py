@@ -31,7 +31,8 @@ from ..options import Amount, Share
 from ..runs import directory as runs
 from ..runs.kinds import DATA
 from ..runs.sweep import sweep as sweep_methods
-from .console import OUT, Missing, UsageError, arguments, at_least
+from ..tables.dataset import PanelData
+from .console import ERROR, OUT, Missing, UsageError, arguments, at_least
 from .tables import is_table
 
 DEFAULT = Training(decay=0.5)
@@ -158,7 +159,11 @@ class DataOptions:
         if attributes := given.pop("attributes", ()):  # a method may have a `static` of its own
             given["static"] = attributes
         with arguments() if kind == "panel" else nullcontext():  # of which columns are arguments
-            return DATA[kind].open(given.pop("data", SIMULATED), **given)
+            opened = DATA[kind].open(given.pop("data", SIMULATED), **given)
+        if isinstance(opened, PanelData):
+            for said in opened.parts().values():
+                ERROR.print(said)
+        return opened
 
 
 OF_KINDS = {

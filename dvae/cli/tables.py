@@ -110,6 +110,8 @@ def info(paths: Sequence[str], out: Path | None) -> None:
                 shown = [f"{own.min():.4g}", f"{own.mean():.4g}", f"{own.max():.4g}"] if len(own) else ["–"] * 3
             table.add_row(column.name, column.role, column.family, column.unit, known, *shown)
         OUT.print(table)
+        for said in opened.parts().values():
+            OUT.print(said, markup=False, soft_wrap=True)
         text = written_schema(panel.columns, opened.schema.cut)
         if out is None:
             if schema_beside(path) == (None, None):

@@ -11,7 +11,7 @@ from ..options import check
 from .ahead import ahead
 from .columns import Columns
 from .encoding import PanelSchema
-from .panel import Panel
+from .panel import SPLITS, Panel
 from .proposing import Told
 from .protocol import Cut
 from .reading import is_domain, read_panel, schema_beside
@@ -112,6 +112,19 @@ class PanelData:
     def windows(self, split: str) -> PanelWindows:
         """The windows of "train", "validation", "test" or "train+validation"; of "all", wherever they are."""
         return PanelWindows(self.panel, self.schema, split)
+
+    def parts(self) -> dict[str, str]:
+        """For training, validation and test: what windows there are and which are left out, or why there are none."""
+        found = {}
+        for split in SPLITS:
+            try:
+                windows = self.windows(split)
+            except ValueError as error:
+                found[split] = str(error)
+            else:
+                less = f"; left out are {windows.left_out}" if windows.left_out else ""
+                found[split] = f"{len(windows)} {split} windows of {self.protocol.name}{less}"
+        return found
 
     def ahead(self, horizon: int | None = None) -> PanelWindows:
         """The end of each sequence, and what comes after it, see `dvae.tables.ahead`.

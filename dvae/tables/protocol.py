@@ -68,6 +68,16 @@ class Cut:
         sequences, wherever they are, and "last" of the end of each, rows without targets included.
         """
         found = []
+        for place, low, high in self.spans(panel, split):
+            if self.length is None:
+                found.append((place, 0, 0))
+            elif high - low >= self.length:
+                found.append((place, high - self.length if split == "last" else low, high - self.length))
+        return found
+
+    def spans(self, panel: Panel, split: str) -> list[tuple[int, int, int]]:
+        """(sequence, first step, step behind the last) of what windows of a split are cut from, long enough or not."""
+        found = []
         everywhere = split in ("all", "last")
         parts = None if self.split == "time" or everywhere else self._parts(panel)
         for place, one in enumerate(panel.series):
@@ -76,10 +86,7 @@ class Cut:
                 continue
             if parts is None and not everywhere:
                 low, high = self._between(high, split)
-            if self.length is None:
-                found.append((place, 0, 0))
-            elif high - low >= self.length:
-                found.append((place, high - self.length if split == "last" else low, high - self.length))
+            found.append((place, low, high))
         return found
 
     def _between(self, total: int, split: str) -> tuple[int, int]:

@@ -41,9 +41,10 @@ class PanelWindows:
         self._ranges = schema.cut.starts(panel, split)
         if schema.columns.group:  # those of a group are drawn together
             self._ranges.sort(key=lambda each: panel.series[each[0]].group)
-        self.skipped = (
-            [] if schema.cut.length is None else [one.name for one in panel.series if len(one) < schema.cut.length]
-        )
+        shortest = schema.cut.length or 0
+        cut_from = schema.cut.spans(panel, split)
+        self.skipped = [panel.series[place].name for place, low, high in cut_from if high - low < shortest]
+        self.untold = 0
         steps = [panel.present(one) for one in panel]
         none = (
             f"{panel.name} has no {split} window of {schema.cut.name}; up to their last targets its {len(panel)} "
@@ -74,13 +75,24 @@ class PanelWindows:
             self._static = torch.from_numpy(np.stack([schema.static(one) for one in some])).float()
         self._windows = self._listed()
         if not len(self):
-            raise ValueError(none)
+            raise ValueError(f"{none}, and left out are {self.left_out}")
         self._weights = (self._last - self._low + 1).double().cumsum(0)
 
     @property
     def length(self) -> int | None:
         """T, steps of a window; None of whole sequences."""
         return self.schema.cut.length
+
+    @property
+    def left_out(self) -> str:
+        """What is not among the listed windows, in words; empty where all is."""
+        parts = []
+        if self.skipped:
+            names = ", ".join(self.skipped[:3]) + ("…" if len(self.skipped) > 3 else "")
+            parts.append(f"{len(self.skipped)} sequences, which have fewer than {self.length} steps there ({names})")
+        if self.untold:
+            parts.append(f"{self.untold} windows, in whose past or future no target was observed")
+        return " and ".join(parts)
 
     @property
     def protocol(self) -> Cut:
@@ -228,8 +240,10 @@ class PanelWindows:
         if cut.length is None or self.split in ("all", "last"):
             return which, starts
         known = torch.cat([torch.zeros(1).long(), self._mask.any(-1).cumsum(0)])
-        ends = self._first[which] + starts + cut.length
-        told = known[ends] > known[ends - (cut.horizon or 0)]  # something of its future was observed
+        first = self._first[which] + starts
+        start, now, end = known[first], known[first + (cut.observed or 0)], known[first + cut.length]
+        told = (now > start) & (end > now)  # of what it observes something was, and something of its future
+        self.untold = int((~told).sum())
         return which[told], starts[told]
 
     def _cut(self, which: Tensor, starts: Tensor) -> dict[str, Any]:

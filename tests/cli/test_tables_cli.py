@@ -95,6 +95,7 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     printed = capsys.readouterr().out
     assert "6 sequences of 20 steps" in printed
     assert 'id = ["station"]' in printed
+    assert "test windows of 6 + 2 steps" in printed
     schema = tmp_path / "riders.toml"
     assert main(["data", "info", str(path), "--out", str(schema)]) == 0
     assert "correct it" in capsys.readouterr().err

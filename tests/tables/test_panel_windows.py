@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from dvae.data import HeldOutWindows, Source
-from dvae.tables import Column, Columns, Panel, Series
+from dvae.inference.held import hold
+from dvae.tables import Column, Columns, Panel, PanelData, Series
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
 from dvae.tables.windows import PanelWindows
@@ -228,7 +229,14 @@ def test_windows_of_whose_future_nothing_is_known_are_not_listed():
     (one,) = panel.only([before[2][1]])
     start = before[2][2]
     one.values[start + 5 : start + 9, :2] = NAN
-    assert PanelWindows(panel, schema, "test").keys == before[:2] + before[3:]
+    windows = PanelWindows(panel, schema, "test")
+    assert windows.keys == before[:2] + before[3:]
+    assert windows.left_out == "1 windows, in whose past or future no target was observed"
+    one.values[start + 4 : start + 9, :2] = NAN  # the past of the next one, which begins at + 4
+    windows = PanelWindows(panel, schema, "test")
+    assert windows.keys == before[:2] + before[4:]
+    assert windows.untold == 2
+    hold(windows)  # which refuses such windows
     for one in panel:
         one.values[5:-1, :2] = NAN
     with pytest.raises(ValueError, match=r"no test window of 5 \+ 4 steps"):
@@ -237,4 +245,16 @@ def test_windows_of_whose_future_nothing_is_known_are_not_listed():
 
 def test_sequences_that_are_too_short_are_listed():
     panel = table()
-    assert PanelWindows(panel, PanelSchema.under(panel, Cut(8, 3)), "all").skipped == ["s0", "s3", "s9"]
+    windows = PanelWindows(panel, PanelSchema.under(panel, Cut(8, 3)), "all")
+    assert windows.skipped == ["s0", "s3", "s9"]
+    assert windows.left_out == "3 sequences, which have fewer than 11 steps there (s0, s3, s9)"
+    assert PanelWindows(panel, PanelSchema.under(panel, Cut()), "test").left_out == ""
+    data = PanelData("a", table(), PanelSchema.under(table(), Cut(4, 3, split="time")))
+    steps = {one.name: data.panel.present(one) for one in data.panel}
+    short = [name for name, count in steps.items() if round(0.7 * count) < 7]
+    assert data.windows("train").skipped == short
+    said = data.parts()
+    assert list(said) == ["train", "validation", "test"]
+    assert f"{len(short)} sequences, which have fewer than 7 steps there" in said["train"]
+    assert said["test"].startswith(f"{len(data.windows('test'))} test windows of 4 + 3 steps")
+    assert data.recut(horizon=25).parts()["test"].startswith("panel has no test window of 4 + 25 steps")
