@@ -130,7 +130,7 @@ class LikelihoodMethod(Method):
             if self.residual:
                 raise ValueError(
                     f"residual is {self.residual}, but the law of x is that of its columns, which adds no previous "
-                    'value; say another by emission, such as "normal"'
+                    'value; leave residual at 0, or give all columns one law that does, by emission="normal"'
                 )
             described["laws"]["p(x)"] = schema.emission
         model = kind(**described, view=schema.view)

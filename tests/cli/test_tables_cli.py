@@ -253,9 +253,12 @@ def test_options_of_tables_are_not_those_of_motion(people, tabled, tmp_path, cap
     for option in (["--joints", "LWrist"], ["--pose-prior", "a"], ["--missing"]):
         assert "is about motion" in failure(capsys, "evaluate", tabled / "vae", *option, code=2)
     assert "--fix is about motion" in failure(capsys, "forecast", tabled / "vae", *out, "--fix", "lower", code=2)
-    assert "needs to know what poses are" in failure(
-        capsys, "fit", "gsps", *out, "--data", next(tabled.parent.glob("table*/riders.csv")), code=1
-    )
+    own = [*out, "--data", next(tabled.parent.glob("table*/riders.csv")), "--steps", "1"]
+    for name in ("gsps", "hit-dvae", "trajevae", "mix-and-match", "pose-prior"):
+        said = failure(capsys, "fit", name, *own)
+        assert "needs to know what poses are, and was given panel, which has none; take a method for any" in said
+    said = failure(capsys, "fit", "srnn", *own, "--residual", "1")
+    assert 'leave residual at 0, or give all columns one law that does, by emission="normal"' in said
     assert not (tmp_path / "run" / "config.json").exists()
 
 
