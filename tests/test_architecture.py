@@ -32,7 +32,7 @@ MOTION = re.compile(
     r"|dvae\.cli\.(data|fitting|futures|judging|report|segments)$"
 )
 # Tables likewise, but that any method is fitted to them.
-TABLES = re.compile(r"dvae\.tables\b|dvae\.cli\.(data|fitting|futures|judging|tables)$")
+TABLES = re.compile(r"dvae\.tables\b|dvae\.cli\.(data|fitting|futures|judging|report|tables)$")
 
 
 @cache

@@ -18,7 +18,7 @@ from .console import UsageError, note
 
 USES = {
     "motion": "forecasts and has no segments; use dvae forecast, complete, animate or evaluate",
-    "panel": "is of a table; use dvae forecast, impute, evaluate, compare or criticise",
+    "panel": "is of a table; use dvae forecast, impute, evaluate, compare, criticise or report",
     "segments": "makes whole segments and forecasts nothing; use dvae evaluate, interpolate or recover",
 }
 """What there is for runs, by the kind of their data."""

@@ -15,8 +15,10 @@ from ..inference.result import progress_bar, reason
 from ..motion.player import SCRIPT, player
 from ..motion.plot import staged
 from ..report import Section, document, lacking, sections
+from ..report.page import beside, picture
 from ..runs import directory as runs
-from . import opening
+from ..tables.windows import PanelWindows
+from . import opening, tables
 from .console import ERROR, Missing, at_least, check_files
 from .futures import draw_futures
 from .judging import Control
@@ -31,6 +33,10 @@ OF_DIRECTORIES = (
     sections.calibration,
 )
 """What needs no data."""
+QUANTILES = 100
+"""Draws of which intervals of 95 % are shown."""
+COLUMNS = 4
+"""Of a table whose futures are shown."""
 
 
 def report(
@@ -45,7 +51,7 @@ def report(
     data: str | None = None,
     missing: Missing = False,
 ) -> None:
-    """One page of what is known of runs: equations, graphs, curves, scores, bounds, latents, and moving futures.
+    """One page of what is known of runs: equations, graphs, curves, scores, bounds, latents, and futures.
 
     The page is one file that any browser shows, without a network. Several runs stand side by side. What a run lacks,
     such as scores or a calibration, is said there with the command that makes it.
@@ -55,7 +61,7 @@ def report(
         out: the html file to write.
         evaluate: score the runs first, as `dvae evaluate` does; without it, scores are those that it has left.
         windows: test windows whose futures are shown, evenly spread; 0 leaves them out.
-        samples: futures of each.
+        samples: futures of each; of a table, of which quantiles are shown, at least 100.
         bound_windows: test windows, evenly spread, of which bounds, KL and latents are shown.
         particles: of the importance-weighted bound.
         seed: of the draws.
@@ -64,7 +70,8 @@ def report(
     at_least(0, windows=windows)
     at_least(1, samples=samples, bound_windows=bound_windows, particles=particles)
     check_files(out, None, ".html", ".htm")
-    loaded = opening.alike(run, data)
+    kind = opening.kind_of(run, data)
+    loaded = opening.alike(run, data, kind if kind == "panel" else "motion")
     if evaluate:
         evaluate_runs(run, Control(), data=data, missing=missing, seed=seed)
     named = dict(zip(opening.names(loaded), loaded, strict=True))
@@ -73,18 +80,33 @@ def report(
     with progress_bar(True) as bar:
         shown = [make(named) for make in bar.track(OF_DIRECTORIES, description="run directories")]
     try:
-        test = opening.data_of(data, *loaded, missing=missing).windows("test")
+        opened = opening.data_of(data, *loaded, missing=missing)
+        test: Any = tables.windows(loaded[0], opened) if kind == "panel" else opened.windows("test")
     except CheckpointError as error:
         text = f"Bounds, latents and futures need the data. {reason(error)}; say where they are with --data."
         shown.append(Section("Latents and futures", before=lacking(text)))
     else:
         few = sections.Few(test, bound_windows)
         shown += [sections.weighed(named, few, particles, seed), sections.posteriors(named, few, seed)]
-        shown += [_futures(named, test, windows, samples, seed)] if windows else []
-    text = document("Report: " + ", ".join(named), shown, [SCRIPT])
+        futures = _fans if kind == "panel" else _futures
+        shown += [futures(named, test, windows, samples, seed)] if windows else []
+    text = document("Report: " + ", ".join(named), shown, [] if kind == "panel" else [SCRIPT])
     with files.written(out) as file:
         file.write(text.encode(errors="replace"))
     ERROR.print(f"wrote {out}: {', '.join(named)}, {len(text) / 1e6:.1f} MB")
+
+
+def _fans(named: Mapping[str, Any], windows: PanelWindows, count: int, samples: int, seed: int) -> Section:
+    """A few windows with what happened and the intervals of what each run forecasts."""
+    few = windows.some(sections.Few(windows, count).chosen)
+
+    def cell(run: runs.Loaded) -> Markup:
+        found = few.forecast(run.model, max(samples, QUANTILES), seed)
+        shown = ((found.plot(place, most=COLUMNS), key) for place, key in enumerate(found.keys))
+        return beside(*(picture(figure, f"forecasts of {name} from step {step}") for figure, (name, step) in shown))
+
+    about = "Grey: observed. Black: what happened. Blue: median, and intervals of 50, 80 and 95 % of the forecasts."
+    return Section("Futures", sections.cells(named, cell, "futures"), about)
 
 
 def _futures(named: Mapping[str, Any], windows: Any, count: int, samples: int, seed: int) -> Section:

@@ -185,7 +185,9 @@ def evaluated(runs: Runs) -> Section:
         again = Markup("The run has changed since it was scored; score it anew with {}.").format(
             _command(run, "evaluate")
         )
-        return tabulated(found.table()) + (lacking(again) if _row(run, found) is None else "")
+        drawn = any("PIT" in row.histograms for row in found.rows.values())
+        calibrated = picture(found.plot_calibration(), "calibration of forecasts") if drawn else ""
+        return tabulated(found.table()) + calibrated + (lacking(again) if _row(run, found) is None else "")
 
     return Section(
         "Scores", cells(runs, cell), "Of forecasts, and of bounds, on test windows; arrows say what is better."

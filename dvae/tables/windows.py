@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any
+from collections.abc import Sequence
+from copy import copy
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -155,6 +157,13 @@ class PanelWindows:
         found = torch.searchsorted(self._weights, chosen, right=True)
         low, last = self._low[found], self._last[found]
         return found, low + (where * (last - low + 1)).long()
+
+    def some(self, places: Sequence[int]) -> Self:
+        """Some of the listed windows."""
+        found = copy(self)
+        which, starts = self._windows
+        found._windows = which[list(places)], starts[list(places)]
+        return found
 
     def all(self) -> dict[str, Any]:
         """The listed windows, as `keys` has them."""

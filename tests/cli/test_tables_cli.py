@@ -159,6 +159,17 @@ def test_quantiles_are_those_of_the_draws_of_the_same_seed(tabled, tmp_path):
     assert table["truth"].isna().any()
 
 
+def test_a_report_has_the_fans_of_a_table(tabled, tmp_path):
+    page = tmp_path / "a.html"
+    few = ["--windows", "1", "--particles", "2", "--bound-windows", "2"]
+    assert main(["report", str(tabled / "autoregressive"), "--out", str(page), *few]) == 0
+    text = page.read_text()
+    assert "cannot be shown" not in text
+    assert "<script>" not in text
+    assert text.count('alt="forecasts of s') == 1
+    assert "windows of 2 sequences" in text
+
+
 def test_what_is_written_stands_beside_the_rows_that_it_is_about(tabled, table, tmp_path):
     out = tmp_path / "a.csv"
     assert main(["forecast", str(tabled / "vae"), "--out", str(out), "--samples", "2"]) == 0
