@@ -123,15 +123,37 @@ def _comments(content: bytes) -> int:
 
 
 def _parquet(content: bytes) -> Any:
-    import pyarrow.parquet as parquet
+    """The frame of a Parquet file: its flat columns, and an index that pandas kept, if it has a name."""
+    import pyarrow
+    from pyarrow import compute, parquet
 
-    file = parquet.ParquetFile(BytesIO(content))
-    if file.metadata.num_columns > MOST:
-        raise ValueError(f"it has {file.metadata.num_columns} columns; at most {MOST} are read")
-    sizes = (file.metadata.row_group(n).total_byte_size for n in range(file.metadata.num_row_groups))
-    if (size := sum(sizes)) > LARGEST:
+    kinds = pyarrow.types
+    held = parquet.ParquetFile(BytesIO(content))
+    rows, columns = held.metadata.num_rows, held.metadata.num_columns
+    if columns > MOST:
+        raise ValueError(f"it has {columns} columns; at most {MOST} are read")
+    sizes = [held.metadata.row_group(n).total_byte_size for n in range(held.metadata.num_row_groups)]
+    _refuse_large(max(sum(sizes), 8 * rows * columns))  # what repeats takes no room in a file
+    flat = [each for each in held.schema_arrow if not kinds.is_nested(each.type)]
+    words = [each.name for each in flat if kinds.is_string(each.type) or kinds.is_large_string(each.type)]
+    names = [each.name for each in flat if not re.fullmatch(r"__index_level_\d+__", each.name)]
+    table = parquet.ParquetFile(BytesIO(content), read_dictionary=words).read(names, use_threads=False)
+    table.validate(full=True)  # texts are texts
+    for place, each in enumerate(table.schema):
+        column = table.column(place)
+        if kinds.is_dictionary(each.type) and kinds.is_string(each.type.value_type):
+            lengths = (compute.take(compute.binary_length(own.dictionary), own.indices) for own in column.chunks)
+            _refuse_large(sum(compute.sum(own).as_py() or 0 for own in lengths))
+        if each.name in words:
+            table = table.set_column(place, each.name, column.cast(each.type.value_type))
+        elif kinds.is_decimal(each.type):
+            table = table.set_column(place, each.name, column.cast(pyarrow.float64()))
+    return table.to_pandas(ignore_metadata=True)
+
+
+def _refuse_large(size: int) -> None:
+    if size > LARGEST:
         raise ValueError(f"it holds {size} bytes; at most {LARGEST} are read")
-    return file.read().to_pandas()
 
 
 def _of_arrays(place: Path, content: bytes) -> Any:
