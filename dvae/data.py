@@ -146,6 +146,42 @@ class Sequences:
             yield each(self.batch, itemgetter(slice(start, start + batch_size)))
 
 
+@dataclass(frozen=True, eq=False)
+class Hiding:
+    """A source whose batches lack more of x than its own, at random and anew each time.
+
+    The bound stays one, of what is left. A guide that is to tell latents from sequences with gaps meets them so, where
+    training sequences have few or none.
+
+    Args:
+        source: of the batches.
+        share: of the entries of x that are hidden; as many whole steps as single entries.
+        together: for each coordinate of x a number; those of one number are hidden together.
+    """
+
+    source: Any
+    share: float
+    together: Sequence[int]
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
+        """Return a batch of the source, with a mask."""
+        batch = self.source.sample(batch_size, generator)
+        x, seen, kept = batch["x"], mask_of(batch), (1 - self.share) ** 0.5
+        steps, entries = (
+            torch.rand(*x.shape[:2], count, generator=generator) < kept for count in (1, max(self.together) + 1)
+        )
+        left = (steps & entries)[..., list(self.together)].to(x.device)
+        left = left if seen is None else seen & left
+        masks = batch.get("mask")
+        return {**batch, "mask": {**masks, "x": left} if isinstance(masks, Mapping) else left}
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the source, where it has one."""
+        found: str = self.source.fingerprint
+        return found
+
+
 def each(batch: Mapping[str, Any], change: Callable[[Any], Tensor]) -> Batch:
     """Return the batch with every tensor changed."""
     return {n: each(v, change) if isinstance(v, Mapping) else change(v) for n, v in batch.items()}

@@ -54,6 +54,16 @@ class Schema:
         return (), ()
 
     @property
+    def indicators(self) -> tuple[str, ...]:
+        """Names of data of which training sequences lack entries, and guides read which: see `DynamicalVAE`."""
+        return ()
+
+    @property
+    def together(self) -> Sequence[int]:
+        """For each coordinate of x a number; those of one number are observed together or not at all."""
+        return [0] * self.size("x")
+
+    @property
     def units(self) -> Mapping[str, Sequence[Coordinate]]:
         """Variable to how its coordinates are read and made."""
         return {}

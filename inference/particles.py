@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ..data import each
 from ..laws.base import Parameters
-from ..networks.base import computing_once, presence, valid_steps
+from ..networks.base import computing_once, indicator, presence, valid_steps
 from ..networks.rows import Rows, pick, select
 from ..notation import Factor, Parent
 from ..program.batch import AnyBatch
@@ -249,8 +249,9 @@ class Filter:
 
         What is the same for all particles of a sequence is computed once for them.
         """
-        lengths = self.known.lengths
+        lengths, seen = self.known.lengths, self.known.observed
         there = {presence(name): steps for name, steps in self.known.present.items() if name in conditional.parents}
+        there |= {indicator(name): seen[name] for name in conditional.indicators if name in seen}
         given = {**{name: shared[name] for name in conditional.parents if name in shared}, **there}
         own = {name: value for name, value in self.drawn.items() if name in conditional.parents and name not in shared}
         if not own:

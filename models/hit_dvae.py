@@ -154,6 +154,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             raise ValueError(
                 f"emission={self.emission!r} needs loss='evidence'; with best-of-many it is 'fixed' or 'unit'"
             )
+        if self.hide:
+            raise ValueError("hit-dvae has no hide: its guide reads whole poses, beside which there are no indicators")
         own = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run", "bones")
         if self.loss == "evidence" and (given := [name for name in own if getattr(self, name)]):
             raise ValueError(f"loss='evidence' has no {', '.join(given)}; these are of loss='best-of-many'")

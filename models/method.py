@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import torch
 from typing_extensions import override
 
+from ..data import Hiding
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe, Trainable
 from ..inference.schedules import Cosine, Logistic, Ramp, Schedule
@@ -133,7 +134,7 @@ class LikelihoodMethod(Method):
                     'value; leave residual at 0, or give all columns one law that does, by emission="normal"'
                 )
             described["laws"]["p(x)"] = schema.emission
-        model = kind(**described, view=schema.view)
+        model = kind(**{"indicators": schema.indicators, **described}, view=schema.view)
         for name, coordinates in schema.units.items():
             model.standardise(name, coordinates)
         return model
@@ -168,6 +169,8 @@ class LatentMethod(LikelihoodMethod):
         warm_up: steps over which the KL weight rises from 0 to 1.
         warm_up_shape: form of that rise.
         free_bits: nats per frame below which the KL of a latent, averaged over the batch, costs nothing more.
+        hide: share of the entries of training windows that are hidden from the guide and the likelihood, anew in every
+            batch, so that the guide learns to do without them; it then reads indicators of what was observed.
     """
 
     latent: Size = 16
@@ -177,6 +180,12 @@ class LatentMethod(LikelihoodMethod):
     warm_up: Delay | None = 500
     warm_up_shape: Literal["linear", "cosine", "logistic"] = "linear"
     free_bits: Amount = 0.0
+    hide: Annotated[float, Range(0, 1, below=True)] = 0.0
+
+    @override
+    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        """With indicators of x, where entries of it are hidden."""
+        return {**super().described(sizes), **({"indicators": ("x",)} if self.hide else {})}
 
     @override
     def laws(self) -> Mapping[str, LawSpec]:
@@ -208,8 +217,10 @@ class LatentMethod(LikelihoodMethod):
 
         Raises:
             ValueError: on preparing the model, the pseudo-sequences of a prior are longer than the windows.
+            SchemaError: entries are to be hidden of data of which nobody knows which are observed together.
         """
-        return replace(super().train(train, validation, steps), prepare=partial(start_priors, train=train))
+        batches = Hiding(train, self.hide, Schema.of(train, self.name).together) if self.hide else train
+        return replace(super().train(batches, validation, steps), prepare=partial(start_priors, train=train))
 
     @override
     def objective(self) -> Objective:

@@ -51,7 +51,8 @@ class SRNN(LatentMethod):
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model, with one h_t for its three factors."""
+        """The model, with one h_t for its three factors; a guide that reads indicators has one of its own."""
         model = super().build(data)
-        tie(model.generator["z"].network, model.generator["x"].network, model.encoder["z"].network)
+        sides = model.generator["x"], *(() if model.indicators else (model.encoder["z"],))
+        tie(model.generator["z"].network, *(conditional.network for conditional in sides))
         return model

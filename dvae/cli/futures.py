@@ -157,6 +157,7 @@ def impute(
     filled: Path | None = None,
     clip: str | None = None,
     samples: int = 10,
+    particles: int = 1,
     seed: int = 0,
     data: str | None = None,
     missing: Missing = False,
@@ -175,16 +176,19 @@ def impute(
         filled: motion to write, an npz of all clips, BVH or csv of one; a name without an ending is a folder of BVH.
         clip: name of a clip, or split/name where the name is not unique; of any split, filled as one window.
         samples: fillings of each window.
+        particles: of a table, draws for each filling, of which those are taken that what was observed makes likely.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
     """
-    at_least(1, samples=samples)
+    at_least(1, samples=samples, particles=particles)
     check_files(out, None, ".npz", ".csv", ".parquet")
     if kind_of([run], data) == "panel":
         if out is None or filled is not None or clip is not None:
             raise UsageError("of a table, impute writes --out FILE.csv, .parquet or .npz")
-        tables.impute(run, out, samples, seed, data)
+        tables.impute(run, out, samples, particles, seed, data)
         return
+    if particles > 1:
+        raise UsageError("fillings of motion are means, among which there is nothing to choose; leave --particles out")
     check_files(out, None, ".npz")
     if out is None and filled is None:
         raise UsageError("impute writes files; say which, by --out or --filled")

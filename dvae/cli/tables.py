@@ -79,13 +79,13 @@ def forecast(
         save_figure(found.plot(), figure)
 
 
-def impute(path: Path, out: Path, samples: int, seed: int, data: str | None) -> None:
+def impute(path: Path, out: Path, samples: int, particles: int, seed: int, data: str | None) -> None:
     """Fills what the sequences of a table lack, in a table of every missing entry."""
     check_files(out, None, *FORMATS)
     loaded = load_run(path, data, "panel")
     held = data_of(data, loaded).whole()
     with arguments():
-        found = held.impute(loaded.model, samples, seed)
+        found = held.impute(loaded.model, samples, seed, particles)
     found.save(out)
     ERROR.print(f"wrote {out}: {samples} fillings of {found.lacking.sum()} entries that {held.panel.name} lacks")
 

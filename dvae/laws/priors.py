@@ -118,7 +118,7 @@ class VampLaw(Prior):
         self.components, self.steps = spec.components, spec.steps
         object.__setattr__(self, "guide", shape.guide)  # the model's, which is not to be registered twice
         self.pseudo = nn.ParameterDict(
-            {each.name: torch.randn(self.components, self.steps, each.size) for each in self.guide.network.inputs}
+            {name: torch.randn(self.components, self.steps, size) for name, size in self.guide.sizes.items()}
         )
 
     @torch.no_grad()

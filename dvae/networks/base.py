@@ -177,6 +177,11 @@ def presence(name: str) -> str:
     return f"{name} is there"
 
 
+def indicator(name: str) -> str:
+    """Under which a guide's factor finds, among its parents, which entries of the data were observed, if not all."""
+    return f"{name} was observed"
+
+
 def share_modules(networks: Sequence[Any], *names: str) -> None:
     """Gives networks the modules of these names of the first of them."""
     for network in networks[1:]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +14,7 @@ from torch.distributions import constraints
 from ..laws.base import LawSpec, Parameters, Shape
 from ..laws.chain import DERIVATIVES, gaussian_chain
 from ..laws.families import NormalLaw
-from ..networks.base import Input, Network, NetworkSpec, at, once_valid, presence, shift
+from ..networks.base import Input, Network, NetworkSpec, at, indicator, once, once_valid, presence, shift, valid_steps
 from ..networks.rows import Rows
 from ..notation import Factor
 from ..units import Units
@@ -76,6 +76,8 @@ class Conditional(nn.Module):
         generative: p rather than q.
         data: names of the data variables.
         guide: of a static latent without parents its q(w | ...), which some priors are made of.
+        indicators: names of data that the network reads with their indicators beside them: 1 where an entry was
+            observed, 0 where not.
 
     Raises:
         ValueError: a network and a law that do not go together.
@@ -92,12 +94,16 @@ class Conditional(nn.Module):
         generative: bool,
         data: tuple[str, ...] = (),
         guide: Conditional | None = None,
+        indicators: Collection[str] = (),
     ):
         super().__init__()
         self.factor = factor
         self.size = sizes[factor.child]
+        self.sizes = {parent.name: sizes[parent.name] for parent in factor.parents}
+        self.indicators = [name for name in self.sizes if name in indicators]
         self.network: Network | None = None
-        inputs = [Input(p.name, sizes[p.name], p.relation if p.local else None) for p in factor.parents]
+        wide = {name: size * (1 + (name in self.indicators)) for name, size in self.sizes.items()}
+        inputs = [Input(p.name, wide[p.name], p.relation if p.local else None) for p in factor.parents]
         if inputs or not generative:
             self.network = network.build(inputs or [Input(CONSTANT, 1)], factor.local, self.size)
             if self.network.law and not isinstance(law, self.network.law):
@@ -203,12 +209,25 @@ class Conditional(nn.Module):
         return self._in_units(self.law(features, previous))
 
     def _read(self, values: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> dict[str, Tensor]:
-        """The parents among `values`, without unit, or a constant in place of none."""
+        """The parents among `values`, without unit and with their indicators, or a constant in place of none."""
         if not self.parents:
             return {CONSTANT: next(self.parameters()).new_ones(batch, 1)}
         read = [*self.parents, *map(presence, self.parents)]
         found = {name: values[name] for name in read if name in values}
-        return found | {n: once_valid(self.units[n], v, lengths) for n, v in found.items() if n in self.units}
+        found |= {n: once_valid(self.units[n], v, lengths) for n, v in found.items() if n in self.units}
+        told = {n: self._indicated(found[n], values.get(indicator(n)), lengths) for n in self.indicators if n in found}
+        return found | told
+
+    def _indicated(self, value: Tensor, seen: Tensor | None, lengths: Tensor | None) -> Tensor:
+        """The value (B, T, D), or (B, D), with its indicators behind it; 0 at padding."""
+
+        def compute() -> Tensor:
+            told = torch.ones_like(value) if seen is None else seen.to(value)
+            if lengths is not None and value.dim() == 3:
+                told = told * valid_steps(lengths, value.shape[1])[..., None]
+            return torch.cat([value, told], -1)
+
+        return once(self, [value, seen, lengths], compute)
 
     @property
     def _made_in(self) -> Units | None:

@@ -5,7 +5,7 @@ These are the bodies of `DynamicalVAE.forecast`, `reconstruct` and `impute`, whi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -15,7 +15,10 @@ from torch import Tensor
 from ..views import WHOLE
 from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like
-from .groups import GROUP
+from .groups import GROUP, Groups
+
+WEIGHT = "log weight"
+"""Beside what is drawn, how much more likely the latents are given what was observed than under the guide."""
 
 
 def forecast(
@@ -116,7 +119,9 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
         return in_chunks(means, whole.batch, samples, _together(model, data, whole.batch, chunk))
 
 
-def impute(model: Any, batch: AnyBatch, samples: int, chunk: int, draw: bool | None) -> dict[str, Tensor]:
+def impute(
+    model: Any, batch: AnyBatch, samples: int, chunk: int, draw: bool | None, particles: int
+) -> dict[str, Tensor]:
     """The data, where they are missing with means given latents from the guide, or draws one after the other."""
     given: Any = batch if isinstance(batch, Mapping) else {}
     masks = given.get("mask", {})
@@ -124,7 +129,12 @@ def impute(model: Any, batch: AnyBatch, samples: int, chunk: int, draw: bool | N
     if not masks:
         raise ValueError("nothing is missing in this batch; give a 'mask' that is False where entries are to be filled")
     drawn = any(map(model.drawn, model.observed)) if draw is None else draw
-    made = _filled(model, batch, samples, chunk) if drawn else model.reconstruct(batch, samples, chunk=chunk)
+    if particles < 1 or (particles > 1 and not (drawn and model.likelihood)):
+        raise ValueError(
+            f"particles is {particles}; it is at least 1, and more choose among draws (draw=True) by their likelihood, "
+            f"which {model.generative} {'has' if model.likelihood else 'lacks'}"
+        )
+    made = _filled(model, batch, samples, chunk, particles) if drawn else model.reconstruct(batch, samples, chunk=chunk)
     found = {}
     for name, mask in masks.items():
         value = made[name]
@@ -134,21 +144,67 @@ def impute(model: Any, batch: AnyBatch, samples: int, chunk: int, draw: bool | N
     return found
 
 
-def _filled(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
+def _filled(model: Any, batch: AnyBatch, samples: int, chunk: int, particles: int) -> dict[str, Tensor]:
     """The data with draws of what is missing, each given latents from the guide and what came before it."""
     data = model.read(batch)
     whole = model._rollout(model.inference, model.encoder, data, None, 1)  # refuses what cannot be read
+    groups = whole.groups if model.grouped else None
 
     def draws(part: slice, count: int) -> dict[str, Tensor]:
         some = repeat(rows(data, part), count)
         rollout = model._rollout(model.generative, model.generator, some, None, 1)
         rollout.drawing = True
-        rollout.values.update(model.guide(some))
+        guide = poutine.trace(model.guide).get_trace(some)
+        rollout.values.update({name: guide.nodes[name]["value"] for name in model.latents})
         values = {name: {**rollout.values, **rollout.history(name)}[name] for name in model.observed}
-        return model.shown({n: v.unflatten(0, (count, -1)) for n, v in values.items()}, rows(data, part))
+        made = model.shown({n: v.unflatten(0, (count, -1)) for n, v in values.items()}, rows(data, part))
+        if particles > 1:
+            ratio = sum(rollout.law(name).log_prob(rollout.values[name]) for name in model.generative.variables)
+            ratio = ratio - sum(guide.nodes[name]["fn"].log_prob(guide.nodes[name]["value"]) for name in model.latents)
+            made[WEIGHT] = ratio.unflatten(0, (count, -1))
+        return made
 
     with model._evaluating():
-        return in_chunks(draws, whole.batch, samples, _together(model, data, whole.batch, chunk))
+        if particles == 1:
+            return in_chunks(draws, whole.batch, samples, _together(model, data, whole.batch, chunk))
+        return _resampled(draws, whole.batch, samples, particles, chunk, groups)
+
+
+def _resampled(
+    draws: Callable[[slice, int], Mapping[str, Tensor]],
+    size: int,
+    samples: int,
+    particles: int,
+    chunk: int,
+    groups: Groups | None,
+) -> dict[str, Tensor]:
+    """Sampling importance resampling: of K draws for each sample those that their weights choose, none twice.
+
+    Without replacement (Gelman et al., Bayesian Data Analysis, 2013, 10.4), by the largest weights times exponential
+    noise (Efraimidis and Spirakis, 2006): samples stay different ones where a few weights are all.
+
+    Args:
+        draws: values (n, b, ...) and `WEIGHT` (n, b), from a slice of b sequences and n draws.
+        size: B.
+        samples, particles: S and K.
+        chunk: the most sequences times draws at once.
+        groups: of sequences that share latents, which are chosen together.
+    """
+    pool = samples * particles
+    at_once = max(1, chunk // pool) if groups is None else size
+    found = []
+    for first in range(0, size, at_once):
+
+        def some(part: slice, count: int, first: int = first) -> Mapping[str, Tensor]:
+            return draws(slice(first + part.start, first + part.stop), count)
+
+        made = in_chunks(some, min(at_once, size - first), pool, chunk if groups is None else max(chunk, size))
+        weight = made.pop(WEIGHT).double()
+        weight = weight if groups is None else groups.summed(weight)
+        chosen = (weight - torch.empty_like(weight).exponential_().log()).topk(samples, 0).indices
+        chosen = (chosen if groups is None else chosen[:, groups.place])[..., None, None]
+        found.append({name: torch.take_along_dim(value, chosen, 0) for name, value in made.items()})
+    return {name: torch.cat([each[name] for each in found], 1) for name in found[0]}
 
 
 def _together(model: Any, data: Mapping[str, Any], size: int, chunk: int) -> int:

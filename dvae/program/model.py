@@ -60,6 +60,10 @@ class DynamicalVAE(nn.Module):
             hold it: name to law. A forecast draws it once for each sample.
         grouped: static latents that the sequences of a group share, of which a batch says "group" (B,); see
             `dvae.program.groups`. Without that every sequence is a group.
+        indicators: data variables of which the guide reads which entries were observed, beside their values: each
+            coordinate has one of 0 and 1, all 1 without a mask (Collier et al., 2020, arXiv 2006.05301). Without
+            them the guide cannot tell a missing entry from one that was observed at 0, or at the mean of a variable
+            with units.
 
     Raises:
         ValueError: equations that cannot be read or do not fit together; sizes missing or unknown.
@@ -89,6 +93,7 @@ class DynamicalVAE(nn.Module):
         view: View | None = None,
         shared: Mapping[str, Subset] | None = None,
         grouped: Collection[str] = (),
+        indicators: Collection[str] = (),
     ):
         super().__init__()
         self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
@@ -121,6 +126,11 @@ class DynamicalVAE(nn.Module):
                 )
         self.grouped = tuple(grouped)
         self._check_grouped()
+        self.indicators = tuple(indicators)
+        if unknown := [name for name in self.indicators if name not in observed]:
+            raise ValueError(
+                f"indicators tell which data were observed, but {', '.join(unknown)} is none of {', '.join(observed)}"
+            )
         roots, rest = ([f for f in self.generative.factors if bool(f.parents) == more] for more in (False, True))
         self.generator: Any = self._conditionals(rest)
         guides = {} if inference is None else self._conditionals(self.inference.factors)
@@ -163,6 +173,7 @@ class DynamicalVAE(nn.Module):
                     generative=factor.kind == "p",
                     data=self.observed,
                     guide=guides[factor.child] if guides and factor.child in guides else None,
+                    indicators=self.indicators if factor.kind == "q" else (),
                 )
                 for factor in factors
             }
@@ -419,28 +430,32 @@ class DynamicalVAE(nn.Module):
     @alone
     @torch.no_grad()
     def impute(
-        self, batch: AnyBatch, samples: int = 1, *, draw: bool | None = None, chunk: int = CHUNK
+        self, batch: AnyBatch, samples: int = 1, *, draw: bool | None = None, particles: int = 1, chunk: int = CHUNK
     ) -> dict[str, Tensor]:
         """The data with their missing entries filled in, S times: as observed, or given latents of the guide.
 
         The guide reads all that was observed, before and after a gap. Means differ as far as latents do; draws of an
-        entry have the noise of the emission too, and a later entry reads an earlier one that was drawn. What was
-        observed after a gap is told by the latents alone. Frames that a model starts from and does not make, as the
-        first pose of those along paths, take the places of the first frame that it makes.
+        entry have the noise of the emission too, and a later entry reads an earlier one that was drawn. Of one
+        particle, what was observed after a gap is told by the guide alone. More of them make up for what it gets wrong:
+        of S K draws of latents and missing entries those are taken that the weights p(z, x observed) / q(z) choose
+        (Mattei and Frellsen, 2019, arXiv 1812.02633), which are draws given all that was observed as K grows. The
+        longer a sequence, the more it takes. Frames that a model starts from and does not make, as the first pose of
+        those along paths, take the places of the first frame that it makes.
 
         Args:
             batch: with a "mask", see `model`.
             samples: S, draws of the latents for each sequence.
             draw: draw the missing entries, or take their means; None for what `drawn` says.
+            particles: K, draws for each sample, of which it is chosen.
             chunk: sequences times samples to hold at once, beside the result.
 
         Returns:
             Name to (S, B, T, D) for the variables that have a mask.
 
         Raises:
-            ValueError: a batch without a mask.
+            ValueError: a batch without a mask, or particles where there is nothing to choose or to choose by.
         """
-        return impute(self, batch, samples, chunk, draw)
+        return impute(self, batch, samples, chunk, draw, particles)
 
     @alone
     @torch.no_grad()

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from ..laws.base import Parameters
-from ..networks.base import presence, valid_steps
+from ..networks.base import indicator, presence, valid_steps
 from ..notation import Block, Factorization
 from .conditional import Conditional, like
 from .groups import Grouped, Groups
@@ -169,8 +169,9 @@ class Rollout:
 
     @property
     def known(self) -> dict[str, Tensor]:
-        """The values, and at which steps latents are there."""
-        return {**self.values, **{presence(name): steps for name, steps in self.present.items()}}
+        """The values, at which steps latents are there, and which entries of the data were observed."""
+        there = {presence(name): steps for name, steps in self.present.items()}
+        return {**self.values, **there, **{indicator(name): seen for name, seen in self.observed.items()}}
 
     def know(self, name: str, value: Tensor) -> None:
         """Record the value of a site, which later sites read."""

@@ -53,7 +53,7 @@ class PanelSchema(Schema):
         cut: how it is divided and cut.
         means, scales: of the columns that have a unit, over the training data.
         logarithms: of those that are read as such, the least that is, and their mean and deviation.
-        lacking: names of covariates that have an indicator.
+        lacking: names of columns that have an indicator: those that lack entries in training, or end with the present.
         step: median time from one step to the next; 0 where steps are evenly spaced.
     """
 
@@ -114,7 +114,7 @@ class PanelSchema(Schema):
                     logarithms[column.name] = float(floor), float(read.mean()), float(read.std()) or 1.0
             elif column.family == "binary":
                 means[column.name] = float(values.mean())
-            if column.role == "past" or (column.role != "target" and np.isnan(known[:, place]).any()):
+            if column.role == "past" or np.isnan(known[:, place]).any():
                 lacking.append(column.name)
         shares = np.array([means[c.name] for c in panel.columns.targets if c.family == "binary"])
         spread = float(np.sqrt((shares * (1 - shares)).mean())) if len(shares) else 0.0
@@ -165,6 +165,19 @@ class PanelSchema(Schema):
         """Covariates and gaps, and what is static."""
         local = tuple(name for name in (COVARIATES, GAPS) if name in self.sizes)
         return local, ((STATICS,) if STATICS in self.sizes else ())
+
+    @property
+    @override
+    def indicators(self) -> tuple[str, ...]:
+        """x, where a target lacks entries."""
+        return ("x",) if any(column.name in self.lacking for column in self.columns.targets) else ()
+
+    @property
+    @override
+    def together(self) -> Sequence[int]:
+        """The coordinates of a column."""
+        targets = enumerate(self.columns.targets)
+        return [0 if whole(self.columns) else place for place, column in targets for _ in column.coordinates]
 
     @property
     @override

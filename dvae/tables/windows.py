@@ -194,13 +194,14 @@ class PanelWindows:
         beside = known[:, :observed], known[:, observed:], columns_of(self), keys
         return PanelForecasts(np.concatenate(parts, 1), *beside, *self.times(observed + horizon))
 
-    def impute(self, model: DynamicalVAE, samples: int = 100, seed: int = 0) -> PanelImputed:
+    def impute(self, model: DynamicalVAE, samples: int = 100, seed: int = 0, particles: int = 1) -> PanelImputed:
         """The listed windows with draws where entries of targets are missing.
 
         Args:
             model: as it was fitted, to the same schema.
             samples: K, fillings of each.
             seed: of the draws.
+            particles: draws for each filling, of which it is chosen by what was observed, see `DynamicalVAE.impute`.
 
         Raises:
             ValueError: nothing is missing.
@@ -210,7 +211,7 @@ class PanelWindows:
             raise ValueError(f"nothing is missing in {self.panel.name}")
         with reproducibly(model, seed):
             parts = [
-                model.impute(on_device_of(model, part), samples, draw=True)["x"].cpu().numpy()
+                model.impute(on_device_of(model, part), samples, draw=True, particles=particles)["x"].cpu().numpy()
                 for part in Sequences(batch).split(AT_ONCE)
             ]
         count, steps = batch["x"].shape[:2]

@@ -125,7 +125,7 @@ def test_five_commands_on_a_file_that_nobody_prepared(table, capsys, tmp_path):
     path, run = tmp_path / "riders.csv", tmp_path / "run"
     path.write_bytes(table.read_bytes())
     assert main(["data", "info", str(path)]) == 0
-    assert main(["fit", "dkf", "--out", str(run), "--data", str(path), *SMALL, *LATENT]) == 0
+    assert main(["fit", "dkf", "--out", str(run), "--data", str(path), *SMALL, *LATENT, "--hide", "0.2"]) == 0
     assert f"dvae evaluate {run}" in capsys.readouterr().out
     assert main(["evaluate", str(run), "--samples", "3", "--figure", str(tmp_path / "scores.png")]) == 0
     printed = capsys.readouterr().out
@@ -139,7 +139,7 @@ def test_five_commands_on_a_file_that_nobody_prepared(table, capsys, tmp_path):
     table = pd.read_csv(out)
     assert {"sequence", "step", "time", "ahead", "column", "mean", "q025", "q500", "q975", "truth"} <= {*table.columns}
     assert {*table["column"]} == {"riders", "temp", "plan", "weather=rain", "weather=sun"}
-    assert main(["impute", str(run), "--out", str(tmp_path / "filled.csv")]) == 0
+    assert main(["impute", str(run), "--out", str(tmp_path / "filled.csv"), "--particles", "3"]) == 0
     assert len(pd.read_csv(tmp_path / "filled.csv")) == 6 * 3
 
 

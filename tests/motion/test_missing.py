@@ -795,5 +795,7 @@ def test_gaps_are_filled_in_the_motion_itself(tmp_path, capsys):
     capsys.readouterr()
     assert main([*impute, str(tmp_path / "made" / "all.bvh")]) == 2
     assert "holds one clip, of" in capsys.readouterr().err
+    assert main([*impute[:-1], "--particles", "2", "--out", str(tmp_path / "i.npz")]) == 2
+    assert "fillings of motion are means" in capsys.readouterr().err
     assert main(["impute", run]) == 2
     assert "say which, by --out or --filled" in capsys.readouterr().err

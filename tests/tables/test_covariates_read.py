@@ -1,6 +1,7 @@
 """Who reads covariates, gaps and statics, and that the units of columns are a change of variables."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 import dvae
 from dvae.models.registry import methods
 from dvae.notation import Factorization
+from dvae.schema import SchemaError
 from dvae.tables import Column, Columns, Panel, Series
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
@@ -56,6 +58,35 @@ def test_methods_read_covariates_where_data_have_them_and_only_then(name):
     written = methods()[name].generative
     plain = method.build({"x": 3})
     assert plain.generative == Factorization.parse(written)
+
+
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "autoregressive"])
+def test_methods_have_guides_with_indicators_where_training_data_have_gaps(name):
+    """Or are to have some; a mask that hides nothing then changes nothing, and one that does is seen."""
+    x, seen = torch.randn(3, 5, 1), torch.rand(3, 5, 1) < 0.5
+    for schema, options in ((replace(SCHEMA, lacking=("y",)), {}), (SCHEMA, {"hide": 0.3})):
+        model = dvae.method(name, latent=2, **options).build(schema)
+        assert model.indicators == ("x",)
+        latent = model.latents[0]
+        batch = {"x": x, "c": torch.zeros(3, 5, 1), "s": torch.zeros(3, 1), "d": torch.ones(3, 5, 1)}
+        found = []
+        for mask in (None, torch.ones_like(seen), seen):
+            torch.manual_seed(0)
+            gone = {} if mask is None else {"x": torch.where(mask, x, 0.0), "mask": mask}
+            found.append(model.guide({**batch, **gone})[latent])
+        torch.manual_seed(0)
+        found.append(model.guide({**batch, "x": torch.where(seen, x, 0.0)})[latent])
+        assert torch.equal(found[0], found[1])
+        assert not torch.allclose(found[2], found[3])
+    assert not dvae.method(name, latent=2).build(SCHEMA).indicators
+
+
+def test_what_is_hidden_in_training_is_told_where_nobody_knows_what_goes_together():
+    windows = dvae.ArrayWindows(torch.randn(4, 5, 1), observed=3)
+    with pytest.raises(SchemaError, match="dkf needs to know what sequences are, and was given ArrayWindows"):
+        dvae.method("dkf", hide=0.2).train(windows, None, 10)
+    with pytest.raises(ValueError, match="hit-dvae has no hide"):
+        dvae.method("hit-dvae", hide=0.2)
 
 
 def test_context_that_a_model_does_not_read_may_be_there_and_does_not_come_back():

@@ -87,7 +87,17 @@ def test_units_are_those_of_the_training_sequences():
     assert (means[-1], scales[-1]) == (share, pytest.approx((share * (1 - share)) ** 0.5))
     assert schema.coordinates == ["riders", "kind=u", "kind=v", "kind=w", "temp", "open"]
     assert schema.sizes == {"x": 6, "c": 1 + 1 + 2 + 1 + 1 + 1 + 2, "s": 1 + 2}
-    assert schema.lacking == ("plan", "weather", "price")
+    assert schema.lacking == tuple(n for n in TOLD.names if n not in ("height", "town", "sunny"))
+
+
+def test_guides_read_indicators_where_training_data_lack_targets():
+    schema = PanelSchema.under(table(), CUT)
+    assert schema.indicators == ("x",)
+    assert schema.together == [0, 1, 1, 1, 2, 3]
+    assert PanelSchema.under(table(missing=False), CUT).indicators == ()
+    assert replace(schema, lacking=("plan", "weather", "price")).indicators == ()  # as an older run has it
+    correlated = (Column("a", family="correlated"), Column("b", family="correlated"))
+    assert PanelSchema(columns=Columns(correlated), means={}, scales={}).together == [0, 0]
 
 
 def altered(panel, split, cut):
