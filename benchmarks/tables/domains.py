@@ -27,6 +27,7 @@ from dvae.inference.checkpoints import Run
 from dvae.inference.comparison import Crossed, Estimate
 from dvae.inference.evaluation import Row
 from dvae.inference.scores import CRPS, ENERGY, LEVELS, Measure, coverage_at
+from dvae.inference.uncertainty import decimals
 from dvae.runs.directory import Config
 from dvae.tables.dataset import PanelData
 from dvae.tables.domains import speech
@@ -148,11 +149,11 @@ SPEECH = Section(
 )
 
 
-def family(width: int, latent: int, **options: Any) -> dict[str, Case]:
+def family(width: int, latent: int) -> dict[str, Case]:
     """All members with their own networks, of one width."""
     names = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae")
     sized = {name: {"width": width} for name in names if name not in ("vae", "kvae")}
-    cases = {name: Case({"latent": latent, **sized.get(name, {}), **options}) for name in names}
+    cases = {name: Case({"latent": latent, **sized.get(name, {})}) for name in names}
     return {BASELINE: Case({"width": width}), **cases}
 
 
@@ -161,9 +162,7 @@ SECTIONS = {
     "chorales": CHORALES,
     "speech": SPEECH,
     "japanese-vowels": Section(family(64, 16), {**SERIES, "steps": 750}, Cut(observed=5, horizon=2), unit="frame"),
-    "basic-motions": Section(
-        family(64, 8), {**SERIES, "steps": 1000, "batch_size": 16}, Cut(observed=50, horizon=10), season=None
-    ),
+    "basic-motions": Section(family(64, 8), {**SERIES, "steps": 1000, "batch_size": 16}, Cut(observed=50, horizon=10)),
     "macrodata": Section(
         family(16, 4),
         {**SERIES, "steps": 600},
@@ -378,11 +377,11 @@ class Read:
         sums = np.stack([np.bincount(places, own) for own in values])
         return Crossed.of(sums / steps, steps)
 
-    def said(self, score: str, other: Read | None = None, digits: int = 2) -> str:
+    def said(self, score: str, other: Read | None = None) -> str:
         """A score, or the paired difference to that of another case; "–" where there is none."""
         if not all(score in (*own.runs[0]["scores"], *SHOWN) for own in (self, other or self)):
             return "–"
-        return said(self.crossed(score).estimate(None if other is None else other.crossed(score)), digits)
+        return said(self.crossed(score).estimate(None if other is None else other.crossed(score)))
 
     @property
     def latents(self) -> list[str]:
@@ -391,20 +390,21 @@ class Read:
 
     @property
     def seconds(self) -> str:
-        """Of processor time, mean and longest fit."""
+        """Of processor time, the mean fit."""
         found = [run["seconds"] for run in self.runs if run["seconds"]]
         return f"{np.mean(found):.0f}" if found else "–"
 
     def unreliable(self) -> str:
-        """Share of sequences whose k-hat is above 0.7."""
+        """Share of sequences whose k-hat is above 0.7; few particles have none."""
         khat = np.array([run["scores"][KHAT] for run in self.runs], float)
-        return f"{100 * float((khat > 0.7).mean()):.0f} %" if self.latents else "–"
+        return f"{100 * float((khat > 0.7).mean()):.0f} %" if self.latents and np.isfinite(khat).all() else "–"
 
 
-def said(estimate: Estimate, digits: int) -> str:
+def said(estimate: Estimate) -> str:
     """Mean, and its errors over sequences and over seeds, those that there are."""
-    values = (estimate.mean, estimate.sequences, estimate.seeds)
-    return " ± ".join(f"{value:.{digits}f}" for value in values if not np.isnan(value))
+    errors = [error for error in (estimate.sequences, estimate.seeds) if not np.isnan(error)]
+    places = decimals(estimate.mean, *errors)
+    return " ± ".join(f"{value:.{places}f}" for value in (estimate.mean, *errors))
 
 
 def bounds(cases: Mapping[str, Read], section: Section) -> str:
@@ -438,7 +438,7 @@ def of_forecasts(cases: Mapping[str, Read], references: Mapping[str, Row]) -> st
     rows = []
     for name in order:
         there = [score for score in SHOWN if score in found[name].forecasts[0].clip_means]
-        rows.append([name, *(found[name].said(score, digits=3) if score in there else "–" for score in SHOWN)])
+        rows.append([name, *(found[name].said(score) if score in there else "–" for score in SHOWN)])
     return table(["", *SHOWN], rows)
 
 

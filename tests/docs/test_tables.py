@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 
 import networkx as nx
+import numpy as np
 import pytest
 import torch
 
@@ -18,6 +19,7 @@ from benchmarks.tables import (
     gsps,
     hit_dvae,
     house,
+    irregular,
     mix_and_match,
     motion_latent,
     occlusion,
@@ -30,6 +32,7 @@ from dvae import Descent, Evaluation, Training, method, motion
 from dvae.cli import main as command
 from dvae.motion.segments import dataset
 from dvae.runs.directory import fit_run
+from dvae.tables import Column, Columns, Panel, Series
 
 SMALL = ["--steps", "2", "--batch-size", "4", "--validate-every", "2"]
 
@@ -348,6 +351,48 @@ def test_occlusion(folder, page, monkeypatch):
     assert all(float(cell.split()[0]) > 0 for row in errors[1:] for cell in row[1:3])
     error, line, more = (float(row[1].split()[0]) for row in (errors[3], errors[1], differences[2]))
     assert abs(error - line - more) < 0.11  # of three rounded numbers
+
+
+def test_irregular(tmp_path, page, monkeypatch):
+    """Fitted and scored once, whatever is asked again; runs are judged on the same halves of the same sequences."""
+    random = np.random.default_rng(0)
+    parts = ["train", "validation", "test"] * 4
+    series = [Series(str(n), random.normal(size=(5 + n, 2)), split=part) for n, part in enumerate(parts)]
+    panel = Panel(series, Columns((Column("a"), Column("b"))))
+    monkeypatch.setattr(irregular, "domain", lambda name: panel)
+    monkeypatch.setattr(irregular, "STEPS", {2: 2})
+    monkeypatch.setattr(irregular, "SIZE", {"width": 4, "decoder": ()})
+    monkeypatch.setattr(irregular, "TRAINING", {"batch_size": 3, "validate_every": 2})
+    monkeypatch.setattr(irregular, "PARTICLES", 3)
+    options = {"runs": tmp_path / "runs", "page": page, "seeds": (0, 1), "latents": (2,)}
+    irregular.main(part="test", **options)
+    text, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
+    times = [file.stat().st_mtime_ns for file in files]
+    irregular.main(part="test", **options)
+    assert page.read_text() == text
+    assert [file.stat().st_mtime_ns for file in files] == times
+    (found,) = tables(page)
+    rows = {row[0]: row[1:] for row in found[1:]}
+    for kept in irregular.KEPT:
+        whole, halves, less = (
+            float(cell.split()[0])
+            for cell in (rows[f"whole, judged on {kept}"][0], *rows[f"halves, judged on {kept}"][:2])
+        )
+        assert abs(halves - whole - less) < 0.0016  # of three rounded numbers
+        assert f"frames apart, judged on {kept}" in rows
+
+
+def test_halves_keep_times_between_frames_and_no_frame_twice():
+    sequences = [np.arange(n, dtype=float)[:, None].repeat(2, 1) for n in (3, 8, 12)]
+    batch = irregular.batch_of(sequences, 0.5, 3)
+    assert batch["lengths"].tolist() == [2, 4, 6]
+    for x, d, length in zip(batch["x"][..., 0], batch["d"][..., 0], batch["lengths"], strict=True):
+        assert torch.equal(x[:length].diff(), d[1:length])  # values are times
+        assert (d[1:length] >= 1).all()
+        assert not d[length:].any()
+    assert len(irregular.frames(batch)) == 12
+    whole = irregular.batch_of(sequences, 1.0, 3)
+    assert torch.equal(irregular.frames(whole), torch.cat([torch.from_numpy(x).float() for x in sequences]))
 
 
 def test_gaps_are_as_long_as_they_are():
