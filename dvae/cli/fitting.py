@@ -27,7 +27,7 @@ from ..models.trajectories import TrajectoryMethod
 from ..motion.dataset import SIMULATED
 from ..motion.protocols import Representation
 from ..motion.segments.dataset import Segmentation
-from ..options import Amount, Share
+from ..options import Amount, Frames, Share
 from ..runs import directory as runs
 from ..runs.kinds import DATA
 from ..runs.sweep import sweep as sweep_methods
@@ -109,6 +109,7 @@ class DataOptions:
         split: of a table: what is divided into training, validation and test.
         validation: of a table: share by which weights are chosen.
         test: of a table: share to be judged on.
+        season: of a table: its period in steps, which a reference repeats.
     """
 
     data: str = SIMULATED
@@ -133,6 +134,7 @@ class DataOptions:
     split: Literal["sequence", "time", "group"] | None = None
     validation: Share | None = None
     test: Share | None = None
+    season: Frames | None = None
 
     def open(self, *methods: Trainable) -> Any:
         """The data on which methods are fitted, of one kind.
@@ -171,7 +173,7 @@ OF_KINDS = {
     "segments": ("cut", "scaling", "warped", "bodies", "skip_bad"),
     "panel": (
         *("columns", "covariates", "past", "attributes", "id", "time", "group"),
-        *("observed", "horizon", "stride", "split", "validation", "test"),
+        *("observed", "horizon", "stride", "split", "validation", "test", "season"),
     ),
 }
 """Options by the kind of data that has them."""

@@ -90,7 +90,8 @@ class PanelSchema(Schema):
     def under(cls, panel: Panel, cut: Cut) -> Self:
         """The schema of a panel, whose units are those of its training sequences."""
         starts = cut.starts(panel, "train")
-        parts = [(panel.series[place], slice(low, high + (cut.length or 10**9))) for place, low, high in starts]
+        ends = [panel.present(panel.series[n]) if cut.length is None else last + cut.length for n, _, last in starts]
+        parts = [(panel.series[n], slice(low, end)) for (n, low, _), end in zip(starts, ends, strict=True)]
         if not parts:
             raise ValueError(
                 f"{panel.name} has no training window of {cut.name}: its sequences have "

@@ -180,6 +180,11 @@ class Panel:
             ValueError: columns that the data do not have, or values that are none.
         """
         if isinstance(data, Panel):
+            if isinstance(columns, Columns) and columns != data.columns:
+                raise ValueError(
+                    f"{data.name} is a panel of {', '.join(data.columns.names)}, whose columns are another thing than "
+                    f"{', '.join(columns.names)}; give what it was made of, or none of these"
+                )
             return data
         kind = type(data).__module__.partition(".")[0]
         if kind in ("pandas", "xarray"):

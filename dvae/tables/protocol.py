@@ -25,6 +25,7 @@ class Cut:
             sequences of a group. Sequences that say their split are where they say.
         validation, test: shares of them.
         seed: of the division of sequences or groups.
+        season: period of the data in steps, such as 7 of days, which the reference "seasonal" repeats.
         multimodal_threshold: distance below which two last observed steps are alike, in deviations.
 
     Raises:
@@ -38,6 +39,7 @@ class Cut:
     validation: Share = 0.1
     test: Share = 0.2
     seed: Delay = 0
+    season: Frames | None = None
     multimodal_threshold: Positive = 0.5
 
     def __post_init__(self) -> None:
@@ -47,6 +49,10 @@ class Cut:
         if self.split == "time" and self.observed is None:
             raise ValueError(
                 "sequences are divided by time into windows; say how many steps are observed, and a horizon"
+            )
+        if self.season is not None and self.season > (self.observed or 0):
+            raise ValueError(
+                f"season is {self.season} and observed {self.observed}; a period is among what is observed"
             )
         if self.validation + self.test >= 1:
             raise ValueError(f"validation {self.validation} and test {self.test} leave nothing to train on")
@@ -70,7 +76,7 @@ class Cut:
         found = []
         for place, low, high in self.spans(panel, split):
             if self.length is None:
-                found.append((place, 0, 0))
+                found += [(place, 0, 0)] if high else []
             elif high - low >= self.length:
                 found.append((place, high - self.length if split == "last" else low, high - self.length))
         return found

@@ -43,7 +43,7 @@ class PanelWindows:
         self._ranges = schema.cut.starts(panel, split)
         if schema.columns.group:  # those of a group are drawn together
             self._ranges.sort(key=lambda each: panel.series[each[0]].group)
-        shortest = schema.cut.length or 0
+        shortest = schema.cut.length or 1
         cut_from = schema.cut.spans(panel, split)
         self.skipped = [panel.series[place].name for place, low, high in cut_from if high - low < shortest]
         self.untold = 0
@@ -55,18 +55,17 @@ class PanelWindows:
         if not self._ranges:
             raise ValueError(none)
         some = [panel.series[place] for place, _, _ in self._ranges]
-        self._lengths = torch.tensor([len(one) for one in some])
-        self._first = self._lengths.cumsum(0) - self._lengths
+        rows = torch.tensor([len(one) for one in some])
+        self._first = rows.cumsum(0) - rows
+        self._lengths = torch.tensor([panel.present(one) for one in some])
         self._low, self._last = torch.tensor([ends for _, *ends in self._ranges]).unbind(1)
         self._x = _joined([schema.targets(one) for one in some])
         self._mask = self._x.isfinite()
         if whole(schema.columns):
             self._mask = self._mask.all(-1, keepdim=True).expand_as(self._x)
-        spans = zip(self._first.tolist(), self._low.tolist(), self._last.tolist(), strict=True)
-        parts = (
-            slice(one + low, one + last + schema.cut.length if schema.cut.length else None) for one, low, last in spans
-        )
-        self._missing = not all(bool(self._mask[part].all()) for part in parts)
+        last = self._lengths if schema.cut.length is None else self._last + schema.cut.length
+        spans = zip((self._first + self._low).tolist(), (self._first + last).tolist(), strict=True)
+        self._missing = not all(bool(self._mask[start:end].all()) for start, end in spans)
         self._x = self._x.nan_to_num(0.0)
         self._context = {}
         for name, make in ((COVARIATES, schema.context), (GAPS, schema.gaps)):
@@ -120,7 +119,8 @@ class PanelWindows:
         """Columns with their units and scales, for the record."""
         columns = {name: column.unit for column in self.schema.columns.targets for name in column.coordinates}
         scales = [coordinate.scale for coordinate in self.schema.units["x"]]
-        said = {"columns": columns, "scales": scales, "called": ["sequence", "step"]}
+        said: dict[str, Any] = {"columns": columns, "scales": scales, "called": ["sequence", "step"]}
+        said |= {} if self.protocol.season is None else {"season": self.protocol.season}
         return {**said, "title": [self.panel.name, self.split]}
 
     @property

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+import dvae
 from dvae.data import HeldOutWindows, Source
 from dvae.inference.held import hold
 from dvae.tables import Column, Columns, Panel, PanelData, Series
@@ -258,3 +259,45 @@ def test_sequences_that_are_too_short_are_listed():
     assert f"{len(short)} sequences, which have fewer than 7 steps there" in said["train"]
     assert said["test"].startswith(f"{len(data.windows('test'))} test windows of 4 + 3 steps")
     assert data.recut(horizon=25).parts()["test"].startswith("panel has no test window of 4 + 25 steps")
+
+
+def test_whole_sequences_end_with_their_last_target():
+    """Rows behind it are a plan, of which nothing is missing."""
+    rng = np.random.default_rng(0)
+    columns = Columns((Column("y"), Column("plan", "known")))
+    series = [Series(f"s{n}", rng.normal(size=(9 + n, 2))) for n in range(6)]
+    planned = []
+    for one in series:
+        future = np.column_stack([np.full(3, np.nan), rng.normal(size=3)])
+        planned.append(Series(one.name, np.concatenate([one.values, future])))
+    plain, more = (PanelData.of(Panel(each, columns), cut=Cut()) for each in (series, planned))
+    assert more.schema == plain.schema
+    assert not more.schema.indicators
+    ours, theirs = more.windows("train").all(), plain.windows("train").all()
+    assert "mask" not in ours
+    for name in theirs:
+        assert torch.equal(ours[name], theirs[name]), name
+    nothing = Series("t", np.column_stack([np.full(4, np.nan), np.ones(4)]))
+    windows = PanelData("p", Panel([*planned, nothing], columns), plain.schema).windows("all")
+    assert len(windows) == 6
+    assert "t" in windows.left_out
+
+
+def test_a_panel_of_other_columns_is_refused():
+    first, second = Columns((Column("a"), Column("b", "known"))), Columns((Column("b", "known"), Column("a")))
+    panel = Panel([Series(f"s{n}", np.ones((5, 2)) * n) for n in range(5)], first)
+    data = PanelData.of(panel, cut=Cut())
+    assert data.on(panel).panel is panel
+    with pytest.raises(ValueError, match="panel of b, a, whose columns are another thing than a, b"):
+        data.on(Panel(panel.series, second))
+
+
+def test_a_season_that_is_told_is_repeated():
+    days = np.tile(np.arange(7.0), 12)[:, None]
+    columns = Columns((Column("y"),))
+    data = PanelData.of(Panel([Series("s", days)], columns), cut=Cut(14, 5, split="time", season=7))
+    windows = data.windows("test")
+    rows = dvae.evaluate({}, windows, references=["seasonal"], progress=False)
+    assert rows["seasonal"]["CRPS"].mean == 0
+    with pytest.raises(ValueError, match="season is 7 and observed 5; a period"):
+        Cut(5, 5, season=7)
