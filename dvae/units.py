@@ -63,8 +63,10 @@ class Units(nn.Module):
         """Takes mean and root mean variance of values (..., D).
 
         Raises:
-            ValueError: values that do not vary, or are of another size.
+            ValueError: values that do not vary, or are of another size; coordinates that have their units.
         """
+        if self.scale.dim():
+            raise ValueError("these coordinates have units of their own, which were given; there is nothing to fit")
         rows = values.flatten(0, -2)
         if rows.shape[1:] != self.mean.shape or not rows.var(0).mean() > 0:
             raise ValueError(

@@ -6,7 +6,7 @@ from pyro import poutine
 
 import dvae
 from dvae.networks import Attention, Recurrent
-from dvae.units import Units
+from dvae.units import Coordinate, Units
 
 PAIR = ("p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)")
 SIZES = {"w": 2, "z": 2, "x": 3}
@@ -27,6 +27,11 @@ def test_units_come_from_values_that_vary(shape, fill):
     values = torch.randn(shape) if fill is None else torch.full(shape, fill)
     with pytest.raises(ValueError, match=r"units come from values \(\.\.\., 3\) that vary"):
         Units(3).fit(values)
+
+
+def test_units_that_were_given_are_not_fitted():
+    with pytest.raises(ValueError, match="units of their own, which were given"):
+        Units(2, [Coordinate(1.0, 2.0), Coordinate()]).fit(torch.randn(4, 2))
 
 
 @pytest.mark.parametrize("network", [Attention(8, heads=2), Recurrent(4)])

@@ -112,7 +112,8 @@ class PanelSchema(Schema):
                 if column.family in LOGARITHMIC and (values > 0).any():
                     floor = values[values > 0].min()
                     read = np.log(values.clip(floor))
-                    logarithms[column.name] = float(floor), float(read.mean()), float(read.std()) or 1.0
+                    spread = float(read.std())
+                    logarithms[column.name] = float(floor), float(read.mean()), spread if spread > LEAST else 1.0
             elif column.family == "binary":
                 means[column.name] = float(values.mean())
             if column.role == "past" or np.isnan(known[:, place]).any():
@@ -183,12 +184,13 @@ class PanelSchema(Schema):
     @property
     @override
     def units(self) -> Mapping[str, Sequence[Coordinate]]:
-        """Of x; where a column that is only scaled is missing, its mean, which is its scale, stands for it."""
+        """Of x; for what is missing stands the mean, or that of the logarithms where these are read."""
         found = []
         for column in self.columns.targets:
             mean, scale = self.means.get(column.name, 0.0), self.scales.get(column.name, 1.0)
-            typical = scale if column.family in SCALED else mean
-            own = Coordinate(mean, scale, typical, *self.logarithms.get(column.name, ()))
+            read = self.logarithms.get(column.name, ())
+            typical = float(np.exp(read[1])) if read else scale if column.family in SCALED else mean
+            own = Coordinate(mean, scale, typical, *read)
             found += [own] * len(column.coordinates)
         return {"x": found}
 

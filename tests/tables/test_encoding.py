@@ -64,6 +64,23 @@ def column(panel, name, parts):
     return held[~np.isnan(held)]
 
 
+def test_logarithms_of_a_column_are_read_as_they_vary_and_stand_for_what_is_missing():
+    """A column that hardly varies is not blown up, however it is rounded; zeros are read as the least that is not."""
+    columns, rng = (
+        Columns((Column("flow", family="power"), Column("flat", family="positive"))),
+        np.random.default_rng(0),
+    )
+    values = np.stack([rng.lognormal(1, 2, 9), 3 + 1e-15 * rng.normal(size=9)], 1)
+    values[0, 0], values[1, 0] = 0, NAN
+    panel = Panel([Series(f"s{n}", values) for n in range(4)], columns)
+    flow, flat = PanelSchema.under(panel, Cut()).units["x"]
+    least = values[2:, 0].min()
+    logarithms = np.log([least, *values[2:, 0]])
+    assert (flow.floor, flow.level, flow.spread) == pytest.approx((least, logarithms.mean(), logarithms.std()))
+    assert flow.typical == pytest.approx(np.exp(flow.level))
+    assert (flat.level, flat.spread, flat.typical) == pytest.approx((np.log(3), 1.0, 3.0))
+
+
 def test_units_are_those_of_the_training_sequences():
     panel = table()
     schema = PanelSchema.under(panel, CUT)
