@@ -759,10 +759,7 @@ def main(
         for name, choice in tried().items() if "tuning" in parts else ():
             kept(out / TUNING / f"{folder(name)}.json", partial(run.certain, *choice))
     found = sections(out)
-    if page is None:
-        print(*found, sep="\n")
-    else:
-        write(page, *found, name=MARKS)
+    write(page, *found, name=MARKS)
     draw(out, picture)
 
 

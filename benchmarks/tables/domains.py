@@ -500,10 +500,7 @@ def main(
         for seed, case in itertools.product(seeds, cases or SECTIONS[name].cases):
             run(name, case, seed, runs / name / f"{case}-{seed}", data, part)
     found = tables(runs, part)
-    if page is None:
-        print("\n".join(found))
-    else:
-        write(page, *found)
+    write(page, *found)
 
 
 if __name__ == "__main__":

@@ -195,10 +195,7 @@ def main(
     for latent in STEPS:
         if (runs / str(latent)).exists():
             found += [f"Latent of {latent} numbers, {STEPS[latent]} steps:\n", tabled(runs / str(latent), part)]
-    if page is None:
-        print("\n".join(found))
-    else:
-        write(page, *found)
+    write(page, *found)
 
 
 if __name__ == "__main__":

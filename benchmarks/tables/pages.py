@@ -24,8 +24,11 @@ def code(text: str) -> str:
     return "`" + text.replace("|", "\\|") + "`"
 
 
-def write(page: Path, *tables: str, name: str = "tables") -> None:
-    """Puts tables between the marks of a page, or between those that have another name."""
+def write(page: Path | None, *tables: str, name: str = "tables") -> None:
+    """Puts tables between the marks of a page, or between those that have another name; without a page, prints them."""
+    if page is None:
+        print(*tables, sep="\n")
+        return
     begin, end = (mark.replace("tables", name) for mark in (BEGIN, END))
     before, rest = page.read_text(encoding="utf-8").split(begin)
     page.write_text(before + begin + "\n" + "\n".join(tables) + "\n" + end + rest.split(end)[1], encoding="utf-8")
