@@ -354,19 +354,19 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
     if not order > 0:
         raise ValueError(f"the order of a variogram must be positive, but is {order}")
 
-    def score(x: Tensor, y: Tensor) -> Tensor:
-        size, total = y.shape[-1], y.new_zeros(())
-        seen = (~y.isnan()).sum(-1)  # by frame
-        complete = bool((seen == size).all())
+    samples, truth = _paired(samples, truth)
+    *lead, steps, size = truth.shape
+    count, scores = samples.shape[-3], []
+    windows = samples.reshape(-1, count, steps, size), truth.reshape(-1, steps, size)
+    for x, y in zip(*(part.split(max(1, CACHED // (count * steps * size))) for part in windows), strict=True):
+        seen, total = (~y.isnan()).sum(-1), y.new_zeros(len(y))  # seen by frame
         # Pairs (i, i + lag): a slice stays in the cache, where all D * D pairs at once would not.
         for lag in range(1, size):
-            actual = (y[:, lag:] - y[:, :-lag]).abs().pow(order)
-            forecast = (x[..., lag:] - x[..., :-lag]).abs().pow(order).mean(0)
-            terms = (actual - forecast).square()
-            total = total + (terms if complete else terms.nan_to_num(0.0)).sum()
-        return total / max(1, int((seen * (seen - 1)).sum()) // 2)
-
-    return _per_window(score, *_paired(samples, truth))
+            actual = (y[..., lag:] - y[..., :-lag]).abs().pow(order)
+            forecast = (x[..., lag:] - x[..., :-lag]).abs().pow(order).mean(1)
+            total = total + torch.where(actual.isnan(), 0.0, (actual - forecast).square()).sum((-2, -1))
+        scores.append(total / ((seen * (seen - 1)).sum(-1) // 2).clamp(min=1))
+    return torch.cat(scores).reshape(lead)
 
 
 def frechet_distance(features: Array, other: Array) -> Tensor:
@@ -493,6 +493,8 @@ def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Te
 
 
 LAST = slice(-1, None)
+CACHED = 2**17
+"""Numbers that a processor's cache holds."""
 
 
 def _places(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
