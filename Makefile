@@ -17,7 +17,7 @@ export OMP_NUM_THREADS := 1
 
 # Numerical tests, for the second run: other instructions round otherwise.
 NUMERICAL := laws/test_laws.py networks/test_networks.py networks/test_graphconv.py test_oracle.py program/test_model.py \
-	models/test_trajectories.py motion/test_control.py motion/test_forecasts.py $(addprefix inference/test_,bounds.py compare.py metrics.py particles.py)
+	models/test_trajectories.py motion/test_control.py motion/test_forecasts.py $(addprefix inference/test_,bounds.py metrics.py particles.py)
 
 .PHONY: venv demo lint quick test fuzz coverage bench notebooks docs dist clean
 

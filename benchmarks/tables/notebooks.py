@@ -24,7 +24,10 @@ from PIL import Image
 ROOT = Path(__file__).parents[2]
 PLOTLY = "application/vnd.plotly.v1+json"
 # sequences have fewer steps than training
-SHARED = re.compile(r"(\b(?:steps|particles|samples|warm_up)=|\bStage\(|\"warm_up\": )(\d{3,}|(?<=samples=)\d\d)")
+SHARED = re.compile(
+    r"(\b(?:steps|particles|samples|warm_up)=|\b(?:Stage|draw)\(|\"warm_up\": )(\d{3,}|(?<=samples=)\d\d)"
+)
+CLIPS, FEWEST = re.compile(r"(\bclips=)(\d{2,})"), 0.5  # a share of them, so that every split has some
 LIGHT = np.array([-0.5, -0.6, 0.63])  # towards it, from the left, above and in front
 TEXTS = ("text/plain", "text/html", "text/latex")
 
@@ -34,12 +37,16 @@ def execute(path: Path, share: float = 1.0) -> nbformat.NotebookNode:
 
     Args:
         path: the notebook.
-        share: of the steps of training, of particles and of samples; fewer change no more than numbers and pictures.
+        share: of the steps of training, of particles and of samples, and of simulated clips half at least; fewer change
+            no more than numbers and pictures.
     """
     notebook = nbformat.read(path, as_version=4)
     sources = [cell.source for cell in notebook.cells]
     for cell in notebook.cells:
-        cell.source = SHARED.sub(lambda found: f"{found[1]}{max(int(share * int(found[2])), 2)}", cell.source)
+        for pattern, part in ((SHARED, share), (CLIPS, max(share, FEWEST))):
+            cell.source = pattern.sub(
+                lambda found, part=part: f"{found[1]}{max(int(part * int(found[2])), 2)}", cell.source
+            )
     options = {"timeout": 1200, "kernel_name": "python3", "record_timing": False}
     client = NotebookClient(notebook, resources={"metadata": {"path": str(ROOT)}}, **options)
     own = {"PYTHONPATH": str(ROOT), "MPLBACKEND": "module://matplotlib_inline.backend_inline"}

@@ -403,7 +403,7 @@ def test_columns_are_those_of_the_data():
 def histogram(ranks, clips):
     """An evaluation of what has these PIT, (N, numbers)."""
     places = list(dict.fromkeys(clips))
-    shares = np.stack([np.histogram(row, 20, (0, 1))[0] / row.size for row in ranks])
+    shares = (np.minimum(20 * ranks, 19).astype(int)[..., None] == np.arange(20)).mean(1)
     of = np.array([places.index(clip) for clip in clips])
     means = tuple(tuple(shares[of == place].mean(0)) for place in range(len(places)))
     data = {"windows": len(ranks), "frames": 1 + ranks.shape[1], "coordinates": 1, "fingerprint": "f" * 64}

@@ -368,19 +368,20 @@ def test_missing_joints_stay_missing_where_windows_are_turned(windows):
 
 
 @pytest.mark.parametrize("ablation", ABLATIONS)
-def test_every_ablation_is_fitted_loaded_and_forecasts(walkers, tmp_path, ablation):
+def test_every_ablation_is_fitted_loaded_and_forecasts(people, tmp_path, ablation):
     """And the best weights are by what is trained."""
+    data = dvae.motion.MotionData.open(people)
     method = small(warm_up=1, **ABLATIONS[ablation])
     training = dvae.Training(steps=4, validate_every=2, batch_size=2, progress=False, accelerator="cpu")
-    result = runs.fit_run(method, walkers, tmp_path / "run", training)
+    result = runs.fit_run(method, data, tmp_path / "run", training)
     rows = [row for row in result.history if any(name.startswith("validation/") for name in row)]
     assert all(("validation/loss" in row) == (method.loss == "best-of-many") for row in rows)
     assert ("validation loss" in result.best) == (method.loss == "best-of-many")
     loaded = runs.load(tmp_path / "run")
-    assert loaded.method == replace(method.suited(walkers.windows("train")))
+    assert loaded.method == replace(method.suited(data.windows("train")))
     assert configured(loaded.method.config()) == loaded.method
     assert loaded.model.feeding.probability == 0
-    past = walkers.windows("test").all()["x"][:2, :15]
+    past = data.windows("test").all()["x"][:2, :15]
     assert torch.isfinite(loaded.model.forecast(past, 3, 2)["x"]).all()
     assert ("w" in loaded.model.latents) == bool(method.static)
 

@@ -203,8 +203,9 @@ def left(network, present, a, wanted):
     """What draws a (S, T, D) at steps `wanted` are beside their mean given what is present, made white."""
     alpha = torch.ones(a.shape[1], 1).double()
     here = places(network, wanted, a.shape[1], "a")
-    means, covariances = zip(*(given(network, alpha, present, row, here) for row in a), strict=True)
-    away = a[:, wanted].flatten(1) - torch.stack(means)
+    each = torch.eye(a[0].numel(), dtype=a.dtype).view(-1, *a.shape[1:])  # in which the mean is linear
+    means, covariances = zip(*(given(network, alpha, present, row, here) for row in each), strict=True)
+    away = a[:, wanted].flatten(1) - a.flatten(1) @ torch.stack(means)
     return torch.linalg.solve_triangular(torch.linalg.cholesky(covariances[0]), away.mT, upper=False)
 
 
