@@ -30,6 +30,8 @@ class Schema:
     """
 
     kind: ClassVar[str] = "sequences"
+    per: ClassVar[str] = "frame"
+    """What bounds are per."""
 
     sizes: Mapping[str, Size]
     length: Frames | None = None

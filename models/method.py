@@ -135,6 +135,7 @@ class LikelihoodMethod(Method):
                 )
             described["laws"]["p(x)"] = schema.emission
         model = kind(**{"indicators": schema.indicators, **described}, view=schema.view)
+        model.per = schema.per
         for name, coordinates in schema.units.items():
             model.standardise(name, coordinates)
         return model

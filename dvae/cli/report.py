@@ -18,7 +18,7 @@ from ..report import Section, document, lacking, sections
 from ..report.page import beside, picture
 from ..runs import directory as runs
 from ..tables.windows import PanelWindows
-from . import opening, tables
+from . import opening
 from .console import ERROR, Missing, at_least, check_files
 from .futures import draw_futures
 from .judging import Control
@@ -81,7 +81,7 @@ def report(
         shown = [make(named) for make in bar.track(OF_DIRECTORIES, description="run directories")]
     try:
         opened = opening.data_of(data, *loaded, missing=missing)
-        test: Any = tables.windows(loaded[0], opened) if kind == "panel" else opened.windows("test")
+        test: Any = opened.windows("test")
     except CheckpointError as error:
         text = f"Bounds, latents and futures need the data. {reason(error)}; say where they are with --data."
         shown.append(Section("Latents and futures", before=lacking(text)))
@@ -98,6 +98,9 @@ def report(
 
 def _fans(named: Mapping[str, Any], windows: PanelWindows, count: int, samples: int, seed: int) -> Section:
     """A few windows with what happened and the intervals of what each run forecasts."""
+    if windows.length is None:
+        text = "These runs are of whole sequences. To see futures, fit with --observed and --horizon."
+        return Section("Futures", before=lacking(text))
     few = windows.some(sections.Few(windows, count).chosen)
 
     def cell(run: runs.Loaded) -> Markup:

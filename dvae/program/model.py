@@ -76,7 +76,7 @@ class DynamicalVAE(nn.Module):
 
     extras: ClassVar[tuple[str, ...]] = ()
     """What a batch may hold that is no variable, for `penalties`."""
-    per: ClassVar[str] = "frame"
+    per: str = "frame"
     """What there is one log-likelihood of."""
 
     @alone

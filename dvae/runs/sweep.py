@@ -392,6 +392,7 @@ class _Progress:
     def __init__(self, runs: Sequence[_Run], training: Training) -> None:
         self.console = Plain(stderr=True, quiet=not training.progress, force_jupyter=False)
         self.steps, self.total = training.steps, len(runs)
+        self.bound = f"bound (nats a {runs[0].data.schema.per if runs else Fit.per})"
         self.logs = {run.path: _Log(run.path) for run in runs}
         # away from a terminal nothing is drawn, but the logs are looked at all the same
         self.live = Live(console=self.console, get_renderable=self._look, refresh_per_second=2, transient=True)
@@ -422,7 +423,7 @@ class _Progress:
         ended, waiting = self.total - len(logs), len(logs) - len(running)
         table = Table(caption=f"{ended} of {self.total} runs ended, {waiting} waiting", caption_justify="left")
         table.add_column("run", overflow="fold")
-        for name in ("step", "bound (nats a frame)", "elapsed"):
+        for name in ("step", self.bound, "elapsed"):
             table.add_column(name, justify="right")
         for log in running:
             assert log.begin is not None

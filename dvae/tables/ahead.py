@@ -47,16 +47,6 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
         if len(future) < steps:
             future = np.concatenate([future, np.full((steps - len(future), future.shape[1]), np.nan)])
         values = np.concatenate([one.values[:present], future])
-        found.append(Series(one.name, values, _times(one, len(values)), one.group))
+        found.append(Series(one.name, values, one.moments(0, len(values)), one.group))
     cut = replace(schema.cut, horizon=steps, split="sequence")
     return PanelWindows(replace(panel, series=found), replace(schema, cut=cut), "last")
-
-
-def _times(one: Series, count: int) -> np.ndarray | None:
-    """Times of so many steps, behind the last one as far apart as the median of them all."""
-    if one.times is None:
-        return None
-    times = one.times[:count]
-    lacking = count - len(times)
-    step = np.median(np.diff(one.times)) if len(one) > 1 else 1.0
-    return np.concatenate([times, times[-1] + step * np.arange(1, lacking + 1)])

@@ -58,6 +58,7 @@ class PanelSchema(Schema):
     """
 
     kind: ClassVar[str] = "panel"
+    per: ClassVar[str] = "step"
 
     sizes: Mapping[str, int] = field(default_factory=dict)
     columns: Columns = field(default_factory=lambda: Columns((Column("x"),)))
@@ -225,6 +226,15 @@ class PanelSchema(Schema):
             values[0, place] = known[0] if len(known) else np.nan
         (found,) = self._filled(values, columns)
         return np.asarray(found)
+
+    def unforeseen(self, parts: Sequence[np.ndarray]) -> list[str]:
+        """Covariates that values (T, C) lack, and training data nowhere."""
+        found = []
+        for column in self.columns.of("known", "static"):
+            gone = (np.isnan(part[:, self.places[column.name]]) for part in parts)
+            lacks = any(each.all() if column.role == "static" else each.any() for each in gone)
+            found += [column.name] if lacks and column.name not in self.lacking else []
+        return found
 
     def gaps(self, one: Series) -> np.ndarray:
         """d (T, 1) of a sequence, 1 at its first step."""

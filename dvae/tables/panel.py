@@ -50,6 +50,14 @@ class Series:
     def __len__(self) -> int:
         return len(self.values)
 
+    def moments(self, start: int, steps: int) -> np.ndarray | None:
+        """Times (steps,) from a step on; behind the end as far apart as the median of them all."""
+        if self.times is None:
+            return None
+        own = self.times[start : start + steps]
+        apart = np.median(np.diff(self.times)) if len(self) > 1 else 1.0
+        return np.concatenate([own, self.times[-1] + apart * np.arange(1, steps - len(own) + 1)])
+
 
 @dataclass(frozen=True, eq=False)
 class Panel:

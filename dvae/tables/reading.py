@@ -135,6 +135,8 @@ def _parquet(content: bytes) -> Any:
     sizes = [held.metadata.row_group(n).total_byte_size for n in range(held.metadata.num_row_groups)]
     _refuse_large(max(sum(sizes), 8 * rows * columns))  # what repeats takes no room in a file
     flat = [each for each in held.schema_arrow if not kinds.is_nested(each.type)]
+    if nested := [each.name for each in held.schema_arrow if kinds.is_nested(each.type)]:
+        warnings.warn(f"columns of lists or records are left out: {', '.join(nested)}", stacklevel=2)
     words = [each.name for each in flat if kinds.is_string(each.type) or kinds.is_large_string(each.type)]
     names = [each.name for each in flat if not re.fullmatch(r"__index_level_\d+__", each.name)]
     table = parquet.ParquetFile(BytesIO(content), read_dictionary=words).read(names, use_threads=False)

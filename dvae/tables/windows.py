@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Sequence
 from copy import copy
 from typing import Any, Self
@@ -67,6 +68,13 @@ class PanelWindows:
         spans = zip((self._first + self._low).tolist(), (self._first + last).tolist(), strict=True)
         self._missing = not all(bool(self._mask[start:end].all()) for start, end in spans)
         self._x = self._x.nan_to_num(0.0)
+        parts = [one.values[low:end] for one, low, end in zip(some, self._low.tolist(), last.tolist(), strict=True)]
+        if unforeseen := schema.unforeseen(parts):
+            warnings.warn(
+                f"the {split} part of {panel.name} lacks values of {', '.join(unforeseen)}, of which training data "
+                "lack none; the last value before, or the mean, stands for them, and no indicator tells models so",
+                stacklevel=2,
+            )
         self._context = {}
         for name, make in ((COVARIATES, schema.context), (GAPS, schema.gaps)):
             if name in schema.sizes:
@@ -223,17 +231,13 @@ class PanelWindows:
     def times(self, steps: int) -> tuple[np.ndarray | None, bool]:
         """Times (N, steps) from the start of the listed windows, and whether they are dates; None where rows have none.
 
-        Behind the end of a sequence they are as far apart as the last two.
+        Behind the end of a sequence they go on as `Series.moments` says.
         """
-        found = []
-        for place, start in zip(*map(Tensor.tolist, self._windows), strict=True):
-            one = self.panel.series[self._ranges[place][0]]
-            if one.times is None:
-                return None, False
-            own = one.times[start : start + steps]
-            step = own[-1] - own[-2] if len(own) > 1 else 1.0
-            found.append(np.concatenate([own, own[-1] + step * np.arange(1, steps - len(own) + 1)]))
-        return np.stack(found), self.panel.dates
+        places, starts = map(Tensor.tolist, self._windows)
+        listed = [self.panel.series[self._ranges[place][0]] for place in places]
+        found = [one.moments(start, steps) for one, start in zip(listed, starts, strict=True)]
+        known = [own for own in found if own is not None]
+        return (np.stack(known), self.panel.dates) if len(known) == len(found) else (None, False)
 
     def _listed(self) -> tuple[Tensor, Tensor]:
         """Range and first step: test windows so far apart as the protocol says, all others by half a horizon."""

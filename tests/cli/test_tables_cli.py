@@ -14,6 +14,8 @@ from dvae.cli.fitting import DataOptions
 from dvae.cli.tables import is_table
 from dvae.inference.training import Training
 from dvae.models.registry import judges, methods
+from dvae.runs import directory
+from dvae.tables import Cut, PanelData
 
 pd = pytest.importorskip("pandas")
 
@@ -168,6 +170,19 @@ def test_a_report_has_the_fans_of_a_table(tabled, tmp_path):
     assert "<script>" not in text
     assert text.count('alt="forecasts of s') == 1
     assert "windows of 2 sequences" in text
+
+
+def test_runs_of_whole_sequences_are_reported_without_futures(table, tmp_path, capsys):
+    run, page = str(tmp_path / "run"), tmp_path / "a.html"
+    data = PanelData.open(str(table), cut=Cut())
+    training = dvae.Training(steps=2, batch_size=4, validate_every=2)
+    fit = directory.fit_run(dvae.method("vae", latent=2, warm_up=1), data, run, training)
+    assert re.fullmatch(r"best bound -\d+\.\d+ nats a step at step 2", fit.best)
+    assert main(["report", run, "--out", str(page), "--particles", "2", "--bound-windows", "2"]) == 0
+    text = page.read_text()
+    assert "cannot be shown" not in text
+    assert "These runs are of whole sequences. To see futures, fit with --observed and --horizon." in text
+    assert "importance bound" in text
 
 
 def test_what_is_written_stands_beside_the_rows_that_it_is_about(tabled, table, tmp_path):
