@@ -52,6 +52,7 @@ class PanelWindows:
         none = (
             f"{panel.name} has no {split} window of {schema.cut.name}; up to their last targets its {len(panel)} "
             f"sequences have {min(steps)} to {max(steps)} steps"
+            f"{f', and {split} has a share of 0 of them' if getattr(schema.cut, split, 1) == 0 else ''}"
         )
         if not self._ranges:
             raise ValueError(none)
