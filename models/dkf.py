@@ -22,7 +22,7 @@ from typing_extensions import override
 from ..laws.base import LawSpec, Parameters, Shape
 from ..laws.families import Gaussian
 from ..networks import Dense, Input, NetworkSpec, Recurrent
-from ..networks.base import Network, at, shift
+from ..networks.base import Network, aligned, at, shift
 from ..options import Extra, Size
 from .method import LatentMethod
 
@@ -33,13 +33,17 @@ class Gated:
 
         g = sigmoid(MLP(z))    h = MLP(z)    mean = (1 - g) * L(z) + g * h    variance = softplus(L(relu(h)))
 
-    Its features are the mean and relu(h); `GatedNormal` is its law.
+    Gate and proposal also read what is given at t, such as covariates and the gap since t-1. Its features are the mean
+    and relu(h); `GatedNormal` is its law.
     """
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> GatedTransition:
-        """The network of a factor with one parent, a local one at t-1."""
-        if len(inputs) != 1 or inputs[0].lags != (-1,) or inputs[0].size != size:
-            raise ValueError(f"a gated transition is of one variable from its own last value, not from {inputs}")
+        """The network of a factor whose first parent is its own last value, and others static or at t."""
+        fits = bool(inputs) and inputs[0].lags == (-1,) and inputs[0].size == size
+        if not fits or any(parent.relation and parent.lags != (0,) for parent in inputs[1:]):
+            raise ValueError(
+                f"a gated transition is of one variable from its own last value and what is given at t, not {inputs}"
+            )
         return GatedTransition(inputs, size)
 
 
@@ -48,30 +52,39 @@ class GatedTransition(Network):
 
     def __init__(self, inputs: Sequence[Input], size: int):
         super().__init__(inputs, True, 2 * size)
-        self.name, self.size = inputs[0].name, size
+        own, *beside = inputs
+        self.name, self.size, self.beside = own.name, size, [parent.name for parent in beside]
+        read = size + sum(parent.size for parent in beside)
         self.gate, self.proposal = (
-            nn.Sequential(nn.Linear(size, size), nn.ReLU(), nn.Linear(size, size)) for _ in range(2)
+            nn.Sequential(nn.Linear(read, size), nn.ReLU(), nn.Linear(size, size)) for _ in range(2)
         )
         self.linear = nn.Linear(size, size)
 
-    def _features(self, previous: Tensor) -> Tensor:
-        proposal = self.proposal(previous)
-        mean = torch.lerp(self.linear(previous), proposal, torch.sigmoid(self.gate(previous)))
+    def _features(self, previous: Tensor, beside: Tensor) -> Tensor:
+        read = torch.cat([previous, beside], -1)
+        proposal = self.proposal(read)
+        mean = torch.lerp(self.linear(previous), proposal, torch.sigmoid(self.gate(read)))
         return torch.cat([mean, functional.relu(proposal)], dim=-1)
+
+    def _given(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
+        """What is given beside z_{t-1}, (B, T, E)."""
+        empty = self.linear.weight.new_empty(batch, length, 0)
+        return torch.cat(aligned([empty, *(parents[name] for name in self.beside)]), -1)
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        return self._features(shift(parents[self.name], -1))
+        previous = shift(parents[self.name], -1)
+        return self._features(previous, self._given(parents, len(previous), length))
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        return self(given, length).unbind(1) if self.name in given else self.linear.weight.new_empty(batch, 0)
+        return self(given, length).unbind(1) if self.name in given else self._given(given, batch, length)
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         if isinstance(state, tuple):
             return state[t], state
-        return self._features(at(drawn[self.name], t - 1, state, self.size)), state
+        return self._features(at(drawn[self.name], t - 1, state, self.size), state[:, t]), state
 
 
 @dataclass(frozen=True)
@@ -113,7 +126,7 @@ class DKF(LatentMethod):
     source = "Krishnan, Shalit and Sontag, 2015, arXiv 1511.05121"
     generative = "p(z_t | z_{t-1}) p(x_t | z_t)"
     inference = "q(z_t | z_{t-1}, x_{t:T})"
-    apart = ("p(z)", "q(z)")
+    apart = ("q(z)",)
 
     width: Size = 64
     embed: Extra = 64

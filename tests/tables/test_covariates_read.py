@@ -54,6 +54,9 @@ def test_methods_read_covariates_where_data_have_them_and_only_then(name):
             assert not read or read == {"c", "d", "s"}
             if f"{factor.kind}({factor.child})" in method.apart or not (factor.local or factor.parents):
                 assert not read
+    transition = next(factor for factor in model.generative.factors if factor.child in (*model.latents, "x"))
+    reads = {parent.name for parent in transition.parents} >= {"c", "d", "s"}
+    assert reads == (name not in ("dsae", "kvae"))  # w of dsae is static, and the chain of kvae reads its own past
     assert not method.build(PanelSchema(columns=Columns((Column("y"),)))).context
     written = methods()[name].generative
     plain = method.build({"x": 3})
