@@ -224,7 +224,7 @@ def _terms(parents: dict[str, tuple[Parent, ...]]) -> dict[str, tuple[str, ...]]
 
 def audit(
     generative: Factorization | str,
-    inference: Factorization | str,
+    inference: Factorization | str | None,
     steps: int | None = None,
     observed: Iterable[str] = ("x",),
 ) -> Audit:
@@ -241,7 +241,7 @@ def audit(
 
     Args:
         generative: p, a factorization or its text.
-        inference: q.
+        inference: q; None or "" of a model without latents.
         steps: number of inner steps compared, 5 if None; with masks of the user's own T, the length that they will
             be used at, 16 if None.
         observed: names of the observed variables.
@@ -253,7 +253,7 @@ def audit(
     {'z': ('z_{t-1}',)}
     """
     generative = Factorization.parse(generative) if isinstance(generative, str) else generative
-    inference = Factorization.parse(inference) if isinstance(inference, str) else inference
+    inference = Factorization.guide(inference) if inference is None or isinstance(inference, str) else inference
     latents, data, context = check_pair(generative, inference, observed)
     relations = _relations(generative, inference)
     custom = any(relation.intervals is None for relation in relations)

@@ -221,6 +221,11 @@ class Factorization:
         observed = tuple(observed)
         return Factorization("q", tuple(replace(f, kind="q") for f in self.factors if f.child not in observed))
 
+    @classmethod
+    def guide(cls, text: str | None) -> Factorization:
+        """A guide by its text, without factors where there is none: that of a model without latents."""
+        return cls.parse(text) if text and text.strip() else cls("q", ())
+
     def given(self, local: Iterable[str], static: Iterable[str], but: Collection[str] = ()) -> Factorization:
         """The same with context that factors read too: those of local variables at t, those of static latents nothing.
 

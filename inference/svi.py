@@ -174,10 +174,11 @@ class SVI:
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
         self._numbers = torch.stack([loss.detach(), norm])
         if not torch.isfinite(self.total(self._numbers)).all():
-            raise NonFiniteError(
-                f"{where}: {_culprit(self.model, terms, loss)}; no step was taken. Try a lower learning "
-                "rate, a smaller gradient_clip or a longer warm-up"
-            )
+            impossible = any((value == -math.inf).any() for value in terms.log_likelihood.values())
+            advice = "a lower learning rate, a smaller gradient_clip or a longer warm-up"
+            if impossible and not state.step:
+                advice = "a law that can have these values; where it ends may depend on its parameters"
+            raise NonFiniteError(f"{where}: {_culprit(self.model, terms, loss)}; no step was taken. Try {advice}")
         if training.gradient_clip is not None and norm > training.gradient_clip:
             for gradient in gradients:
                 gradient.mul_(training.gradient_clip / norm)

@@ -45,8 +45,7 @@ class Method(Trainable):
 
     def equations(self) -> tuple[Factorization, Factorization]:
         """The generative model and the guide, which has no factor where there are no latents."""
-        guide = Factorization.parse(self.inference) if self.inference.strip() else Factorization("q", ())
-        return Factorization.parse(self.generative), guide
+        return Factorization.parse(self.generative), Factorization.guide(self.inference)
 
     def sizes(self) -> dict[str, int]:
         """Sizes of the latents."""

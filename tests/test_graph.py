@@ -265,6 +265,15 @@ def test_a_pair_that_does_not_fit_is_refused():
         audit(DSAE, "q(v | x_{1:T})")
 
 
+@pytest.mark.parametrize("guide", [None, "", " "])
+def test_a_model_without_latents_has_nothing_to_infer(guide):
+    found = audit("p(x_t | x_{<t})", guide)
+    assert found.exact
+    assert not found.missing
+    with pytest.raises(ValueError, match="the latent z has no factor in the guide"):
+        audit("p(z_t) p(x_t | z_t)", guide)
+
+
 def test_how_an_audit_shows():
     result = audit(*PUBLISHED["hit-dvae"][:2])
     assert str(result).splitlines()[:3] == [

@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if debug:
             traceback.print_exc()
-        expected = isinstance(error, ValueError | OSError | RuntimeError | FloatingPointError)
+        expected = isinstance(error, ValueError | OSError | RuntimeError | FloatingPointError | ImportError)
         hint = "" if expected or debug else " (this looks like a bug: --debug shows the traceback)"
         ERROR.print("error: ", style="bold red", end="")
         ERROR.print((reason(error) or type(error).__name__) + hint)

@@ -41,7 +41,7 @@ def show(
     Args:
         method: name of a method, or give two equations instead.
         generative: the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)".
-        inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})".
+        inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; "" of a model without latents.
         steps: time steps in the figure.
         out: save the unrolled graphs of model and guide to this file (png, pdf, svg).
     """
@@ -56,9 +56,9 @@ def show(
             raise UsageError(f"{method} has no equations of its own; give --generative and --inference")
         pair = kind.equations()
         observed = [name for name in pair[0].variables if name not in pair[1].variables]
-    elif generative and inference:
+    elif generative and inference is not None:
         with arguments():
-            pair = Factorization.parse(generative), Factorization.parse(inference)
+            pair = Factorization.parse(generative), Factorization.guide(inference)
         observed = ["x"]
     else:
         raise UsageError("give the name of a method, or both --generative and --inference")

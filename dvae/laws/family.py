@@ -28,8 +28,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -166,7 +166,8 @@ class FamilyLaw(Law):
         self.out = self.projection(shape.features, sum(self.widths), widths.get("loc", 0)) if self.read else None
         with torch.no_grad():
             probe = torch.ones(1, shape.features), torch.zeros(1, shape.size) if self.residual else None
-            self.centre = _centre(self.distribution(self(*probe)))
+            with _refusing(spec, AttributeError, TypeError):
+                self.centre = _centre(self.distribution(self(*probe)))
 
     @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
@@ -225,12 +226,12 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
             left.pop(own, None)
     forms: dict[str, Form] = {}
     for own, constraint in left.items():
-        if constraint.is_discrete:
-            if taken[own].default is inspect.Parameter.empty:
-                raise ValueError(
-                    f"{own} of {name} is a whole number, which no network makes; give it: given={{{own!r}: 10}}"
-                )
-            continue
+        with _refusing(spec, NotImplementedError):
+            whole = constraint.is_discrete
+        if whole:
+            raise ValueError(
+                f"{own} of {name} is a whole number, which no network makes; give it: given={{{own!r}: 10}}"
+            )
         if own in spec.shapes:
             size: tuple[int, ...] = tuple(shape.size if n == -1 else n for n in spec.shapes[own])
         else:  # of a distribution of numbers each has one for each coordinate
@@ -240,6 +241,18 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
     if not forms:
         raise ValueError(f"nothing of {name} is left to be read or learned; it has {', '.join(constraints)}")
     return forms
+
+
+@contextmanager
+def _refusing(spec: Family, *errors: type[Exception]) -> Iterator[None]:
+    """Has a distribution that cannot be made of its parameters refused in a sentence."""
+    try:
+        yield
+    except errors as error:
+        raise ValueError(
+            f"{spec.kind.__name__} with given={dict(spec.given)} cannot be made of numbers that a network reads "
+            f"({error}); give what it needs, or write a law of your own"
+        ) from error
 
 
 def _to(constraint: Any) -> Any:

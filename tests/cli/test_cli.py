@@ -53,6 +53,8 @@ def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
     equations = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t)", "--inference", "q(z_t | z_{t-1}, x_{t:T})"]
     assert main(["show", *equations]) == 0
     assert "exact: the guide reads everything" in capsys.readouterr().out
+    assert main(["show", "--generative", "p(x_t | x_{<t})", "--inference", ""]) == 0
+    assert "nothing is latent" in capsys.readouterr().out
 
 
 def test_wrong_arguments_exit_with_2(capsys, tmp_path):

@@ -13,6 +13,7 @@ from scipy import integrate, stats
 
 import dvae
 from dvae import laws
+from dvae.inference.svi import NonFiniteError
 from dvae.laws import Family, Shape
 from dvae.networks import Dense, Recurrent
 
@@ -361,11 +362,21 @@ def test_values_that_a_family_does_not_have_are_refused_unless_hidden(law, value
         (lambda: Family("Poisson", given={"rate": 1.0}), "nothing of Poisson is left to be read"),
         (lambda: Family("Poisson", residual=1.0), "Poisson has no location"),
         (lambda: laws.NormalMixture(0), "at least one component"),
+        (lambda: Family("Delta"), "Delta with given={} cannot be made of numbers that a network reads"),
+        (lambda: Family("LKJ"), "missing 1 required positional argument: 'dim'.; give what it needs"),
+        (lambda: Family("Binomial"), "total_count of Binomial is a whole number, which no network makes; give it"),
     ],
 )
 def test_refusals(make, said):
     with pytest.raises(ValueError, match=said):
         make().build(Shape(2, 3))
+
+
+def test_values_beyond_where_a_law_happens_to_end_are_told_from_steps_that_are_too_large():
+    """Of twelve there are no twenty: where a support depends on parameters, the first bound tells."""
+    x = torch.full((4, 3, 2), 20.0)
+    with pytest.raises(NonFiniteError, match=r"is -inf in 4 of 4 sequences.*Try a law that can have these values"):
+        dvae.fit(built(Family("Binomial", given={"total_count": 12})), x, steps=1, progress=False)
 
 
 def test_a_distribution_without_a_mean_says_so_where_one_is_needed():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.io import wavfile
 
+from dvae.cli import main
 from dvae.tables import domains
 from dvae.tables.domains.chorales import NAMES, SIZES, VOICES, changes, chorales, different, quarters, roll, to_c, tonic
 from dvae.tables.domains.series import read_ts
@@ -42,6 +43,14 @@ def test_a_package_that_is_not_there_is_named_and_how_to_get_it(monkeypatch, nam
     monkeypatch.setitem(sys.modules, NEEDED[name], None)
     with pytest.raises(ImportError, match=rf"the package {NEEDED[name]}: pip install 'pyro-dvae\["):
         domains.domain(name)
+
+
+def test_the_command_line_takes_it_for_no_bug(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "statsmodels", None)
+    assert main(["data", "info", "macrodata"]) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "pip install 'pyro-dvae[" in said
+    assert "bug" not in said
 
 
 def test_a_name_that_is_none_is_answered_with_the_nearest():
