@@ -78,6 +78,11 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
         """
 
 
+def clusters(windows: Any) -> list[tuple[str, str, int]]:
+    """Keys of windows by what is independent of each other: by clips, unless the windows know of more (`clusters`)."""
+    return list(getattr(windows, "clusters", None) or windows.keys)
+
+
 def called(said: Mapping[str, Any]) -> tuple[str, str]:
     """What a clip and a frame are called, by what windows say of themselves."""
     clip, frame = said.get("called", ("clip", "frame"))

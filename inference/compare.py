@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, HeldOutWindows, Listed, called, each, leaves, sequences
+from ..data import Batch, HeldOutWindows, Listed, called, clusters, each, leaves, sequences
+from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import require_likelihood
@@ -121,7 +122,8 @@ def compare(
         )
     windows = data if isinstance(data, HeldOutWindows) else None
     batch = sequences(data).batch
-    keys = list(windows.keys) if windows is not None else [("data", str(n), 0) for n in range(length_of(batch))]
+    alone = batch[GROUP].tolist() if GROUP in batch else range(length_of(batch))
+    keys = [("data", str(n), 0) for n in alone] if windows is None else clusters(windows)
     chosen = torch.randperm(len(keys), generator=torch.Generator().manual_seed(seed))[:contrasts]
     shared: dict[str, Any] = {"seed": seed, "batch_size": batch_size, "progress": progress}
     free: dict[str, dict[str, Any]] = {label: {} for label in labelled}

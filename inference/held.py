@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, HeldOutWindows, called, each, gapped, mask_of, past_of
+from ..data import Batch, HeldOutWindows, called, clusters, each, gapped, mask_of, past_of
 from ..program.batch import rows
 from ..program.conditional import evaluating
 
@@ -58,12 +58,12 @@ class Held:
     @property
     def clips(self) -> dict[str, int]:
         """{"split/clip": number of its windows}."""
-        return dict(Counter(f"{split}/{clip}" for split, clip, _ in self.keys))
+        return dict(Counter(f"{split}/{clip}" for split, clip, _ in clusters(self.windows)))
 
     @property
     def places(self) -> Tensor:
         """`(N,)`, the clip of every window, as its place in `clips`."""
-        return clip_places(self.keys)
+        return clip_places(clusters(self.windows))
 
     def description(self) -> dict[str, Any]:
         """Of the data, for the record."""
@@ -108,9 +108,9 @@ def hold(windows: HeldOutWindows) -> Held:
         for what, mask in (("past", held.mask[:, :observed]), ("future", held.mask[:, observed:])):
             if (empty := ~mask.flatten(1).any(1)).any():
                 split, name, start = held.keys[int(empty.nonzero()[0])]
-                clip, frame = called(windows.description)
+                _, frame = called(windows.description)
                 raise ValueError(
-                    f"nothing was observed in the {what} of the window at {frame} {start} of {clip} {name!r} "
+                    f"nothing was observed in the {what} of the window at {frame} {start} of {name!r} "
                     f"({split}); leave it out"
                 )
     return held

@@ -124,11 +124,23 @@ class PanelWindows:
         ]
 
     @property
+    def clusters(self) -> list[tuple[str, str, int]]:
+        """The same by groups, where the data have some: sequences of a group are no independent evidence."""
+        if not self.schema.columns.group:
+            return self.keys
+        groups = [self.panel.series[self._ranges[place][0]].group for place in self._windows[0].tolist()]
+        return [(split, group, start) for (split, _, start), group in zip(self.keys, groups, strict=True)]
+
+    @property
     def description(self) -> dict[str, Any]:
         """Columns with their units and scales, for the record."""
         columns = {name: column.unit for column in self.schema.columns.targets for name in column.coordinates}
         scales = [coordinate.scale for coordinate in self.schema.units["x"]]
-        said: dict[str, Any] = {"columns": columns, "scales": scales, "called": ["sequence", "step"]}
+        said: dict[str, Any] = {
+            "columns": columns,
+            "scales": scales,
+            "called": ["group" if self.schema.columns.group else "sequence", "step"],
+        }
         said |= {} if self.protocol.season is None else {"season": self.protocol.season}
         return {**said, "title": [self.panel.name, self.split]}
 

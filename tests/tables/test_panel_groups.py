@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+import pytest
 import torch
 
 import dvae
@@ -39,6 +40,27 @@ def test_batches_for_training_have_several_windows_of_a_group():
     assert means.diff().abs().min() > 0.3  # of which each has its own
     again = train.sample(20, torch.Generator().manual_seed(0))
     assert torch.equal(again["x"], batch["x"])
+
+
+def test_errors_are_over_groups_whose_sequences_share_what_is_drawn():
+    """Bounds of a group's sequences are equal shares of its own: their spread tells nothing of other groups."""
+    data = panel(Cut(4, 4, split="group", validation=0.2, test=0.3))
+    torch.manual_seed(0)
+    pair = {"generative": "p(g) p(x_t | g)", "inference": "q(g | x_{1:T})"}
+    model = dvae.method("equations", **pair, grouped=("g",), latent=1, width=8).build(data.schema)
+    test = data.windows("test")
+    how = {"progress": False, "samples": 2}
+    found = dvae.compare({"ours": model}, test, particles=5, contrasts=0, **how)
+    assert "windows of 3 groups" in str(found)
+    assert "clustered by group" in str(found)
+    groups = np.unique([group for _, group, _ in test.clusters], return_inverse=True)[1]
+    bounds = found.rows["ours"].bounds["importance bound"][0]
+    means = np.bincount(groups, bounds) / np.bincount(groups) / test.length
+    assert found["ours"]["importance bound"].sequences == pytest.approx(means.std(ddof=1) / 3**0.5, rel=1e-6)
+    scores = dvae.evaluate({"ours": model}, test, training_windows=data.windows("train"), **how)
+    assert "windows of 3 groups" in str(scores)
+    assert len(scores.rows["ours"].clip_means["CRPS"]) == 3
+    assert np.isfinite(scores["ours"]["CRPS"].standard_error)
 
 
 def test_what_a_group_shares_is_learned_and_told_by_its_sequences(tmp_path):
