@@ -131,7 +131,7 @@ CHORALES = Section(
 SIZE: dict[str, Any] = {"latent": 16, "warm_up": 300}
 SPEECH = Section(
     {
-        BASELINE: Case({"width": 128, "hidden": ()}),
+        BASELINE: Case({"width": 256, "hidden": ()}, {"learning_rate": 1e-3}),
         "vae": Case({**SIZE, "hidden": (128, 64)}),
         "dkf": Case({**SIZE, "width": 128, **PLAIN, "embed_latent": (), "decoder": (128,)}),
         "storn": Case({**SIZE, "width": 128, "embed": 128, "hidden": (128,)}),
