@@ -95,6 +95,13 @@ def columns_of(windows: HeldOutWindows) -> Mapping[str, str]:
     return found
 
 
+def scales_of(windows: HeldOutWindows) -> Sequence[float]:
+    """By what columns are divided to be told together: their scales where they share no unit, else nothing."""
+    units = [*columns_of(windows).values()]
+    mixed = len(units) > 1 and (len({*units}) > 1 or "" in units)
+    return windows.description.get("scales", ()) if mixed else ()
+
+
 @dataclass(frozen=True)
 class Sequences:
     """N sequences in memory.

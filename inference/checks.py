@@ -1,15 +1,16 @@
 """Predictive checks: do replicated sequences look like real ones?
 
 `predictive_checks` compares statistics of real windows with those of forecasts and of draws from the posterior
-predictive distribution (Gelman, Meng and Stern, 1996). `STATISTICS` are some for any sequences.
+predictive distribution (Gelman, Meng and Stern, 1996). `STATISTICS` are some for any sequences, `usual` these in the
+unit of the data.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,7 @@ import torch
 from rich.text import Text
 from torch import Tensor
 
-from ..data import HeldOutWindows, called, gapped, mean_of_known, past_of
+from ..data import HeldOutWindows, called, columns_of, gapped, mean_of_known, past_of, scales_of
 from ..program.batch import repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
@@ -36,10 +37,12 @@ class Statistic:
     Args:
         function: x (..., T, D) -> (...). Of windows with missing entries x is NaN there, in replicates too.
         unit: of the number.
+        note: a line below the table.
     """
 
     function: Callable[[Tensor], Tensor]
     unit: str = ""
+    note: str = ""
 
 
 def variance(x: Tensor) -> Tensor:
@@ -94,6 +97,36 @@ STATISTICS = {
 that of their steps from frame to frame (root mean squares over coordinates); the lag at which the autocorrelation,
 pooled over coordinates, falls below 1/e, T where it never does, and that at a lag of 1, 1 of what stands still; and of
 data that are counts or positive, the share of numbers that are 0, and the extremes. Means are of what was observed."""
+_OF_DATA = ("mean", "scale", "roughness", "smallest", "largest")
+"""Those in the unit of the data."""
+
+
+def usual(windows: HeldOutWindows) -> dict[str, Statistic]:
+    """`STATISTICS`, of all columns together, as `scores.proper` has its scores.
+
+    In the unit of the columns, if windows name them and they share one; else, where windows tell the scales of columns,
+    of numbers in these, which have no unit.
+    """
+    units = dict.fromkeys(columns_of(windows).values())
+    if scales := scales_of(windows):
+        unit, note = "scales", "statistics of all columns together are of numbers in their scales, in the training data"
+    elif len(units) > 1:
+        unit, note = "", f"statistics without a unit mix numbers in {', '.join(unit or '1' for unit in units)}"
+    else:
+        unit, note = next(iter(units), ""), ""
+    return {
+        name: replace(
+            each,
+            function=_in_scales(each.function, scales) if scales else each.function,
+            unit=unit if name in _OF_DATA else each.unit,
+            note=note,
+        )
+        for name, each in STATISTICS.items()
+    }
+
+
+def _in_scales(function: Callable[[Tensor], Tensor], scales: Sequence[float]) -> Callable[[Tensor], Tensor]:
+    return lambda x: function(x / x.new_tensor(scales))
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,12 +195,14 @@ class PredictiveChecks(Result):
     """Statistics of replicated windows beside those of the real ones.
 
     Attributes:
-        checks: (model, program, statistic) to `Check`; programs are "forecast" and "posterior".
+        checks: (model, program, statistic) to `Check`; programs are "forecast" and, of a model with latents,
+            "posterior".
         data: fingerprint, windows, frames, coordinates, and what the windows say of themselves.
         protocol: the fields of the windows' protocol.
         samples: S, replicates of each window.
         emission: "mean" or "drawn".
         seed: of every model's draws.
+        notes: lines below the table on how statistics are to be read.
     """
 
     checks: dict[tuple[str, str, str], Check]
@@ -176,6 +211,7 @@ class PredictiveChecks(Result):
     samples: int
     emission: str
     seed: int
+    notes: list[str] = field(default_factory=list)
 
     def __getitem__(self, key: tuple[str, str, str]) -> Check:
         if key not in self.checks:
@@ -185,26 +221,27 @@ class PredictiveChecks(Result):
     def table(self) -> Table:
         """Quantiles of real and replicated values, their distance, and where real values lie among replicates."""
         expected = next(iter(self.checks.values())).expected_outside
+        models, programs, names = self._keys
         caption = [
-            *(f"{name}: {meaning}" for name, meaning in PROGRAMS.items()),
+            *(f"{program}: {PROGRAMS[program]}" for program in programs),
             "tail area: share of a window's replicates above the real value, mean over windows",
             "outside: share of windows with a tail area below .05 or above .95",
             f"forecasts of a true model have ½ and, with {self.samples} replicates, {expected:.1%}"
             if self.emission == "drawn"
             else f"means lack the emission's noise: even a true model's need not have ½ and {expected:.1%}",
+            *self.notes,
         ]
         table = Table(title=self._title, caption="\n".join(caption))
         for column in ("", "", "5 %", "median", "95 %", "Wasserstein", "tail area", "outside"):
             table.add_column(column, justify="right" if column else "left", no_wrap=True)
-        models, programs, names = (list(dict.fromkeys(keys)) for keys in zip(*self.checks, strict=True))
         for program in programs:
             table.add_section()
             table.add_row(Text(program, "bold"))
             for name in names:
-                first = self.checks[models[0], program, name]
+                first = self.checks[models[program][0], program, name]
                 label = Text.assemble(name, (f" ({first.unit})" if first.unit else "", "dim"))
                 table.add_row(label, "real", *_quantiles(first.real))
-                for model in models:
+                for model in models[program]:
                     check = self.checks[model, program, name]
                     outcome = (f"{check.wasserstein:.3g}", f"{check.tail_areas.mean():.2f}", f"{check.outside:.0%}")
                     table.add_row("", model, *_quantiles(check.replicated), *outcome)
@@ -212,21 +249,23 @@ class PredictiveChecks(Result):
 
     def plot(self) -> Figure:
         """Densities of each statistic: real windows grey, replicates as one line per model."""
-        models, programs, names = (list(dict.fromkeys(keys)) for keys in zip(*self.checks, strict=True))
+        models, programs, names = self._keys
         size = (0.6 + 2.3 * len(names), 0.8 + 2.0 * len(programs))
         figure = canvas(*size)
         panels = figure.subplots(len(programs), len(names), squeeze=False, sharex="col")
         for column, name in enumerate(names):
-            checks = [self.checks[model, program, name] for program in programs for model in models]
+            checks = [self.checks[model, program, name] for program in programs for model in models[program]]
             values = [found for check in checks for found in (check.real, check.replicated)]
             # the outer bins take what is more extreme: a wild replicate must not flatten the rest
             low, high = np.quantile(np.stack([np.quantile(v, (0.005, 0.995)) for v in values]), (0, 1))
             edges = np.linspace(low, high if high > low else low + 1, 41)
             for row, program in enumerate(programs):
                 panel = panels[row, column]
-                real = self.checks[models[0], program, name].real
+                real = self.checks[models[program][0], program, name].real
                 panel.stairs(_density(real, edges), edges, fill=True, color="0.8", label="real")
-                for place, model in enumerate(models):
+                for place, model in enumerate(models["forecast"]):
+                    if model not in models[program]:
+                        continue
                     replicated = self.checks[model, program, name].replicated
                     panel.stairs(_density(replicated, edges), edges, color=f"C{place}", label=model, linewidth=1.3)
                 panel.set_yticks([])
@@ -248,11 +287,18 @@ class PredictiveChecks(Result):
         for (model, program, name), check in self.checks.items():
             nested.setdefault(model, {}).setdefault(program, {})[name] = check.document()
         rest = {name: value for name, value in vars(self).items() if name != "checks"}
-        return {**rest, "programs": PROGRAMS, "checks": nested}
+        return {**rest, "programs": {program: PROGRAMS[program] for program in self._keys[1]}, "checks": nested}
 
     def to_json(self) -> str:
         """`document` as text."""
         return json.dumps(self.document(), indent=1, allow_nan=False)
+
+    @property
+    def _keys(self) -> tuple[dict[str, list[str]], list[str], list[str]]:
+        """Models of each program, programs and statistics."""
+        _, programs, names = (list(dict.fromkeys(keys)) for keys in zip(*self.checks, strict=True))
+        models = {p: list(dict.fromkeys(model for model, own, _ in self.checks if own == p)) for p in programs}
+        return models, programs, names
 
     @property
     def _title(self) -> str:
@@ -265,7 +311,7 @@ class PredictiveChecks(Result):
 def predictive_checks(
     model: DynamicalVAE | Mapping[str, DynamicalVAE],
     windows: HeldOutWindows,
-    statistics: Mapping[str, Statistic] = STATISTICS,
+    statistics: Mapping[str, Statistic] | None = None,
     *,
     samples: int = 20,
     draw_emission: bool = True,
@@ -277,13 +323,15 @@ def predictive_checks(
 
     Two replications, both free-running. "forecast": the frames after the observed ones; the last two observed frames
     are joined to them, so that a jump at the seam counts. "posterior", the posterior predictive distribution proper:
-    latents are inferred from the whole window, and all its frames are generated anew from them. Where entries of a
-    window are missing, its replicates lack them too; a window that leaves too few for a statistic does not count in it.
+    latents are inferred from the whole window, and all its frames are generated anew from them; a model without latents
+    has none. Where entries of a window are missing, its replicates lack them too; a window that leaves too few for a
+    statistic does not count in it.
 
     Args:
         model: a model, or `{name: model}`.
         windows: `ArrayWindows`, windows of `dvae.motion`, or any `HeldOutWindows`.
-        statistics: name to `Statistic`, such as `dvae.motion.statistics(windows)`; a few of any sequences without it.
+        statistics: name to `Statistic`, such as `dvae.motion.statistics(windows)`; those that are `usual`, if not
+            given.
         samples: S, replicates of each window; at least 19, for tail areas below .05 to be a tenth.
         draw_emission: replicate draws of x. Its means, as forecasts are shown, lack the noise of the emission: with
             them what is shown is examined, and no longer the model.
@@ -306,6 +354,7 @@ def predictive_checks(
             "expected a model, at least 19 samples, for tail areas below .05 to be no more than a tenth, and a "
             f"batch_size of at least 1; got {len(models)}, {samples} and {batch_size}"
         )
+    statistics = usual(windows) if statistics is None else statistics
     if not statistics:
         raise ValueError("there is no statistic to check")
     for each in models.values():
@@ -320,6 +369,8 @@ def predictive_checks(
             real = _measure(statistics, truth[:, first:], "real windows")
             told = {name: values.isfinite() for name, values in real.items()}
             for label, each in models.items():
+                if program == "posterior" and not each.latents:
+                    continue  # nothing is inferred
                 parts: list[dict[str, Tensor]] = []
                 with reproducibly(each, seed):
                     starts = range(0, len(held.x), batch_size)
@@ -336,12 +387,13 @@ def predictive_checks(
                     unit = statistic.unit.replace("frame", frame)
                     checks[label, program, name] = Check(values[kept].numpy(), replicated[:, kept].numpy(), unit)
     return PredictiveChecks(
-        checks={(m, p, s): checks[m, p, s] for m in models for p in firsts for s in statistics},
+        checks={(m, p, s): checks[m, p, s] for m in models for p in firsts for s in statistics if (m, p, s) in checks},
         data=held.description(),
         protocol=plain(asdict(windows.protocol)),
         samples=samples,
         emission="drawn" if draw_emission else "mean",
         seed=seed,
+        notes=list(dict.fromkeys(each.note for each in statistics.values() if each.note)),
     )
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..data import Batch, HeldOutWindows, columns_of, mask_of
+from ..data import Batch, HeldOutWindows, columns_of, mask_of, scales_of
 from . import metrics
 
 
@@ -154,8 +154,7 @@ def proper(windows: HeldOutWindows) -> list[Measure]:
 def _of_all(measure: Measure, windows: HeldOutWindows) -> Measure:
     """A score in the unit of the data, of all columns together."""
     units = dict.fromkeys(columns_of(windows).values())
-    scales = windows.description.get("scales")
-    if scales and len(columns_of(windows)) > 1 and (len(units) > 1 or "" in units):
+    if scales := scales_of(windows):
         note = "scores of all columns together are of numbers in the scales of their columns, in the training data"
         return replace(measure, function=_in_scales(measure.function, scales), unit="scales", note=note)
     mixed = f"scores without a unit mix numbers in {', '.join(unit or '1' for unit in units)}; by_column has them apart"

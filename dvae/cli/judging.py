@@ -15,7 +15,7 @@ import tyro
 from .. import files, motion
 from ..inference.calibration import calibrate
 from ..inference.checkpoints import CheckpointError, Run
-from ..inference.checks import STATISTICS, predictive_checks
+from ..inference.checks import predictive_checks
 from ..inference.compare import compare as compare_models
 from ..inference.evaluate import evaluate as evaluate_models
 from ..models.trajectories import TrajectoryModel
@@ -266,7 +266,7 @@ def criticise(
     checks = predictive_checks(
         {loaded.method.name: model},
         windows,
-        STATISTICS if kind == "panel" else motion.statistics(windows),
+        None if kind == "panel" else motion.statistics(windows),
         samples=samples,
         draw_emission=draw_emission and not isinstance(model, TrajectoryModel),
         seed=seed,

@@ -397,7 +397,8 @@ def _scores(run: Loaded) -> dict[str, str]:
 
 def _checks(document: Mapping[str, Any]) -> Table:
     """Predictive checks as they were written."""
-    shown = Table(title="predictive checks", caption="\n".join(f"{n}: {m}" for n, m in document["programs"].items()))
+    caption = [*(f"{n}: {m}" for n, m in document["programs"].items()), *document.get("notes", ())]
+    shown = Table(title="predictive checks", caption="\n".join(caption))
     for column in ("", "", "5 %", "median", "95 %", "Wasserstein", "tail area", "outside"):
         shown.add_column(column, justify="right" if column else "left")
     for model, programs in document["checks"].items():

@@ -237,6 +237,8 @@ def test_runs_are_compared_criticised_resumed_and_swept(tabled, table, tmp_path,
     assert "no calibration" in said.err
     assert "windows of 2 sequences" in said.out
     assert "correlation length (steps)" in said.out
+    assert "largest (scales)" in said.out
+    assert "inferred from the whole window" not in said.out
     assert not OF_MOTION.findall(said.out)
     assert main(["resume", both[0], "--steps", "3"]) == 0
     out = str(tmp_path / "sweep")

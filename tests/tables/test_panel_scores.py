@@ -53,6 +53,52 @@ def test_a_score_of_columns_that_share_a_unit_is_in_it():
     assert {measure.unit for measure in proper(windows)} == {"m"}
 
 
+def dependent(windows):
+    """A model of two columns, which reads them in their units."""
+    torch.manual_seed(0)
+    return dvae.method("autoregressive", width=4).build(windows.schema).eval()
+
+
+@pytest.mark.parametrize("which", ["mixed", "unsaid"])
+def test_statistics_of_columns_that_share_no_unit_do_not_depend_on_their_units(which):
+    first, second = (
+        dvae.predictive_checks(dependent(windows), windows, samples=19, progress=False)
+        for windows in (table(UNITS[which]), table(UNITS[which], factor=1024.0))
+    )
+    for key, check in first.checks.items():
+        np.testing.assert_allclose(second[key].real, check.real, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(second[key].replicated, check.replicated, rtol=1e-4, atol=1e-4)
+    units = {name: check.unit for (_, _, name), check in first.checks.items()}
+    assert [units[name] for name in ("mean", "scale", "roughness", "smallest", "largest")] == ["scales"] * 5
+    assert (units["correlation length"], units["lag-1 correlation"], units["zeros"]) == ("steps", "", "share")
+    assert "of all columns together are of numbers in their scales" in " ".join(str(first).split())
+    assert first.document()["notes"] == first.notes
+
+
+def test_statistics_of_columns_that_share_a_unit_are_in_it():
+    windows = table(UNITS["shared"], factor=1024.0)
+    found = dvae.predictive_checks(dependent(windows), windows, samples=19, progress=False)
+    assert not found.notes
+    assert "mean (m)" in str(found)
+    own = windows.all()["x"][:, 4:].double().mean((-2, -1))
+    np.testing.assert_allclose(found["model", "forecast", "mean"].real, own, rtol=1e-5)
+
+
+def test_nothing_is_inferred_of_a_model_without_latents():
+    windows = table(UNITS["shared"])
+    latent = dvae.method("vae", latent=2, warm_up=1).build(windows.schema).eval()
+    found = dvae.predictive_checks({"plain": dependent(windows)}, windows, samples=19, progress=False)
+    assert {program for _, program, _ in found.checks} == {"forecast"} == {*found.document()["programs"]}
+    assert "posterior" not in str(found)
+    both = {"plain": dependent(windows), "latent": latent}
+    found = dvae.predictive_checks(both, windows, samples=19, progress=False)
+    kept = {(model, program) for model, program, _ in found.checks}
+    assert kept == {("plain", "forecast"), ("latent", "forecast"), ("latent", "posterior")}
+    assert "posterior: free-running given latents" in str(found)
+    figure = found.plot()
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["real", "plain", "latent"]
+
+
 def test_one_column_has_no_dependence_to_score():
     windows = table(("m", "m"), columns=1)
     assert [measure.name for measure in proper(windows)] == ["energy score", "CRPS"]
