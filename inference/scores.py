@@ -183,7 +183,7 @@ _CALIBRATED: dict[str, Any] = {
 def coverage_at(level: float) -> Measure:
     """Coverage of the central interval of a level (`metrics.coverage`), of as many forecasts as reach around it."""
     function = paired(partial(metrics.coverage, level=level))
-    return Measure(f"coverage {100 * level:g} %", function, "share", **_CALIBRATED, least=_reaching(level))
+    return Measure(f"coverage {100 * level:g} %", function, "share", **_CALIBRATED, least=reaching(level))
 
 
 def width_at(level: float) -> Measure:
@@ -192,10 +192,10 @@ def width_at(level: float) -> Measure:
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         return metrics.interval_width(forecasts.masked_fill(truth[:, None].isnan(), torch.nan), level)
 
-    return Measure(f"width {100 * level:g} %", function, better="", least=_reaching(level), of_draws=True)
+    return Measure(f"width {100 * level:g} %", function, better="", least=reaching(level), of_draws=True)
 
 
-def _reaching(level: float) -> int:
+def reaching(level: float) -> int:
     """The fewest samples of which some lie beyond a central interval of this level."""
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval is between 0 and 1, got {level}")

@@ -24,13 +24,16 @@ from . import tables
 from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, save_figure
 from .opening import data_of, kind_of, load_run
 
+SAMPLES = 10
+"""Futures and fillings of motion where nobody says how many."""
+
 
 def forecast(
     run: Annotated[Path, tyro.conf.Positional],
     out: Path,
     clip: str | None = None,
     horizon: int | None = None,
-    samples: int = 10,
+    samples: int | None = None,
     fix: tuple[str, ...] = (),
     seed: int = 0,
     data: str | None = None,
@@ -56,7 +59,7 @@ def forecast(
         clip: name of a clip, or split/name where the name is not unique; of a table, of a sequence; of any split.
         horizon: frames to forecast; by default those of the protocol.
         beyond: of a table: what comes after its last row with a target, from rows behind that with known covariates.
-        samples: forecasts of each window.
+        samples: forecasts of each window; by default 10, and of a table, of which quantiles are written, 100.
         fix: parts of the body, such as lower, or static latents, of which all forecasts of a window share one draw.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
@@ -69,6 +72,7 @@ def forecast(
             raise UsageError(f"--{'fix' if fix else 'missing'} is about motion, and {run} is of a table")
         tables.forecast(run, out, clip, horizon, samples, seed, data, figure, beyond)
         return
+    samples = samples or SAMPLES
     if beyond:
         raise UsageError(f"--beyond is about tables, and {run} is of motion")
     suffix = out.suffix.lower()
@@ -156,7 +160,7 @@ def impute(
     out: Path | None = None,
     filled: Path | None = None,
     clip: str | None = None,
-    samples: int = 10,
+    samples: int | None = None,
     particles: int = 1,
     seed: int = 0,
     data: str | None = None,
@@ -175,7 +179,7 @@ def impute(
         out: the npz file to write.
         filled: motion to write, an npz of all clips, BVH or csv of one; a name without an ending is a folder of BVH.
         clip: name of a clip, or split/name where the name is not unique; of any split, filled as one window.
-        samples: fillings of each window.
+        samples: fillings of each window; by default 10, and of a table, of which quantiles are written, 100.
         particles: of a table, draws for each filling, of which those are taken that what was observed makes likely.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
@@ -187,6 +191,7 @@ def impute(
             raise UsageError("of a table, impute writes --out FILE.csv, .parquet or .npz")
         tables.impute(run, out, samples, particles, seed, data)
         return
+    samples = samples or SAMPLES
     if particles > 1:
         raise UsageError("fillings of motion are means, among which there is nothing to choose; leave --particles out")
     check_files(out, None, ".npz")

@@ -10,13 +10,17 @@ import numpy as np
 
 from .. import files
 from ..inference.result import Table
+from ..inference.scores import reaching
 from ..runs import directory as runs
 from ..tables.dataset import PanelData
-from ..tables.forecasts import FORMATS
+from ..tables.forecasts import BANDS, FORMATS, QUANTILES, column_of, needed
 from ..tables.reading import SUFFIXES, is_domain, schema_beside, written_schema
 from ..tables.windows import PanelWindows
-from .console import ERROR, OUT, UsageError, arguments, check_files, save_figure
+from .console import ERROR, OUT, UsageError, arguments, check_files, note, save_figure
 from .opening import data_of, load_run
+
+SAMPLES = 100
+"""Draws of a table where nobody says how many: its quantiles from 2.5 to 97.5 % need 39, and are rough then."""
 
 
 def is_table(path: str) -> bool:
@@ -59,7 +63,7 @@ def forecast(
     out: Path,
     sequence: str | None,
     horizon: int | None,
-    samples: int,
+    samples: int | None,
     seed: int,
     data: str | None,
     figure: Path | None,
@@ -70,24 +74,35 @@ def forecast(
     loaded = load_run(path, data, "panel")
     opened = data_of(data, loaded)
     opened = opened if sequence is None else opened.only([sequence])
+    samples = samples or SAMPLES
     split = "test" if sequence is None else "all"
     held = opened.ahead(horizon) if beyond else windows(loaded, opened, split, horizon=horizon)
     found = held.forecast(loaded.model, samples, seed)
     found.save(out)
     ERROR.print(f"wrote {out}: {samples} futures of {found.draws.shape[2]} steps for each of {len(found.keys)} windows")
+    _say_left_out(samples, out, figure)
     if figure is not None:
         save_figure(found.plot(), figure)
 
 
-def impute(path: Path, out: Path, samples: int, particles: int, seed: int, data: str | None) -> None:
+def impute(path: Path, out: Path, samples: int | None, particles: int, seed: int, data: str | None) -> None:
     """Fills what the sequences of a table lack, in a table of every missing entry."""
     check_files(out, None, *FORMATS)
-    loaded = load_run(path, data, "panel")
+    loaded, samples = load_run(path, data, "panel"), samples or SAMPLES
     held = data_of(data, loaded).whole()
     with arguments():
         found = held.impute(loaded.model, samples, seed, particles)
     found.save(out)
     ERROR.print(f"wrote {out}: {samples} fillings of {found.lacking.sum()} entries that {held.panel.name} lacks")
+    _say_left_out(samples, out)
+
+
+def _say_left_out(samples: int, out: Path, figure: Path | None = None) -> None:
+    """Notes which quantiles and intervals so many draws do not have."""
+    least = {} if out.suffix.lower() == ".npz" else {column_of(level): needed(level) for level in QUANTILES}
+    least |= {} if figure is None else {f"the interval of {100 * level:g} %": reaching(level) for level in BANDS}
+    if lacking := [f"{name} ({draws})" for name, draws in least.items() if draws > samples]:
+        note(f"left out, as they need more than {samples} draws (--samples): {', '.join(lacking)}")
 
 
 def info(paths: Sequence[str], out: Path | None) -> None:

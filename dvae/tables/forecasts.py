@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import files
 from ..inference.result import canvas
+from ..inference.scores import reaching
 from ..options import nearest
 
 if TYPE_CHECKING:
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 QUANTILES = (0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975)
 """Of the intervals of 50, 80, 90 and 95 %, and the median."""
+BANDS = {0.95: 0.15, 0.8: 0.3, 0.5: 0.5}
+"""Shade of the intervals that a fan shows."""
 FORMATS = (".csv", ".parquet", ".npz")
 
 
@@ -46,7 +49,10 @@ class PanelForecasts:
     dates: bool = False
 
     def table(self) -> Any:
-        """A pandas frame with a row for each window, step and coordinate: mean, quantiles, and what happened."""
+        """A pandas frame with a row for each window, step and coordinate: mean, quantiles, and what happened.
+
+        Of the quantiles there are those that so many draws have, see `needed`.
+        """
         import pandas as pd
 
         count, horizon, size = self.draws.shape[1:]
@@ -69,7 +75,7 @@ class PanelForecasts:
     def plot(self, window: int = 0, columns: Sequence[str] | None = None, most: int = 8) -> Figure:
         """A fan for each coordinate: intervals of 50, 80 and 95 % and the median, after the past and beside the truth.
 
-        Of what is 0 or 1 there is the share of the draws.
+        Of what is 0 or 1 there is the share of the draws. Intervals that need more draws, see `needed`, are left out.
 
         Args:
             window: which.
@@ -114,7 +120,9 @@ class PanelForecasts:
             axis.set_ylabel("share", fontsize=8)
             axis.set_ylim(-0.05, 1.05)
         else:
-            for level, shade in ((0.95, 0.15), (0.8, 0.3), (0.5, 0.5)):
+            for level, shade in BANDS.items():
+                if reaching(level) > len(draws):
+                    continue
                 low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
                 axis.fill_between(after, low, high, color="C0", alpha=shade, linewidth=0, label=f"{level:.0%}")
             axis.plot(after, np.median(draws, 0), "C0", linewidth=1.2, label="median")
@@ -148,7 +156,7 @@ class PanelImputed:
     dates: bool = False
 
     def table(self) -> Any:
-        """A pandas frame with a row for each missing entry: mean and quantiles."""
+        """A pandas frame with a row for each missing entry: mean, and quantiles that so many draws have (`needed`)."""
         import pandas as pd
 
         window, step, place = np.nonzero(self.lacking)
@@ -164,6 +172,11 @@ class PanelImputed:
             ValueError: another ending, or Parquet without pyarrow.
         """
         _save(self, path, filled=self.draws, observed=~self.lacking)
+
+
+def needed(quantile: float) -> int:
+    """The fewest draws of which some lie beyond a quantile: 39 for that of 2.5 %, 1 for the median."""
+    return 1 if quantile == 0.5 else reaching(abs(1 - 2 * quantile))
 
 
 def _shown(times: np.ndarray, dates: bool) -> Any:
@@ -184,10 +197,15 @@ def _columns(columns: Mapping[str, str], place: np.ndarray) -> dict[str, np.ndar
     return {"column": names[place], "unit": units[place]}
 
 
+def column_of(quantile: float) -> str:
+    """What a quantile is called in tables."""
+    return f"q{1000 * quantile:03.0f}"
+
+
 def _quantiles(draws: np.ndarray) -> dict[str, np.ndarray]:
-    """Mean and quantiles of draws (K, N)."""
-    quantiles = np.quantile(draws, QUANTILES, axis=0)
-    named = {f"q{1000 * level:03.0f}": values for level, values in zip(QUANTILES, quantiles, strict=True)}
+    """Mean of draws (K, N), and the quantiles that K draws have."""
+    levels = [level for level in QUANTILES if needed(level) <= len(draws)]
+    named = dict(zip(map(column_of, levels), np.quantile(draws, levels, axis=0), strict=True))
     return {"mean": draws.mean(0, dtype=np.float64), **named}
 
 

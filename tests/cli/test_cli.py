@@ -201,7 +201,7 @@ def test_forecasts_continue_what_was_observed(capsys, run, tmp_path):
         np.testing.assert_array_equal(file["truth"], truth.numpy())
     assert main(["forecast", str(run), "--out", str(out), "--clip", "person_0000", "--horizon", "80"]) == 0
     with np.load(out) as file:
-        assert file["forecasts"].shape[2] == 80
+        assert file["forecasts"].shape[::2] == (10, 80, 3)
         assert set(file["split"]) == {"train"}
     assert "no clip 'nobody'" in failure(capsys, "forecast", str(run), "--out", str(out), "--clip", "nobody")
     assert "at least 1" in failure(capsys, "forecast", str(run), "--out", str(out), "--samples", "0", code=2)

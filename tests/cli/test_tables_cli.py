@@ -148,17 +148,44 @@ def test_five_commands_on_a_file_that_nobody_prepared(table, capsys, tmp_path):
 def test_quantiles_are_those_of_the_draws_of_the_same_seed(tabled, tmp_path):
     for name in ("a.csv", "a.npz"):
         assert (
-            main(["forecast", str(tabled / "vae"), "--out", str(tmp_path / name), "--seed", "3", "--samples", "9"]) == 0
+            main(["forecast", str(tabled / "vae"), "--out", str(tmp_path / name), "--seed", "3", "--samples", "39"])
+            == 0
         )
     table = pd.read_csv(tmp_path / "a.csv")
     with np.load(tmp_path / "a.npz") as held:
-        draws, truth = held["draws"].reshape(9, -1), held["truth"].ravel()
+        draws, truth = held["draws"].reshape(39, -1), held["truth"].ravel()
     for level in (0.025, 0.5, 0.9):
         wanted = np.quantile(draws, level, axis=0)
         np.testing.assert_array_equal(table[f"q{1000 * level:03.0f}"].astype("float32"), wanted)
     np.testing.assert_allclose(table["mean"], draws.mean(0, dtype=float), rtol=1e-8)
     np.testing.assert_allclose(table["truth"], truth, rtol=1e-6)
     assert table["truth"].isna().any()
+
+
+def test_a_table_is_drawn_as_often_as_its_quantiles_need(tabled, tmp_path, capsys):
+    for command in ("forecast", "impute"):
+        run = [command, str(tabled / "autoregressive"), "--out"]
+        assert main([*run, str(tmp_path / "a.npz")]) == 0
+        with np.load(tmp_path / "a.npz") as held:
+            assert len(held["draws" if command == "forecast" else "filled"]) == 100
+        assert main([*run, str(tmp_path / "a.npz"), "--samples", "9"]) == 0
+        assert "left out" not in capsys.readouterr().err
+        assert main([*run, str(tmp_path / "a.csv"), "--samples", "9"]) == 0
+        said = "left out, as they need more than 9 draws (--samples): q025 (39), q050 (19), q950 (19), q975 (39)"
+        assert said in " ".join(capsys.readouterr().err.split())
+        assert [n for n in pd.read_csv(tmp_path / "a.csv") if n.startswith("q")] == [
+            "q100",
+            "q250",
+            "q500",
+            "q750",
+            "q900",
+        ]
+
+
+def test_fans_that_so_few_draws_do_not_have_are_left_out(tabled, tmp_path, capsys):
+    out = ["--out", str(tmp_path / "a.npz"), "--figure", str(tmp_path / "a.png"), "--samples", "19"]
+    assert main(["forecast", str(tabled / "autoregressive"), *out]) == 0
+    assert "need more than 19 draws (--samples): the interval of 95 % (39)" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_report_has_the_fans_of_a_table(tabled, tmp_path):

@@ -13,7 +13,7 @@ from dvae.models.registry import methods
 from dvae.runs import directory as runs
 from dvae.tables import Column, Columns, Panel
 from dvae.tables.dataset import PanelData
-from dvae.tables.forecasts import QUANTILES, PanelForecasts
+from dvae.tables.forecasts import QUANTILES, PanelForecasts, PanelImputed, needed
 from dvae.tables.protocol import Cut
 from dvae.tables.scoring import panel_scores
 
@@ -162,9 +162,9 @@ def test_a_run_is_fitted_loaded_resumed_and_refused_where_it_was_tampered_with(d
         runs.load(out).data.windows("test")
 
 
-def forecasts(times=None, dates=False):
+def forecasts(times=None, dates=False, samples=50):
     rng = np.random.default_rng(0)
-    draws = rng.normal(1e6, 1, size=(50, 2, 3, 2)).astype(np.float32)
+    draws = rng.normal(1e6, 1, size=(samples, 2, 3, 2)).astype(np.float32)
     draws[..., 1] = rng.integers(0, 2, draws.shape[:-1])
     past, truth = rng.normal(size=(2, 4, 2)), rng.normal(size=(2, 3, 2))
     truth[0, 1, 0] = past[1, 2, 0] = NAN
@@ -186,6 +186,25 @@ def test_the_table_has_a_row_for_each_window_step_and_column():
         np.testing.assert_array_equal(row[names].astype(float), np.quantile(own, QUANTILES).astype(float))
         np.testing.assert_equal(row["truth"], found.truth[window, row["ahead"] - 1, place])
     assert names == ["q025", "q050", "q100", "q250", "q500", "q750", "q900", "q950", "q975"]
+
+
+@pytest.mark.parametrize(
+    ("samples", "first", "bands"), [(1, "q500", 0), (8, "q250", 1), (9, "q100", 2), (38, "q050", 2), (39, "q025", 3)]
+)
+def test_quantiles_that_so_many_draws_do_not_have_are_left_out(samples, first, bands):
+    found = forecasts(samples=samples)
+    written = [name for name in found.table() if name.startswith("q")]
+    names = [f"q{1000 * level:03.0f}" for level in QUANTILES]
+    assert written == names[names.index(first) : len(names) - names.index(first)]
+    assert len(found.plot().axes[0].collections) == bands
+    gaps = PanelImputed(found.draws, np.ones((2, 3, 2), bool), found.columns, found.keys)
+    assert [name for name in gaps.table() if name.startswith("q")] == written
+
+
+@pytest.mark.parametrize("quantile", QUANTILES)
+def test_a_draw_lies_beyond_a_quantile_where_there_are_as_many_as_it_needs(quantile):
+    beyond = min(quantile, 1 - quantile)
+    assert needed(quantile) == pytest.approx(1 / beyond - 1)  # the mean rank of the least of K draws is 1 / (K + 1)
 
 
 @pytest.mark.parametrize("times", [20240101.0 + np.arange(14).reshape(2, 7), 1.7e9 + 0.5 * np.arange(14).reshape(2, 7)])
@@ -289,7 +308,7 @@ def test_forecasts_are_what_the_model_draws(data, model):
 
 def test_every_missing_entry_of_a_table_is_filled(data, model, tmp_path):
     whole = data.whole()
-    found, batch = whole.impute(model, 5), whole.all()
+    found, batch = whole.impute(model, 39), whole.all()
     np.testing.assert_array_equal(found.lacking, ~batch["mask"])
     for draw in found.draws:
         np.testing.assert_array_equal(draw[~found.lacking], batch["x"][batch["mask"]])
