@@ -123,7 +123,7 @@ class PanelForecasts:
             for level, shade in BANDS.items():
                 if reaching(level) > len(draws):
                     continue
-                low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
+                low, high = _quantile(draws, [(1 - level) / 2, (1 + level) / 2])
                 axis.fill_between(after, low, high, color="C0", alpha=shade, linewidth=0, label=f"{level:.0%}")
             axis.plot(after, np.median(draws, 0), "C0", linewidth=1.2, label="median")
         axis.plot(before, self.past[window, :, place], color="0.3", linewidth=1, marker=".", markersize=3)
@@ -205,8 +205,17 @@ def column_of(quantile: float) -> str:
 def _quantiles(draws: np.ndarray) -> dict[str, np.ndarray]:
     """Mean of draws (K, N), and the quantiles that K draws have."""
     levels = [level for level in QUANTILES if needed(level) <= len(draws)]
-    named = dict(zip(map(column_of, levels), np.quantile(draws, levels, axis=0), strict=True))
+    named = dict(zip(map(column_of, levels), _quantile(draws, levels), strict=True))
     return {"mean": draws.mean(0, dtype=np.float64), **named}
+
+
+def _quantile(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:
+    """Of draws (K, ...), at mean ranks k / (K + 1): intervals hold what is exchangeable with them at their level.
+
+    As those of `metrics.coverage`; numpy's own run from draw to draw, (k - 1) / (K - 1), and are too narrow.
+    """
+    found: np.ndarray = np.quantile(draws, levels, axis=0, method="weibull")
+    return found
 
 
 def _save(found: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **arrays: np.ndarray) -> None:

@@ -183,7 +183,9 @@ def test_the_table_has_a_row_for_each_window_step_and_column():
         assert row["unit"] == ("m", "")[place]
         assert row["mean"] == own.mean(dtype=np.float64)
         names = [f"q{1000 * level:03.0f}" for level in QUANTILES]
-        np.testing.assert_array_equal(row[names].astype(float), np.quantile(own, QUANTILES).astype(float))
+        np.testing.assert_array_equal(
+            row[names].astype(float), np.quantile(own, QUANTILES, method="weibull").astype(float)
+        )
         np.testing.assert_equal(row["truth"], found.truth[window, row["ahead"] - 1, place])
     assert names == ["q025", "q050", "q100", "q250", "q500", "q750", "q900", "q950", "q975"]
 
@@ -199,6 +201,18 @@ def test_quantiles_that_so_many_draws_do_not_have_are_left_out(samples, first, b
     assert len(found.plot().axes[0].collections) == bands
     gaps = PanelImputed(found.draws, np.ones((2, 3, 2), bool), found.columns, found.keys)
     assert [name for name in gaps.table() if name.startswith("q")] == written
+
+
+@pytest.mark.parametrize("samples", [39, 60, 100])
+def test_intervals_hold_truths_that_are_exchangeable_with_the_draws_at_their_level(samples):
+    rng = np.random.default_rng(0)
+    count = 20_000
+    drawn, truth = rng.uniform(size=(samples, count, 1, 1)), rng.uniform(size=(count, 1, 1))
+    keys = [("a", n) for n in range(count)]
+    table = PanelForecasts(drawn, truth[:, :0], truth, {"y": ""}, keys).table()
+    for quantile in QUANTILES:
+        below = (truth.ravel() < table[f"q{1000 * quantile:03.0f}"]).mean()
+        assert below == pytest.approx(quantile, abs=4 * np.sqrt(quantile * (1 - quantile) / count))
 
 
 @pytest.mark.parametrize("quantile", QUANTILES)
@@ -249,7 +263,7 @@ def test_fans_hold_the_quantiles():
     found = forecasts()
     figure = found.plot(1)
     fan, share = figure.axes[:2]
-    low, high = np.quantile(found.draws[:, 1, :, 0], [0.025, 0.975], axis=0)
+    low, high = np.quantile(found.draws[:, 1, :, 0], [0.025, 0.975], axis=0, method="weibull")
     edges = fan.collections[0].get_paths()[0].vertices
     assert {*np.float32(low), *np.float32(high)} <= {*np.float32(edges[:, 1])}
     np.testing.assert_allclose(share.lines[0].get_ydata(), found.draws[:, 1, :, 1].mean(0))
