@@ -61,7 +61,10 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
 
     @property
     def protocol(self) -> Any:
-        """A dataclass with `observed` (frames), and for multimodal truths `multimodal_threshold`."""
+        """A dataclass with `observed` (frames), and for multimodal truths `multimodal_threshold`.
+
+        `observed` is None of whole sequences, of which there are bounds, and no forecasts.
+        """
 
     @property
     def keys(self) -> Sequence[tuple[str, str, int]]:

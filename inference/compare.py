@@ -83,7 +83,7 @@ def compare(
         contrasts: M, the sequences, drawn at random, among which information is measured; all if there are no more,
             0 leaves it out.
         samples: forecasts per window of the free-running scores; 0 leaves these out, which take longest. Data that are
-            no windows have none.
+            no windows, or whole sequences, have none.
         draw_emission: forecast draws of x, or its means; see `evaluate`.
         seed: of every model's draws, and of the choice of contrasts.
         batch_size: sequences scored at once.
@@ -110,6 +110,9 @@ def compare(
             "particles, estimates and batch_size are at least 1, contrasts and samples at least 0, not "
             f"{particles}, {estimates}, {batch_size}, {contrasts} and {samples}"
         )
+    windows = data if isinstance(data, HeldOutWindows) else None
+    whole = windows is not None and windows.protocol.observed is None
+    samples = 0 if windows is None or whole else samples
     contenders = _contenders(models)
     labelled = {label: model for label, _, model in _each(contenders)}
     of: dict[str, str] = {}
@@ -120,7 +123,6 @@ def compare(
             "bounds compare where they are densities of the same, but here are "
             f"{' and '.join(f'those of {label}, of {what}' for what, label in of.items())}; evaluate compares forecasts"
         )
-    windows = data if isinstance(data, HeldOutWindows) else None
     batch = sequences(data).batch
     alone = batch[GROUP].tolist() if GROUP in batch else range(length_of(batch))
     keys = [("data", str(n), 0) for n in alone] if windows is None else clusters(windows)
@@ -159,12 +161,14 @@ def compare(
         protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
         particles=particles,
         contrasts=len(chosen),
-        samples=samples if windows is not None else 0,
+        samples=samples,
         emission=emission,
         seed=seed,
         shown={measure.name: measure.unit for measure in measures if measure.headline},
         better={measure.name: measure.better for measure in measures if measure.headline},
-        notes=list(dict.fromkeys(measure.note for measure in measures if measure.headline and measure.note)),
+        notes=["no forecasts: whole sequences have no future"]
+        if whole
+        else list(dict.fromkeys(measure.note for measure in measures if measure.headline and measure.note)),
     )
 
 

@@ -181,7 +181,7 @@ class Comparison(Result):
         emission: "mean" or "drawn": what was forecast.
         seed: of every model's draws.
         shown: free-running score to its unit, those of the table.
-        notes: lines below that table on how scores are to be read.
+        notes: lines below that table on how scores are to be read, or why there are none.
         better: by score of that table, "lower", "higher" or "".
 
     Example:
@@ -424,11 +424,20 @@ class Comparison(Result):
     @property
     def _words(self) -> tuple[str, str, str]:
         """What is scored, what it is cut from, and what it consists of."""
-        return ("window", *called(self.data)) if "called" in self.data else ("sequence", *called(self.data))
+        clip, frame = called(self.data)
+        if self._whole:
+            return f"whole {clip}", clip, frame
+        return "window" if "called" in self.data else "sequence", clip, frame
+
+    @property
+    def _whole(self) -> bool:
+        """Whether clips are scored as they are, and not cut into windows."""
+        return self.protocol.get("observed", 0) is None
 
     def _title(self) -> str:
         each, clip, _ = self._words
-        parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} {each}s of {len(set(self._clips))} {clip}s"]
+        parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} {each}s"]
+        parts[-1] += "" if self._whole else f" of {len(set(self._clips))} {clip}s"
         parts += [f"seed {self.seed}"]
         parts += [f"data {self.data['fingerprint'][:12]}"] if "fingerprint" in self.data else []
         return " · ".join(part for part in parts if part)
@@ -438,8 +447,13 @@ class Comparison(Result):
         bounds = (f"importance bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
         table = _table(
             f"{self._title()}\nteacher-forced, nats a {frame}",
-            f"mean ± standard error over {each}s (clustered by {clip}) ± over seeds\n"
-            "95 %: from both, by Student's t, in brackets its degrees of freedom",
+            "\n".join(
+                [
+                    f"mean ± standard error over {each}s (clustered by {clip}) ± over seeds",
+                    "95 %: from both, by Student's t, in brackets its degrees of freedom",
+                    *([] if self.samples else self.notes),
+                ]
+            ),
             ("seeds", *bounds, f"k-hat\n> {KHAT}"),
         )
         ranking = self.ranking

@@ -92,10 +92,15 @@ def hold(windows: HeldOutWindows) -> Held:
     """Windows prepared.
 
     Raises:
-        ValueError: windows that are ragged, or leave nothing to observe or to predict.
+        ValueError: whole sequences; windows that are ragged, or leave nothing to observe or to predict.
     """
     batch = windows.all()
     observed = windows.protocol.observed
+    if observed is None:
+        raise ValueError(
+            "whole sequences have no future; cut them, with observed and horizon steps, to forecast; compare compares "
+            "bounds of whole ones"
+        )
     if "lengths" in batch:
         raise ValueError("evaluation needs windows of one length, but these have lengths")
     if not 1 <= observed < batch["x"].shape[1]:

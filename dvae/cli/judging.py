@@ -302,7 +302,7 @@ def compare(
 ) -> None:
     """Compare runs on the test windows of their protocol. Runs that differ in the seed only are seeds of one row.
 
-    All must have ended: one that was stopped is no whole fit.
+    All must have ended: one that was stopped is no whole fit. Of whole sequences of a table bounds are compared alone.
 
     Args:
         run: run directories, fitted on the same data under the same protocol.
@@ -347,6 +347,10 @@ def compare(
 
 def _compared(first: runs.Loaded, opened: Any, stride: int | None) -> tuple[Any, Any]:
     """Test windows, so far apart, and what forecasts of them are scored by."""
+    if first.config.kind == "panel" and opened.schema.cut.length is None:
+        if stride is not None:
+            raise UsageError(f"--stride is between windows, and {first.path} was fitted on whole sequences")
+        return opened.windows("test"), panel_scores
     if first.config.kind == "panel":
         return tables.windows(first, opened, stride=stride), panel_scores
     protocol = opened.protocol if stride is None else replace(opened.protocol, test_stride=stride)

@@ -54,7 +54,10 @@ def windows(loaded: runs.Loaded, opened: PanelData, split: str = "test", **cut: 
         UsageError: whole sequences, of which nothing is forecast.
     """
     if opened.schema.cut.length is None:
-        raise UsageError(f"{loaded.path} was fitted on whole sequences; fit with --observed and --horizon to forecast")
+        raise UsageError(
+            f"{loaded.path} was fitted on whole sequences; fit with --observed and --horizon to forecast, or compare "
+            "their bounds by `dvae compare`"
+        )
     return opened.recut(**{name: steps for name, steps in cut.items() if steps is not None}).windows(split)
 
 

@@ -210,6 +210,19 @@ def test_runs_of_whole_sequences_are_reported_without_futures(table, tmp_path, c
     assert "cannot be shown" not in text
     assert "These runs are of whole sequences. To see futures, fit with --observed and --horizon." in text
     assert "importance bound" in text
+    compared = ["compare", run, "--particles", "2", "--contrasts", "0", "--out", str(tmp_path / "a.json")]
+    found = []
+    for own in ([], ["--no-forecasts"]):
+        assert main([*compared, *own]) == 0
+        said = capsys.readouterr().out
+        assert "no forecasts: whole sequences have no future" in said
+        assert "free-running" not in said
+        found.append(json.loads((tmp_path / "a.json").read_text()))
+    assert found[0] == found[1]
+    assert found[0]["samples"] == 0
+    refused = failure(capsys, "evaluate", run, code=2)
+    assert "fit with --observed and --horizon to forecast, or compare their bounds by `dvae compare`" in refused
+    assert "--stride is between windows" in failure(capsys, *compared, "--stride", "2", code=2)
 
 
 def test_what_is_written_stands_beside_the_rows_that_it_is_about(tabled, table, tmp_path):

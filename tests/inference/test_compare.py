@@ -21,6 +21,7 @@ from dvae.data import ArrayWindows
 from dvae.inference.compare import compare
 from dvae.inference.comparison import Contender, Estimate
 from dvae.inference.evaluate import evaluate
+from dvae.tables import Column, Columns, Cut, PanelData
 
 T = 5
 DKF = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})")
@@ -523,6 +524,28 @@ def test_ragged_windows_are_refused_before_any_bound_is_computed():
     )
     with pytest.raises(ValueError, match="windows of one length, but these have lengths"):
         run({"a": recurrent()}, ragged, samples=2)
+
+
+def test_whole_sequences_have_bounds_and_no_forecasts():
+    values = np.random.default_rng(0).normal(size=(8, 9, 3))
+    ragged = [own[: 5 + n % 3] for n, own in enumerate(values)]
+    columns = Columns(tuple(Column(name) for name in "abc"))
+    whole = PanelData.of(ragged, columns, Cut()).windows("test")
+    even = PanelData.of(values, columns, Cut()).windows("test")
+    models = {name: recurrent().float() for name in "ab"}
+    found, bare = run(models, whole, samples=5, contrasts=2), run(models, whole.all(), contrasts=2)
+    assert found.samples == 0
+    assert found.ranking == bare.ranking
+    for name in models:
+        for metric in ("importance bound", "ELBO", "KL z"):
+            assert found[name][metric].mean == bare[name][metric].mean
+        np.testing.assert_array_equal(found.rows[name].bounds["k-hat"], bare.rows[name].bounds["k-hat"])
+    for text in (str(found), str(type(found).from_json(found.to_json()))):
+        assert "no forecasts: whole sequences have no future" in text
+        assert "2 whole sequences · seed 0" in text
+    for windows in (whole, even):
+        with pytest.raises(ValueError, match=r"whole sequences have no future; .* compare compares bounds"):
+            evaluate(models, windows, progress=False)
 
 
 # ----------------------------------------------------------------------------------------------------------- records
