@@ -57,7 +57,7 @@ def _check_file(path: Path | None, option: str, *suffixes: str) -> None:
     if path is not None and path.is_dir():
         raise UsageError(f"--{option} {path} is a directory; name a file")
     if path is not None and path.suffix.lower() not in (suffixes or (path.suffix.lower(),)):
-        kinds = " or ".join(suffixes)
+        kinds = " or ".join(filter(None, suffixes)) + (", or in nothing for a folder" if "" in suffixes else "")
         raise UsageError(f"--{option} {path}: the end of a name says what is written; end its name in {kinds}")
 
 

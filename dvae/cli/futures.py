@@ -66,7 +66,7 @@ def forecast(
         figure: save a figure of the first window's futures.
     """
     at_least(1, samples=samples, horizon=horizon)
-    check_files(out, figure, ".npz", ".bvh", "", ".csv", ".parquet")
+    check_files(out, figure)
     if kind_of([run], data) == "panel":
         if fix or missing:
             raise UsageError(f"--{'fix' if fix else 'missing'} is about motion, and {run} is of a table")
@@ -185,7 +185,7 @@ def impute(
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
     """
     at_least(1, samples=samples, particles=particles)
-    check_files(out, None, ".npz", ".csv", ".parquet")
+    check_files(out, None)
     if kind_of([run], data) == "panel":
         if out is None or filled is not None or clip is not None:
             raise UsageError("of a table, impute writes --out FILE.csv, .parquet or .npz")

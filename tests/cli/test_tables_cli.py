@@ -162,6 +162,15 @@ def test_quantiles_are_those_of_the_draws_of_the_same_seed(tabled, tmp_path):
     assert table["truth"].isna().any()
 
 
+def test_names_of_files_end_in_what_a_command_writes_of_its_data(tabled, run, tmp_path, capsys):
+    out = ["--out", tmp_path / "f.xlsx"]
+    for command in ("forecast", "impute"):
+        said = failure(capsys, command, tabled / "vae", *out, code=2)
+        assert said.endswith("end its name in .csv or .parquet or .npz")
+    assert failure(capsys, "forecast", run, *out, code=2).endswith("in .npz or .bvh, or in nothing for a folder")
+    assert failure(capsys, "impute", run, *out, code=2).endswith("end its name in .npz")
+
+
 def test_a_table_is_drawn_as_often_as_its_quantiles_need(tabled, tmp_path, capsys):
     for command in ("forecast", "impute"):
         run = [command, str(tabled / "autoregressive"), "--out"]
