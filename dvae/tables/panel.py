@@ -2,7 +2,7 @@
 
 | from | how |
 |---|---|
-| pandas, long | one row for each sequence and step: `Panel.of(frame, columns)`, with `id` and `time` |
+| pandas, long | one row for each sequence and step: `Panel.of(frame, columns)`, with `id` and `time`, or in its index |
 | pandas, wide | one row for each step, one column for each sequence: `Panel.wide(frame)` |
 | numpy, torch | (N, T, D), or (T, D) of one sequence |
 | a list of such | sequences of different lengths (T_n, D) |
@@ -21,7 +21,7 @@ import torch
 
 from ..options import nearest
 from .columns import Column, Columns
-from .parsing import is_number, numeric, texts, times
+from .parsing import is_number, numeric, tabular, texts, times
 from .proposing import LARGEST, TIMES, Told, is_date
 
 SPLITS = ("train", "validation", "test")
@@ -110,7 +110,7 @@ class Panel:
             "share": (lambda v: (v > 0) & (v < 1), "numbers above 0 and below 1"),
             "angle": (lambda v: np.abs(v) <= np.pi + 1e-6, "radians from -pi to pi"),
         }
-        right, said = tests.get(column.family, (np.isfinite, "numbers"))
+        right, said = tests.get(column.family, (lambda v: ~np.isnan(v), "numbers"))
         with np.errstate(invalid="ignore", over="ignore"):
             seen = right(values.astype(np.float32))  # as models compute
         wrong = ~(seen & (np.abs(values) < LARGEST)) & ~np.isnan(values)
@@ -120,9 +120,10 @@ class Panel:
                 if row < len(one):
                     break
                 row -= len(one)
+            size = f", below {LARGEST:g} in size" if seen[first] else ""
             raise ValueError(
                 f"sequence {one.name!r} of {self.name} has {values[first]:g} in row {row} of column {column.name!r}, "
-                f"and the family {column.family!r} is of {said} below {LARGEST:g}; give it another family"
+                f"and the family {column.family!r} is of {said}{size}; give it another family"
             )
 
     def __len__(self) -> int:
@@ -200,7 +201,7 @@ class Panel:
                 columns = Told(columns=tuple(columns or ()))
             if kind == "xarray":
                 data, columns = _of_grid(data, columns)
-            frame = _named(data)
+            frame = tabular(data)
             columns = columns.of(frame) if isinstance(columns, Told) else columns
             series = list(_of_frame(frame, columns))
             return cls(series, columns, name, columns.time is not None and not is_number(frame[columns.time]))
@@ -210,9 +211,13 @@ class Panel:
                 f"a table is made of a pandas frame, an xarray Dataset, arrays (N, T, D) or a list of arrays (T, D), "
                 f"not of {type(data).__name__}"
             )
-        found = [np.asarray(each, np.float64).copy() for each in arrays]
+        plain = [each.detach().cpu().double().numpy() if isinstance(each, torch.Tensor) else each for each in arrays]
+        found = [np.asarray(each, np.float64).copy() for each in plain]
         if not found or any(each.ndim != 2 for each in found):
-            raise ValueError(f"sequences are (T, D); got {', '.join(str(each.shape) for each in found[:3]) or 'none'}")
+            whole = [data] if getattr(data, "ndim", 0) == 1 else found
+            shapes = ", ".join(str(tuple(each.shape)) for each in whole[:3])
+            advice = "; one sequence of one column is (T, 1), as of x[:, None]" if shapes else ""
+            raise ValueError(f"sequences are (T, D); got {shapes or 'none'}{advice}")
         if not isinstance(columns, Columns):
             named = columns.columns if isinstance(columns, Told) else columns
             columns = Columns(tuple(map(Column, named or [f"x{place}" for place in range(found[0].shape[1])])))
@@ -245,20 +250,6 @@ class Panel:
 def _counts(values: np.ndarray) -> np.ndarray:
     found: np.ndarray = (values >= 0) & (values % 1 == 0)
     return found
-
-
-def _named(data: Any) -> Any:
-    """A frame whose columns have names.
-
-    Raises:
-        ValueError: two of one name.
-    """
-    frame = data.to_frame() if data.ndim == 1 else data
-    names = [str(name) for name in frame.columns]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"the table has two columns {twice!r}; rename one")
-    return frame.set_axis(names, axis=1)
 
 
 def _of_grid(data: Any, columns: Columns | Told) -> tuple[Any, Columns | Told]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import re
 from reprlib import repr as brief
 from typing import Any
 
@@ -11,12 +11,72 @@ import numpy as np
 from ..options import nearest
 from .columns import Column
 
+LONGEST = 64
+"""Characters of a date; patterns are tried on none that is longer."""
+MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+WANTED = "2024-12-31"
+_DAY = r"(?P<day>\d{1,2})(?:st|nd|rd|th)?"
+_WEEKDAY = r"(?:(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*[.,]{0,2}\s+)?"
+_WORD = rf"(?P<word>{'|'.join(MONTHS)})[a-z]*\.?"
+_CLOCK = (
+    r"(?:(?:[T,]\s?|\s+)(?P<hour>\d{1,2})(?=:|\s?[ap])(?P<rest>(?::\d\d){1,2}(?:\.\d{1,9})?)?"
+    r"\s?(?:(?P<half>[ap])\.?m\.?)?\s?(?P<zone>z|utc|gmt|[-+]\d\d:?\d\d)?)?"
+)
+WRITTEN = [
+    re.compile(pattern + _CLOCK, re.IGNORECASE | re.ASCII)
+    for pattern in (
+        r"(?P<first>\d{1,2})(?P<sign>[-/. ])\s?(?P<second>\d{1,2})(?P=sign)\s?(?P<year>\d{4}|\d\d)",
+        r"(?P<year>\d{4})[-/. ](?P<month>\d{1,2})[-/. ](?P<day>\d{1,2})",
+        r"(?P<month>\d{1,2})[-/](?P<year>\d{4})",
+        rf"{_WEEKDAY}{_DAY}[-/.\s]{{0,2}}{_WORD}[-/.,\s]{{0,2}}(?P<year>\d{{4}}|\d\d)",
+        rf"{_WEEKDAY}{_WORD}[-/.\s]{{0,2}}{_DAY}[-/.,\s]{{1,2}}(?P<year>\d{{4}})",
+        rf"{_WORD}[-/.,\s]{{0,2}}(?P<year>\d{{4}})",
+    )
+]
+"""How dates are written that are not as in ISO 8601, each column in one of these ways."""
+
+
+class Undecided(ValueError):
+    """Dates whose day and month cannot be told apart."""
+
 
 def is_number(column: Any) -> bool:
     """Whether a column is of numbers, or of true and false."""
     import pandas as pd
 
     return bool(pd.api.types.is_numeric_dtype(column))
+
+
+def tabular(data: Any) -> Any:
+    """A frame whose columns have names, its index among them where that has a name or holds dates.
+
+    Raises:
+        ValueError: two columns of one name.
+    """
+    import pandas as pd
+
+    frame = data.to_frame() if data.ndim == 1 else data
+    frame = frame.set_axis([str(name) for name in frame.columns], axis=1)
+    columns, levels = [*frame.columns], []
+    for place in range(frame.index.nlevels):
+        level = frame.index.get_level_values(place)
+        dated = isinstance(level, pd.DatetimeIndex | pd.PeriodIndex)
+        if level.name is not None or dated or not (frame.index.nlevels == 1 or is_number(level)):
+            unnamed = "time" if dated and "time" not in columns else f"level_{place}"
+            name = unnamed if level.name is None else str(level.name)
+            kept = columns.count(name) == 1 and level.equals(pd.Index(frame[name]))  # by set_index(drop=False)
+            if not kept:
+                levels.append((name, level))
+    names = [*(name for name, _ in levels), *columns]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        beside = " or an index of a column's name" if twice in dict(levels) else ""
+        raise ValueError(f"the table has two columns {twice!r}{beside}; rename one")
+    if levels:
+        frame = frame.reset_index(drop=True)
+    for place, (name, level) in enumerate(levels):
+        frame.insert(place, name, level)
+    return frame
 
 
 def texts(column: Any) -> Any:
@@ -27,24 +87,68 @@ def texts(column: Any) -> Any:
 
 
 def dates(column: Any) -> Any:
-    """Dates, in UTC.
+    """Dates, in UTC: of ISO 8601, with a month in English, or in digits of which some tell the day from the month.
 
     Raises:
+        Undecided: day, month and year in digits, and nothing that tells which is which.
         TypeError, ValueError: a column that holds something else, or dates that are written in several ways.
     """
     import pandas as pd
 
     if isinstance(column.dtype, pd.PeriodDtype):
         column = column.dt.to_timestamp()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # a guess by row, in which 1/2 is February's, and 13/2 too
-        try:
-            return pd.to_datetime(column, utc=True, format="ISO8601")
-        except (TypeError, ValueError):
-            try:
-                return pd.to_datetime(column, utc=True)
-            except UserWarning as error:
-                raise ValueError("write them as 2024-12-31") from error
+    try:
+        return pd.to_datetime(column, utc=True, format="ISO8601")
+    except (TypeError, ValueError):
+        codes, said = pd.factorize(column.astype(str).str.strip().where(column.notna()))  # sequences share their dates
+        said = pd.Series(said, dtype=object)
+        when = pd.to_datetime(_as_iso(said), utc=True, format="ISO8601", errors="coerce")
+        if (wrong := when.isna()).any():
+            raise _unread(said[wrong]) from None
+        return when.reindex(codes).set_axis(column.index)
+
+
+def _as_iso(said: Any) -> Any:
+    """Texts, of which the first is a date in another way, in that of ISO 8601; as they are, where it is in none."""
+    fitting = (way for first in said[:1] if len(first) <= LONGEST for way in WRITTEN if way.fullmatch(first))
+    way = next(fitting, None)
+    if way is None:
+        return said
+    parts = said.str.slice(0, LONGEST + 1).str.extract(f"^{way.pattern}$", flags=way.flags)
+    if (other := parts.year.isna()).any():
+        raise _unread(said[other])
+    if "first" in parts:
+        parts = parts.rename(columns=_order(parts, said[0]))
+    if "word" in parts:
+        parts["month"] = parts.word.str.lower().map({name: str(place) for place, name in enumerate(MONTHS, 1)})
+        century = parts.year.lt("69").map({True: "20", False: "19"})  # as POSIX has it
+        parts["year"] = parts.year.where(parts.year.str.len() != 2, century + parts.year)
+    if "day" not in parts:
+        parts["day"] = "1"
+    late = parts.half.str.lower().map({"a": 0, "p": 12})
+    hour = parts.hour.fillna("0").astype(int)
+    hour = (hour % 12 + late).where(late.notna(), hour).astype(int).astype(str)
+    date = parts.year + "-" + parts.month + "-" + parts.day
+    zone = parts.zone.str.upper().replace({"UTC": "Z", "GMT": "Z"}).fillna("")
+    return date + "T" + hour + parts.rest.fillna(":00") + zone
+
+
+def _unread(said: Any) -> ValueError:
+    """Of texts, the first is no date as others are."""
+    return ValueError(f"{brief(said.iloc[0])} among them; write dates as {WANTED}")
+
+
+def _order(parts: Any, example: str) -> dict[str, str]:
+    """Which of two numbers is the day: that above 12."""
+    first, second = (parts[name].astype(int).max() > 12 for name in ("first", "second"))
+    if first and second:
+        raise ValueError(f"some begin with the day and others with the month; write dates as {WANTED}")
+    if not (first or second) or (parts.year.str.len() == 2).any():
+        raise Undecided(
+            f"dates such as {example!r}, of which nothing tells the day from the month, or the year; "
+            f"write them as {WANTED}"
+        )
+    return {"first": "day", "second": "month"} if first else {"first": "month", "second": "day"}
 
 
 def times(column: Any) -> np.ndarray:
@@ -59,6 +163,8 @@ def times(column: Any) -> np.ndarray:
     else:
         try:
             when = dates(column)
+        except Undecided as error:
+            raise ValueError(f"column {column.name!r} holds {error}") from error
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"the times of column {column.name!r} are neither numbers nor dates: {str(error)[:200]}"

@@ -112,6 +112,11 @@ class Cut:
             raise ValueError(f"some sequences of {panel.name} say their split and others do not; let all, or none")
         if said:
             return [one.split for one in panel.series]
+        if self.split == "group" and not any(units):
+            raise ValueError(
+                f'split="group" holds out groups, and no column of {panel.name} says which group a sequence is of; '
+                'name one, such as group="region" of its columns, or --group region'
+            )
         names = sorted(dict.fromkeys(units), key=lambda name: hashlib.sha256(f"{self.seed} {name}".encode()).digest())
         test, validation = (int(np.ceil(share * len(names))) for share in (self.test, self.validation))
         if len(names) < 3:

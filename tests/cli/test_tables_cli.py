@@ -116,6 +116,29 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     )
 
 
+@pytest.mark.filterwarnings("always:left out of what is proposed")
+@pytest.mark.parametrize("format", ["%d/%m/%Y", "%d.%m.%Y"])
+def test_dates_in_digits_are_read_or_said_to_be_undecided(tmp_path, capfd, format):
+    path = tmp_path / "shops.csv"
+    days = pd.date_range("2024-01-01", periods=40)
+    for count, read in ((40, True), (12, False)):
+        told = pd.DataFrame({"date": np.tile(days[:count].strftime(format), 16), "sold": np.arange(16.0 * count)})
+        told["shop"] = np.repeat([f"s{n}" for n in range(16)], count)
+        told["price"] = [f"{10 + n / 100:.2f} €" for n in range(len(told))]
+        told.to_csv(path)  # with its index
+        assert main(["data", "info", str(path)]) == 0
+        out, error = (" ".join(each.split()) for each in capfd.readouterr())
+        assert f"16 sequences of {count} steps" in out
+        assert ('time = "date"' in out) == read
+        assert ("write them as 2024-12-31" in error) == (not read)
+        assert "'price' (neither numbers nor 2 to 20 classes, such as '10.00 €')" in error
+        assert "'Unnamed: 0' (the numbers of the rows" in error
+        assert "Exception ignored" not in error
+    assert "column 'date' holds dates such as '01" in failure(
+        capfd, "fit", "vae", "--out", tmp_path / "run", "--data", path, "--columns", "sold", "--time", "date", code=2
+    )
+
+
 def test_shares_are_told_on_the_command_line(table):
     shares = DataOptions(data=str(table), observed=5, horizon=3, split="time", validation=0.15, test=0.3)
     windows = shares.open(dvae.method("vae")).windows
@@ -308,7 +331,7 @@ def test_runs_are_compared_criticised_resumed_and_swept(tabled, table, tmp_path,
         (["--observed", "500", "--horizon", "3"], "no training window of 500 + 3 steps"),
         (["--test", "1.5"], "test is 1.5"),
         (["--validation", "0.5", "--test", "0.5"], "validation 0.5 and test 0.5 leave nothing to train on"),
-        (["--split", "group"], "too few to train, choose and test on"),
+        (["--split", "group"], "no column of riders says which group a sequence is of; name one"),
         (["--skip-bad"], "--skip-bad is about motion, and vae is fitted on a table"),
         (["--protocol", "cmu8"], "--protocol is about motion, and vae is fitted on a table"),
         (["--cut", "clips"], "--cut is about segments of motion, and vae is fitted on a table"),

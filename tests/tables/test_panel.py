@@ -1,5 +1,6 @@
 """A panel is the same whatever held its numbers, and says what it cannot hold."""
 
+import re
 from decimal import Decimal
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dvae.laws.family import FAMILIES
-from dvae.tables import Column, Columns, Panel, Series
+from dvae.tables import Column, Columns, Cut, Panel, PanelData, Series, Told, proposed
 
 pd = pytest.importorskip("pandas")
 xr = pytest.importorskip("xarray")
@@ -47,7 +48,11 @@ def test_the_same_numbers_from_everywhere_are_the_same_panel():
     same(values(Panel.of(list(numbers))), wanted)
     same(values(Panel.of([torch.from_numpy(each) for each in numbers])), wanted)
     same(values(Panel.of(torch.from_numpy(numbers))), wanted)
+    same(values(Panel.of(torch.from_numpy(numbers).requires_grad_())), wanted)
     same(values(Panel.of(long(numbers), LONG)), wanted)
+    for index in ("s", "t", ["s", "t"], ["t", "s"]):
+        same(values(Panel.of(long(numbers).set_index(index), LONG)), wanted)
+    same(values(Panel.of(long(numbers).set_index("t", drop=False), LONG)), wanted)
     dataset = xr.Dataset({name: (("s", "t"), numbers[..., n]) for n, name in enumerate(("x0", "x1"))})
     same(values(Panel.of(dataset, LONG)), wanted)
     same(values(Panel.of(dataset)), wanted)
@@ -72,6 +77,58 @@ def test_what_changes_later_elsewhere_does_not_change_a_panel():
     panel, wanted = Panel.of(numbers), numbers[0].copy()
     numbers[:] = 0
     np.testing.assert_array_equal(panel.series[0].values, wanted)
+
+
+DAYS = pd.to_datetime(["2024-01-01", "2024-01-02", "2024-01-05", "2024-01-06"])
+
+
+@pytest.mark.parametrize("name", [None, "day", "y"])
+@pytest.mark.parametrize(
+    "days", [DAYS, DAYS.tz_localize("Asia/Tokyo"), DAYS.to_period("D")], ids=["", "zone", "period"]
+)
+def test_dates_in_an_index_are_times(days, name):
+    frame = pd.DataFrame({"x": [1.0, 2.0, 3.0, 4.0], "time": [0.5, 0.5, 0.25, 0.5]}, index=days.rename(name))[::-1]
+    told = Told(columns=("x",))
+    panel = Panel.of(frame[["x"]], told)
+    assert panel.columns.time == (name or "time")
+    assert panel.dates
+    np.testing.assert_array_equal(panel.series[0].values[:, 0], [1, 2, 3, 4])
+    np.testing.assert_array_equal(np.diff(panel.series[0].times) / 86400, [1, 3, 1])
+    assert Panel.of(frame, told).series[0].times.tolist() == panel.series[0].times.tolist()
+    assert proposed(frame[["x"]]) == told.of(frame[["x"]]) == panel.columns
+    assert Panel.of(frame["x"]).fingerprint() == panel.fingerprint()
+
+
+def test_an_index_of_stations_and_days_is_that_of_their_columns():
+    days = pd.date_range("2024-01-01", periods=40)
+    index = pd.MultiIndex.from_product([list("abcd"), days], names=["station", "day"])
+    frame = pd.DataFrame({"y": np.random.default_rng(0).normal(size=160)}, index=index)
+    panel = Panel.of(frame.sample(frac=1, random_state=0))
+    assert [len(one) for one in panel] == [40] * 4
+    told = Told(id=("station",), time="day")
+    for other in (Panel.of(frame.reset_index(), told), Panel.of(frame, told), Panel.of(frame.reset_index("day"))):
+        assert other.fingerprint() == panel.fingerprint()
+    data = PanelData.of(frame, told, Cut(6, 2, split="time"))
+    assert data.on(frame.reset_index()).fingerprint == data.fingerprint == panel.fingerprint()
+    joined = pd.concat({key: part.droplevel("station") for key, part in frame.groupby("station")})
+    joined.index.names = [None, None]
+    same(values(Panel.of(joined)), values(panel))
+
+
+def test_an_index_that_says_nothing_is_no_column():
+    frame = pd.DataFrame({"y": [1.5, 0.5, 2.5]})
+    wanted = Panel.of(frame).fingerprint()
+    for index in ([2, 0, 5], list("abc"), [0, 0, 0]):
+        assert Panel.of(frame.set_axis(index)).fingerprint() == wanted
+    with pytest.raises(ValueError, match="two columns 'y' or an index of a column's name; rename one"):
+        Panel.of(frame.set_axis(pd.Index([7, 8, 9], name="y")))
+
+
+def test_a_panel_leaves_its_frame_as_it_was():
+    frame = long(grid()).set_index(["s", "t"])
+    before = frame.copy()
+    Panel.of(frame, LONG)
+    pd.testing.assert_frame_equal(frame, before)
 
 
 @given(st.permutations(range(15)))
@@ -188,8 +245,11 @@ def test_values_are_of_their_family_as_models_see_them(family):
     for value in GOOD.get(family, [-3.5, 0.0]):
         panel(value)
     for value in [*BAD.get(family, []), np.inf, 1e31]:
-        with pytest.raises(ValueError, match=r"sequence 'q' of riders has .* in row 1 of column 'y', and the family"):
+        with pytest.raises(
+            ValueError, match=r"'q' of riders has .* in row 1 of column 'y', and the family '\S+' is of .*; give it"
+        ) as refused:
             panel(value)
+        assert len(re.findall("below", str(refused.value))) <= 1
 
 
 @pytest.mark.parametrize(
@@ -220,6 +280,40 @@ def test_dates_are_read_as_they_are_written(column):
     np.testing.assert_array_equal(np.diff(times), [43200, 43200])
 
 
+@pytest.mark.parametrize(
+    "written",
+    [
+        "%Y-%m-%d %H:%M",
+        "%Y/%m/%d %H:%M",
+        "%Y%m%dT%H%M",
+        "%d/%m/%Y %H:%M",
+        "%d.%m.%Y %H:%M:%S",
+        "%d-%m-%Y, %H:%M",
+        "%m/%d/%Y %I:%M %p",
+        "%Y-%m-%d %I:%M %p",
+        "%d %b %Y %H:%M",
+        "%d-%b-%y %H:%M",
+        "%B %d, %Y %I:%M%p",
+        "%a, %d %b %Y %H:%M:%S +0000",
+        " %d/%m/%Y %H:%M UTC",
+    ],
+)
+def test_moments_are_read_back_however_they_are_written(written):
+    when = pd.date_range("2024-01-01", periods=400, freq="11h") + pd.Timedelta("7min")
+    frame = pd.DataFrame({"t": when.strftime(written), "y": np.arange(400.0)})
+    panel = Panel.of(frame, Columns((Column("y"),), time="t"))
+    np.testing.assert_array_equal(panel.series[0].times, when.astype("datetime64[s]").astype(int))
+    assert proposed(frame).time == "t"
+
+
+@pytest.mark.parametrize("written", ["%Y-%m", "%Y/%m", "%m/%Y", "%b %Y", "%B %Y"])
+def test_months_are_read_back(written):
+    when = pd.date_range("1975-01-01", periods=300, freq="MS")
+    frame = pd.DataFrame({"t": when.strftime(written), "y": np.arange(300.0)})
+    times = Panel.of(frame).series[0].times
+    np.testing.assert_array_equal(times, when.astype("datetime64[s]").astype(int))
+
+
 def test_dates_before_1970_are_times_too():
     frame = pd.DataFrame({"t": ["1500-01-01", "1500-01-02", "1969-12-31"], "y": [1.0, 2, 3]})
     times = Panel.of(frame, Columns((Column("y"),), time="t")).series[0].times
@@ -235,7 +329,15 @@ def test_dates_before_1970_are_times_too():
         ([0, None, 1], "row 1 of column 't' has no time"),
         (["2020", None, "2021"], "row 1 of column 't' has no time"),
         (["a", "b", "c"], "times of column 't' are neither numbers nor dates"),
-        (["1/2/2020", "13/2/2020", "2/2/2020"], "times of column 't' are neither numbers nor dates"),
+        (["1/2/2020", "13/2/2020", "2/13/2020"], "neither .* nor dates: some begin with the day and others with the m"),
+        (["13/1/2020", "n.a.", "15/1/2020"], "neither numbers nor dates: 'n.a.' among them; write dates as 2024-12-31"),
+        (["30/1/2020", "30/2/2020", "30/3/2020"], "neither numbers nor dates: '30/2/2020' among them"),
+        (
+            ["1/2/2020", "2/2/2020", "12/2/2020"],
+            "column 't' holds dates such as '1/2/2020', .* as 2024-12-31",
+        ),
+        (["1.2.20", "2.2.20", "13.2.20"], "column 't' holds dates such as '1.2.20'"),
+        (["12:30", "12:40", "12:50"], "neither numbers nor dates: '12:30' among them"),
     ],
 )
 def test_rows_without_a_time_of_their_own_are_refused(column, said):
@@ -278,7 +380,9 @@ def test_the_wrong_column_has_the_nearest_named():
     ("data", "said"),
     [
         ([], "sequences are .T, D.; got none"),
-        ([1.0, 2.0], r"got \(\), \(\)"),
+        ([1.0, 2.0], r"got \(\), \(\); one sequence of one column is \(T, 1\)"),
+        (np.zeros(3), r"got \(3,\); one sequence of one column is \(T, 1\)"),
+        (torch.zeros(3), r"got \(3,\); one sequence of one column is \(T, 1\)"),
         ([np.zeros((3, 2)), np.zeros((4, 3))], r"sequence '1' of panel has shape \(4, 3\); expected rows of 2 columns"),
         (np.zeros((2, 0, 3)), r"shape \(0, 3\)"),
         (pd.DataFrame(np.zeros((2, 2)), columns=["a", "a"]), "two columns 'a'"),

@@ -30,7 +30,12 @@ def test_families_are_those_that_the_values_have():
             "empty": [None] * 200,
         }
     )
-    found = {name: family for name, (_, family) in families(frame).items()}
+    with pytest.warns(UserWarning, match="left out of what is proposed") as said:
+        found = {name: family for name, (_, family) in families(frame).items()}
+    (left_out,) = said
+    for name in ("text", "one", "empty"):
+        assert f"'{name}' (neither numbers nor 2 to 20 classes" in str(left_out.message)
+    assert "such as 'text 0'" in str(left_out.message)
     assert found == {
         "real": "real",
         "few": "count",
@@ -41,7 +46,7 @@ def test_families_are_those_that_the_values_have():
         "skewed": "positive",
         "narrow": "real",
     }
-    Panel.of(frame)  # and all that is proposed can be read
+    Panel.of(frame[[*found]])  # and all that is proposed can be read
 
 
 def panel(**more):
@@ -79,6 +84,63 @@ def test_a_table_of_one_sequence_has_its_id_too():
     assert found.id == ("station_id",)
     assert [column.name for column in found.columns] == ["riders"]
     assert Panel.of(frame).series[0].name == "5"
+
+
+def shops(days, format):
+    """Shops and their cities, a row for each day."""
+    frame = pd.DataFrame({"date": np.tile(days.strftime(format), 6), "shop": np.repeat(list("abcdef"), len(days))})
+    return frame.assign(
+        city=np.repeat(["n", "s"], 3 * len(days)), sold=np.random.default_rng(0).normal(size=len(frame))
+    )
+
+
+@pytest.mark.parametrize("format", ["%d/%m/%Y", "%d.%m.%Y", "%m/%d/%Y", "%d-%m-%Y"])
+def test_one_day_above_12_tells_days_from_months(format):
+    for first in ("2024-01-01", "2024-01-15"):
+        days = pd.date_range(first, periods=13)
+        panel = Panel.of(shops(days, format))
+        assert (panel.columns.id, panel.columns.time) == (("shop",), "date")
+        for one in panel:
+            np.testing.assert_array_equal(one.times, days.astype("datetime64[s]").astype(int))
+
+
+@pytest.mark.parametrize("format", ["%d/%m/%Y", "%m.%d.%Y", "%d/%m/%y"])
+@pytest.mark.parametrize("freq", ["D", "MS"])
+def test_dates_whose_day_and_month_cannot_be_told_apart_are_said_to_be(format, freq):
+    frame = shops(pd.date_range("2024-01-01", periods=12, freq=freq), format)
+    with pytest.warns(UserWarning, match=r"'date' \(perhaps the time: dates such as '01.01.(20)?24', .* as 2024-12-31"):
+        found = proposed(frame)
+    assert (found.id, found.time) == (("shop",), None)  # and they tell rows apart
+    assert "date" not in found.names
+    with pytest.warns(UserWarning, match="perhaps the time"):
+        Told(columns=("sold",)).of(frame)
+    with pytest.raises(ValueError, match=r"column 'date' holds dates such as '01.01.(20)?24'"):
+        Panel.of(frame, Told(time="date"))
+    with pytest.raises(ValueError, match=r"dates such as '01.01.(20)?24'"):
+        Panel.wide(frame.pivot(index="date", columns="shop", values="sold"))
+    Told(columns=("sold",), past=("date:category",), id=("shop",)).of(frame)  # what is named is not left out
+
+
+def test_the_numbers_of_rows_that_pandas_writes_are_left_out():
+    frame = panel(station=np.repeat(["a", "b", "c"], 7))
+    written = frame.reset_index(names="Unnamed: 0")
+    with pytest.warns(UserWarning, match=r"'Unnamed: 0' \(the numbers of the rows, without a name\)"):
+        assert proposed(written) == proposed(frame)
+    measured = written.assign(**{"Unnamed: 0": frame.riders})
+    assert "Unnamed: 0" in proposed(measured).names
+    assert Told(columns=("riders",), past=("Unnamed: 0",)).of(written).names == ["riders", "Unnamed: 0"]
+
+
+def test_numbers_that_are_written_as_texts_are_named():
+    prices = [f"{n},234.50" for n in range(10, 31)]
+    with pytest.warns(UserWarning, match="left out of what is proposed: 'price' .*, such as '10,234.50'"):
+        assert "price" not in proposed(panel(price=prices)).names
+
+
+def test_texts_of_which_one_is_a_date_are_no_dates():
+    frame = panel(said=["1/2/2024", *(f"{n}th of them" for n in range(20))])
+    with pytest.warns(UserWarning, match=r"'said' \(neither numbers nor 2 to 20 classes, such as '1/2/2024'\)"):
+        proposed(frame.drop(columns="day"))
 
 
 def test_dates_with_offsets_that_change_are_a_time():
