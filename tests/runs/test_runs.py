@@ -516,9 +516,9 @@ def test_nothing_is_suggested_where_nothing_is_near(capsys):
         ("animate RUN --out f.png", ".html"),
     ],
 )
-def test_a_file_ends_in_what_is_written(capsys, tmp_path, monkeypatch, arguments, end):
+def test_a_file_ends_in_what_is_written(fitted, capsys, tmp_path, monkeypatch, arguments, end):
     monkeypatch.chdir(tmp_path)
-    assert f"end its name in {end}" in failure(capsys, *arguments.split(), code=2)
+    assert f"end its name in {end}" in failure(capsys, *arguments.replace("RUN", str(fitted)).split(), code=2)
     assert not list(tmp_path.iterdir())
 
 

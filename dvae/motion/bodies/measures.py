@@ -17,7 +17,7 @@ def vertex_error(vertices: Tensor, truth: Tensor) -> Tensor:
     """
     if vertices.shape != truth.shape:
         raise ValueError(f"vertices {tuple(vertices.shape)} and truth {tuple(truth.shape)} are not of one shape")
-    distances: Tensor = (vertices - truth).norm(dim=-1)
+    distances: Tensor = (vertices - truth).contiguous().norm(dim=-1)  # across strides, as surfaces come, it is slow
     return distances.mean((-2, -1))
 
 
