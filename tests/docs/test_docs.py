@@ -34,7 +34,9 @@ def test_what_a_comment_of_the_notation_says_is_printed(capsys):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_a_page_links_to_what_is_there(page):
     for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), target
+        there = (page.parent / target).resolve()
+        assert there.exists(), target
+        assert there.is_relative_to(ROOT / "docs"), f"{target} is not on the site"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
