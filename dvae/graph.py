@@ -241,7 +241,7 @@ def audit(
 
     Args:
         generative: p, a factorization or its text.
-        inference: q; None or "" of a model without latents.
+        inference: q, "" where nothing is latent; the prior if None.
         steps: number of inner steps compared, 5 if None; with masks of the user's own T, the length that they will
             be used at, 16 if None.
         observed: names of the observed variables.
@@ -252,8 +252,9 @@ def audit(
     >>> dvae.audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})").missing
     {'z': ('z_{t-1}',)}
     """
-    generative = Factorization.parse(generative) if isinstance(generative, str) else generative
-    inference = Factorization.guide(inference) if inference is None or isinstance(inference, str) else inference
+    generative = Factorization.parse(generative)
+    observed = tuple(observed)
+    inference = generative.guide(inference, observed)
     latents, data, context = check_pair(generative, inference, observed)
     relations = _relations(generative, inference)
     custom = any(relation.intervals is None for relation in relations)

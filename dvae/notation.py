@@ -179,11 +179,13 @@ class Factorization:
         _ = self.blocks
 
     @classmethod
-    def parse(cls, text: str, masks: Mapping[str, Relation | MaskFunction] | None = None) -> Factorization:
+    def parse(
+        cls, text: str | Factorization, masks: Mapping[str, Relation | MaskFunction] | None = None
+    ) -> Factorization:
         """Reads equations such as `"p(z_t | z_{t-1}) p(x_t | z_t)"`.
 
         Args:
-            text: the factors, all p or all q.
+            text: the factors, all p or all q; what is a factorization already is returned.
             masks: relations of the user's own: `masks={"band": function}` gives `z_{band}` its meaning,
                 where function(T) is a bool array (T, T), rows t, columns s; or a Relation.
 
@@ -192,6 +194,8 @@ class Factorization:
             ValueError: it can be read but not drawn (see the class).
             TypeError: not text at all.
         """
+        if isinstance(text, Factorization):
+            return text
         if not isinstance(text, str):
             raise TypeError(f'equations are text such as "p(z_t | z_{{t-1}}) p(x_t | z_t)", got {text!r}')
         return cls(*_Reader(text, masks or {}).factorization())
@@ -221,10 +225,22 @@ class Factorization:
         observed = tuple(observed)
         return Factorization("q", tuple(replace(f, kind="q") for f in self.factors if f.child not in observed))
 
-    @classmethod
-    def guide(cls, text: str | None) -> Factorization:
-        """A guide by its text, without factors where there is none: that of a model without latents."""
-        return cls.parse(text) if text and text.strip() else cls("q", ())
+    def guide(
+        self,
+        inference: Factorization | str | None,
+        observed: Iterable[str] = ("x",),
+        masks: Mapping[str, Relation | MaskFunction] | None = None,
+    ) -> Factorization:
+        """The guide that is meant: a factorization, its text, None for the prior, or "" where nothing is latent.
+
+        Raises:
+            NotationError, ValueError, TypeError: as in `parse`.
+        """
+        if inference is None:
+            return self.prior_guide(observed)
+        if isinstance(inference, str) and not inference.strip():
+            return Factorization("q", ())
+        return Factorization.parse(inference, masks)
 
     def given(self, local: Iterable[str], static: Iterable[str], but: Collection[str] = ()) -> Factorization:
         """The same with context that factors read too: those of local variables at t, those of static latents nothing.

@@ -26,7 +26,7 @@ from .views import LOG_DET, volume
 @alone
 def twin(
     generative: str | Factorization,
-    inference: str | Factorization,
+    inference: str | Factorization | None,
     sizes: Mapping[str, int],
     steps: int,
     seed: int = 0,
@@ -46,7 +46,8 @@ def twin(
         >>> model.sample(5, length=4)["x"].shape
         torch.Size([5, 4, 2])
     """
-    equations = [f if isinstance(f, Factorization) else Factorization.parse(f) for f in (generative, inference)]
+    model = Factorization.parse(generative)
+    equations = (model, model.guide(inference, observed))
     laws = {
         f"{factor.kind}({factor.child})": FixedNormal(
             scale=0.7, learned=True, project=False, steps=steps if factor.local else 0
@@ -57,8 +58,7 @@ def twin(
     }
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        p, q = equations
-        return DynamicalVAE(p, q, sizes, Linear(steps, scale), laws, observed=observed).double()
+        return DynamicalVAE(generative, inference, sizes, Linear(steps, scale), laws, observed=observed).double()
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ class Oracle:
 @alone
 def price(
     generative: str | Factorization,
-    inference: str | Factorization,
+    inference: str | Factorization | None,
     sizes: Mapping[str, int],
     steps: int = 5,
     seeds: int = 5,

@@ -423,21 +423,16 @@ class Comparison(Result):
 
     @property
     def _words(self) -> tuple[str, str, str]:
-        """What is scored, what it is cut from, and what it consists of."""
+        """What is scored, what errors are over, and what it consists of."""
         clip, frame = called(self.data)
-        if self._whole:
-            return f"whole {clip}", clip, frame
+        if self.protocol.get("observed", 0) is None:
+            return "whole sequence", clip, frame
         return "window" if "called" in self.data else "sequence", clip, frame
-
-    @property
-    def _whole(self) -> bool:
-        """Whether clips are scored as they are, and not cut into windows."""
-        return self.protocol.get("observed", 0) is None
 
     def _title(self) -> str:
         each, clip, _ = self._words
         parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} {each}s"]
-        parts[-1] += "" if self._whole else f" of {len(set(self._clips))} {clip}s"
+        parts[-1] += "" if each == f"whole {clip}" else f" of {len(set(self._clips))} {clip}s"
         parts += [f"seed {self.seed}"]
         parts += [f"data {self.data['fingerprint'][:12]}"] if "fingerprint" in self.data else []
         return " · ".join(part for part in parts if part)

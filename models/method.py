@@ -45,7 +45,8 @@ class Method(Trainable):
 
     def equations(self) -> tuple[Factorization, Factorization]:
         """The generative model and the guide, which has no factor where there are no latents."""
-        return Factorization.parse(self.generative), Factorization.guide(self.inference)
+        generative = Factorization.parse(self.generative)
+        return generative, generative.guide(self.inference)
 
     def sizes(self) -> dict[str, int]:
         """Sizes of the latents."""

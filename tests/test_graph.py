@@ -270,8 +270,14 @@ def test_a_model_without_latents_has_nothing_to_infer(guide):
     found = audit("p(x_t | x_{<t})", guide)
     assert found.exact
     assert not found.missing
+
+
+def test_no_guide_is_the_prior_and_an_empty_one_infers_nothing():
+    found = audit("p(z_t | z_{t-1}) p(x_t | z_t)", None)
+    assert str(found.inference) == "q(z_{1:T}) = ∏_t q(z_t | z_{t-1})"
+    assert [str(parent) for parent in found.missing["z"]] == ["x_{>=t}"]
     with pytest.raises(ValueError, match="the latent z has no factor in the guide"):
-        audit("p(z_t) p(x_t | z_t)", guide)
+        audit("p(z_t) p(x_t | z_t)", "")
 
 
 def test_how_an_audit_shows():

@@ -58,7 +58,8 @@ def show(
         observed = [name for name in pair[0].variables if name not in pair[1].variables]
     elif generative and inference is not None:
         with arguments():
-            pair = Factorization.parse(generative), Factorization.guide(inference)
+            model = Factorization.parse(generative)
+            pair = model, model.guide(inference)
         observed = ["x"]
     else:
         raise UsageError("give the name of a method, or both --generative and --inference")

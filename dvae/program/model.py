@@ -46,8 +46,8 @@ class DynamicalVAE(nn.Module):
 
     Args:
         generative: such as "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", as text or a `Factorization`.
-        inference: such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)". None for no inference network: the guide is
-            the prior, so that every KL term is exactly zero.
+        inference: such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)"; "" where nothing is latent. None for no
+            inference network: the guide is the prior, so that every KL term is exactly zero.
         sizes: dimension of every variable, context included.
         network: description of the networks, or a mapping from factors to descriptions. Its keys are "p(x)" for one
             factor, "p" for all generative ones, "q" for the guide's, and "default".
@@ -97,13 +97,11 @@ class DynamicalVAE(nn.Module):
     ):
         super().__init__()
         self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
-        self.generative = _factorization(generative, masks)
+        self.generative = Factorization.parse(generative, masks)
         self.feeding = SelfFeeding(0.0)
         self.view = view or View()
         observed = tuple(self.view.parts or observed)
-        self.inference = (
-            self.generative.prior_guide(observed) if inference is None else _factorization(inference, masks)
-        )
+        self.inference = self.generative.guide(inference, observed, masks)
         self.sizes = dict(sizes)
         self.latents, self.observed, self.context = check_pair(self.generative, self.inference, observed, sizes)
         for name, size in self.sizes.items():
@@ -531,10 +529,6 @@ class DynamicalVAE(nn.Module):
         self, factorization: Factorization, conditionals: Any, batch: AnyBatch | None, length: int | None, size: int
     ) -> Rollout:
         return self.reader.rollout(factorization, conditionals, self.read(batch), length, size)
-
-
-def _factorization(equations: str | Factorization, masks: Mapping[str, MaskFunction] | None) -> Factorization:
-    return equations if isinstance(equations, Factorization) else Factorization.parse(equations, masks=masks or {})
 
 
 def _locality(factorization: Factorization) -> dict[str, bool]:

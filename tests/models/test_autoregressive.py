@@ -44,6 +44,14 @@ def test_its_forecasts_are_draws():
     assert not model.forecast(X, 2, samples=5, draw_emission=False)["x"].std(0).any()
 
 
+@pytest.mark.parametrize("guide", ["", None])
+def test_a_model_without_a_method_is_the_same(guide):
+    model = dvae.DynamicalVAE("p(x_t | x_{<t})", guide, {"x": 2})
+    assert model.latents == ()
+    likelihood = model.eval().log_joint(X, {})["x"]
+    torch.testing.assert_close(dvae.SequenceELBO().terms(model, X).bound, likelihood)
+
+
 def test_there_is_no_guide_to_calibrate():
     model = dvae.method("equations", generative="p(x_t | x_{<t})", inference="", width=4).build({"x": 2})
     with pytest.raises(ValueError, match="has no latents, so that its likelihood is exact and no guide"):

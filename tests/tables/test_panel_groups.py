@@ -57,6 +57,10 @@ def test_errors_are_over_groups_whose_sequences_share_what_is_drawn():
     bounds = found.rows["ours"].bounds["importance bound"][0]
     means = np.bincount(groups, bounds) / np.bincount(groups) / test.length
     assert found["ours"]["importance bound"].sequences == pytest.approx(means.std(ddof=1) / 3**0.5, rel=1e-6)
+    whole = panel(Cut(None, split="group", validation=0.2, test=0.3)).windows("test")
+    bounds = str(dvae.compare({"ours": model}, whole, particles=5, contrasts=0, samples=0, progress=False))
+    assert "9 whole sequences of 3 groups" in bounds
+    assert "over whole sequences (clustered by group)" in bounds
     scores = dvae.evaluate({"ours": model}, test, training_windows=data.windows("train"), **how)
     assert "windows of 3 groups" in str(scores)
     assert len(scores.rows["ours"].clip_means["CRPS"]) == 3
