@@ -20,16 +20,16 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 from typing_extensions import override
 
 from ..inference.recipe import Recipe
 from ..motion import Windows
 from ..networks import Input, Network, NetworkSpec
 from ..networks.base import once, perceptron, share_modules
-from ..networks.recurrent import gru_cell
 from ..options import Amount, Size
 from ..program.rollout import SelfFeeding
+from ..views import WHOLE
+from .futures import FedBackNetwork
 from .trajectories import FIRST, GIVEN, REST, TrajectoryMethod
 
 
@@ -146,47 +146,23 @@ class Decoder:
         return DecoderNetwork(self, inputs, size)
 
 
-class DecoderNetwork(Network):
+class DecoderNetwork(FedBackNetwork):
     """What `Decoder` describes."""
 
     def __init__(self, spec: Decoder, inputs: Sequence[Input], size: int):
-        behind = (spec.width, *spec.hidden[:-1])
-        super().__init__(inputs, True, behind[-1])
         sizes = {parent.name: parent.size for parent in inputs}
-        (self.latent,) = sizes.keys() - {"x", GIVEN, FIRST}
+        (latent,) = sizes.keys() - {WHOLE, GIVEN, FIRST}
+        known = spec.hidden[-1] + sizes[latent] + sizes[GIVEN]
+        super().__init__(inputs, known, size, spec.width, spec.hidden[:-1])
+        self.latent = latent
         self.summaries = nn.ModuleDict({GIVEN: Summary(sizes[GIVEN], spec.summary)})
         self.before = perceptron((2 * spec.summary, *spec.hidden), "tanh")
         self.first = perceptron((2 * spec.summary, *spec.hidden[:-1], spec.width), "tanh")
-        self.known = spec.hidden[-1] + sizes[self.latent] + sizes[GIVEN]
-        self.cell: Any = nn.GRU(self.known + size, spec.width, batch_first=True)
-        self.behind = perceptron(behind, "tanh")
 
     @override
-    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """No sequence is padded."""
-        self.refuse_ragged(lengths)
-        known, state = self._known(parents)
-        previous = torch.cat([parents[FIRST][:, None], parents["x"][:, : length - 1]], 1)
-        return self.behind(self.cell(torch.cat([known, previous], -1), state[None])[0])
-
-    def _known(self, parents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """What enters the states at every step (B, T, known) but for x, and the state before the first (B, W)."""
+    def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
         given = parents[GIVEN]
         summary = self.summaries[GIVEN](parents[FIRST], given)
         static = torch.cat([self.before(summary), parents[self.latent]], -1)
-        return torch.cat([static[:, None].expand(-1, given.shape[1], -1), given], -1), self.first(summary)
-
-    @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        self.refuse_ragged(lengths)
-        known, state = self._known(given)
-        weight, bias = self.cell.weight_ih_l0[:, : self.known], self.cell.bias_ih_l0
-        return functional.linear(known, weight, bias).unbind(1), given[FIRST], given.get("x"), state
-
-    @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        shares, first, given, hidden = state
-        previous = first if t == 0 else drawn["x"][t - 1] if given is None else given[:, t - 1]
-        gates = torch.addmm(shares[t], previous, self.cell.weight_ih_l0[:, self.known :].t())
-        hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
-        return self.behind(hidden), (shares, first, given, hidden)
+        steps = torch.cat([static[:, None].expand(-1, given.shape[1], -1), given], -1)
+        return steps, parents[FIRST], self.first(summary)

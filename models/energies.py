@@ -21,7 +21,6 @@ from ..data import Source
 from ..motion import Bones, Heading, Skeleton, Windows, energies
 from ..motion.angles import AngleLimits, angle_names, estimate_angle_limits
 from ..motion.judges.pose_prior import PosePriorModel, fit_pose_prior, load_pose_prior
-from ..motion.protocols import Poses
 from ..motion.truths import PseudoTruths, WithPseudoTruths
 from ..motion.views import LENGTHS
 from ..options import Amount, Count, Positive, Range, Size
@@ -72,20 +71,6 @@ class EnergyMethod(PoseMethod):
     pool_stride: Count | None = None
     bones: bool = False
     heading: bool | None = None
-
-    def poses(self, data: Any) -> Poses:
-        """The schema of data, of poses without a root.
-
-        Raises:
-            ValueError: poses with a root, or no poses.
-        """
-        schema = Poses.of(data, self.name)
-        if schema.protocol.root != "drop":
-            raise ValueError(
-                f"{self.name} makes poses relative to the pelvis, but the protocol {schema.protocol.name} has the "
-                f"root {schema.protocol.root!r}; use one with root='drop'"
-            )
-        return schema
 
     def start(self, model: EnergyModel, windows: Windows) -> None:
         """Has a model take the limits of the angles and the pose prior.

@@ -36,7 +36,7 @@ from ..laws import FixedNormal, LawSpec
 from ..motion.protocols import Poses
 from ..motion.views import LENGTHS, Rotations
 from ..networks import Input, Network, NetworkSpec
-from ..networks.base import AtOnce, once, share_modules
+from ..networks.base import share_modules
 from ..networks.noise import AddProjected, Concatenate, MixAndMatch, Noise, Residual, half
 from ..networks.recurrent import gru_cell
 from ..notation import Factorization
@@ -45,9 +45,11 @@ from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, SelfFeeding
 from ..schema import Schema
 from ..views import WHOLE, Past, Views
+from .futures import HISTORY, LastState
+from .pose_knows import FutureFilter
 from .poses import PoseMethod
 
-HISTORY, INDICES = "h", MixAndMatch.indices_name
+INDICES = MixAndMatch.indices_name
 EQUATIONS = {
     "mix": ("p(z) p(x_t | x_{<t}, h, z, i)", "q(z | x_{1:T}, h, i)"),
     "concatenate": ("p(z) p(x_t | x_{<t}, h, z)", "q(z | x_{1:T}, h)"),
@@ -210,19 +212,6 @@ class MixAndMatchModel(DynamicalVAE):
         return found
 
 
-class PastCode(nn.Module):
-    """The last state (B, L) of a recurrent network over the past."""
-
-    def __init__(self, size: int, width: int) -> None:
-        super().__init__()
-        self.size = size
-        self.network = nn.GRU(size, width, batch_first=True)
-
-    def forward(self, past: Tensor) -> Tensor:
-        """Of (B, O D)."""
-        return once(self, [past], lambda: self.network(past.unflatten(-1, (-1, self.size)))[1][0])
-
-
 @dataclass(frozen=True)
 class FutureEncoder:
     """Features of z from the codes of past and future; of z_t, states of a network that goes on from the past.
@@ -237,7 +226,7 @@ class FutureEncoder:
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
         """The network of a factor with these parents."""
-        return FutureFilterNetwork(self, inputs) if local else FutureEncoderNetwork(self, inputs)
+        return FutureFilter(self.width).build(inputs, local, size) if local else FutureEncoderNetwork(self, inputs)
 
 
 class FutureEncoderNetwork(Network):
@@ -246,7 +235,7 @@ class FutureEncoderNetwork(Network):
     def __init__(self, spec: FutureEncoder, inputs: Sequence[Input]) -> None:
         super().__init__(inputs, False, spec.width)
         size = next(parent.size for parent in inputs if parent.name == WHOLE)
-        self.past = PastCode(size, spec.width)
+        self.past = LastState(size, spec.width)
         self.future = nn.GRU(size, spec.width, batch_first=True)
         assert spec.noise is not None
         self.noise: Any = spec.noise.encoder(spec.width)
@@ -259,21 +248,6 @@ class FutureEncoderNetwork(Network):
             code = states.take_along_dim((lengths - 1)[:, None, None], 1).squeeze(1)
         features: Tensor = self.noise(self.past(parents[HISTORY]), code, parents.get(INDICES))
         return features
-
-
-class FutureFilterNetwork(AtOnce):
-    """What `FutureEncoder` describes, of a latent for each step."""
-
-    def __init__(self, spec: FutureEncoder, inputs: Sequence[Input]) -> None:
-        super().__init__(inputs, True, spec.width)
-        size = next(parent.size for parent in inputs if parent.name == WHOLE)
-        self.past = PastCode(size, spec.width)
-        self.network = nn.GRU(size, spec.width, batch_first=True)
-
-    @override
-    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        states: Tensor = self.network(parents[WHOLE], self.past(parents[HISTORY])[None])[0]
-        return states
 
 
 @dataclass(frozen=True)
@@ -302,7 +276,7 @@ class FutureDecoderNetwork(Network):
         super().__init__(inputs, True, size)
         latent = next(parent.size for parent in inputs if parent.name == "z")
         self.velocity = spec.velocity
-        self.past = PastCode(size, spec.width)
+        self.past = LastState(size, spec.width)
         self.noise = None if spec.noise is None else spec.noise.decoder(spec.width, latent)
         self.cell: Any = nn.GRU(size, spec.width, batch_first=True)
         self.join = Residual(spec.width + latent, spec.width) if spec.noise is None else None

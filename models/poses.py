@@ -36,6 +36,20 @@ class PoseMethod(Method):
         """With the options that are left open chosen for the skeleton of these data."""
         return self.filled(self.preset(Poses.of(data, self.name, self.representation).skeleton))
 
+    def poses(self, data: Any) -> Poses:
+        """The schema of data, of poses without a root.
+
+        Raises:
+            ValueError: poses with a root, or no poses.
+        """
+        schema = Poses.of(data, self.name)
+        if schema.protocol.root != "drop":
+            raise ValueError(
+                f"{self.name} makes poses relative to the pelvis, but the protocol {schema.protocol.name} has the "
+                f"root {schema.protocol.root!r}; use one with root='drop'"
+            )
+        return schema
+
     def filled(self, preset: Mapping[str, Any]) -> Self:
         """With options that are None taken from a preset."""
         return replace(self, **{name: value for name, value in preset.items() if getattr(self, name) is None})

@@ -1,0 +1,136 @@
+"""CVAE: futures of a moving body by one latent and a recurrent decoder; the first stage of DLow.
+
+    p(w) p(x_t | x_{<t}, h, w)        q(w | x_{1:T}, h)
+
+One recurrent network sums up the observed poses h, for the guide and the decoder, and another the future x, for the
+guide. The decoder reads the summary of h, w and its own mean at t-1 (the last observed pose at first) in place of
+x_{t-1}; gradients flow through these means. Poses are absolute.
+
+Yuan and Kitani, 2020, arXiv 2003.08386: 725,292 numbers for Human3.6M. Its latent of a mixture of normals is that of
+GMVAE (Dilokthanakul et al., 2016, arXiv 1611.02648), in the tables of motion prediction without its further latents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from ..laws import LawSpec, Mixture
+from ..networks import Input, Network, NetworkSpec
+from ..networks.base import perceptron, share_modules
+from ..options import Count, Size
+from ..views import WHOLE, View
+from .futures import HISTORY, FedBackNetwork, FutureMethod, FutureModel, LastState
+
+
+@dataclass(frozen=True)
+class CVAE(FutureMethod):
+    """See the file.
+
+    Args:
+        width: units of the recurrent networks.
+        hidden: widths of perceptrons.
+        components: normals of the prior of w; 1 for N(0, I).
+    """
+
+    name = "cvae"
+    source = "Yuan and Kitani, 2020, arXiv 2003.08386"
+    generative = "p(w) p(x_t | x_{<t}, h, w)"
+    inference = "q(w | x_{1:T}, h)"
+
+    join: float = 1000.0
+    width: Size = 128
+    hidden: tuple[Size, ...] = (300, 200)
+    components: Count = 1
+
+    @override
+    def sizes(self) -> dict[str, int]:
+        return {"w": self.latent or 0}
+
+    @override
+    def laws(self) -> Mapping[str, LawSpec]:
+        return {**super().laws(), **({"p(w)": Mixture(self.components)} if self.components > 1 else {})}
+
+    @override
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        return {"q(w)": FutureEncoder(self.width, self.hidden), "p(x)": FutureDecoder(self.width, self.hidden)}
+
+    @override
+    def _built(self, size: int, frames: int, view: View) -> FutureModel:
+        model = super()._built(size, frames, view)
+        share_modules([model.encoder["w"].network, model.generator[WHOLE].network], "past")
+        return model
+
+
+@dataclass(frozen=True)
+class FutureEncoder:
+    """Features of w from the last states of recurrent networks over past and future.
+
+    Args:
+        width: of the states.
+        hidden: widths of the perceptron on both.
+    """
+
+    width: int
+    hidden: tuple[int, ...]
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureEncoderNetwork:
+        """The network of a factor with these parents."""
+        return FutureEncoderNetwork(self, inputs)
+
+
+class FutureEncoderNetwork(Network):
+    """What `FutureEncoder` describes."""
+
+    def __init__(self, spec: FutureEncoder, inputs: Sequence[Input]) -> None:
+        super().__init__(inputs, False, (2 * spec.width, *spec.hidden)[-1])
+        size = next(parent.size for parent in inputs if parent.name == WHOLE)
+        self.past, self.future = LastState(size, spec.width), LastState(size, spec.width)
+        self.join = perceptron((2 * spec.width, *spec.hidden), "tanh")
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """No sequence is padded."""
+        self.refuse_ragged(lengths)
+        made: Tensor = self.join(torch.cat([self.past(parents[HISTORY]), self.future(parents[WHOLE])], -1))
+        return made
+
+
+@dataclass(frozen=True)
+class FutureDecoder:
+    """Features of x_t: states of a recurrent network over [summary of h, w, x_{t-1}], and a perceptron.
+
+    Args:
+        width: of the states.
+        hidden: widths of the perceptrons, on the summary to the first state and behind the states.
+    """
+
+    width: int
+    hidden: tuple[int, ...]
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureDecoderNetwork:
+        """The network of a factor with these parents."""
+        return FutureDecoderNetwork(self, inputs, size)
+
+
+class FutureDecoderNetwork(FedBackNetwork):
+    """What `FutureDecoder` describes."""
+
+    def __init__(self, spec: FutureDecoder, inputs: Sequence[Input], size: int) -> None:
+        latents = [parent for parent in inputs if parent.name not in (WHOLE, HISTORY)]
+        known = spec.width + sum(parent.size for parent in latents)
+        super().__init__(inputs, known, size, spec.width, spec.hidden)
+        self.latents = [parent.name for parent in latents]
+        self.past = LastState(size, spec.width)
+        self.first = perceptron((spec.width, *spec.hidden, spec.width), "tanh")
+
+    @override
+    def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
+        code = self.past(parents[HISTORY])
+        parts = [code, *(parents[name] for name in self.latents)]
+        steps = [part if part.dim() == 3 else part[:, None].expand(-1, length, -1) for part in parts]
+        return torch.cat(steps, -1), parents[HISTORY][:, -self.past.size :], self.first(code)
