@@ -57,7 +57,7 @@ class CVAE(FutureMethod):
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        return {"q(w)": FutureEncoder(self.width, self.hidden), "p(x)": FutureDecoder(self.width, self.hidden)}
+        return {"q(w)": SummaryEncoder(self.width, self.hidden), "p(x)": SummaryDecoder(self.width, self.hidden)}
 
     @override
     def _built(self, size: int, frames: int, view: View) -> FutureModel:
@@ -67,7 +67,7 @@ class CVAE(FutureMethod):
 
 
 @dataclass(frozen=True)
-class FutureEncoder:
+class SummaryEncoder:
     """Features of w from the last states of recurrent networks over past and future.
 
     Args:
@@ -78,15 +78,15 @@ class FutureEncoder:
     width: int
     hidden: tuple[int, ...]
 
-    def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureEncoderNetwork:
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> SummaryEncoderNetwork:
         """The network of a factor with these parents."""
-        return FutureEncoderNetwork(self, inputs)
+        return SummaryEncoderNetwork(self, inputs)
 
 
-class FutureEncoderNetwork(Network):
-    """What `FutureEncoder` describes."""
+class SummaryEncoderNetwork(Network):
+    """What `SummaryEncoder` describes."""
 
-    def __init__(self, spec: FutureEncoder, inputs: Sequence[Input]) -> None:
+    def __init__(self, spec: SummaryEncoder, inputs: Sequence[Input]) -> None:
         super().__init__(inputs, False, (2 * spec.width, *spec.hidden)[-1])
         size = next(parent.size for parent in inputs if parent.name == WHOLE)
         self.past, self.future = LastState(size, spec.width), LastState(size, spec.width)
@@ -101,7 +101,7 @@ class FutureEncoderNetwork(Network):
 
 
 @dataclass(frozen=True)
-class FutureDecoder:
+class SummaryDecoder:
     """Features of x_t: states of a recurrent network over [summary of h, w, x_{t-1}], and a perceptron.
 
     Args:
@@ -112,15 +112,15 @@ class FutureDecoder:
     width: int
     hidden: tuple[int, ...]
 
-    def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureDecoderNetwork:
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> SummaryDecoderNetwork:
         """The network of a factor with these parents."""
-        return FutureDecoderNetwork(self, inputs, size)
+        return SummaryDecoderNetwork(self, inputs, size)
 
 
-class FutureDecoderNetwork(FedBackNetwork):
-    """What `FutureDecoder` describes."""
+class SummaryDecoderNetwork(FedBackNetwork):
+    """What `SummaryDecoder` describes."""
 
-    def __init__(self, spec: FutureDecoder, inputs: Sequence[Input], size: int) -> None:
+    def __init__(self, spec: SummaryDecoder, inputs: Sequence[Input], size: int) -> None:
         latents = [parent for parent in inputs if parent.name not in (WHOLE, HISTORY)]
         known = spec.width + sum(parent.size for parent in latents)
         super().__init__(inputs, known, size, spec.width, spec.hidden)

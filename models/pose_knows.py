@@ -21,7 +21,7 @@ from ..networks import Input, NetworkSpec
 from ..networks.base import AtOnce, share_modules
 from ..options import Size
 from ..views import WHOLE, View
-from .cvae import FutureDecoder
+from .cvae import SummaryDecoder
 from .futures import HISTORY, FutureMethod, FutureModel, LastState
 
 
@@ -44,7 +44,7 @@ class PoseKnows(FutureMethod):
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        return {"q(z)": FutureFilter(self.width), "p(x)": FutureDecoder(self.width, self.hidden)}
+        return {"q(z)": FutureFilter(self.width), "p(x)": SummaryDecoder(self.width, self.hidden)}
 
     @override
     def _built(self, size: int, frames: int, view: View) -> FutureModel:
