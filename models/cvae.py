@@ -21,10 +21,10 @@ from typing_extensions import override
 
 from ..laws import LawSpec, Mixture
 from ..networks import Input, Network, NetworkSpec
-from ..networks.base import perceptron, share_modules
+from ..networks.base import perceptron
 from ..options import Count, Size
-from ..views import WHOLE, View
-from .futures import HISTORY, FedBackNetwork, FutureMethod, FutureModel, LastState
+from ..views import WHOLE
+from .futures import HISTORY, FedBackNetwork, FutureMethod, LastState
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,6 @@ class CVAE(FutureMethod):
     def networks(self) -> Mapping[str, NetworkSpec]:
         return {"q(w)": SummaryEncoder(self.width, self.hidden), "p(x)": SummaryDecoder(self.width, self.hidden)}
 
-    @override
-    def _built(self, size: int, frames: int, view: View) -> FutureModel:
-        model = super()._built(size, frames, view)
-        share_modules([model.encoder["w"].network, model.generator[WHOLE].network], "past")
-        return model
-
 
 @dataclass(frozen=True)
 class SummaryEncoder:
@@ -94,15 +88,16 @@ class SummaryEncoderNetwork(Network):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """No sequence is padded."""
-        self.refuse_ragged(lengths)
-        made: Tensor = self.join(torch.cat([self.past(parents[HISTORY]), self.future(parents[WHOLE])], -1))
+        """Padding at the end is not read."""
+        made: Tensor = self.join(torch.cat([self.past(parents[HISTORY]), self.future(parents[WHOLE], lengths)], -1))
         return made
 
 
 @dataclass(frozen=True)
 class SummaryDecoder:
     """Features of x_t: states of a recurrent network over [summary of h, w, x_{t-1}], and a perceptron.
+
+    A latent of each step is read by the perceptron, beside the state.
 
     Args:
         width: of the states.
@@ -121,16 +116,15 @@ class SummaryDecoderNetwork(FedBackNetwork):
     """What `SummaryDecoder` describes."""
 
     def __init__(self, spec: SummaryDecoder, inputs: Sequence[Input], size: int) -> None:
-        latents = [parent for parent in inputs if parent.name not in (WHOLE, HISTORY)]
-        known = spec.width + sum(parent.size for parent in latents)
-        super().__init__(inputs, known, size, spec.width, spec.hidden)
-        self.latents = [parent.name for parent in latents]
+        (latent,) = (parent for parent in inputs if parent.name not in (WHOLE, HISTORY))
+        own = (latent.name, latent.size) if latent.relation else None
+        super().__init__(inputs, spec.width + (0 if own else latent.size), size, spec.width, spec.hidden, own)
+        self.latent = latent.name
         self.past = LastState(size, spec.width)
         self.first = perceptron((spec.width, *spec.hidden, spec.width), "tanh")
 
     @override
     def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
         code = self.past(parents[HISTORY])
-        parts = [code, *(parents[name] for name in self.latents)]
-        steps = [part if part.dim() == 3 else part[:, None].expand(-1, length, -1) for part in parts]
-        return torch.cat(steps, -1), parents[HISTORY][:, -self.past.size :], self.first(code)
+        static = code if self.own else torch.cat([code, parents[self.latent]], -1)
+        return static[:, None].expand(-1, length, -1), parents[HISTORY][:, -self.past.size :], self.first(code)

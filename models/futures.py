@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
+from ..data import mask_of
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
 from ..inference.training import Stage
@@ -28,14 +29,15 @@ from ..laws import FixedNormal, LawSpec
 from ..motion import HUMAN36M, Heading, Skeleton, energies
 from ..motion.protocols import Poses
 from ..networks import Input, Network
-from ..networks.base import once, perceptron
+from ..networks.base import once, perceptron, share_modules
 from ..networks.recurrent import gru_cell
 from ..options import Amount, Size
+from ..program.batch import AnyBatch
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, SelfFeeding
 from ..schema import Schema
-from ..views import WHOLE, Past, View, Views
-from .poses import PoseMethod
+from ..views import WHOLE, Past, Views
+from .poses import PoseMethod, without_gaps
 
 HISTORY = "h"
 
@@ -80,17 +82,18 @@ class FutureMethod(PoseMethod):
             ValueError: poses with a root.
         """
         schema = Schema.of(data)
-        method, size, frames = self.filled(self.presets[HUMAN36M.name]), schema.size(WHOLE), 2
-        views: list[View] = []
-        if isinstance(schema, Poses):
-            schema = self.poses(schema)
-            method, frames = self.suited(schema), schema.protocol.observed
-            views = [Heading(schema.skeleton, frames)] if method.heading else []
-            views += [Past(HISTORY, frames)]
-        return method._built(size, frames, Views(*views))
+        if not isinstance(schema, Poses):
+            return self.filled(self.presets[HUMAN36M.name])._built(schema.size(WHOLE), 2)
+        schema = self.poses(schema)
+        method, observed = self.suited(schema), schema.protocol.observed
+        return method._built(schema.size(WHOLE), observed, schema.skeleton)
 
-    def _built(self, size: int, frames: int, view: View) -> FutureModel:
-        model = FutureModel(self, view=view, **self.described({WHOLE: size, HISTORY: frames * size}))
+    def _built(self, size: int, frames: int, skeleton: Skeleton | None = None) -> FutureModel:
+        views = [Heading(skeleton, frames)] if skeleton and self.heading else []
+        given = self.described({WHOLE: size, HISTORY: frames * size})
+        model = FutureModel(self, frames, skeleton, view=Views(*views, Past(HISTORY, frames)), **given)
+        networks = [side[name].network for side in (model.encoder, model.generator) for name in side]
+        share_modules([network for network in networks if hasattr(network, "past")], "past")
         model.feeding = SelfFeeding(1.0, gradient=True)
         return model
 
@@ -109,23 +112,42 @@ class FutureModel(DynamicalVAE):
 
     Args:
         method: with no option left open.
+        frames: O, that are observed.
+        skeleton: of the poses; None where it is not known.
         **options: of `DynamicalVAE`.
     """
 
-    def __init__(self, method: FutureMethod, **options: Any) -> None:
+    def __init__(self, method: FutureMethod, frames: int, skeleton: Skeleton | None, **options: Any) -> None:
         super().__init__(**options)
-        self.method = method
+        self.method, self.frames, self.skeleton = method, frames, skeleton
+
+    @override
+    def read(self, batch: AnyBatch | None, **options: Any) -> dict[str, Any]:
+        """The batch, whose observed frames have no gaps (see `without_gaps`)."""
+        if (
+            self.skeleton
+            and isinstance(batch, Mapping)
+            and HISTORY not in batch
+            and (mask := mask_of(batch)) is not None
+        ):
+            x, (seen, later) = torch.as_tensor(batch[WHOLE]), mask.tensor_split([self.frames], 1)
+            past = without_gaps(self.skeleton, x[:, : self.frames], seen)
+            whole = torch.cat([past, x[:, self.frames :]], 1)
+            batch = {**batch, WHOLE: whole, "mask": torch.cat([torch.ones_like(seen), later], 1)}
+        return super().read(batch, **options)
 
     @override
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
         """How far the first pose is from the last observed one; and the best of several draws from what happened."""
         if WHOLE not in data or not (self.method.join or draws):
             return {}
-        x, size = rollout.values[WHOLE], rollout.batch // rollout.draws
-        made = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size))
-        found = {"reconstruction": energies.best_of_many(made, x[:size])} if draws else {}
+        size = rollout.batch // rollout.draws
+        made, truth = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (-1, size)), data[WHOLE][:size]
+        if (mask := data.get("mask", {}).get(WHOLE)) is not None:
+            truth = torch.where(mask[:size], truth, torch.nan)
+        found = {"reconstruction": energies.best_of_many(made, truth)} if draws else {}
         if self.method.join:
-            steps = made[:, :, 0] - data[HISTORY][:size, -x.shape[-1] :]
+            steps = made[:, :, 0] - data[HISTORY][:size, -truth.shape[-1] :]
             found["join"] = steps.square().sum(-1).mean(0)
         return found
 
@@ -139,13 +161,22 @@ class FedBackNetwork(Network):
         size: D.
         width: of the states.
         hidden: widths of the perceptron.
+        own: name and size of a latent of each step, which the perceptron reads beside the state; no other step does.
     """
 
-    def __init__(self, inputs: Sequence[Input], known: int, size: int, width: int, hidden: Sequence[int]) -> None:
+    def __init__(
+        self,
+        inputs: Sequence[Input],
+        known: int,
+        size: int,
+        width: int,
+        hidden: Sequence[int],
+        own: tuple[str, int] | None = None,
+    ) -> None:
         super().__init__(inputs, True, (width, *hidden)[-1])
-        self.share = known
+        self.share, (self.own, latent) = known, own or ("", 0)
         self.cell: Any = nn.GRU(known + size, width, batch_first=True)
-        self.behind = perceptron((width, *hidden), "tanh")
+        self.behind = perceptron((width + latent, *hidden), "tanh")
 
     def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
         """What is known at each step (B, T, known), the pose before the first (B, D), and the first state (B, W)."""
@@ -153,27 +184,30 @@ class FedBackNetwork(Network):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """No sequence is padded."""
-        self.refuse_ragged(lengths)
+        """Padding at the end changes nothing before it."""
         known, first, state = self.known(parents, length)
         before = torch.cat([first[:, None], parents[WHOLE][:, : length - 1]], 1)
-        made: Tensor = self.behind(self.cell(torch.cat([known, before], -1), state[None].contiguous())[0])
+        states = self.cell(torch.cat([known, before], -1), state[None].contiguous())[0]
+        made: Tensor = self.behind(torch.cat([states, parents[self.own]], -1) if self.own else states)
         return made
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        self.refuse_ragged(lengths)
         known, first, state = self.known(given, length)
         weight, bias = self.cell.weight_ih_l0[:, : self.share], self.cell.bias_ih_l0
-        return functional.linear(known, weight, bias).unbind(1), first, given.get(WHOLE), state
+        latents = given[self.own].unbind(1) if self.own in given else None
+        return functional.linear(known, weight, bias).unbind(1), first, given.get(WHOLE), latents, state
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        shares, first, given, hidden = state
+        shares, first, given, latents, hidden = state
         before = first if t == 0 else drawn[WHOLE][t - 1] if given is None else given[:, t - 1]
         gates = torch.addmm(shares[t], before, self.cell.weight_ih_l0[:, self.share :].t())
         hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
-        return self.behind(hidden), (shares, first, given, hidden)
+        read = hidden
+        if self.own:
+            read = torch.cat([hidden, drawn[self.own][t] if latents is None else latents[t]], -1)
+        return self.behind(read), (shares, first, given, latents, hidden)
 
 
 class LastState(nn.Module):
@@ -189,6 +223,14 @@ class LastState(nn.Module):
         self.size = size
         self.network = nn.GRU(size, width, batch_first=True)
 
-    def forward(self, poses: Tensor) -> Tensor:
-        """Of (B, T, D), or of (B, T D), frame after frame."""
-        return once(self, [poses], lambda: self.network(poses.reshape(len(poses), -1, self.size))[1][0])
+    def forward(self, poses: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Of (B, T, D), or of (B, T D), frame after frame; of the first steps of each where there are lengths."""
+
+        def last() -> Tensor:
+            states, final = self.network(poses.reshape(len(poses), -1, self.size))
+            if lengths is None:
+                return final[0]
+            found: Tensor = states.take_along_dim((lengths - 1)[:, None, None], 1)[:, 0]
+            return found
+
+        return once(self, [poses] if lengths is None else [poses, lengths], last)

@@ -47,7 +47,7 @@ from ..program.batch import AnyBatch
 from ..program.rollout import Rollout
 from ..views import WHOLE, History, Parts
 from .energies import EnergyMethod, EnergyModel
-from .poses import table
+from .poses import table, without_gaps
 
 PRESETS = table(
     "coefficients width draws diversity diversity_scale pseudo_minimum pool_stride heading",
@@ -253,22 +253,13 @@ class GSPSModel(EnergyModel):
 
     @override
     def read(self, batch: AnyBatch | None, **options: Any) -> dict[str, Any]:
-        """The batch, whose observed frames have no gaps.
-
-        Ours: across a gap a joint goes straight from where it was to where it is next among the observed frames. One
-        that these never show is at its parent's place.
-        """
+        """The batch, whose observed frames have no gaps (see `without_gaps`)."""
         data = super().read(batch, **options)
         mask = data.get("mask", {}).get(HISTORY)
         if mask is None or mask.all():
             return data
-        past, seen = data[HISTORY][:, : self.frames], mask[:, : self.frames]
-        bridge, shown = (self.skeleton.with_root(x.unflatten(-1, (-1, 3))) for x in (bridged(past, seen), seen.any(1)))
-        for joint in self.skeleton.order[1:]:
-            above = bridge[..., self.skeleton.parents[joint], :]
-            bridge[..., joint, :] = torch.where(shown[:, None, joint], bridge[..., joint, :], above)
-        bridge = self.skeleton.without_root(bridge).flatten(-2)
-        return data | {HISTORY: torch.cat([bridge, data[HISTORY][:, self.frames :]], 1)}
+        past = without_gaps(self.skeleton, data[HISTORY][:, : self.frames], mask[:, : self.frames])
+        return data | {HISTORY: torch.cat([past, data[HISTORY][:, self.frames :]], 1)}
 
     @torch.no_grad()
     @override

@@ -236,17 +236,14 @@ class FutureEncoderNetwork(Network):
         super().__init__(inputs, False, spec.width)
         size = next(parent.size for parent in inputs if parent.name == WHOLE)
         self.past = LastState(size, spec.width)
-        self.future = nn.GRU(size, spec.width, batch_first=True)
+        self.future = LastState(size, spec.width)
         assert spec.noise is not None
         self.noise: Any = spec.noise.encoder(spec.width)
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        states, last = self.future(parents[WHOLE])
-        code = last[0]
-        if lengths is not None:
-            code = states.take_along_dim((lengths - 1)[:, None, None], 1).squeeze(1)
-        features: Tensor = self.noise(self.past(parents[HISTORY]), code, parents.get(INDICES))
+        future = self.future(parents[WHOLE], lengths)
+        features: Tensor = self.noise(self.past(parents[HISTORY]), future, parents.get(INDICES))
         return features
 
 

@@ -3,7 +3,7 @@
     p(z_t) p(x_t | x_{<t}, h, z_t)        q(z_t | x_{<=t}, h)
 
 Latents are independent of each other, so that futures jitter. The guide's states go on from the summary of the observed
-poses h; the decoder is that of the CVAE, with z_t at step t.
+poses h; the decoder is that of the CVAE, whose perceptron reads z_t beside the state.
 
 Walker, Marino, Gupta and Hebert, 2017, arXiv 1705.00053, whose code is not known; sizes are those of the CVAE of Yuan
 and Kitani, 2020, arXiv 2003.08386, beside which the tables of motion prediction have it.
@@ -18,11 +18,11 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from ..networks import Input, NetworkSpec
-from ..networks.base import AtOnce, share_modules
+from ..networks.base import AtOnce
 from ..options import Size
-from ..views import WHOLE, View
+from ..views import WHOLE
 from .cvae import SummaryDecoder
-from .futures import HISTORY, FutureMethod, FutureModel, LastState
+from .futures import HISTORY, FutureMethod, LastState
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,6 @@ class PoseKnows(FutureMethod):
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
         return {"q(z)": FutureFilter(self.width), "p(x)": SummaryDecoder(self.width, self.hidden)}
-
-    @override
-    def _built(self, size: int, frames: int, view: View) -> FutureModel:
-        model = super()._built(size, frames, view)
-        share_modules([model.encoder["z"].network, model.generator[WHOLE].network], "past")
-        return model
 
 
 @dataclass(frozen=True)

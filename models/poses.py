@@ -6,8 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
+import torch
+from torch import Tensor
 from typing_extensions import override
 
+from ..data import bridged
 from ..motion import Skeleton
 from ..motion.protocols import Poses
 from .method import Method
@@ -16,6 +19,24 @@ from .method import Method
 def table(options: str, rows: Mapping[str, Sequence[Any]]) -> dict[str, dict[str, Any]]:
     """Presets from rows of values, by skeleton, under the names of their options."""
     return {skeleton: dict(zip(options.split(), values, strict=True)) for skeleton, values in rows.items()}
+
+
+def without_gaps(skeleton: Skeleton, poses: Tensor, seen: Tensor) -> Tensor:
+    """Poses (B, T, D) without a root whose missing joints are where one would take them to be.
+
+    Ours: across a gap a joint goes straight from where it was to where it is next. One that is never seen is at its
+    parent's place.
+
+    Args:
+        skeleton: of the poses.
+        poses: anything where entries are missing.
+        seen: (B, T, D), True where an entry was observed.
+    """
+    found, shown = (skeleton.with_root(x.unflatten(-1, (-1, 3))) for x in (bridged(poses, seen), seen.any(1)))
+    for joint in skeleton.order[1:]:
+        above = found[..., skeleton.parents[joint], :]
+        found[..., joint, :] = torch.where(shown[:, None, joint], found[..., joint, :], above)
+    return skeleton.without_root(found).flatten(-2)
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ def forecast(
     if horizon < 1 or samples < 1:
         raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
     first = data.get(model.view.history or model.observed[0])
-    size, past = (len(next(iter(data.values()))), 0) if first is None else first.shape[:2]
+    size, past = (len(next(v for v in data.values() if isinstance(v, Tensor))), 0) if first is None else first.shape[:2]
     given = {name: torch.as_tensor(value).to(like(model)) for name, value in (fix or {}).items()}
     fixed = _fixed(model, given, data, size, horizon)
     drawn = {name: model.drawn(name) if draw_emission is None else draw_emission for name in model.observed}
