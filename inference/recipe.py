@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import torch
@@ -17,7 +17,7 @@ from ..turns import alone
 from .fit import Fit, fit, run_directory
 from .objectives import Objective
 from .schedules import Schedule
-from .training import Stage
+from .training import Stage, Training
 
 
 def _as_it_is(model: nn.Module) -> None:
@@ -90,6 +90,8 @@ class Trainable:
     source: ClassVar[str]
     fitted_on: ClassVar[str] = "motion"
     """The kind of its data, by the name that runs know it by (`dvae.runs.kinds.DATA`)."""
+    trainings: ClassVar[Mapping[str, Training]] = {"": Training(decay=0.5)}
+    """How it is fitted where nothing else is said, by the name of a skeleton, and "" for all other data."""
 
     def __post_init__(self) -> None:
         check(self)
@@ -110,8 +112,12 @@ class Trainable:
         """How the model is trained on these data, in so many steps."""
         raise NotImplementedError
 
+    def training(self, data: Any) -> Training:
+        """How the model is fitted to these data, where nothing else is said."""
+        return self.trainings[""]
+
     @alone
-    def fit(self, data: Any, *, steps: int = 2000, seed: int = 0, **options: Any) -> Fit:
+    def fit(self, data: Any, **options: Any) -> Fit:
         """Builds the model for data and fits it to them: in one call, in memory.
 
         `dvae.runs.directory.fit_run` keeps a run that can be loaded and resumed.
@@ -119,9 +125,8 @@ class Trainable:
         Args:
             data: with a `schema`, and `windows` to train and to validate on, such as `dvae.tables.PanelData` or
                 `dvae.motion.MotionData`.
-            steps: optimiser steps in all.
-            seed: of initial weights, batches and draws.
-            **options: of `Recipe.fit`.
+            **options: of `Recipe.fit`; those of `Training` that are not given are the method's own (`training`). Its
+                seed is that of the initial weights too.
 
         Returns:
             The fit; its `model` has the best weights.
@@ -130,11 +135,13 @@ class Trainable:
             ValueError: see `Recipe.fit`, or data without windows of these parts.
         """
         train = data.windows("train")
+        names = Training.__dataclass_fields__.keys() & options
+        training = replace(self.training(data.schema), **{name: options.pop(name) for name in names})
         method = self.suited(train)
-        recipe = method.train(train, data.windows("validation"), steps)
+        recipe = method.train(train, data.windows("validation"), training.steps)
         with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            return recipe.fit(method.build(data.schema), seed=seed, **options)
+            torch.manual_seed(training.seed)
+            return recipe.fit(method.build(data.schema), **vars(training), **options)
 
     def check(self) -> None:
         """Refuses options that do not fit together, before any data are read.

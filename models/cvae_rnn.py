@@ -16,13 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
 from ..inference.recipe import Recipe
+from ..inference.training import Training
 from ..motion import Windows
 from ..networks import Input, Network, NetworkSpec
 from ..networks.base import once, perceptron, share_modules
@@ -48,6 +49,7 @@ class CVAERNN(TrajectoryMethod):
     source = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
     generative = "p(w) p(x_t | x_{<t}, y_{1:T}, w, s)"
     inference = "q(w | r_{1:T}, y_{1:T}, s)"
+    trainings: ClassVar[Mapping[str, Training]] = {**TrajectoryMethod.trainings, "": Training(6000, 16, 1e-3, 0.5)}
 
     latent: Size | None = 256
     beta: Amount | None = 0.1

@@ -24,7 +24,7 @@ from typing_extensions import override
 from ..data import mask_of
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
-from ..inference.training import Stage
+from ..inference.training import Stage, Training
 from ..laws import FixedNormal, LawSpec
 from ..motion import HUMAN36M, Heading, Skeleton, energies
 from ..motion.protocols import Poses
@@ -55,6 +55,12 @@ class FutureMethod(PoseMethod):
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
+
+    trainings: ClassVar[Mapping[str, Training]] = {
+        HUMAN36M.name: Training(39_063, 64, 1e-3, 0.8),
+        "humaneva": Training(7813, 64, 1e-3, 0.8),
+        "": Training(decay=0.5),
+    }
 
     latent: Size | None = 128
     beta: Amount = 0.1

@@ -26,7 +26,7 @@ from itertools import accumulate
 from math import prod
 from operator import mul
 from string import ascii_lowercase
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ from typing_extensions import override
 from ..data import bridged, mask_of
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
-from ..inference.training import Stage
+from ..inference.training import Stage, Training
 from ..laws import Delta, Directions
 from ..motion import Skeleton, Windows, energies
 from ..motion.parts import body_parts
@@ -83,6 +83,11 @@ class GSPS(EnergyMethod):
     generative = "p(a) p(lower_t | h_{1:O}, a) p(b) p(upper_t | h_{1:O}, lower_{1:T}, b)"
     inference = "q(a) q(b)"
     presets = PRESETS
+    trainings: ClassVar[Mapping[str, Training]] = {
+        "human36m": Training(156_000, 16, 1e-3, 0.8, gradient_clip=100.0),
+        "humaneva": Training(62_500, 16, 1e-3, 0.8, gradient_clip=100.0),
+        "": Training(6500, 16, 3e-3, 0.5),
+    }
     latent: Size = 64
     parts: tuple[str, ...] = ("lower", "upper")
     coefficients: Size | None = None

@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -47,7 +47,7 @@ from ..data import bridged
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
 from ..inference.schedules import Ramp, Schedule
-from ..inference.training import Stage
+from ..inference.training import Stage, Training
 from ..laws import Directions
 from ..motion import Skeleton, energies
 from ..motion.parts import body_parts
@@ -125,6 +125,11 @@ class HiTDVAE(EnergyMethod, LatentMethod):
     generative = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
     inference = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
     presets = PRESETS
+    trainings: ClassVar[Mapping[str, Training]] = {
+        "human36m": Training(15_625, 32, 1e-3),
+        "humaneva": Training(7813, 64, 1e-3),
+        "": Training(1200, 16, 2e-3, 0.8),
+    }
     residual: Share = 0.5
     self_feeding: Share = 1.0
     warm_up: Delay | None = None

@@ -31,7 +31,7 @@ from typing_extensions import override
 from ..inference.objectives import Evidence
 from ..inference.recipe import Recipe
 from ..inference.schedules import Logistic, Ramp
-from ..inference.training import Stage
+from ..inference.training import Stage, Training
 from ..laws import FixedNormal, LawSpec
 from ..motion.protocols import Poses
 from ..motion.views import LENGTHS, Rotations
@@ -86,6 +86,10 @@ class MixAndMatchMotion(PoseMethod):
     generative, inference = EQUATIONS["mix"]  # of the default; `equations` has those of each way
     representation: ClassVar[str] = "quaternion"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"human36m": {"width": 1024}, "": {"width": 128}}
+    trainings: ClassVar[Mapping[str, Training]] = {
+        "human36m": Training(100_000, 64, 1e-3),
+        "": Training(1000, 32, 2e-3, 0.5),
+    }
 
     noise: Literal["mix", "concatenate", "add", "step"] = "mix"
     alpha: Share = 0.5

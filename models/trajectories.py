@@ -26,7 +26,8 @@ from typing_extensions import override
 from ..data import Batch
 from ..inference.objectives import Evidence
 from ..inference.recipe import Recipe
-from ..inference.training import Stage
+from ..inference.schedules import Piecewise
+from ..inference.training import Stage, Training
 from ..laws import FixedNormal, LawSpec
 from ..motion import HUMAN36M, PROTOCOLS, Clip, Heading, Skeleton, Windows
 from ..motion.control import bend
@@ -61,6 +62,13 @@ class TrajectoryMethod(PoseMethod):
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
+
+    trainings: ClassVar[Mapping[str, Training]] = {
+        HUMAN36M.name: Training(
+            240_000, 64, Piecewise(((0, 1e-4), (79_999, 1e-4), (80_000, 2.5e-5), (159_999, 2.5e-5), (160_000, 6.25e-6)))
+        ),
+        "": Training(24_000, 16, 5e-4, 0.8),
+    }
 
     latent: Size | None = None
     beta: Amount | None = None

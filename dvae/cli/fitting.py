@@ -35,17 +35,15 @@ from ..tables.dataset import PanelData
 from .console import ERROR, OUT, Missing, UsageError, arguments, at_least
 from .tables import is_table
 
-DEFAULT = Training(decay=0.5)
-"""How the command line trains, where it is not told."""
 
-
-def _options(name: str, kind: type[Any], default: Any, *aside: str) -> Any:
+def _options(name: str, kind: type[Any], *aside: str) -> Any:
     """A dataclass of the options of another that can be written as words, but those that are left aside.
+
+    Options are None where they are not given.
 
     Args:
         name: of the class.
         kind: whose options.
-        default: with the values that they have by default; None for options that are None where they are not given.
         aside: names of options.
     """
     hints = get_type_hints(kind, include_extras=True)
@@ -54,8 +52,7 @@ def _options(name: str, kind: type[Any], default: Any, *aside: str) -> Any:
         hint = hints[option.name]
         if schedules & {*get_args(hint)}:
             hint = reduce(or_, [part for part in get_args(hint) if part not in schedules])
-        value = None if default is None else getattr(default, option.name)
-        found.append((option.name, hint | None if default is None else hint, value))
+        found.append((option.name, hint | None, None))
     kept = [option for option in found if option[0] not in aside]
     return make_dataclass(name, kept, frozen=True, namespace={"__doc__": kind.__doc__})
 
@@ -76,9 +73,9 @@ else:
     )
     ProtocolName = tyro.extras.literal_type_from_choices(motion.PROTOCOLS)
     SweptMethod = tyro.extras.literal_type_from_choices([name for name in methods() if name != "equations"])
-    MethodOptions = _options("MethodOptions", LatentMethod, None, "latent")
-    TrainingOptions = _options("TrainingOptions", Training, DEFAULT, "self_feeding", "progress")
-    SweepOptions = _options("SweepOptions", Training, DEFAULT, "self_feeding", "progress", "seed", "devices")
+    MethodOptions = _options("MethodOptions", LatentMethod, "latent")
+    TrainingOptions = _options("TrainingOptions", Training, "self_feeding", "progress")
+    SweepOptions = _options("SweepOptions", Training, "self_feeding", "progress", "seed", "devices")
 
 
 @dataclass(frozen=True)
@@ -194,7 +191,7 @@ def fit(
     Args:
         method: what to fit.
         out: the run directory.
-        training: options of the run.
+        training: options of the run; what is not given is the method's own, see `dvae show METHOD`.
         source: the motion data.
         tensorboard: write TensorBoard files to the run directory too.
     """
@@ -204,7 +201,7 @@ def fit(
         raise ValueError(f"{out} already holds a run; continue it with: dvae resume {out}, or choose another directory")
     with arguments():
         method.check()  # wrong equations and options are found before the data are read
-        how = Training(**vars(training))
+        how = _given(training)
     opened = source.open(method)
     with _reported():
         _report(runs.fit_run(method, opened, out, how, trackers=[TensorBoard(out)] if tensorboard else []))
@@ -255,7 +252,7 @@ def sweep(
         method: names of methods.
         out: directory of the run directories, such as srnn-seed0, or srnn-z8-seed0 where sizes differ.
         model: options of all methods, in place of their defaults.
-        training: options of the runs.
+        training: options of the runs; what is not given is each method's own, see `dvae show METHOD`.
         source: the motion data.
         seeds: of initial weights, batches and draws; a run for each.
         latent: sizes of z; a run for each.
@@ -273,7 +270,7 @@ def sweep(
         chosen = [registry.method(name, **given, **size) for name in method for size in sizes]
         for each in chosen:
             each.check()
-        how = Training(**vars(training))
+        how = _given(training)
     opened = source.open(*chosen)
     with nullcontext() if scheduler is None else _cluster(scheduler):
         results = sweep_methods(chosen, opened, out, seeds, how, jobs)
@@ -286,6 +283,13 @@ def sweep(
     if chosen[0].fitted_on == "motion":
         then += f", and bounds, where all have one: dvae compare {out}/*"
     OUT.print(f"all {len(results)} runs have ended; {then}", soft_wrap=True)
+
+
+def _given(training: Any) -> dict[str, Any]:
+    """The options of training that are given, each of which may be."""
+    given = {name: value for name, value in vars(training).items() if value is not None}
+    Training(**given)
+    return given
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,6 +11,7 @@ import tyro
 
 from ..graph import audit
 from ..inference.result import Table
+from ..inference.training import Training
 from ..models import registry
 from ..models.registry import judges, methods
 from ..notation import Factorization
@@ -36,7 +38,7 @@ def show(
     steps: int = 4,
     out: Path | None = None,
 ) -> None:
-    """Show two equations: the joint distributions, the audit of the guide, and the graph.
+    """Show two equations: the joint distributions, the audit of the guide, and the graph; and how a method is fitted.
 
     Args:
         method: name of a method, or give two equations instead.
@@ -72,6 +74,8 @@ def show(
         OUT.print(found.verdict)
     else:
         OUT.print("nothing is latent: there is no guide, and the bound is the log evidence")
+    if method is not None:
+        OUT.print("\n".join(_fitted(kind.trainings)), highlight=False, soft_wrap=True)
     if out is not None:
         from matplotlib.figure import Figure
 
@@ -83,6 +87,19 @@ def show(
             title = "guide" if found.exact else "guide (dashed: what the exact posterior also reads)"
             found.draw(steps, ax=axes).set_title(title)
         save_figure(figure, out)
+
+
+def _fitted(trainings: Mapping[str, Training]) -> list[str]:
+    """How a method is fitted where nothing else is said, in words, by the skeleton."""
+    lines = []
+    for skeleton, told in trainings.items():
+        rate = told.rate
+        ends = "" if rate(0) == rate(told.steps) else f", at the end {rate(told.steps):g}"
+        on = f"to {skeleton}" if skeleton else "to other data" if len(trainings) > 1 else "to data"
+        lines.append(
+            f"fitted {on} in {told.steps} steps of {told.batch_size}, {told.optimizer}, learning rate {rate(0):g}{ends}"
+        )
+    return lines
 
 
 def _asks_for_equations(kind: Any) -> bool:

@@ -8,7 +8,7 @@ relative path stays relative, so that a project folder can be moved. Runs of for
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -120,7 +120,7 @@ def fit_run(
     method: Trainable,
     data: Dataset,
     out: str | os.PathLike[str],
-    training: Training | None = None,
+    training: Training | Mapping[str, Any] | None = None,
     callbacks: Sequence[Callback] = (),
     trackers: Sequence[Tracker] = (),
 ) -> Fit:
@@ -130,7 +130,8 @@ def fit_run(
         method: such as `dvae.method("hit-dvae", latent=8)`; it tells objective and self-feeding.
         data: training and validation windows are taken from it.
         out: the run directory.
-        training: the other options; its seed is also that of the initial weights.
+        training: the other options, or some of them beside the method's own (`Trainable.training`); its seed is also
+            that of the initial weights.
         callbacks: hooks of the loop.
         trackers: further receivers of the log's rows.
 
@@ -138,10 +139,15 @@ def fit_run(
         ValueError: `training` sets the self-feeding, which is the method's to tell; or the pseudo-sequences of a
             prior are longer than the windows.
     """
-    training = training or Training()
+    training = training_of(method, data, training)
     method = method.suited(data.windows("train"))
     config = Config(method, data.schema, data.kind, data.recorded(), training).written()
     return method.fit(data, out=out, config=config, callbacks=callbacks, trackers=trackers, **vars(training))
+
+
+def training_of(method: Trainable, data: Dataset, training: Training | Mapping[str, Any] | None) -> Training:
+    """How a method is fitted to data: as is said, or by the method's own options but for those that are said."""
+    return training if isinstance(training, Training) else replace(method.training(data.schema), **(training or {}))
 
 
 @alone

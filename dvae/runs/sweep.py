@@ -45,7 +45,7 @@ from ..models.method import Method
 from ..options import flat
 from ..schema import Schema
 from ..turns import alone
-from .directory import fit_run, read_config, resume
+from .directory import fit_run, read_config, resume, training_of
 from .kinds import Dataset
 
 ENDED = ("finished", "stopped early")
@@ -105,7 +105,7 @@ def sweep(
     data: Dataset,
     out: str | os.PathLike[str],
     seeds: Sequence[int] = (0, 1, 2),
-    training: Training | None = None,
+    training: Training | Mapping[str, Any] | None = None,
     jobs: int = 2,
 ) -> list[Outcome]:
     """Fits each method with each seed, several runs at a time.
@@ -122,8 +122,8 @@ def sweep(
         data: training and validation windows are taken from it.
         out: where the run directories go.
         seeds: of the runs of each method; `training` has none to tell.
-        training: the other options. `progress` shows the runs: a table on a terminal, or else a line as each starts and
-            ends.
+        training: the other options, or some of them beside each method's own. `progress` shows the runs: a table on a
+            terminal, or else a line as each starts and ends.
         jobs: runs at a time; a cluster has as many as workers.
 
     Returns:
@@ -138,25 +138,35 @@ def sweep(
         methods = [dvae.method("srnn", latent=latent) for latent in (8, 16)]
         results = sweep(methods, MotionData.open("people.npz"), "runs", training=dvae.Training(steps=4000), jobs=4)
     """
-    out, training = Path(out), training or Training()
-    if training.devices != 1:
-        raise ValueError(f"devices is {training.devices}; a run of a sweep has one device, fit it alone for more")
+    out = Path(out)
     lease = out.absolute() / f".sweep-{uuid4().hex}"
     source = data.location
     runs = [
-        _Run(out.absolute() / f"{name}-seed{seed}", method, data, source, replace(training, seed=seed), lease)
+        _Run(
+            out.absolute() / f"{name}-seed{seed}",
+            method,
+            data,
+            source,
+            replace(training_of(method, data, training), seed=seed),
+            lease,
+        )
         for seed in seeds
         for name, method in _named(methods).items()
     ]
     if not runs or len({run.path for run in runs}) < len(runs):
         raise ValueError(f"a sweep has at least one method and one seed, each once; seeds are {list(seeds)}")
+    if devices := [run.training.devices for run in runs if run.training.devices != 1]:
+        raise ValueError(f"devices is {devices[0]}; a run of a sweep has one device, fit it alone for more")
     results = {run.path: result for run in runs if (result := _earlier(run)) is not None}
     waiting = [run for run in runs if run.path not in results]
     notes: list[str] = []
     received, blind = None, False
     out.mkdir(parents=True, exist_ok=True)
     lease.touch(exist_ok=False)
-    with _Progress(waiting, training) as progress, Signals(then=partial(lease.unlink, missing_ok=True)) as stop:
+    with (
+        _Progress(waiting, runs[0].training.progress) as progress,
+        Signals(then=partial(lease.unlink, missing_ok=True)) as stop,
+    ):
         try:
             for result in results.values():
                 progress.end(result)
@@ -353,9 +363,9 @@ def _options(method: Trainable, schema: Schema, training: Training, fingerprint:
 class _Log:
     """What the log of a run tells, while another process writes it."""
 
-    def __init__(self, run: Path) -> None:
+    def __init__(self, run: Path, steps: int) -> None:
         self.path = run / "log.jsonl"
-        self.name = run.name
+        self.name, self.steps = run.name, steps
         self.begins = f"continues after step {Run(run).state['step']}" if Run(run).exists else "starts"
         self.begin: float | None = None
         self.step = 0
@@ -389,11 +399,11 @@ class _Log:
 class _Progress:
     """A line as each run ends. Meanwhile, a live table of the runs; away from a terminal, a line as each starts."""
 
-    def __init__(self, runs: Sequence[_Run], training: Training) -> None:
-        self.console = Plain(stderr=True, quiet=not training.progress, force_jupyter=False)
-        self.steps, self.total = training.steps, len(runs)
+    def __init__(self, runs: Sequence[_Run], shown: bool) -> None:
+        self.console = Plain(stderr=True, quiet=not shown, force_jupyter=False)
+        self.total = len(runs)
         self.bound = f"bound (nats a {runs[0].data.schema.per if runs else Fit.per})"
-        self.logs = {run.path: _Log(run.path) for run in runs}
+        self.logs = {run.path: _Log(run.path, run.training.steps) for run in runs}
         # away from a terminal nothing is drawn, but the logs are looked at all the same
         self.live = Live(console=self.console, get_renderable=self._look, refresh_per_second=2, transient=True)
 
@@ -428,7 +438,7 @@ class _Progress:
         for log in running:
             assert log.begin is not None
             bound = "" if log.bound is None else f"{log.bound:.3f}"
-            table.add_row(log.name, f"{log.step}/{self.steps}", bound, _clock(time.monotonic() - log.begin))
+            table.add_row(log.name, f"{log.step}/{log.steps}", bound, _clock(time.monotonic() - log.begin))
         return table
 
 

@@ -189,7 +189,7 @@ def test_the_table_is_read_from_the_logs(tmp_path):
     run.mkdir()
     file = run / "log.jsonl"
     file.write_text('{"step": 80, "bound": 0}\n')  # of an earlier sweep
-    log = sweeps._Log(run)
+    log = sweeps._Log(run, 100)
     assert not log.look()
     assert (log.begin, log.step) == (None, 0)
     file.with_name("new").write_text('{"step": 40, "bound": 0}\n{"step": 50, "validation/bound": 2.5}\n{"step": 6')

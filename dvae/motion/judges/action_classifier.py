@@ -16,6 +16,7 @@ noise at every call, so that its scores are random; here the first state is zero
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -26,7 +27,7 @@ from torch import Tensor, nn
 
 from ...data import Batch
 from ...inference.recipe import Recipe, Trainable
-from ...inference.training import Stage
+from ...inference.training import Stage, Training
 from ...options import Layers, Size
 from ...schema import SchemaError
 from ..protocols import Poses, Protocol, Windows
@@ -49,6 +50,7 @@ class ActionClassifier(Trainable):
 
     name: ClassVar[str] = "action-classifier"
     source: ClassVar[str] = "Bie et al., 2022, arXiv 2204.01565"
+    trainings: ClassVar[Mapping[str, Training]] = {"": Training(3000, 32, 3e-3, 0.5)}
     label: str = "content"
     hidden: Size = 128
     layers: Layers = 2

@@ -34,7 +34,7 @@ from ...data import Batch, bridged
 from ...inference.checkpoints import Run, load_weights
 from ...inference.recipe import Recipe, Trainable
 from ...inference.trackers import Bar
-from ...inference.training import Stage
+from ...inference.training import Stage, Training
 from ...laws import QRFlow, Shape
 from ...options import Layers, Range
 from ...turns import alone
@@ -60,6 +60,7 @@ class PosePrior(Trainable):
 
     name: ClassVar[str] = "pose-prior"
     source: ClassVar[str] = "Mao, Liu and Salzmann, 2021, arXiv 2108.08422"
+    trainings: ClassVar[Mapping[str, Training]] = {"": Training(1000, 32, 0.01, 0.8)}
 
     layers: Layers = 3
     noise: Annotated[float, Range(0, 1, below=True)] = 0.002
