@@ -6,6 +6,7 @@ checkpoint: a resumed run repeats, bit for bit on a CPU, what the uninterrupted 
 
 import os
 import signal
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -61,6 +62,8 @@ class Fit:
         run: the run directory, if there is one.
         per: what bounds are per: a frame, unless the model has another word in `per`.
         model: what was fitted, with the best weights; None where only the log of a run was read.
+        processor_seconds: of all threads of the first process, validation and checkpoints included; of a resumed run in
+            all.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -77,6 +80,7 @@ class Fit:
     run: Path | None
     per: str = "frame"
     model: Any = field(default=None, repr=False)
+    processor_seconds: float = 0.0
 
     @property
     def best(self) -> str:
@@ -235,7 +239,8 @@ def fit(
         if state.best is not None:
             model.load_state_dict(state.best)
     path, per = run.path if run else None, model.per if isinstance(model, Program) else Fit.per
-    result = Fit(history.rows, state.step, state.best_step, state.best_bound, state.status, path, per, model)
+    told = state.step, state.best_step, state.best_bound, state.status
+    result = Fit(history.rows, *told, path, per, model, state.processor_seconds)
     if state.status == "interrupted":
         raise Interrupted(result, signals.received or signal.SIGINT)
     return result
@@ -287,6 +292,7 @@ def _train(
         except KeyboardInterrupt:  # the step is complete, so this is as good a place to stop as any
             signals.received = signal.SIGINT
 
+    begun = time.process_time() - state.processor_seconds
     while state.status == "running":
         svi.step(source.sample(training.batch_size, svi.generator))
         if state.step % training.log_every == 0 or state.step == training.steps:
@@ -298,6 +304,7 @@ def _train(
             call("on_validation")
         stopped = svi.total(torch.tensor(float(bool(signals.received)))).item() > 0  # in any process
         state.status = "interrupted" if stopped else _status(state, training)
+        state.processor_seconds = time.process_time() - begun
         if run is not None and (due or state.status != "running"):
             store(svi, run)
     call("on_end")

@@ -32,7 +32,7 @@ _KEPT: dict[str, set[str]] = {"adam": {"step", "exp_avg", "exp_avg_sq"}, "sgd": 
 _KEPT["adamw"] = _KEPT["adam"]
 
 # what state.json holds of `State`
-_STORED = ("step", "best_step", "best_bound", "waited", "status")
+_STORED = ("step", "best_step", "best_bound", "waited", "status", "processor_seconds")
 
 
 def store(svi: SVI, run: Run) -> None:
@@ -94,7 +94,7 @@ def restore(svi: SVI, run: Run) -> None:
     except (RuntimeError, TypeError, ValueError) as error:
         raise _damaged(run, str(error)) from error
     for name in _STORED:
-        setattr(state, name, stored[name])
+        setattr(state, name, stored.get(name, getattr(state, name)))  # earlier versions kept no time
     if isinstance(svi.objective, Adapting) and state.step > stage_at(svi.plan, state.step)[0]:
         _take_up(svi.objective, run, content.get("objective", {}))
     if BEST in stored["fingerprints"]:

@@ -45,6 +45,7 @@ class State:
     best_step: int | None = None
     best_bound: float | None = None
     waited: int = 0
+    processor_seconds: float = 0.0
     status: str = "running"
     stop: bool = False
 

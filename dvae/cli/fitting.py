@@ -314,7 +314,8 @@ def _cluster(scheduler: str) -> Iterator[None]:
 
 
 def _report(result: Fit) -> None:
-    found = ", ".join(filter(None, [f"{result.status} at step {result.step}", result.best]))
+    took = f"{result.processor_seconds:.0f} s of processor time"
+    found = ", ".join(filter(None, [f"{result.status} at step {result.step}", result.best, took]))
     OUT.print(found, highlight=False, soft_wrap=True)
     assert result.run is not None
     OUT.print(_use(Run(result.run).config["method"]["method"], result.run), highlight=False, soft_wrap=True)

@@ -351,6 +351,7 @@ def _earlier(run: _Run) -> Outcome | None:
     if state["status"] not in ENDED:
         return None
     found = {name: state[name] for name in ("status", "step", "best_step", "best_bound")}
+    found["processor_seconds"] = state.get("processor_seconds", 0.0)
     return _outcome(run, Fit(JSONLines(run.path / "log.jsonl").read(), run=run.path, **found))
 
 

@@ -624,6 +624,7 @@ def test_a_state_that_verifies_nothing_is_refused(finished, state, message):
         ({"step": "five"}, "step missing or not a whole number from 0"),
         ({"status": None, "waited": 1.5}, "waited missing or not a whole .*, status missing or not one of"),
         ({"best_bound": "high"}, "best_bound missing"),
+        ({"processor_seconds": -1.0}, "processor_seconds missing or not a number from 0"),
     ],
 )
 def test_a_state_of_wrong_types_is_refused(finished, change, message):
@@ -631,6 +632,17 @@ def test_a_state_of_wrong_types_is_refused(finished, change, message):
     (finished / "state.json").write_text(json.dumps(state))
     with pytest.raises(CheckpointError, match=f"state.json is damaged: {message}"):
         run(out=finished, steps=10, resume=True)
+
+
+def test_a_run_knows_how_long_it_took_over_all_its_parts(finished):
+    before = json.loads((finished / "state.json").read_text())
+    assert 0 < before["processor_seconds"] < 600
+    took = run(out=finished, steps=before["step"] + 5, resume=True).processor_seconds
+    assert took > before["processor_seconds"]
+    assert json.loads((finished / "state.json").read_text())["processor_seconds"] == took
+    del before["processor_seconds"]  # as earlier versions left it
+    (finished / "state.json").write_text(json.dumps(before | {"fingerprints": Run(finished).state["fingerprints"]}))
+    assert "processor_seconds" not in Run(finished).state
 
 
 def test_a_best_checkpoint_without_its_fingerprint_is_refused(finished):
