@@ -37,6 +37,7 @@ SMALL = {
     "trajevae": {"width": 8, "feedforward": 8, "components": 4},
     "cvae-rnn": {"latent": 4, "summary": 4, "width": 8, "hidden": (8,)},
     **{name: {"latent": 4, "width": 8, "hidden": (8,)} for name in ("cvae", "bom", "pose-knows")},
+    "mt-vae": {"latent": 4, "width": 8},
 }
 
 
