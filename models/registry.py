@@ -35,6 +35,7 @@ METHODS = {
     "cvae": "dvae.models.cvae:CVAE",
     "bom": "dvae.models.bom:BestOfMany",
     "mt-vae": "dvae.models.mt_vae:MTVAE",
+    "rhp": "dvae.models.rhp:RHP",
     "pose-knows": "dvae.models.pose_knows:PoseKnows",
     "mix-and-match": "dvae.models.mix_and_match:MixAndMatchMotion",
     "motion-latent": "dvae.models.motion_latent:MotionLatent",
