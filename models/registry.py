@@ -34,6 +34,7 @@ METHODS = {
     "cvae-rnn": "dvae.models.cvae_rnn:CVAERNN",
     "cvae": "dvae.models.cvae:CVAE",
     "bom": "dvae.models.bom:BestOfMany",
+    "bom-parts": "dvae.models.bom_parts:BoMParts",
     "mt-vae": "dvae.models.mt_vae:MTVAE",
     "rhp": "dvae.models.rhp:RHP",
     "pose-knows": "dvae.models.pose_knows:PoseKnows",

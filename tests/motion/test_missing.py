@@ -38,6 +38,7 @@ SMALL = {
     "cvae-rnn": {"latent": 4, "summary": 4, "width": 8, "hidden": (8,)},
     **{name: {"latent": 4, "width": 8, "hidden": (8,)} for name in ("cvae", "bom", "pose-knows", "rhp")},
     "mt-vae": {"latent": 4, "width": 8},
+    "bom-parts": {"width": 8, "blocks": 1, "coefficients": 4},
 }
 
 
