@@ -104,6 +104,27 @@ class Logistic(_Rise):
 
 
 @dataclass(frozen=True)
+class Saturating(_Rise):
+    """Fast at first and ever slower: 1 - e^{-steepness s} of the way at a share s of the steps, stretched to its end.
+
+    A weight 1 - q^step, which has no end, is that of `Saturating(0.0, 1 - q**n, n, steepness=-n * log(q))` in n steps.
+
+    Args:
+        start: value before and at `delay`.
+        end: value from `delay + steps` on.
+        steps: length of the rise.
+        delay: steps at `start` before the rise.
+        steepness: how many times the distance to where it tends falls by a factor of e; the curve is linear as it goes
+            to 0.
+    """
+
+    steepness: Annotated[float, Range(1e-9, 1e9)] = 3.0
+
+    def _share(self, elapsed: float) -> float:
+        return math.expm1(-self.steepness * elapsed) / math.expm1(-self.steepness)
+
+
+@dataclass(frozen=True)
 class Piecewise:
     """Straight lines through `(step, value)` points; two points at one step make a jump.
 
@@ -135,8 +156,8 @@ class Piecewise:
         return (1 - share) * low + share * high
 
 
-Schedule = Constant | Ramp | Cosine | Logistic | Piecewise
-_SCHEDULES = {kind.__name__: kind for kind in (Constant, Ramp, Cosine, Logistic, Piecewise)}
+Schedule = Constant | Ramp | Cosine | Logistic | Saturating | Piecewise
+_SCHEDULES = {kind.__name__: kind for kind in (Constant, Ramp, Cosine, Logistic, Saturating, Piecewise)}
 _FORMER = {"Linear": "Ramp"}
 """Names in configs of before to those of now."""
 

@@ -94,10 +94,14 @@ class FutureMethod(PoseMethod):
         method, observed = self.suited(schema), schema.protocol.observed
         return method._built(schema.size(WHOLE), observed, schema.skeleton)
 
+    def kind(self) -> type[FutureModel]:
+        """The class of the model."""
+        return FutureModel
+
     def _built(self, size: int, frames: int, skeleton: Skeleton | None = None) -> FutureModel:
         views = [Heading(skeleton, frames)] if skeleton and self.heading else []
         given = self.described({WHOLE: size, HISTORY: frames * size})
-        model = FutureModel(self, frames, skeleton, view=Views(*views, Past(HISTORY, frames)), **given)
+        model = self.kind()(self, frames, skeleton, view=Views(*views, Past(HISTORY, frames)), **given)
         networks = [side[name].network for side in (model.encoder, model.generator) for name in side]
         share_modules([network for network in networks if hasattr(network, "past")], "past")
         model.feeding = SelfFeeding(1.0, gradient=True)

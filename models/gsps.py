@@ -104,7 +104,7 @@ class GSPS(EnergyMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.parts:
-            raise ValueError("gsps makes the body part by part; name at least one part")
+            raise ValueError(f"{self.name} makes the body part by part; name at least one part")
         for name in ("draws", "diversity", "diversity_scale"):
             values = getattr(self, name)
             if values is not None and len(values) not in (1, len(self.parts)):
@@ -302,8 +302,8 @@ class GSPSModel(EnergyModel):
             return super().impute(batch, samples, **options)  # which says so
         if (length := batch[WHOLE].shape[1]) != self.length:
             raise ValueError(
-                f"gsps fills gaps in windows of {self.length} frames, not {length}; cut the motion so, as "
-                "`dvae impute` does without --clip"
+                f"{self.method.name} fills gaps in windows of {self.length} frames, not {length}; cut the motion so, "
+                "as `dvae impute` does without --clip"
             )
         filled, count = [], prod(self.draws.values())
         for _ in range(samples):

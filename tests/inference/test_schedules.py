@@ -16,6 +16,7 @@ from dvae.inference.schedules import (
     Logistic,
     Piecewise,
     Ramp,
+    Saturating,
     clamp,
     from_config,
     schedule,
@@ -25,7 +26,7 @@ from dvae.inference.schedules import (
 levels = st.floats(-10, 10).map(lambda value: round(value, 3))
 ramps = st.builds(
     lambda kind, start, end, steps, delay: kind(start, end, steps, delay),
-    st.sampled_from([Ramp, Cosine, Logistic]),
+    st.sampled_from([Ramp, Cosine, Logistic, Saturating]),
     levels,
     levels,
     st.integers(1, 500),
@@ -54,6 +55,13 @@ def test_a_ramp_is_half_way_in_the_middle(kind):
 def test_a_flat_logistic_is_linear_and_a_steep_one_a_jump():
     assert Logistic(0.0, 1.0, 100, steepness=1e-3)(25) == pytest.approx(0.25, abs=1e-6)
     assert Logistic(0.0, 1.0, 100, steepness=1e4)(49) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_saturating_rise_is_a_weight_that_nears_its_end_by_a_share_a_step():
+    steps, rate = 200, 0.99
+    rise = Saturating(0.0, 5 * (1 - rate**steps), steps, steepness=-steps * math.log(rate))
+    assert [rise(step) for step in (1, 50, 200)] == pytest.approx([5 * (1 - rate**step) for step in (1, 50, 200)])
+    assert Saturating(0.0, 1.0, 100, steepness=1e-9)(25) == pytest.approx(0.25)
 
 
 def test_piecewise_goes_through_its_points_in_lines_and_jumps_to_the_later_of_two():

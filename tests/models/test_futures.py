@@ -47,6 +47,11 @@ class TestPoseKnows(Contract):
     name = "pose-knows"
 
 
+class TestRHP(Contract):
+    name = "rhp"
+    missing: ClassVar = {"w": ("h", "x_{1:T}")}
+
+
 @pytest.fixture(scope="module")
 def windows():
     protocol = replace(motion.PROTOCOLS["simulated"], observed=5, predicted=7, train_stride=3, test_stride=6)
@@ -104,7 +109,7 @@ def test_best_of_many_pays_for_the_nearest_future_alone(windows):
     assert objective(terms, 0).item() == pytest.approx(expected.item(), rel=1e-6)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, "rhp"])
 def test_decoders_read_their_own_means_in_training_and_gradients_flow_through_them(windows, name):
     model, batch = built(windows, name), batch_of(windows, 2)
     drawn, data = model.guide(batch), model.read(batch)
@@ -125,6 +130,34 @@ def test_a_future_has_one_summary_of_the_past_for_all_networks(windows, name):
     model = built(windows, name)
     (latent,) = model.latents
     assert model.encoder[latent].network.past is model.generator["x"].network.past
+
+
+def test_perturbations_of_nothing_have_the_squared_error_of_draws_of_the_prior(windows):
+    model, batch = built(windows, "rhp"), batch_of(windows)
+    torch.manual_seed(1)
+    terms = dvae.SequenceELBO().terms(model, batch, self_feeding=1.0)
+    torch.manual_seed(1)
+    (made,), truth = futures(model, batch, [{"w": torch.randn(3, 4, dtype=torch.float64)}])
+    constant = 0.5 * math.log(math.pi) * truth[0].numel()  # of N(0, 1/2)
+    expected = ((made - truth).square().sum() / 3 + constant) / 7
+    loss = small("rhp").train(windows).objective(terms, 0)
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-6)
+    assert not terms.kl["w"].any()
+
+
+def test_what_perturbs_the_code_is_all_that_futures_differ_by(windows):
+    model, past = built(windows, "rhp"), {"x": batch_of(windows)["x"][:, :5]}
+    spread = model.forecast(past, 7, 6)["x"].var(0)
+    assert (spread > 0).all()
+    with torch.no_grad():
+        model.generator["x"].network.noise.layer.weight.zero_()
+    made = model.forecast(past, 7, 6)["x"]
+    assert torch.equal(made, made[:1].expand(6, -1, -1, -1))
+
+
+def test_there_is_no_divergence_to_weigh_without_a_guide():
+    with pytest.raises(ValueError, match=r"beta is 0.1, but rhp's guide is its prior, with no divergence to weigh"):
+        dvae.method("rhp", beta=0.1)
 
 
 def test_gaps_of_the_past_are_bridged(windows):

@@ -71,6 +71,7 @@ def options(name):
 
 def test_every_method_that_is_not_of_motion_is_tested():
     motion = {"hit-dvae", "gsps", "trajevae", "cvae-rnn", "cvae", "bom", "pose-knows", "mix-and-match", "motion-latent"}
+    motion |= {"bom-parts", "mt-vae", "rhp"}
     assert {*METHODS} == {*methods()} - motion - {"equations"}
 
 
