@@ -147,6 +147,11 @@ def evaluate(
             *dict.fromkeys([*held.notes, *(measure.note for measure in measures if measure.note)]),
             *_reservations(measures, samples, draw_emission),
             *(
+                f"{name} draws nothing: its {samples} forecasts of a window are one, which is the best of them"
+                for name, each in models.items()
+                if samples > 1 and _certain(each, draw_emission)
+            ),
+            *(
                 f"bounds of {name}: densities of {each.view.measured}"
                 for name, each in models.items()
                 if isinstance(each, DynamicalVAE) and each.likelihood and each.view.measured
@@ -185,6 +190,12 @@ def _emission(model: Any, draw_emission: bool | None) -> str:
     if draw_emission is None and isinstance(model, DynamicalVAE):
         draw_emission = any(map(model.drawn, model.observed))
     return "drawn" if draw_emission else "mean"
+
+
+def _certain(model: Any, draw_emission: bool | None) -> bool:
+    """Whether all forecasts of a window are one: means of a model in which nothing is latent."""
+    means = _emission(model, draw_emission) == "mean"
+    return isinstance(model, DynamicalVAE) and means and not (model.latents or model.shared)
 
 
 def _reservations(measures: Sequence[Measure], samples: int, draw_emission: bool | None) -> Iterator[str]:

@@ -91,10 +91,10 @@ class SVI:
                 raise ValueError(f"no parameter's name starts with {', '.join(missing)}; they are {', '.join(trained)}")
             if all(name.startswith(stage.frozen) for name in trained):
                 raise ValueError(f"a stage of {stage.steps} steps has every parameter frozen; there is nothing to fit")
-            if stage.curriculum is not None and not getattr(model, "shared", None):
+            if stage.curriculum is not None and not getattr(model, "gradual", False):
                 raise ValueError(
-                    f"a stage of {stage.steps} steps has a curriculum, which is of what sequences share "
-                    f"(DynamicalVAE(shared=...)), and {type(model).__name__} has nothing that they do"
+                    f"a stage of {stage.steps} steps has a curriculum, by which nothing of {type(model).__name__} "
+                    "comes; what sequences share does (DynamicalVAE(shared=...))"
                 )
             if isinstance(stage.objective, Adaptive):
                 stage.objective.begin(model)  # which is refused now, not when its stage comes

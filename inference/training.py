@@ -97,7 +97,8 @@ class Stage:
         objective: what it minimises.
         learning_rate: that of `Training` if None.
         self_feeding: that of `Training` if None.
-        curriculum: how far draws of what sequences share have come, from 0 to 1 (`laws.Subset`); all the way if None.
+        curriculum: how far what comes gradually has come, from 0 to 1, such as draws of what sequences share
+            (`laws.Subset`); all the way if None.
         frozen: parameters whose names start with one of these stay as they are.
 
     Example:

@@ -31,11 +31,11 @@ from ..options import Amount, Size
 from ..program.rollout import SelfFeeding
 from ..views import WHOLE
 from .futures import FedBackNetwork
-from .trajectories import FIRST, GIVEN, REST, TrajectoryMethod
+from .trajectories import FIRST, GIVEN, REST, LatentTrajectoryMethod
 
 
 @dataclass(frozen=True)
-class CVAERNN(TrajectoryMethod):
+class CVAERNN(LatentTrajectoryMethod):
     """See the file.
 
     Args:

@@ -32,6 +32,7 @@ METHODS = {
     "gsps": "dvae.models.gsps:GSPS",
     "trajevae": "dvae.models.trajevae:TrajeVAE",
     "cvae-rnn": "dvae.models.cvae_rnn:CVAERNN",
+    "motion-infilling": "dvae.models.motion_infilling:MotionInfilling",
     "cvae": "dvae.models.cvae:CVAE",
     "bom": "dvae.models.bom:BestOfMany",
     "bom-parts": "dvae.models.bom_parts:BoMParts",

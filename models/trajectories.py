@@ -48,13 +48,11 @@ NEEDED = "relative", 1
 
 @dataclass(frozen=True)
 class TrajectoryMethod(PoseMethod):
-    """A method that completes motion. The likelihood is the paper's squared error.
+    """A method that completes motion.
 
     Args:
         latent: size of the latent.
-        beta: weight of the KL, beside squared errors in square metres.
         keep: probability with which a joint is given, in training.
-        complement: the guide sees the joints that are not given, and not the others.
         rotate: turn every training window about the up axis by a uniform angle.
         heading: turn every window so that its first pose faces one way, and the motion back. Turned windows then have
             turned motions, exactly, and `rotate` changes nothing. None for not with Human3.6M's poses, as in the
@@ -71,9 +69,7 @@ class TrajectoryMethod(PoseMethod):
     }
 
     latent: Size | None = None
-    beta: Amount | None = None
     keep: Share = 0.15
-    complement: bool = True
     rotate: bool = True
     heading: bool | None = None
 
@@ -83,10 +79,13 @@ class TrajectoryMethod(PoseMethod):
         found = super().preset(skeleton)
         return found if skeleton.left and skeleton.right else {**found, "heading": False}
 
-    @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        """x is normal with variance 1/2, minus whose log-density is the squared error."""
-        return {"p(x)": FixedNormal(scale=sqrt(0.5))}
+    def beside(self) -> Paths:
+        """What its models see beside the motion."""
+        return Paths()
+
+    def kind(self) -> type[TrajectoryModel]:
+        """Of its models for poses."""
+        return TrajectoryModel
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
@@ -114,26 +113,64 @@ class TrajectoryMethod(PoseMethod):
         method = self.filled(self.preset(skeleton))
         if method.heading:
             skeleton.heading(torch.zeros(skeleton.joints, 3))  # refuses one without left and right
-        return method._built(TrajectoryModel, 3 * skeleton.joints, method, skeleton, frames)
+        return method._built(method.kind(), 3 * skeleton.joints, method, skeleton, frames)
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
-        return kind(*arguments, **self.described(dict.fromkeys((WHOLE, FIRST, GIVEN, REST), size)))
+        generative, inference = self.equations()
+        names = {*generative.variables, *generative.context, *inference.context}
+        poses = {name: size for name in (WHOLE, FIRST, GIVEN, REST) if name in names}
+        return kind(*arguments, **self.described(poses))
 
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
-        """Minimises squared errors and the weighted KL, on windows that are turned anyhow, with some paths given.
+        """Maximises the bound, on windows that are turned anyhow, with some paths given."""
+        turned = train.with_protocol(replace(train.protocol, rotate=self.rotate))
+        return Recipe(turned.given(self.keep), validation and validation.given(self.keep), [Stage(steps)])
+
+
+@dataclass(frozen=True)
+class LatentTrajectoryMethod(TrajectoryMethod):
+    """A method that completes motion in many ways. The likelihood is the paper's squared error.
+
+    Args:
+        beta: weight of the KL, beside squared errors in square metres.
+        complement: the guide sees the joints that are not given, and not the others.
+    """
+
+    beta: Amount | None = None
+    complement: bool = True
+
+    @override
+    def laws(self) -> Mapping[str, LawSpec]:
+        """x is normal with variance 1/2, minus whose log-density is the squared error."""
+        return {"p(x)": FixedNormal(scale=sqrt(0.5))}
+
+    @override
+    def beside(self) -> Paths:
+        return Rest(self.complement)
+
+    @override
+    def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
+        """Minimises squared errors and the weighted KL, on such windows.
 
         The best weights are those of the lowest loss: beta is part of the model, which the bound does not know.
         """
         method: Any = self.suited(train)
-        turned = train.with_protocol(replace(train.protocol, rotate=self.rotate))
         stages = [Stage(steps, Evidence(kl_weight=method.beta, select="loss"))]
-        return Recipe(turned.given(self.keep), validation and validation.given(self.keep), stages)
+        return replace(super().train(train, validation, steps), stages=stages)
+
+
+class Paths(View):
+    """Beside the motion, given trajectories; without any in a batch none are."""
+
+    @override
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        return {GIVEN: torch.zeros_like(data[WHOLE]), **data} if WHOLE in data else dict(data)
 
 
 @dataclass(frozen=True)
-class Rest(View):
-    """Beside the motion, given trajectories and the joints that are not given; without trajectories none are.
+class Rest(Paths):
+    """Beside the motion, given trajectories and the joints that are not given.
 
     Args:
         complement: False for r that is all of x.
@@ -145,11 +182,10 @@ class Rest(View):
     def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
         if WHOLE not in data:
             return dict(data)
-        x = data[WHOLE]
+        seen, x = super().__call__(data, beside), data[WHOLE]
         if (mask := data.get("mask", {}).get(WHOLE)) is not None:
             x = torch.where(mask, x, 0.0)
-        given = data.get(GIVEN, torch.zeros_like(x))
-        return {REST: torch.where(given == 0, x, 0.0) if self.complement else x, **data, GIVEN: given}
+        return {REST: torch.where(seen[GIVEN] == 0, x, 0.0) if self.complement else x, **seen}
 
 
 class TrajectoryModel(DynamicalVAE):
@@ -168,26 +204,31 @@ class TrajectoryModel(DynamicalVAE):
     """
 
     def __init__(self, method: TrajectoryMethod, skeleton: Skeleton, frames: int | None, **options: Any):
-        seen: list[View] = [Past(FIRST, also=(GIVEN,)), Rest(method.complement)]
+        seen: list[View] = [Past(FIRST, also=(GIVEN,)), method.beside()]
         if method.heading:
             seen.append(Heading(skeleton, pose=FIRST, turned=(FIRST, GIVEN, REST, WHOLE)))
         super().__init__(view=Views(*seen), **options)
         self.method, self.skeleton, self.frames = method, skeleton, frames
 
     @override
-    def model(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
+    def drawn(self, name: str) -> bool:
+        """Never, where nobody says: the emission is the weight of an error, and its draws are noise."""
+        return False
+
+    @override
+    def model(self, batch: AnyBatch | None = None, *, curriculum: float = 1.0, **options: Any) -> dict[str, Tensor]:
         """Without trajectories in the batch, none are given.
 
         Raises:
             ValueError: no pose to start from.
         """
-        data = self.read(batch)
+        data = self.read(batch, curriculum=curriculum)
         if FIRST not in data:
             raise ValueError("a motion starts from a pose: give a batch with s (B, D), or with windows x (B, 1 + T, D)")
         first, length = data[FIRST], options.get("length")
         if GIVEN not in data and length is not None:
             data[GIVEN] = first.new_zeros(len(first), length, first.shape[-1])
-        return super().model(data, **options)
+        return super().model(data, curriculum=curriculum, **options)
 
     @alone
     @torch.no_grad()
@@ -243,7 +284,7 @@ class TrajectoryModel(DynamicalVAE):
                 stacklevel=3,  # torch.no_grad is between
             )
         length = data[GIVEN].shape[1]
-        distinct = samples if temperature or draw_emission else 1
+        distinct = samples if draw_emission or (temperature and self.latents) else 1
 
         def futures(part: slice, count: int) -> dict[str, Tensor]:
             some, latents = rows(data, part), {}
@@ -346,6 +387,11 @@ class TrajectoryModel(DynamicalVAE):
             raise ValueError(f"expected paths of one length, or frames= without any; got {got}")
         if exact and not paths:
             raise ValueError("exact=True has motions follow paths; give some trajectories")
+        if exact and not self.latents:
+            raise ValueError(
+                f"exact=True has motions follow paths by a move of their latents, of which {self.method.name} has "
+                "none; take a method with latents, such as trajevae"
+            )
         length = next(iter(lengths.values()))
         world = pose[self.skeleton.root]
         told, known = pose.new_zeros(2, length, self.skeleton.joints, 3)

@@ -36,7 +36,7 @@ from ..networks.base import share_modules
 from ..notation import Factorization
 from ..options import Extra, Layers, Range, Size
 from .poses import table
-from .trajectories import TrajectoryMethod
+from .trajectories import LatentTrajectoryMethod
 
 PRESETS = table(
     "latent beta components width feedforward layers dropout heading",
@@ -46,7 +46,7 @@ PRESETS = table(
 
 
 @dataclass(frozen=True)
-class TrajeVAE(TrajectoryMethod):
+class TrajeVAE(LatentTrajectoryMethod):
     """See the file. Options that are None are chosen by the skeleton.
 
     Args:

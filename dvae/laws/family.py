@@ -108,6 +108,8 @@ class Family:
             {"cov_factor": (-1, 2)}.
         min_scale: scales, and roots of diagonals, stay above it; a likelihood whose scale can vanish has no maximum.
         residual: see `Law`; of a distribution with a location.
+        project: a linear layer from features to the parameters; False takes the features themselves, in their order,
+            the location first.
 
     Example:
         >>> pair, sizes = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"), {"z": 2, "x": 3}
@@ -122,6 +124,7 @@ class Family:
     shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     min_scale: float = 1e-3
     residual: float = False
+    project: bool = True
 
     @property
     def kind(self) -> type[Distribution]:
@@ -163,7 +166,14 @@ class FamilyLaw(Law):
         self.read = sorted(read, key=lambda name: name != "loc")  # the location first
         self.widths = [widths[name] for name in self.read]
         self.learned = nn.ParameterDict({name: torch.zeros(widths[name]) for name in spec.learned})
-        self.out = self.projection(shape.features, sum(self.widths), widths.get("loc", 0)) if self.read else None
+        self.out: Any = nn.Identity()
+        if spec.project:
+            self.out = self.projection(shape.features, sum(self.widths), widths.get("loc", 0)) if self.read else None
+        elif shape.features != sum(self.widths):
+            raise ValueError(
+                f"a {self.kind.__name__} without projection takes {sum(self.widths)} features, as many as the "
+                f"parameters that are read ({', '.join(self.read) or 'none'}), but the network gives {shape.features}"
+            )
         with torch.no_grad():
             probe = torch.ones(1, shape.features), torch.zeros(1, shape.size) if self.residual else None
             with _refusing(spec, AttributeError, TypeError):

@@ -225,6 +225,11 @@ class DynamicalVAE(nn.Module):
         """Whether the data have a density given the latents; without it there is no bound (see `laws.Delta`)."""
         return not any(self.generator[name].law.deterministic for name in self.observed)
 
+    @property
+    def gradual(self) -> bool:
+        """Whether a curriculum changes what its programs do: draws of what sequences share."""
+        return bool(self.shared)
+
     def drawn(self, name: str) -> bool:
         """Whether forecasts of a data variable are draws where they are not told.
 

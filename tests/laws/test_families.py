@@ -197,6 +197,18 @@ def test_densities_are_those_of_scipy(name):
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6 if name == "angle" else 1e-10)
 
 
+def test_without_a_layer_features_are_parameters_and_a_location_comes_first():
+    law = Family("Laplace", project=False).build(Shape(3, 6)).double()
+    features, value = torch.randn(2, 6, dtype=torch.float64), torch.randn(2, 3, dtype=torch.float64)
+    loc, scale = law(features)
+    assert not list(law.parameters())
+    torch.testing.assert_close(loc, features[:, :3], rtol=0, atol=0)
+    torch.testing.assert_close(scale, features[:, 3:].exp() + 1e-3)
+    alone = Family("Laplace", {"scale": 1.0}, project=False).build(Shape(3, 3))
+    density = alone.distribution(alone(loc)).log_prob(value)
+    torch.testing.assert_close(density, -(value - loc).abs() - np.log(2))
+
+
 def test_minus_the_log_density_of_a_power_is_its_itakura_saito_divergence():
     law = laws.FAMILIES["power"].build(Shape(3, 4)).double()
     features = torch.randn(2, 2, 4, dtype=torch.float64)
@@ -364,6 +376,10 @@ def test_values_that_a_family_does_not_have_are_refused_unless_hidden(law, value
         (lambda: laws.NormalMixture(0), "at least one component"),
         (lambda: Family("Delta"), "Delta with given={} cannot be made of numbers that a network reads"),
         (lambda: Family("LKJ"), "missing 1 required positional argument: 'dim'.; give what it needs"),
+        (
+            lambda: Family("Laplace", {"scale": 1.0}, project=False),
+            r"takes 2 features, .* read \(loc\), but .* gives 3",
+        ),
         (lambda: Family("Binomial"), "total_count of Binomial is a whole number, which no network makes; give it"),
     ],
 )

@@ -36,6 +36,7 @@ SMALL = {
     "gsps": {"width": 8, "blocks": 1, "draws": (2, 2), "coefficients": 4, "pose_prior": 0.0},
     "trajevae": {"width": 8, "feedforward": 8, "components": 4},
     "cvae-rnn": {"latent": 4, "summary": 4, "width": 8, "hidden": (8,)},
+    "motion-infilling": {"maps": (4, 6)},
     **{name: {"latent": 4, "width": 8, "hidden": (8,)} for name in ("cvae", "bom", "pose-knows", "rhp")},
     "mt-vae": {"latent": 4, "width": 8},
     "bom-parts": {"width": 8, "blocks": 1, "coefficients": 4},
