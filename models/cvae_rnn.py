@@ -49,7 +49,10 @@ class CVAERNN(LatentTrajectoryMethod):
     source = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
     generative = "p(w) p(x_t | x_{<t}, y_{1:T}, w, s)"
     inference = "q(w | r_{1:T}, y_{1:T}, s)"
-    trainings: ClassVar[Mapping[str, Training]] = {**TrajectoryMethod.trainings, "": Training(6000, 16, 1e-3, 0.5)}
+    trainings: ClassVar[Mapping[str, Training]] = {
+        **LatentTrajectoryMethod.trainings,
+        "": Training(6000, 16, 1e-3, 0.5),
+    }
 
     latent: Size | None = 256
     beta: Amount | None = 0.1

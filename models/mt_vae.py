@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import expm1
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -38,7 +38,7 @@ from typing_extensions import override
 from ..inference.objectives import Evidence
 from ..inference.recipe import Recipe
 from ..inference.schedules import Saturating
-from ..inference.training import Stage
+from ..inference.training import Stage, Training
 from ..laws import Family
 from ..networks import Input, Network, NetworkSpec
 from ..networks.base import AtOnce, once
@@ -76,6 +76,7 @@ class MTVAE(FutureMethod):
     generative = "p(w) p(x_t | h, w)"
     inference = "q(w | x_{1:T}, h)"
     presets = PRESETS
+    trainings: ClassVar[Mapping[str, Training]] = {"human36m": Training(60_000, 256, 1e-4), "": Training(decay=0.5)}
 
     latent: Size | None = None
     beta: Amount = 1.0

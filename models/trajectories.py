@@ -61,13 +61,6 @@ class TrajectoryMethod(PoseMethod):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
 
-    trainings: ClassVar[Mapping[str, Training]] = {
-        HUMAN36M.name: Training(
-            240_000, 64, Piecewise(((0, 1e-4), (79_999, 1e-4), (80_000, 2.5e-5), (159_999, 2.5e-5), (160_000, 6.25e-6)))
-        ),
-        "": Training(24_000, 16, 5e-4, 0.8),
-    }
-
     latent: Size | None = None
     keep: Share = 0.15
     rotate: bool = True
@@ -136,6 +129,13 @@ class LatentTrajectoryMethod(TrajectoryMethod):
         beta: weight of the KL, beside squared errors in square metres.
         complement: the guide sees the joints that are not given, and not the others.
     """
+
+    trainings: ClassVar[Mapping[str, Training]] = {
+        HUMAN36M.name: Training(
+            240_000, 64, Piecewise(((0, 1e-4), (79_999, 1e-4), (80_000, 2.5e-5), (159_999, 2.5e-5), (160_000, 6.25e-6)))
+        ),
+        "": Training(24_000, 16, 5e-4, 0.8),
+    }
 
     beta: Amount | None = None
     complement: bool = True
