@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from ..graph import audit
 from ..inference.result import Table
-from ..inference.training import Training
 from ..models import registry
 from ..models.registry import judges, methods
 from ..notation import Factorization
 from .console import OUT, UsageError, arguments, at_least, check_figure, save_figure
+
+if TYPE_CHECKING:
+    from ..inference.training import Training
 
 
 def list_methods() -> None:
