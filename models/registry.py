@@ -35,6 +35,8 @@ METHODS = {
     "cvae": "dvae.models.cvae:CVAE",
     "bom": "dvae.models.bom:BestOfMany",
     "pose-knows": "dvae.models.pose_knows:PoseKnows",
+    "dlow": "dvae.models.dlow:DLow",
+    "dsf": "dvae.models.dsf:DSF",
     "mix-and-match": "dvae.models.mix_and_match:MixAndMatchMotion",
     "motion-latent": "dvae.models.motion_latent:MotionLatent",
     "equations": "dvae.models.equations:Equations",

@@ -37,6 +37,10 @@ SMALL = {
     "trajevae": {"width": 8, "feedforward": 8, "components": 4},
     "cvae-rnn": {"latent": 4, "summary": 4, "width": 8, "hidden": (8,)},
     **{name: {"latent": 4, "width": 8, "hidden": (8,)} for name in ("cvae", "bom", "pose-knows")},
+    **{
+        name: {"latent": 4, "width": 8, "hidden": (8,), "modes": 3, "sampler_width": 8, "sampler_hidden": (8,)}
+        for name in ("dlow", "dsf")
+    },
 }
 
 
