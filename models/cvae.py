@@ -127,4 +127,4 @@ class SummaryDecoderNetwork(FedBackNetwork):
     def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
         code = self.past(parents[HISTORY])
         static = code if self.own else torch.cat([code, parents[self.latent]], -1)
-        return static[:, None].expand(-1, length, -1), parents[HISTORY][:, -self.past.size :], self.first(code)
+        return static[:, None], parents[HISTORY][:, -self.past.size :], self.first(code)

@@ -189,7 +189,10 @@ class FedBackNetwork(Network):
         self.behind = perceptron((width + latent, *hidden), "tanh")
 
     def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
-        """What is known at each step (B, T, known), the pose before the first (B, D), and the first state (B, W)."""
+        """What is known at each step, the pose before the first (B, D), and the first state (B, W).
+
+        The first is (B, T, known), or (B, 1, known) where it is the same at all steps.
+        """
         raise NotImplementedError
 
     @override
@@ -197,7 +200,7 @@ class FedBackNetwork(Network):
         """Padding at the end changes nothing before it."""
         known, first, state = self.known(parents, length)
         before = torch.cat([first[:, None], parents[WHOLE][:, : length - 1]], 1)
-        states = self.cell(torch.cat([known, before], -1), state[None].contiguous())[0]
+        states = self.cell(torch.cat([known.expand(-1, length, -1), before], -1), state[None].contiguous())[0]
         made: Tensor = self.behind(torch.cat([states, parents[self.own]], -1) if self.own else states)
         return made
 
@@ -206,7 +209,8 @@ class FedBackNetwork(Network):
         known, first, state = self.known(given, length)
         weight, bias = self.cell.weight_ih_l0[:, : self.share], self.cell.bias_ih_l0
         latents = given[self.own].unbind(1) if self.own in given else None
-        return functional.linear(known, weight, bias).unbind(1), first, given.get(WHOLE), latents, state
+        shares = functional.linear(known, weight, bias).expand(-1, length, -1)
+        return shares.unbind(1), first, given.get(WHOLE), latents, state
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:

@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -34,7 +34,7 @@ from typing_extensions import override
 from ..data import Batch, gapped, mean_of_known
 from ..inference.recipe import Recipe
 from ..inference.schedules import Ramp
-from ..inference.training import Stage
+from ..inference.training import Stage, Training
 from ..laws import Family, LawSpec
 from ..motion import Windows
 from ..networks import Input, NetworkSpec
@@ -80,6 +80,7 @@ class MotionInfilling(TrajectoryMethod):
     inference = ""
 
     presets = PRESETS
+    trainings: ClassVar[Mapping[str, Training]] = {"": Training(batch_size=80, decay=0.5)}
 
     latent: None = None
     maps: tuple[Size, ...] | None = None

@@ -39,6 +39,8 @@ METHODS = {
     "mt-vae": "dvae.models.mt_vae:MTVAE",
     "rhp": "dvae.models.rhp:RHP",
     "pose-knows": "dvae.models.pose_knows:PoseKnows",
+    "dlow": "dvae.models.dlow:DLow",
+    "dsf": "dvae.models.dsf:DSF",
     "mix-and-match": "dvae.models.mix_and_match:MixAndMatchMotion",
     "motion-latent": "dvae.models.motion_latent:MotionLatent",
     "equations": "dvae.models.equations:Equations",

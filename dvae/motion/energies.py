@@ -2,7 +2,7 @@
 
 They are no likelihoods: a model takes them in through `pyro.factor`, and an objective weighs them (`Evidence`'s
 `energy_weights`). Source: GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422), with the normalisation of its public
-code.
+code, where nothing else is said.
 
 Shapes everywhere: samples (S, B, T, D), S samples for each of B sequences, T frames of D coordinates in metres; the
 result is (B,), and its mean over the batch is the paper's term. Which frames count is up to the caller, who passes
@@ -108,6 +108,68 @@ def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
 
     diversity: Tensor = _InBlocks.apply(energy, samples)
     return diversity
+
+
+def gaussian_diversity(samples: Tensor, scale: float) -> Tensor:
+    """How alike the samples are: mean over the pairs i < j of exp(-||vec(x_i) - vec(x_j)||^2 / scale). DLow's E_d.
+
+    Yuan and Kitani, 2020, arXiv 2003.08386, with the normalisation of its public code.
+
+    Args:
+        samples: (S, B, T, D).
+        scale: square metres.
+
+    Returns:
+        (B,), from 0 to 1 (all samples equal); zeros where there is no pair.
+    """
+    if not scale > 0:
+        raise ValueError(f"scale is {scale}, expected a squared distance above 0, in square metres")
+    _check(samples)
+    first, second = torch.triu_indices(len(samples), len(samples), 1, device=samples.device)
+    likeness = (-_squared_distances(samples)[:, first, second] / scale).exp()
+    return likeness.sum(1) / max(len(first), 1)
+
+
+def determinantal_diversity(samples: Tensor, quality: Tensor, scale: float) -> Tensor:
+    """Minus the expected number of samples that a determinantal point process chooses: -tr(I - (L + I)^-1).
+
+    L_ij = r_i r_j exp(-||vec(x_i) - vec(x_j)||^2 / scale). Samples that are alike are seldom chosen together, and
+    one of low quality seldom at all. The loss of DSF (Yuan and Kitani, 2020, arXiv 1907.04967).
+
+    Args:
+        samples: (S, B, T, D).
+        quality: (S, B), r.
+        scale: square metres.
+
+    Returns:
+        (B,), from -S to 0.
+    """
+    _check(samples, quality=(quality, samples.shape[:2]))
+    if not scale > 0:
+        raise ValueError(f"scale is {scale}, expected a squared distance above 0, in square metres")
+    distances = _squared_distances(samples)
+    r = quality.T.to(distances)
+    one = torch.eye(len(samples)).to(distances)
+    with torch.autocast(samples.device.type, enabled=False):
+        kernel = r[:, :, None] * r[:, None] * (-distances / scale).exp()
+        left: Tensor = torch.linalg.inv(kernel + one)
+    return left.diagonal(dim1=1, dim2=2).sum(1) - len(samples)
+
+
+def _squared_distances(samples: Tensor) -> Tensor:
+    """||vec(x_i) - vec(x_j)||^2 of all pairs of samples, over all T D coordinates.
+
+    Args:
+        samples: (S, B, T, D).
+
+    Returns:
+        (B, S, S), square metres, in single precision at least.
+    """
+    with torch.autocast(samples.device.type, enabled=False):
+        x = samples.to(torch.promote_types(samples.dtype, torch.float32)).transpose(0, 1).flatten(2)
+        x = x - x.mean(1, keepdim=True)  # lest digits cancel below
+        squares = x.square().sum(2)
+        return squares[:, :, None] + squares[:, None] - 2 * x @ x.mT
 
 
 def history_error(samples: Tensor, history: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from .skeleton import Skeleton
 
 _HUMAN36M = {
@@ -47,23 +49,40 @@ def body_parts(skeleton: Skeleton, parts: tuple[str, ...]) -> dict[str, tuple[in
     Raises:
         ValueError: a part that is not known, or joints that are in no part or in several.
     """
-    limbs = LIMBS.get(skeleton.name, {})
-    joints = [name for j, name in enumerate(skeleton.names) if j != skeleton.root]
     found: dict[str, tuple[int, ...]] = {}
     for text in parts:
         name, _, members = text.partition("=")
         if not name.isidentifier() or name in found:
             raise ValueError(f"parts have names of their own, such as lower and upper; got {', '.join(parts)}")
-        names: list[str] = []
-        for member in (members or name).split("+"):
-            for one in UNIONS.get(member, (member,)):
-                if one not in limbs and one not in joints:
-                    known = ", ".join([*(UNIONS if limbs else ()), *limbs, *joints])
-                    raise ValueError(f"skeleton {skeleton.name!r} has no part or joint {one!r}; it has {known}")
-                names += limbs.get(one, (one,))
-        found[name] = tuple(sorted(joints.index(one) for one in names))
+        found[name] = places_of(skeleton, (members or name).split("+"))
+    joints = [name for j, name in enumerate(skeleton.names) if j != skeleton.root]
     everything = sorted(place for places in found.values() for place in places)
     if everything != list(range(len(joints))):
         wrong = [name for place, name in enumerate(joints) if everything.count(place) != 1]
         raise ValueError(f"every joint but the root is in one part; {', '.join(wrong)} are in none or in several")
     return found
+
+
+def places_of(skeleton: Skeleton, members: Iterable[str]) -> tuple[int, ...]:
+    """The joints of parts, or single ones.
+
+    Args:
+        skeleton: the tree.
+        members: each such a part as in `body_parts`, or a joint.
+
+    Returns:
+        Places among all joints but the root, ascending, as often as they are named.
+
+    Raises:
+        ValueError: one that is not known.
+    """
+    limbs = LIMBS.get(skeleton.name, {})
+    joints = [name for j, name in enumerate(skeleton.names) if j != skeleton.root]
+    names: list[str] = []
+    for member in members:
+        for one in UNIONS.get(member, (member,)):
+            if one not in limbs and one not in joints:
+                known = ", ".join([*(UNIONS if limbs else ()), *limbs, *joints])
+                raise ValueError(f"skeleton {skeleton.name!r} has no part or joint {one!r}; it has {known}")
+            names += limbs.get(one, (one,))
+    return tuple(sorted(joints.index(one) for one in names))

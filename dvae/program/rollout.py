@@ -207,10 +207,15 @@ class Rollout:
 
     def parameters(self, name: str, value: Tensor) -> Parameters:
         """Those of `evaluate`, (B, T, ...); computed once for a value."""
-        if name not in self._evaluated or self._evaluated[name][0] is not value:
-            known = {**self.known, name: value, **self.history(name)}
-            self._evaluated[name] = (value, self.conditionals[name](known, self.batch, self.length, self.lengths))
+        if not self._is_evaluated(name, value):
+            history = self.history(name)  # in whose loop it may be evaluated
+            if not self._is_evaluated(name, value):
+                known = {**self.known, name: value, **history}
+                self._evaluated[name] = (value, self.conditionals[name](known, self.batch, self.length, self.lengths))
         return self._evaluated[name][1]
+
+    def _is_evaluated(self, name: str, value: Tensor) -> bool:
+        return name in self._evaluated and self._evaluated[name][0] is value
 
     def draw(self, name: str) -> Tensor:
         """A draw (B, T, D) of a local variable, and with it of the variables that its loop interleaves it with."""

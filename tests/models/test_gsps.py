@@ -19,7 +19,7 @@ from dvae.models.gsps import PRESETS, GSPSModel, part_by_part
 from dvae.models.registry import configured, judge
 from dvae.motion import energies
 from dvae.motion.judges.pose_prior import PosePriorModel, load_pose_prior
-from dvae.motion.parts import LIMBS, body_parts
+from dvae.motion.parts import LIMBS, body_parts, places_of
 from dvae.networks import GraphConv
 from dvae.runs import directory as runs
 from dvae.testing import FactorizationContract
@@ -91,6 +91,11 @@ def test_parts_of_ones_own():
     )
     assert parts["legs"] == body_parts(motion.WALKER, ("lower", "upper"))["lower"]
     assert parts["top"] == (8, 9)
+
+
+def test_parts_and_joints_may_be_named_together():
+    assert places_of(motion.WALKER, ("Head", "lower")) == (0, 1, 2, 3, 4, 5, 9)
+    assert places_of(motion.WALKER, ()) == ()
 
 
 @pytest.mark.parametrize(

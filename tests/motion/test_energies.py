@@ -10,6 +10,8 @@ from dvae.motion import HUMAN36M, HUMANEVA, WALKER, AngleLimits, Skeleton, energ
 from dvae.motion.angles import cosines
 from dvae.motion.energies import (
     best_of_many,
+    determinantal_diversity,
+    gaussian_diversity,
     history_error,
     joint_angles,
     limb_length,
@@ -42,11 +44,17 @@ ENERGIES = {
     "best_of_many": lambda x, truth, **_: best_of_many(x, truth),
     "multimodal_best_of_many": lambda x, pseudo, valid, **_: multimodal_best_of_many(x, pseudo, valid),
     "pairwise_diversity": lambda x, **_: pairwise_diversity(x, scale=100.0),
+    "gaussian_diversity": lambda x, **_: gaussian_diversity(x, scale=500.0),
+    "determinantal_diversity": lambda x, **_: determinantal_diversity(x, x.new_full(x.shape[:2], 0.7), scale=500.0),
     "history_error": lambda x, truth, **_: history_error(x, truth),
     "limb_length": lambda x, reference, **_: limb_length(x, reference, WALKER),
     "joint_angles": lambda x, **_: joint_angles(x, LIMITS, WALKER),
     "pose_prior_energy": lambda x, **_: pose_prior_energy(x, linear_prior, WALKER),
 }
+OF_SAMPLES = (
+    *("pairwise_diversity", "gaussian_diversity", "determinantal_diversity"),
+    *("joint_angles", "pose_prior_energy"),
+)
 every_energy = pytest.mark.parametrize("energy", ENERGIES.values(), ids=list(ENERGIES))
 
 
@@ -130,7 +138,7 @@ class TestEveryEnergy:
             energy(normal(S, T, D), **SEQUENCES)
         with pytest.raises(ValueError, match="with no size 0"):
             energy(normal(0, B, T, D), **SEQUENCES)
-        if energy not in [ENERGIES[name] for name in ("pairwise_diversity", "joint_angles", "pose_prior_energy")]:
+        if energy not in [ENERGIES[name] for name in OF_SAMPLES]:
             with pytest.raises(ValueError, match="beside samples"):
                 energy(normal(S, B + 1, T, D), **SEQUENCES)
 
@@ -229,8 +237,56 @@ class TestPairwiseDiversity:
 
     @pytest.mark.parametrize("scale", [0, -1, math.nan])
     def test_refuses_a_scale_that_is_no_distance(self, scale):
+        samples = normal(S, B, T, D)
+        for energy in (pairwise_diversity, gaussian_diversity):
+            with pytest.raises(ValueError, match=f"scale is {scale}"):
+                energy(samples, scale)
         with pytest.raises(ValueError, match=f"scale is {scale}"):
-            pairwise_diversity(normal(S, B, T, D), scale)
+            determinantal_diversity(samples, torch.ones(S, B), scale)
+
+
+class TestGaussianDiversity:
+    def test_is_the_naive_form_and_its_gradient(self):
+        samples = normal(S, B, T, D).requires_grad_()
+        pairs = [(a - b).square().sum((1, 2)) for a, b in combinations(samples, 2)]
+        naive = torch.stack([(-d / 300).exp() for d in pairs]).mean(0)
+        found = gaussian_diversity(samples, 300)
+        torch.testing.assert_close(found, naive)
+        torch.testing.assert_close(gradient(found, samples), gradient(naive, samples))
+
+    def test_distances_of_what_is_far_away_lose_no_digits(self):
+        near = 0.01 * normal(S, B, T, D)
+        expected = gaussian_diversity(near, 0.04)
+        found = gaussian_diversity((near + 100).float(), 0.04)
+        torch.testing.assert_close(found, expected.float(), rtol=1e-3, atol=0)
+
+    def test_equal_samples_are_not_diverse_and_one_sample_has_no_pair(self):
+        assert gaussian_diversity(normal(1, B, T, D).expand(S, B, T, D), 1).tolist() == pytest.approx([1] * B)
+        assert gaussian_diversity(normal(1, B, T, D), 1).tolist() == [0] * B
+
+
+class TestDeterminantalDiversity:
+    def test_is_minus_the_expected_size_of_a_random_subset_of_the_samples(self):
+        """P(A) = det L_A / det (L + I), over all subsets A."""
+        samples, quality = normal(S, 1, T, D), 1 + torch.rand(S, 1).double()
+        apart = (samples[:, None] - samples[None]).square().sum((3, 4))[..., 0]
+        kernel = quality * quality.T * (-apart / 300).exp()
+        subsets = [torch.tensor(c, dtype=torch.long) for n in range(S + 1) for c in combinations(range(S), n)]
+        weights = torch.stack([torch.linalg.det(kernel[c][:, c]) for c in subsets])
+        torch.testing.assert_close(weights.sum(), torch.linalg.det(kernel + torch.eye(S)))
+        expected = (weights * torch.tensor([len(c) for c in subsets])).sum() / weights.sum()
+        torch.testing.assert_close(-determinantal_diversity(samples, quality, 300)[0], expected)
+
+    def test_samples_that_are_far_apart_count_by_their_quality_and_equal_ones_as_one(self):
+        quality = torch.tensor([1.0, 2.0, 0.0]).double()[:, None]
+        apart = 1e3 * torch.arange(3).double()[:, None, None, None].expand(3, 1, T, D)
+        assert determinantal_diversity(apart, quality, 1).tolist() == pytest.approx([-(1 / 2 + 4 / 5)])
+        together = determinantal_diversity(apart[:1].expand(3, 1, T, D), quality, 1)
+        assert together.tolist() == pytest.approx([-5 / 6])  # the one eigenvalue is 1 + 4
+
+    def test_refuses_qualities_of_other_samples(self):
+        with pytest.raises(ValueError, match=r"quality has shape \(3, 5\), expected \(5, 3\)"):
+            determinantal_diversity(normal(S, B, T, D), torch.ones(B, S), 1.0)
 
 
 def test_history_error_by_hand():

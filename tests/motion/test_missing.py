@@ -40,6 +40,10 @@ SMALL = {
     **{name: {"latent": 4, "width": 8, "hidden": (8,)} for name in ("cvae", "bom", "pose-knows", "rhp")},
     "mt-vae": {"latent": 4, "width": 8},
     "bom-parts": {"width": 8, "blocks": 1, "coefficients": 4},
+    **{
+        name: {"latent": 4, "width": 8, "hidden": (8,), "modes": 3, "sampler_width": 8, "sampler_hidden": (8,)}
+        for name in ("dlow", "dsf")
+    },
 }
 
 

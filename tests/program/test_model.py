@@ -514,9 +514,10 @@ def test_gradients_flow_back_in_time_through_fed_means():
     assert any(not torch.allclose(a, b) for a, b in zip(loop, detached, strict=True) if a is not None)
 
 
-def test_a_loop_on_own_means_is_what_the_data_are_scored_by(monkeypatch):
+@pytest.mark.parametrize("pair", ["srnn", ("p(w) p(x_t | x_{<t}, w)", "q(w | x_{1:T})")], ids=["local", "static"])
+def test_a_loop_on_own_means_is_what_the_data_are_scored_by(pair, monkeypatch):
     """Their network runs through time once, and not a second time over what that made."""
-    model = build("srnn")
+    model = build(pair)
     x = draw(model)["x"]
     expected = SequenceELBO().terms(model, x, self_feeding=SelfFeeding(1.0, passes=T)).log_likelihood["x"].shape
     monkeypatch.setattr(model.generator["x"].network, "forward", None)
