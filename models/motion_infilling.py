@@ -2,20 +2,22 @@
 
     p(x_t | y_{1:T}, s)        no guide: nothing is latent, and the likelihood is exact
 
-The first pose s and the given trajectories y are the columns of an image with a row for each coordinate, less the mean
-of each, and 0 where nothing is known. Convolutions and pooling halve it again and again, transposed convolutions bring
-it back, without a short cut around them, and what comes out is the motion. Minimised is the absolute error of all of
-it: x has Laplace's law, whose scale is one metre, and minus the log-density is that error and a constant.
+The first pose s and the given trajectories y are the columns of an image with a row for each coordinate, without unit
+and 0 where nothing is known, which is also what the mean is. Convolutions and pooling halve it again and again,
+transposed convolutions bring it back, without a short cut around them, and what comes out is the motion. Minimised is
+the absolute error of all of it: x has Laplace's law, whose scale is one metre, and minus the log-density is that error
+and a constant.
 
 In training a gap in time hides the paths, or some joints lack theirs. A curriculum widens the gaps and takes more
 joints.
 
 Kaufmann, Aksan, Song, Pece, Ziegler and Hilliges, 2020, arXiv 2010.11531, with the layers, gaps and curriculum of its
-public implementation, whose network for gaps of any width has 4,703,425 parameters. TrajeVAE's tables have it for a
-baseline. Ours: the frames of the paper are shares of a window, the curriculum rises evenly, each window draws for
-itself whether it has a gap or lacks joints, joints are taken over the curriculum and not over all of training, and
-coordinates keep their metres, which that divides by a deviation. Bodies move through space, as TrajeVAE's do. Off
-Human3.6M's skeleton maps are a quarter as many and windows turned to one heading.
+public implementation, whose network for gaps of any width has 4,703,425 parameters. It is a baseline in TrajeVAE's
+tables (arXiv 2104.00351). Ours: the frames of the paper are shares of a window, the curriculum rises evenly, each
+window draws for itself whether it has a gap or lacks joints, joints are taken over the curriculum and not over all of
+training, and all coordinates have one scale and their errors the weight of metres, where that divides each by a
+deviation. Bodies move through space, as TrajeVAE's do. Off Human3.6M's skeleton maps are a quarter as many and windows
+turned to one heading.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from ..data import Batch, gapped, mean_of_known
+from ..data import Batch, bridged
 from ..inference.recipe import Recipe
 from ..inference.schedules import Ramp
 from ..inference.training import Stage, Training
@@ -41,6 +43,7 @@ from ..networks import Input, NetworkSpec
 from ..networks.base import AtOnce
 from ..options import Share, Size
 from ..program.batch import AnyBatch
+from ..units import Units
 from ..views import WHOLE
 from .poses import table
 from .trajectories import FIRST, GIVEN, TrajectoryMethod, TrajectoryModel
@@ -114,7 +117,7 @@ class MotionInfilling(TrajectoryMethod):
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
         """Minimises the absolute error, with gaps that widen; validation windows have gaps of the last width."""
-        recipe = replace(super().train(train, validation, steps), prepare=partial(centre, train=train))
+        recipe = replace(super().train(train, validation, steps), prepare=partial(start, train=train))
         if not self.gap:
             return recipe
         begin = steps // 20
@@ -127,10 +130,10 @@ class MotionInfilling(TrajectoryMethod):
         )
 
 
-def centre(model: InfillingModel, train: Windows) -> None:
-    """Gives the network the mean of 1024 windows, as the model sees them."""
+def start(model: InfillingModel, train: Windows) -> None:
+    """Gives the network mean and spread of 1024 windows, as the model sees them."""
     seen = model.read(train.sample(1024, torch.default_generator))
-    model.generator[WHOLE].network.mean.copy_(mean_of_known(gapped(seen), (0, 1)).nan_to_num(0.0))
+    model.generator[WHOLE].network.units.fit(bridged(seen[WHOLE], seen.get("mask", {}).get(WHOLE)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,11 +220,9 @@ class Infiller:
 class InfillerNetwork(AtOnce):
     """What `Infiller` describes."""
 
-    mean: Tensor
-
     def __init__(self, spec: Infiller, inputs: Sequence[Input], size: int):
         super().__init__(inputs, True, size)
-        self.register_buffer("mean", torch.zeros(size))
+        self.units = Units(size)
         self.down: Any = nn.ModuleList()
         self.up: Any = nn.ModuleList()
         self.pools: list[tuple[int, int]] = []
@@ -243,7 +244,7 @@ class InfillerNetwork(AtOnce):
         """No sequence is padded."""
         self.refuse_ragged(lengths)
         poses = torch.cat([parents[FIRST][:, None], parents[GIVEN]], 1)
-        image = torch.where(poses == 0, 0.0, poses - self.mean).mT[:, None]
+        image = torch.where(poses == 0, 0.0, self.units(poses)).mT[:, None]
         shapes = []
         for layers, pool in zip(self.down, self.pools, strict=True):
             image = layers(image)
@@ -252,7 +253,7 @@ class InfillerNetwork(AtOnce):
         for place, (wider, last) in reversed(list(enumerate(self.up))):
             image = last(functional.leaky_relu(wider(image, output_size=shapes[place])))
             image = functional.leaky_relu(image) if place else image
-        return self.mean + image[:, 0, :, 1:].mT
+        return torch.addcmul(self.units.mean, image[:, 0, :, 1:].mT, self.units.scale)
 
 
 def _convolved(before: int, maps: int) -> list[nn.Module]:

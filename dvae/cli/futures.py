@@ -116,7 +116,7 @@ def complete(
     What is written is what `dvae forecast` writes.
 
     Args:
-        run: the run directory of a trajevae or cvae-rnn.
+        run: the run directory of a trajevae, cvae-rnn or motion-infilling.
         out: the npz file to write.
         joints: joints whose way in the window is given.
         paths: file of other paths.
@@ -124,7 +124,7 @@ def complete(
         window: which of its windows, from 0; by default the one that moves most.
         samples: motions.
         exact: have the given joints on their paths, with bones at their lengths, by moving the motions' latents and, by
-            what that leaves, their poses.
+            what that leaves, their poses; not of motion-infilling, which has none.
         temperature: of the latents' scale; 0 for the motion of the prior's mean.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.

@@ -29,7 +29,7 @@ from .futures import joint_names
 
 @dataclass(frozen=True)
 class Control:
-    """What methods that take trajectories (trajevae, cvae-rnn) are told.
+    """What methods that take trajectories (trajevae, cvae-rnn, motion-infilling) are told.
 
     Args:
         joints: joints whose paths are given to the runs.
@@ -236,7 +236,7 @@ def criticise(
         ranked_steps: time steps, evenly spread, at which local latents are ranked.
         samples: replicates of each test window, at least 19.
         draw_emission: replicate draws of x, or its means, which lack the emission's noise: motion as it is shown. Of
-            trajevae and cvae-rnn always means, as their emission is a weight of the loss.
+            trajevae, cvae-rnn and motion-infilling always means, as their emission is a weight of the loss.
         seed: of the draws.
         batch_size: windows replicated at once.
         out: file to write instead of criticism.json in the run.

@@ -9,7 +9,7 @@ from scipy.stats import binomtest, norm
 
 import dvae
 from dvae import motion
-from dvae.models.motion_infilling import HIDDEN, IN_TIME, JOINTS, NARROWEST, SPREAD, Gaps, centre
+from dvae.models.motion_infilling import HIDDEN, IN_TIME, JOINTS, NARROWEST, SPREAD, Gaps, start
 from dvae.motion import HUMAN36M, PROTOCOLS
 from dvae.testing import FactorizationContract
 
@@ -177,7 +177,7 @@ def test_exact_paths_need_latents(windows):
 def test_a_network_that_makes_nothing_makes_the_mean_of_what_it_is_to_learn(windows):
     model = small(heading=True).build(windows).eval()
     torch.manual_seed(0)
-    centre(model, windows)
+    start(model, windows)
     with torch.no_grad():
         for parameter in model.generator["x"].network.up[0].parameters():
             parameter.zero_()
