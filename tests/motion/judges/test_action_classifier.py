@@ -163,9 +163,9 @@ def test_a_fitted_classifier_is_read_back_and_goes_on(run, file, tmp_path, capsy
     loaded = dvae.load(run)
     assert isinstance(loaded.model, ActionClassifierModel)
     assert loaded.model.classes == ("down", "up")
-    training = dvae.Training(steps=20, batch_size=16, validate_every=10, decay=0.5, progress=False)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     method = judge("action-classifier", **SMALL)
+    training = replace(method.trainings[""], steps=20, batch_size=16, validate_every=10, progress=False)
     result = runs.fit_run(method, MotionData.open(file), whole, training)
     assert "nats a window" in result.best
     x = loaded.data.windows("test").all()["x"][:, 15:]

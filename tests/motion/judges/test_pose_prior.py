@@ -140,9 +140,9 @@ def test_a_fitted_prior_is_read_back_and_goes_on(run, people, tmp_path):
     assert not torch.equal(loaded.model.flow.whitening, torch.eye(48))
     x = loaded.data.windows("test").all()["x"]
     assert torch.isfinite(loaded.model.log_prob(x)).all()
-    training = dvae.Training(steps=12, batch_size=4, validate_every=4, decay=0.5, progress=False)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     method, data = judge("pose-prior", noise=0.005), MotionData.open(people)
+    training = replace(method.trainings[""], steps=12, batch_size=4, validate_every=4, progress=False)
     runs.fit_run(method, data, whole, training)
     assert torch.equal(dvae.load(whole).model.log_prob(x), loaded.model.log_prob(x))
     runs.fit_run(method, data, parts, replace(training, steps=8))
