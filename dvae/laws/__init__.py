@@ -5,6 +5,7 @@
 """
 
 from .base import Law, LawSpec, Shape, renamed
+from .conditional_flow import ConditionalFlow
 from .families import Delta, Directions, FixedNormal, KnownNoise, Normal, StandardNormal, StudentT
 from .family import FAMILIES, Family, LowRankNormal, NormalMixture
 from .flow import FlowDistribution, QRFlow
@@ -15,6 +16,7 @@ from .triangular import Triangular
 
 __all__ = [
     "FAMILIES",
+    "ConditionalFlow",
     "Delta",
     "Directions",
     "Family",

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
@@ -87,7 +87,7 @@ class QRFlowLaw(Prior):
 
     @override
     def prior(self) -> FlowDistribution:
-        return FlowDistribution(self)
+        return FlowDistribution(self, self.bias[0])
 
     def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The noise that stands for a value.
@@ -163,11 +163,24 @@ class QRFlowLaw(Prior):
             raise ValueError(f"a QRFlow of size {self.size} takes (..., {self.size}), got {tuple(value.shape)}")
 
 
+class Bijection(Protocol):
+    """A bijection of R^D between values and noise."""
+
+    def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The noise (..., D) that stands for values (..., D), and log |det| (...) of the Jacobian."""
+        ...
+
+    def from_noise(self, z: Tensor) -> Tensor:
+        """The values (..., D) for which noise (..., D) stands."""
+        ...
+
+
 class FlowDistribution(TorchDistribution):
-    """The density that a flow gives standard normal noise: exact log density, exact draws.
+    """The density that a bijection gives standard normal noise: exact log density, exact draws.
 
     Args:
         flow: from values to noise.
+        like: a tensor (..., D) of their size, type and device.
         batch_shape: of independent values.
     """
 
@@ -175,22 +188,21 @@ class FlowDistribution(TorchDistribution):
     support = constraints.real_vector
     has_rsample = True
 
-    def __init__(self, flow: QRFlowLaw, batch_shape: Any = ()):
-        self.flow = flow
-        super().__init__(torch.Size(batch_shape), torch.Size([flow.size]), validate_args=False)
+    def __init__(self, flow: Bijection, like: Tensor, batch_shape: Any = ()):
+        self.flow, self.like = flow, like
+        super().__init__(torch.Size(batch_shape), like.shape[-1:], validate_args=False)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
         """Draws (*sample_shape, *batch_shape, D)."""
-        bias = self.flow.bias
-        noise = torch.randn(self._extended_shape(torch.Size(sample_shape)), dtype=bias.dtype, device=bias.device)
-        return self.flow.from_noise(noise)
+        shape = self._extended_shape(torch.Size(sample_shape))
+        return self.flow.from_noise(torch.randn(shape, dtype=self.like.dtype, device=self.like.device))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """log p (...) of values (..., D), in nats."""
         noise, log_det = self.flow.to_noise(value)
-        found = log_det - noise.square().sum(-1) / 2 - self.flow.size / 2 * math.log(2 * math.pi)
+        found = log_det - noise.square().sum(-1) / 2 - self.event_shape[0] / 2 * math.log(2 * math.pi)
         return found.expand(torch.broadcast_shapes(found.shape, self.batch_shape))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> FlowDistribution:
         """With another batch shape."""
-        return FlowDistribution(self.flow, batch_shape)
+        return FlowDistribution(self.flow, self.like, batch_shape)

@@ -83,7 +83,7 @@ class ProductLaw(Law):
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         return sum((self._part(n, features, previous, t) for n in range(len(self.parts))), ())
 
-    def _each(self, parameters: Parameters) -> list[tuple[Any, list[int], Parameters]]:
+    def each(self, parameters: Parameters) -> list[tuple[Any, list[int], Parameters]]:
         """Law, places and parameters of every part."""
         split, start = [], 0
         for count in self.counts:
@@ -96,22 +96,22 @@ class ProductLaw(Law):
 
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        return ProductDistribution([(places, law.distribution(own)) for law, places, own in self._each(parameters)])
+        return ProductDistribution([(places, law.distribution(own)) for law, places, own in self.each(parameters)])
 
     @override
     def mean(self, parameters: Parameters) -> Tensor:
-        return self._whole([law.mean(own) for law, _, own in self._each(parameters)])
+        return self._whole([law.mean(own) for law, _, own in self.each(parameters)])
 
     @override
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         scale, found = scale.expand_as(mean), ()
-        for law, places, own in self._each(parameters):
+        for law, places, own in self.each(parameters):
             found += law.in_units(own, mean[places], scale[places]) if law.location_scale else own
         return found
 
     @override
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        return self._whole([law.draw(own, noise[..., places]) for law, places, own in self._each(parameters)])
+        return self._whole([law.draw(own, noise[..., places]) for law, places, own in self.each(parameters)])
 
 
 def _order(parts: Iterable[Sequence[int]]) -> Tensor:
