@@ -128,17 +128,25 @@ class LikelihoodMethod(Method):
         described = self.described({name: size for name, size in schema.sizes.items() if name in names})
         described |= {"generative": generative, "inference": inference}
         if schema.emission is not None and self.emission is None:
-            if self.residual:
-                raise ValueError(
-                    f"residual is {self.residual}, but the law of x is that of its columns, which adds no previous "
-                    'value; leave residual at 0, or give all columns one law that does, by emission="normal"'
-                )
-            described["laws"]["p(x)"] = schema.emission
+            described["laws"]["p(x)"] = self.of_columns(schema.emission)
         model = kind(**{"indicators": schema.indicators, **described}, view=schema.view)
         model.per = schema.per
         for name, coordinates in schema.units.items():
             model.standardise(name, coordinates)
         return model
+
+    def of_columns(self, law: LawSpec) -> LawSpec:
+        """The law of x where the columns of a table say one: theirs.
+
+        Raises:
+            ValueError: a residual, which theirs have not.
+        """
+        if self.residual:
+            raise ValueError(
+                f"residual is {self.residual}, but the law of x is that of its columns, which adds no previous "
+                'value; leave residual at 0, or give all columns one law that does, by emission="normal"'
+            )
+        return law
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:

@@ -28,6 +28,7 @@ METHODS = {
     "dsae": "dvae.models.dsae:DSAE",
     "kvae": "dvae.models.kvae:KVAE",
     "autoregressive": "dvae.models.autoregressive:Autoregressive",
+    "moglow": "dvae.models.moglow:MoGlow",
     "hit-dvae": "dvae.models.hit_dvae:HiTDVAE",
     "gsps": "dvae.models.gsps:GSPS",
     "trajevae": "dvae.models.trajevae:TrajeVAE",

@@ -521,7 +521,7 @@ def small(name):
     return data, dvae.method(name, **options).suited(data.windows("train"))
 
 
-@pytest.mark.parametrize("name", [name for name in METHODS if name not in ("mix-and-match", "motion-latent")])
+@pytest.mark.parametrize("name", [name for name in METHODS if name not in ("mix-and-match", "motion-latent", "moglow")])
 def test_every_method_goes_the_whole_way_with_gaps(name):
     """Fitted, validated, scored; and whatever stands where nothing was observed changes nothing."""
     data, method = small(name)
@@ -561,6 +561,14 @@ def test_a_method_that_reads_turns_alone_says_what_to_do_about_gaps():
         ValueError, match=r"lacks joints, without which their turns are not known; .* fill its gaps first"
     ):
         dvae.method("mix-and-match").build(motion.MotionData("simulated", GAPS, protocol).windows("train"))
+
+
+def test_a_method_whose_density_is_of_whole_frames_says_so_of_gaps():
+    data = motion.MotionData("simulated", GAPS, motion.PROTOCOLS["simulated"])
+    method = dvae.method("moglow", width=4, flow_steps=1)
+    recipe = method.train(data.windows("train"), None, 1)
+    with pytest.raises(ValueError, match=r"hides some entries of a step and not others, .*; hide them together"):
+        recipe.fit(method.build(data.schema), progress=False)
 
 
 def still_gsps():
