@@ -250,7 +250,7 @@ def test_a_product_is_its_parts():
     law = MIXED.build(Shape(4, 5)).double()
     parameters = law(torch.randn(2, 3, 5, dtype=torch.float64))
     value = law.draw(parameters, law.noise((2, 3, 4), parameters[0]))
-    whole, parts = law.distribution(parameters), law._each(parameters)
+    whole, parts = law.distribution(parameters), law.each(parameters)
     for own, places, theirs in parts:
         expected = own.distribution(theirs).log_prob(value[..., places])
         torch.testing.assert_close(whole.log_prob(value)[..., places], expected)
