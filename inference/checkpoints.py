@@ -63,6 +63,7 @@ _STORED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "best_bound": (lambda v: v is None or (isinstance(v, float) and math.isfinite(v)), "a finite number or null"),
     "waited": (lambda value: _count(value), _NUMBER),
     "status": (lambda value: value in STATUSES, "one of the known ones"),
+    "per": (lambda value: value is ... or (isinstance(value, str) and value.isidentifier()), "a word"),
     "processor_seconds": (lambda v: v is ... or (isinstance(v, float) and 0 <= v < math.inf), "a number from 0"),
 }
 

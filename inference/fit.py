@@ -17,7 +17,6 @@ import torch
 from torch import nn
 
 from ..data import Fingerprinted, Sequences, Source, sequences
-from ..program.protocols import Program
 from ..turns import alone
 from .checkpoints import CONFIG, CheckpointError, Run
 from .objectives import Objective
@@ -238,9 +237,9 @@ def fit(
         _train(svi, source, held_out, run, receivers, callbacks, signals)
         if state.best is not None:
             model.load_state_dict(state.best)
-    path, per = run.path if run else None, model.per if isinstance(model, Program) else Fit.per
+    path = run.path if run else None
     told = state.step, state.best_step, state.best_bound, state.status
-    result = Fit(history.rows, *told, path, per, model, state.processor_seconds)
+    result = Fit(history.rows, *told, path, state.per, model, state.processor_seconds)
     if state.status == "interrupted":
         raise Interrupted(result, signals.received or signal.SIGINT)
     return result

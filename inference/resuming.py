@@ -49,7 +49,7 @@ def store(svi: SVI, run: Run) -> None:
     files = {LAST: save_tensors(weights(svi.model)), OPTIMISER: buffer.getvalue()}
     if state.best is not None and state.waited == 0:
         files[BEST] = save_tensors(state.best)
-    run.commit({name: getattr(state, name) for name in _STORED}, files)
+    run.commit({name: getattr(state, name) for name in (*_STORED, "per")}, files)
 
 
 def restore(svi: SVI, run: Run) -> None:

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ..data import Batch, Sequences, each, sequences
+from ..program.protocols import Program
 from ..turns import alone
 from .bounds import SequenceELBO, Terms
 from .checkpoints import weights
@@ -48,6 +49,11 @@ class State:
     processor_seconds: float = 0.0
     status: str = "running"
     stop: bool = False
+
+    @property
+    def per(self) -> str:
+        """What bounds are per: a frame, unless the model has another word."""
+        return self.model.per if isinstance(self.model, Program) else "frame"
 
 
 class SVI:

@@ -340,7 +340,7 @@ def _earlier(run: _Run) -> Outcome | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run itself tells which schedules it makes shorter
         training = clamp(run.training, run.training.steps)
-    here = _options(run.method.suited(run.data.schema), run.data.schema, training, run.data.fingerprint)
+    here = _options(run.method.suited(run.data.windows("train")), run.data.schema, training, run.data.fingerprint)
     if changed := [name for name in {**there, **here} if there.get(name) != here.get(name)]:
         name = changed[0]
         others = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
@@ -351,7 +351,7 @@ def _earlier(run: _Run) -> Outcome | None:
     if state["status"] not in ENDED:
         return None
     found = {name: state[name] for name in ("status", "step", "best_step", "best_bound")}
-    found["processor_seconds"] = state.get("processor_seconds", 0.0)
+    found |= {"per": state.get("per", Fit.per), "processor_seconds": state.get("processor_seconds", 0.0)}
     return _outcome(run, Fit(JSONLines(run.path / "log.jsonl").read(), run=run.path, **found))
 
 

@@ -17,6 +17,7 @@ import dvae
 from dvae import motion
 from dvae.cli import main
 from dvae.motion.dataset import MotionData
+from dvae.motion.judges.action_classifier import ActionClassifier
 from dvae.runs import directory as runs
 from dvae.runs import sweep as sweeps
 from dvae.runs.sweep import Outcome, SweepInterrupted, sweep
@@ -221,14 +222,31 @@ def test_the_callers_backend_is_used_and_threads_take_turns(swept, data, tmp_pat
         sweep([VAE], data, tmp_path / "far", seeds=(0, 1), training=TRAINING)
 
 
-def test_a_method_that_the_data_complete_goes_on_too(data, tmp_path):
-    small = {"width": 4, "coefficients": 2, "blocks": 1, "draws": (2, 2), "latent": 2, "angles": 0.0, "pose_prior": 0.0}
-    method = dvae.method("gsps", **small)  # its other options are chosen by the skeleton
+SMALL_GSPS = {
+    "width": 4,
+    "coefficients": 2,
+    "blocks": 1,
+    "draws": (2, 2),
+    "latent": 2,
+    "angles": 0.0,
+    "pose_prior": 0.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("method", "best"),
+    [
+        (dvae.method("gsps", **SMALL_GSPS), "lowest validation loss"),  # its other options are chosen by the skeleton
+        (ActionClassifier(label="activity", hidden=4, layers=1, features=3), "best bound"),  # its classes by the clips
+    ],
+    ids=["gsps", "action-classifier"],
+)
+def test_a_method_that_the_data_complete_goes_on_too(data, tmp_path, method, best):
     first, again = (sweep([method], data, tmp_path, [0], TRAINING, jobs=1) for _ in range(2))
     assert [outcome.status for outcome in (*first, *again)] == ["finished"] * 2
     assert again[0].seconds == 0
     assert first[0].best == again[0].best
-    assert first[0].best.startswith("lowest validation loss")  # as the objective selects
+    assert first[0].best.startswith(best)  # as the objective selects
 
 
 def test_ctrl_c_in_a_sweep_of_one_job_is_the_sweeps(data, tmp_path):
