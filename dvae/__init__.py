@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from .notation import Factorization
     from .oracle import Oracle, price, twin
     from .program.model import DynamicalVAE
-    from .program.rollout import SelfFeeding
+    from .program.rollout import InputNoise, SelfFeeding
     from .runs.directory import load
 
 __all__ = [
@@ -62,6 +62,7 @@ __all__ = [
     "Factorization",
     "Fit",
     "GradNorm",
+    "InputNoise",
     "Oracle",
     "Posterior",
     "SelfFeeding",
@@ -117,7 +118,7 @@ _PLACES = {
         "notation": "Factorization",
         "oracle": "Oracle price twin",
         "program.model": "DynamicalVAE",
-        "program.rollout": "SelfFeeding",
+        "program.rollout": "InputNoise SelfFeeding",
         "runs.directory": "load",
     }.items()
     for name in names.split()

@@ -32,7 +32,7 @@ class Recipe:
         batches: where training draws from: the data, and what the objective needs beside them.
         validation: what the weights are judged by, or None.
         stages: what is minimised, one after the other.
-        feeding: probability of self-feeding over the run.
+        feeding: probability of self-feeding over the run, or share of the noise (see `Training`).
         prepare: has the model take from the training data what its weights keep, before it is fitted.
     """
 

@@ -25,8 +25,9 @@ class Training:
         weight_decay: the optimiser's weight decay.
         gradient_clip: largest norm of the gradient of the loss (nats per frame); None for no limit.
         self_feeding: probability that a frame of x's history is replaced by the program's own mean (scheduled
-            sampling, Bengio et al. 2015, arXiv 1506.03099); a number or a schedule. The best weights are then
-            by the self-fed bound, from when the schedule has reached its last value.
+            sampling, Bengio et al. 2015, arXiv 1506.03099); a number or a schedule. Of a model that is fed noisy data
+            (`InputNoise`), the share of that noise. The best weights are then by the bound of the program that is fed
+            so, from when the schedule has reached its last value.
         particles: draws from the guide for each sequence and step.
         validate_every: steps from one validation and checkpoint to the next.
         patience: validations without a better bound after which the run stops; None to run all steps.

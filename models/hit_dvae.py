@@ -39,11 +39,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
-import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from ..data import bridged
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
 from ..inference.schedules import Ramp, Schedule
@@ -61,7 +59,7 @@ from ..program.rollout import Rollout, SelfFeeding
 from ..schema import Schema
 from ..views import WHOLE
 from .energies import EnergyMethod, EnergyModel
-from .method import SHAPES, LatentMethod, start_priors
+from .method import SHAPES, LatentMethod, fit_units, start_priors
 from .poses import table
 
 ENERGIES = table(
@@ -265,13 +263,12 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 
     @override
     def start(self, model: Any, windows: Any) -> None:
-        """With mean and spread of 1024 windows' poses, where a learned scale of x starts."""
+        """With the units of the poses, where a learned scale of x starts."""
         start_priors(model, windows)
         if isinstance(model, EnergyModel):
             super().start(model, windows)
         if self.standardise and not model.units[WHOLE].scale.dim():  # those of columns are known
-            poses = model.read(windows.sample(1024, torch.default_generator))
-            model.units[WHOLE].fit(bridged(poses[WHOLE], poses.get("mask", {}).get(WHOLE)))
+            fit_units(model, windows)
             if self.emission in (None, "fixed") and not self.bones:
                 nn.init.zeros_(model.generator[WHOLE].law.log_scale)
 

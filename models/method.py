@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import torch
 from typing_extensions import override
 
-from ..data import Hiding
+from ..data import Hiding, bridged
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe, Trainable
 from ..inference.schedules import Cosine, Logistic, Ramp, Schedule
@@ -23,6 +23,7 @@ from ..options import Amount, Delay, Range, Share, Size
 from ..program.model import DynamicalVAE
 from ..program.rollout import SelfFeeding
 from ..schema import Schema
+from ..views import WHOLE, View
 
 SHAPES: dict[str, type[Ramp | Cosine | Logistic]] = {"linear": Ramp, "cosine": Cosine, "logistic": Logistic}
 
@@ -112,13 +113,16 @@ class LikelihoodMethod(Method):
         model.feeding = SelfFeeding(0.0, gradient=False)
         return model
 
-    def suited_to(self, schema: Schema, extended: bool, kind: type[DynamicalVAE] = DynamicalVAE) -> DynamicalVAE:
+    def suited_to(
+        self, schema: Schema, extended: bool, kind: type[DynamicalVAE] = DynamicalVAE, view: View | None = None
+    ) -> DynamicalVAE:
         """The model for data, with their law and their units.
 
         Args:
             schema: of the data.
             extended: whether factors read the covariates of the data too, whatever the equations say.
             kind: of the model.
+            view: of the model, in place of the data's own.
         """
         generative, inference = self.equations()
         names = {name for part in (generative, inference) for name in (*part.variables, *part.context)}
@@ -129,7 +133,7 @@ class LikelihoodMethod(Method):
         described |= {"generative": generative, "inference": inference}
         if schema.emission is not None and self.emission is None:
             described["laws"]["p(x)"] = self.of_columns(schema.emission)
-        model = kind(**{"indicators": schema.indicators, **described}, view=schema.view)
+        model = kind(**{"indicators": schema.indicators, **described}, view=view or schema.view)
         model.per = schema.per
         for name, coordinates in schema.units.items():
             model.standardise(name, coordinates)
@@ -163,7 +167,7 @@ class LikelihoodMethod(Method):
         reads = {parent.name for factor in p.factors for parent in factor.parents}
         if not self.self_feeding or not reads & (set(p.variables) - set(q.variables)):
             return 0.0
-        return Ramp(0.0, self.self_feeding, steps=max(steps // 3, 1), delay=steps // 10)
+        return rising(self.self_feeding, steps)
 
 
 @dataclass(frozen=True)
@@ -236,6 +240,17 @@ class LatentMethod(LikelihoodMethod):
         """What training minimises."""
         weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0
         return Evidence(kl_weight=weight, free_bits=self.free_bits)
+
+
+def rising(level: float, steps: int) -> Ramp:
+    """From 0 to a level over a third of a run of `steps`, after its first tenth."""
+    return Ramp(0.0, level, steps=max(steps // 3, 1), delay=steps // 10)
+
+
+def fit_units(model: DynamicalVAE, train: Any) -> None:
+    """Takes the units of x from 1024 windows of the training data, as the model sees them."""
+    seen = model.read(train.sample(1024, torch.default_generator))
+    model.units[WHOLE].fit(bridged(seen[WHOLE], seen.get("mask", {}).get(WHOLE)))
 
 
 def start_priors(model: DynamicalVAE, train: Any) -> None:

@@ -29,6 +29,8 @@ METHODS = {
     "kvae": "dvae.models.kvae:KVAE",
     "autoregressive": "dvae.models.autoregressive:Autoregressive",
     "moglow": "dvae.models.moglow:MoGlow",
+    "erd": "dvae.models.erd:ERD",
+    "aclstm": "dvae.models.aclstm:ACLSTM",
     "hit-dvae": "dvae.models.hit_dvae:HiTDVAE",
     "gsps": "dvae.models.gsps:GSPS",
     "trajevae": "dvae.models.trajevae:TrajeVAE",

@@ -28,7 +28,7 @@ LAYERS = {
 }
 # Motion is an application: beside itself, the methods and commands for it import it, and nothing else does.
 MOTION = re.compile(
-    r"dvae\.motion\b|dvae\.models\.(bom|bom_parts|cvae|dlow|dsf|energies|futures|gsps|hit_dvae|modes|poses|trajectories|trajevae|cvae_rnn|mix_and_match|motion_infilling|motion_latent|mt_vae|pose_knows|rhp)$"
+    r"dvae\.motion\b|dvae\.models\.(aclstm|bom|bom_parts|cvae|deterministic|dlow|dsf|energies|erd|futures|gsps|hit_dvae|modes|poses|trajectories|trajevae|cvae_rnn|mix_and_match|motion_infilling|motion_latent|mt_vae|pose_knows|rhp)$"
     r"|dvae\.cli\.(data|fitting|futures|judging|report|segments)$"
 )
 # Tables likewise, but that any method is fitted to them.

@@ -90,9 +90,9 @@ class Law(nn.Module):
         """Parameters, (..., P) each, from features and the variable's own previous value, where it is residual.
 
         Args:
-            features: (B, T, H) at all steps, or (B, H) of a static variable or at step `t`.
+            features: (B, T, H) at all steps or at T steps from `t` on, or (B, H) of a static variable or at step `t`.
             previous: (B, T, D) or (B, D).
-            t: the step, in a loop over time.
+            t: the step, in a loop over time, or the first of several.
         """
         raise NotImplementedError
 

@@ -134,10 +134,10 @@ class FixedNormalLaw(Gaussian):
         loc = self.out(features)
         scale = self.log_scale.exp()
         if self.steps:
-            needed = loc.shape[1] if t is None else t + 1
-            if needed > self.steps:
-                raise ValueError(f"FixedNormal(steps={self.steps}) was given {needed} steps; build it with so many")
-            scale = scale[: loc.shape[1]] if t is None else scale[t]
+            first, end = t or 0, (t or 0) + (loc.shape[1] if loc.dim() == 3 else 1)
+            if end > self.steps:
+                raise ValueError(f"FixedNormal(steps={self.steps}) was given {end} steps; build it with so many")
+            scale = scale[first:end] if loc.dim() == 3 else scale[first]
         return self.moved(loc, previous), scale.expand_as(loc)
 
 

@@ -139,6 +139,21 @@ class Network(nn.Module):
         """
         raise NotImplementedError
 
+    def stretch(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        """Features (B, N, H) at N steps from t on, where what they read is known already, and the next state.
+
+        A network that can do so evaluates them at once.
+
+        Args:
+            state, t, drawn: as in `step`; the draws of these steps may be there before their features.
+            count: N.
+        """
+        features = []
+        for s in range(t, t + count):
+            found, state = self.step(state, s, drawn)
+            features.append(found)
+        return torch.stack(features, dim=1), state
+
     def refuse_ragged(self, lengths: Tensor | None) -> None:
         """Refuses padding, for a network in which every step sees all of a sequence."""
         if lengths is not None:
@@ -215,6 +230,11 @@ def part(values: Tensor, lag: int | None) -> Tensor:
 def at(values: Sequence[Tensor], t: int, like: Tensor, size: int) -> Tensor:
     """values[t] of a loop's draws, zero outside the sequence; `like` is any (B, ...) tensor."""
     return values[t] if 0 <= t < len(values) else like.new_zeros(like.shape[0], size)
+
+
+def over(values: Sequence[Tensor], t: int, count: int, like: Tensor, size: int) -> Tensor:
+    """(B, N, D) of a loop's draws at N steps from t on, as `at` has them."""
+    return torch.stack([at(values, s, like, size) for s in range(t, t + count)], dim=1)
 
 
 def valid_steps(lengths: Tensor, length: int) -> Tensor:
@@ -352,15 +372,15 @@ class Join(nn.Module):
             base = base if base.dim() == 3 else base[:, None].expand(-1, length, -1)
         return Hoisted(base, [weight for i, weight in enumerate(weights) if i not in known], known)
 
-    def add(self, hoisted: Hoisted, t: int, live: Sequence[Tensor]) -> Tensor:
-        """Features (B, H) at step t from their hoisted share and the live parts."""
-        first = hoisted.steps[t]
+    def add(self, hoisted: Hoisted, t: int | slice, live: Sequence[Tensor]) -> Tensor:
+        """Features (B, H) at step t, or (B, N, H) at several, from their hoisted share and the live parts."""
+        first = hoisted.steps[t] if isinstance(t, int) else hoisted.base[:, t]
         if self.first is None:
-            seen = dict(zip(hoisted.known, first.split([self.sizes[i] for i in hoisted.known], dim=1), strict=True))
+            seen = dict(zip(hoisted.known, first.split([self.sizes[i] for i in hoisted.known], dim=-1), strict=True))
             coming = iter(live)
             return self._join([seen[i] if i in seen else next(coming) for i in range(len(self.sizes))])
         for part, weight in zip(live, hoisted.weights, strict=True):
-            first = torch.addmm(first, part, weight.t())
+            first = torch.addmm(first, part, weight.t()) if part.dim() == 2 else first + part @ weight.t()
         features: Tensor = self.rest(first)
         return features
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from .base import Chain, Hoisted, Input, Join, Network, at, keep, once, part, perceptron, reverse, shift
+from .base import Chain, Hoisted, Input, Join, Network, at, keep, once, over, part, perceptron, reverse, shift
 from .extract import Extract, Extractors
 from .rows import Rows, select
 
@@ -157,6 +157,25 @@ class Memory(nn.Module):
             value = new[0]
         return value
 
+    def stretch(self, state: MemoryState, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> Tensor:
+        """The states (B, N, W) of a forward memory at N steps from t on; `state` is advanced."""
+        if self.embed is None and len(state.live) < len(self.entries):  # some of its gates are known, and nothing else
+            return torch.stack([self.step(state, s, drawn) for s in range(t, t + count)], dim=1)
+        like = state.hidden[0][0]
+        parts = [over(drawn[parent.name], t + lag, count, like, parent.size) for parent, lag, _ in state.live]
+        if self.embed is None:
+            value = torch.cat(parts, dim=-1)
+        else:
+            value = state.base[:, t : t + count] if state.base.shape[1] > 1 else state.base
+            for part, (_, _, weight) in zip(parts, state.live, strict=True):
+                value = value + part @ weight
+            value = self.embed[1](value)
+        for i, layer in enumerate(self.layers):
+            before = tuple(each[None].contiguous() for each in state.hidden[i])
+            value, after = layer(value, before if self.cell is lstm_cell else before[0])
+            state.hidden[i] = (after[0][0], after[1][0]) if self.cell is lstm_cell else (after[0], after[0])
+        return value
+
     def gates(self, state: MemoryState, length: int) -> tuple[Tensor, Tensor] | None:
         """(B, T, 4 W) share of an LSTM's gates in what is known, and its weight; None for what is not one LSTM."""
         if self.embed is not None or len(self.layers) > 1 or self.cell is not lstm_cell:
@@ -291,6 +310,14 @@ class RecurrentNetwork(Network):
         like = parts[0] if parts else state.hoisted.like
         parts += [at(values[parent.name], t + lag, like, parent.size) for parent, lag in state.live]
         return self.join.add(state.hoisted, t, parts), state
+
+    @override
+    def stretch(self, state: RecurrentState, t: int, count: int, drawn: Any) -> tuple[Tensor, Any]:
+        values = self.extractors.drawn(state.extracted, drawn, state.lengths)
+        parts = [memory.stretch(memory_state, t, count, values) for memory, memory_state in state.memories]
+        like = parts[0] if parts else state.hoisted.like
+        parts += [over(values[parent.name], t + lag, count, like, parent.size) for parent, lag in state.live]
+        return self.join.add(state.hoisted, slice(t, t + count), parts), state
 
     @override
     def chain(self, state: RecurrentState) -> Chain | None:

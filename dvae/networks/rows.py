@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 
@@ -37,10 +38,13 @@ class Rows(Sequence[Any]):
 
     def follow(self, drawn: Sequence[Any], change: Callable[[Tensor], Tensor], lengths: Tensor | None) -> Rows:
         """What `change` makes of the draws of a loop so far, of each once; 0 at padding."""
-        for s in range(len(drawn)):
-            if self.values[s] is None and (value := drawn[s]) is not None:
-                changed = change(value)
-                self[s] = changed if lengths is None else changed * (s < lengths)[:, None]
+        fresh = [s for s in range(len(drawn)) if self.values[s] is None and drawn[s] is not None]
+        if len(fresh) > 1:
+            made: Sequence[Tensor] = change(torch.stack([drawn[s] for s in fresh], dim=1)).unbind(1)
+        else:
+            made = [change(drawn[s]) for s in fresh]
+        for s, changed in zip(fresh, made, strict=True):
+            self[s] = changed if lengths is None else changed * (s < lengths)[:, None]
         return self
 
     def __getitem__(self, t: Any) -> Any:

@@ -14,7 +14,19 @@ from torch.distributions import constraints
 from ..laws.base import LawSpec, Parameters, Shape
 from ..laws.chain import DERIVATIVES, gaussian_chain
 from ..laws.families import NormalLaw
-from ..networks.base import Input, Network, NetworkSpec, at, indicator, once, once_valid, presence, shift, valid_steps
+from ..networks.base import (
+    Input,
+    Network,
+    NetworkSpec,
+    at,
+    indicator,
+    once,
+    once_valid,
+    over,
+    presence,
+    shift,
+    valid_steps,
+)
 from ..networks.rows import Rows
 from ..notation import Factor
 from ..units import Units
@@ -254,17 +266,39 @@ class Conditional(nn.Module):
         """The law's parameters (B, D) at step t, and the next state."""
         if self.network is None:
             return tuple(p[t] for p in state), state
-        read = drawn
-        if isinstance(state, Standardised):
-            kept, lengths = state.kept, state.lengths
-            read = {**drawn, **{n: rows.follow(drawn[n], self.units[n], lengths) for n, rows in kept.items()}}
-            features, state.network = self.network.step(state.network, t, read)
-        else:
-            features, state = self.network.step(state, t, read)
+        inner, read = self._without_unit(state, drawn)
+        features, inner = self.network.step(inner, t, read)
         previous = None
         if self.law.residual:
             previous = at((drawn if self._made_in is None else read)[self.factor.child], t - 1, features, self.size)
-        return self._in_units(self.law(features, previous, t)), state
+        return self._in_units(self.law(features, previous, t)), self._advanced(state, inner)
+
+    def stretch(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Parameters, Any]:
+        """The law's parameters (B, N, D) at N steps from t on, where what they read is known, and the next state."""
+        if self.network is None:
+            return tuple(torch.stack(p[t : t + count], dim=1) for p in state), state
+        inner, read = self._without_unit(state, drawn)
+        features, inner = self.network.stretch(inner, t, count, read)
+        previous = None
+        if self.law.residual:
+            own = (drawn if self._made_in is None else read)[self.factor.child]
+            previous = over(own, t - 1, count, features, self.size)
+        return self._in_units(self.law(features, previous, t)), self._advanced(state, inner)
+
+    def _without_unit(self, state: Any, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Any, Mapping[str, Any]]:
+        """The state of the network, and the draws as it reads them."""
+        if not isinstance(state, Standardised):
+            return state, drawn
+        found = {n: rows.follow(drawn[n], self.units[n], state.lengths) for n, rows in state.kept.items()}
+        return state.network, {**drawn, **found}
+
+    @staticmethod
+    def _advanced(state: Any, inner: Any) -> Any:
+        """The state with the network's next one."""
+        if not isinstance(state, Standardised):
+            return inner
+        state.network = inner
+        return state
 
     def chain(self, state: Any, direction: int, noise: Tensor) -> tuple[Tensor, Parameters] | None:
         """Draws (B, T, D) and their parameters by one fused loop, where the factor is a Gaussian chain; else None."""

@@ -72,8 +72,11 @@ def forecast(
         again = {n: rows(v, part).expand_as(made[n]) for n, v in given.items() if n in model.observed}
         return model.shown({**made, **again}) if again else made  # as it was given: the way there and back rounds
 
+    # Samples that are all the same are one: rows of one product may differ in their last bits.
+    distinct = samples if model.latents or redrawn or any(drawn.values()) else 1
     with model._evaluating():
-        return in_chunks(futures, size, samples, _together(model, data, size, chunk))
+        out = in_chunks(futures, size, distinct, _together(model, data, size, chunk))
+    return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
 
 
 def _fixed(

@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from itertools import accumulate
 from operator import mul
 from typing import Any, ClassVar
@@ -34,7 +33,7 @@ from ..views import LOG_DET, View, volume
 from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
 from .forecast import forecast, impute, reconstruct
-from .rollout import Rollout, SelfFeeding
+from .rollout import InputNoise, Rollout, SelfFeeding
 
 _COUNT = itertools.count()
 SHARED: Any = {"shared": True}
@@ -98,7 +97,7 @@ class DynamicalVAE(nn.Module):
         super().__init__()
         self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
         self.generative = Factorization.parse(generative, masks)
-        self.feeding = SelfFeeding(0.0)
+        self.feeding: SelfFeeding | InputNoise = SelfFeeding(0.0)
         self.view = view or View()
         observed = tuple(self.view.parts or observed)
         self.inference = self.generative.guide(inference, observed, masks)
@@ -248,7 +247,7 @@ class DynamicalVAE(nn.Module):
         size: int = 1,
         prefix: Mapping[str, Tensor] | None = None,
         mean_emission: bool | Collection[str] = False,
-        self_feeding: SelfFeeding | float | None = None,
+        self_feeding: SelfFeeding | InputNoise | float | None = None,
         draws: Mapping[str, int] | None = None,
         curriculum: float = 1.0,
     ) -> dict[str, Tensor]:
@@ -263,8 +262,8 @@ class DynamicalVAE(nn.Module):
             size: B, where the batch does not tell.
             prefix: name to the first values (B, O, D) of a latent.
             mean_emission: a free run sets the data variables, or those named, to their means and does not draw them.
-            self_feeding: scheduled sampling of the data's history: a `SelfFeeding`, or a probability, in the way of the
-                model's attribute `feeding`.
+            self_feeding: what stands in for the data's history: a `SelfFeeding` (scheduled sampling), an `InputNoise`,
+                or a number, the probability or the share of the noise, in the way of the model's attribute `feeding`.
             draws: latent to a number n: from there on the program goes on n times for each sequence, with a draw
                 of this variable each. Later variables have n times as many rows, draw by draw.
             curriculum: how far the draws of what sequences share have come, see `laws.Subset`.
@@ -287,7 +286,7 @@ class DynamicalVAE(nn.Module):
         names = self.observed if mean_emission else ()
         rollout.mean_emission = names if isinstance(mean_emission, bool) else mean_emission
         if isinstance(self_feeding, int | float):
-            self_feeding = replace(self.feeding, probability=self_feeding)
+            self_feeding = self.feeding.at(self_feeding)
         rollout.feeding = self_feeding
         for block in self.generative.blocks:
             for name in block.names:

@@ -6,9 +6,10 @@ known. A `Rollout` holds what is known in one run; every site of the Pyro progra
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from math import inf
 from typing import Any, ClassVar
 
 import numpy as np
@@ -37,6 +38,8 @@ class SelfFeeding:
             have it) a step takes half the time or less, and the gradient is not that of the self-fed bound. The means
             in place of missing entries always carry theirs.
         start: frames at the beginning that stay as they are, such as those that a forecast will have observed.
+        blocks: from there on so many frames stay as they are, then so many may be replaced, and so on in turns (Zhou
+            et al., 2018, arXiv 1707.05363, have (5, 5)). None where each may be.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -47,10 +50,52 @@ class SelfFeeding:
     passes: int | None = None
     gradient: bool = True
     start: int = 0
+    blocks: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.probability <= 1 or (self.passes is not None and self.passes < 1) or self.start < 0:
             raise ValueError(f"expected a probability in [0, 1], at least one pass and a start from 0, got {self}")
+        if self.blocks is not None and (len(self.blocks) != 2 or min(self.blocks) < 1):
+            raise ValueError(f"blocks are numbers of frames from 1, as they are and replaced, got {self.blocks}")
+
+    def at(self, level: float) -> SelfFeeding:
+        """The same with this probability, which a schedule gives."""
+        return replace(self, probability=level)
+
+    def frames(self, batch: int, length: int, device: torch.device) -> Tensor:
+        """(B, T, 1) True at frames that are replaced, drawn anew."""
+        fed = torch.rand(batch, length, 1, device=device) < self.probability
+        fed[:, : self.start] = False
+        if self.blocks is not None:
+            kept, own = self.blocks
+            place = (torch.arange(length, device=device) - self.start) % (kept + own)
+            fed &= (place >= kept)[:, None]
+        return fed
+
+
+@dataclass(frozen=True)
+class InputNoise:
+    """Normal noise on the data's history, so that a model learns to go on from what is somewhat off, as its own output.
+
+    The data that are scored have none. Source: Fragkiadaki et al., 2015, arXiv 1508.00271.
+
+    Args:
+        scale: standard deviation, in the unit in which networks read the variable (`dvae.units`).
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2})
+        >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2), self_feeding=dvae.InputNoise(0.5))
+    """
+
+    scale: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.scale < inf:
+            raise ValueError(f"the scale of noise is finite and at least 0, got {self.scale}")
+
+    def at(self, level: float) -> InputNoise:
+        """The same with this share of the scale, which a schedule gives."""
+        return InputNoise(level * self.scale)
 
 
 @dataclass(frozen=True)
@@ -89,7 +134,7 @@ class Rollout:
             count there, and networks that read it are told (`networks.base.presence`).
         prefix: name to (B, O, D) first values of a variable that is then drawn on.
         mean_emission: names of data variables that are not drawn but set to their means.
-        feeding: self-feeding of the data's history, or None.
+        feeding: what stands in for the data's history, or None.
         draws: how many rows each sequence of the data has by now (see `fork`).
         drawing: what the model may not read is drawn, in place of the model's own mean.
         groups: which sequences share values of the `grouped` variables, or None where each is a group.
@@ -107,7 +152,7 @@ class Rollout:
     present: Mapping[str, Tensor] = field(default_factory=dict)
     prefix: Mapping[str, Tensor] = field(default_factory=dict)
     mean_emission: Collection[str] = ()
-    feeding: SelfFeeding | None = None
+    feeding: SelfFeeding | InputNoise | None = None
     draws: int = 1
     drawing: bool = False
     groups: Groups | None = None
@@ -120,7 +165,6 @@ class Rollout:
         self._block = {name: block for block in self.factorization.blocks for name in block.names}
         self._drawn: dict[str, Tensor] = {}
         self._evaluated: dict[str, tuple[Tensor, Parameters]] = {}
-        self._fed: dict[str, Tensor] = {}
         self._unfed = list(self.factorization.blocks)
         self._valid = None if self.lengths is None else valid_steps(self.lengths, self.length)[..., None]
 
@@ -228,17 +272,30 @@ class Rollout:
         return self._drawn[name]
 
     def history(self, name: str) -> dict[str, Tensor]:
-        """What a variable reads as the data's past where the model may not read them: the model's own means.
+        """What a variable reads as the data's past where the model may not read them: its own means, or noisy data.
 
-        They are functions of parameters and latents, so that their gradient is part of the bound's, but where
+        Means are functions of parameters and latents, so that their gradient is part of the bound's, but where
         self-feeding asks for none.
         """
         if not self.hidden:
-            return {}
+            return self._fed
         with torch.set_grad_enabled(self._fed_with_gradient and torch.is_grad_enabled()):
             while self._block[name] in self._unfed:  # blocks read themselves and earlier ones
                 self._fed.update(self._feed(self._unfed.pop(0)))
         return self._fed
+
+    @cached_property
+    def _fed(self) -> dict[str, Tensor]:
+        """Name to (B, T, D): the data with the noise of the feeding; and block by block as `history` has them."""
+        found: dict[str, Tensor] = {}
+        if not isinstance(self.feeding, InputNoise) or not self.feeding.scale:
+            return found
+        for name in self.factorization.variables:  # in one order, as noise is drawn
+            if name in self.data and name in self.values and self.factorization.local(name):
+                value, units = self.values[name], self.conditionals[name].units.get(name)
+                noise = self.feeding.scale * torch.randn_like(value) * (1.0 if units is None else units.scale)
+                found[name] = self._hide(value + noise)
+        return found
 
     @cached_property
     def _fed_with_gradient(self) -> bool:
@@ -249,11 +306,9 @@ class Rollout:
         """What the model may not read of the data: missing entries, and frames that self-feeding replaces."""
         missing = {name: ~seen for name, seen in self.observed.items() if name in self.values and not seen.all()}
         hidden = {name: Hidden(entries) for name, entries in missing.items()}
-        if self.feeding is None or not self.feeding.probability:
+        if not isinstance(self.feeding, SelfFeeding) or not self.feeding.probability:
             return hidden
-        frames = torch.rand(self.batch, self.length, 1, device=next(iter(self.values.values())).device)
-        fed = frames < self.feeding.probability
-        fed[:, : self.feeding.start] = False
+        fed = self.feeding.frames(self.batch, self.length, next(iter(self.values.values())).device)
         for name in self.data & self.values.keys():
             if self.factorization.local(name):
                 absent = missing.get(name)
@@ -267,10 +322,11 @@ class Rollout:
         names = [name for name in block.names if name in self.hidden]
         if not names:
             return {}
-        if self.feeding is None or self.feeding.passes is None or not self.feeding.probability:
+        feeding = self.feeding
+        if not isinstance(feeding, SelfFeeding) or feeding.passes is None or not feeding.probability:
             return self._run(block, self._fed, self.hidden)
         known = {**self.known, **self._fed}
-        for _ in range(self.feeding.passes):
+        for _ in range(feeding.passes):
             for name in names:
                 conditional = self.conditionals[name]
                 mean = conditional.law.mean(conditional(known, self.batch, self.length, self.lengths))
@@ -282,7 +338,8 @@ class Rollout:
     ) -> dict[str, Tensor]:
         """Values of the unknown variables of a block; with `hidden`, of its data, with own means at those entries."""
         live = [name for name in block.names if (name not in self.values if hidden is None else name in hidden)]
-        given = {name: value for name, value in {**self.known, **(fed or {})}.items() if name not in live}
+        told = {**self.known, **(fed or {})}
+        given = {name: value for name, value in told.items() if name not in live}
         loop = any(parent in live for name in live for parent in self.conditionals[name].parents)
         noise = {
             name: self.conditionals[name].law.noise(
@@ -292,7 +349,7 @@ class Rollout:
             if (hidden is None or self.drawing) and name not in self.mean_emission
         }
         if loop:
-            return self._loop(block, live, given, noise, hidden)
+            return self._loop(block, live, given, noise, hidden, self.prefix if hidden is None else told)
         drawn = {}
         for name in live:
             conditional = self.conditionals[name]
@@ -300,7 +357,7 @@ class Rollout:
             law = conditional.law
             value = law.draw(parameters, noise[name]) if name in noise else law.mean(parameters)
             if hidden is not None:
-                value = hidden[name].fill(self.values[name], value)
+                value = hidden[name].fill(told[name], value)
             elif name in self.prefix:
                 seen = self.prefix[name].shape[1]
                 value = torch.cat([self._continue(name, slice(seen), value[:, :seen]), value[:, seen:]], dim=1)
@@ -316,6 +373,7 @@ class Rollout:
         given: Mapping[str, Tensor],
         noise: Mapping[str, Tensor],
         hidden: Mapping[str, Hidden] | None,
+        told: Mapping[str, Tensor],
     ) -> dict[str, Tensor]:
         states = {name: self.conditionals[name].start(given, self.batch, self.length, self.lengths) for name in live}
         padded = self._valid is not None and block.direction < 0  # a backward loop meets the padding first
@@ -329,16 +387,27 @@ class Rollout:
         drawn: dict[str, list[Tensor]] = {name: [None] * self.length for name in live}  # type: ignore[list-item]
         evaluated: dict[str, list[Parameters]] = {name: [] for name in live}
         steps = {name: values.unbind(1) for name, values in noise.items()}
-        order = range(self.length) if block.direction >= 0 else range(self.length - 1, -1, -1)
-        for t in order:
+        known = self._told_whole(live, hidden, told)
+        for first, count in _runs(known, block.direction, ahead=len(live) == 1):
+            t = first + count - 1
+            end = t + known[t]
+            for name in live if end > first else ():
+                drawn[name][first:end] = told[name][:, first:end].unbind(1)
             for name in live:
                 conditional = self.conditionals[name]
-                parameters, states[name] = conditional.step(states[name], t, drawn)
-                evaluated[name].append(parameters)
+                if count > 1:
+                    at_all, states[name] = conditional.stretch(states[name], first, count, drawn)
+                    evaluated[name].append(at_all)
+                    parameters = tuple(p[:, -1] for p in at_all)
+                else:
+                    parameters, states[name] = conditional.step(states[name], t, drawn)
+                    evaluated[name].append(tuple(p[:, None] for p in parameters))
+                if known[t]:
+                    continue
                 law = conditional.law
                 value = law.draw(parameters, steps[name][t]) if name in steps else law.mean(parameters)
                 if hidden is not None:
-                    value = hidden[name].fill(self.values[name][:, t], value, t)
+                    value = hidden[name].fill(told[name][:, t], value, t)
                 elif name in self.prefix and t < self.prefix[name].shape[1]:
                     value = self._continue(name, t, value)
                 if padded:
@@ -348,9 +417,24 @@ class Rollout:
         if hidden is None or self._fed_with_gradient:  # by which the data are scored too
             for name in live:
                 in_time = evaluated[name] if block.direction >= 0 else evaluated[name][::-1]
-                stacked = tuple(torch.stack(p, dim=1) for p in zip(*in_time, strict=True))
+                stacked = tuple(torch.cat(p, dim=1) for p in zip(*in_time, strict=True))
                 self._evaluated[name] = (values[name] if hidden is None else self.values[name], stacked)
         return values
+
+    def _told_whole(
+        self, live: list[str], hidden: Mapping[str, Hidden] | None, told: Mapping[str, Tensor]
+    ) -> list[bool]:
+        """At which steps all that a loop would make is known, of every sequence."""
+        if any(name not in told for name in live):
+            return [False] * self.length
+        whole = torch.ones(self.length, dtype=torch.bool, device=told[live[0]].device)
+        for name in live:
+            seen = self.observed.get(name) if hidden is None else ~hidden[name].entries
+            end = told[name].shape[1]
+            whole[end:] = False
+            if seen is not None:
+                whole[:end] &= seen[:, :end].all(-1).all(0)
+        return whole.tolist()  # type: ignore[no-any-return]
 
     def _continue(self, name: str, steps: int | slice, value: Tensor) -> Tensor:
         """The known first values of a variable; `value` at entries that are missing there."""
@@ -424,6 +508,23 @@ class Sequence(TorchDistribution):
                 "vectorised particles are had by repeating the batch (importance_bound(particles=...))"
             )
         return self
+
+
+def _runs(known: list[bool], direction: int, ahead: bool) -> Iterator[tuple[int, int]]:
+    """First step and number of steps of what a loop evaluates at once.
+
+    Forward in time these are runs of steps at which all values are known, and with `ahead` the step after such a run,
+    whose parameters read no other values than these.
+    """
+    if direction < 0:
+        yield from ((t, 1) for t in reversed(range(len(known))))
+        return
+    t = 0
+    while t < len(known):
+        end = next((s for s in range(t, len(known)) if not known[s]), len(known))
+        count = max(min(end + ahead, len(known)) - t, 1)
+        yield t, count
+        t += count
 
 
 @lru_cache(maxsize=1024)

@@ -35,6 +35,8 @@ SMALL = {
     "hit-dvae": {"samples": 2, "width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "pose_prior": 0.0},
     "gsps": {"width": 8, "blocks": 1, "draws": (2, 2), "coefficients": 4, "pose_prior": 0.0},
     "trajevae": {"width": 8, "feedforward": 8, "components": 4},
+    "erd": {"width": 4, "encoder": (5,), "decoder": (6,)},
+    "aclstm": {"width": 4},
     "cvae-rnn": {"latent": 4, "summary": 4, "width": 8, "hidden": (8,)},
     "motion-infilling": {"maps": (4, 6)},
     **{name: {"latent": 4, "width": 8, "hidden": (8,)} for name in ("cvae", "bom", "pose-knows", "rhp")},

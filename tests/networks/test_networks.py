@@ -294,6 +294,50 @@ def test_steps_agree_in_single_precision_and_in_their_gradients(kind):
     torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-4)
 
 
+def by_stretches(network, parents, live, counts):
+    """Features from `start`, `stretch` and, where a count is 1, `step`; of the draws those of the stretch are there."""
+    batch, steps = parents["x"].shape[:2]
+    state = network.start({name: v for name, v in parents.items() if name not in live}, batch, steps)
+    drawn = {name: [None] * steps for name in live}
+    features, t = [], 0
+    for count in counts:
+        for name in live:
+            drawn[name][t : t + count] = parents[name][:, t : t + count].unbind(1)
+        if count > 1:
+            found, state = network.stretch(state, t, count, drawn)
+        else:
+            found, state = network.step(state, t, drawn)
+            found = found[:, None]
+        features.append(found)
+        t += count
+    return torch.cat(features, 1)
+
+
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_a_stretch_is_its_steps_and_the_loop_goes_on_from_it(kind):
+    inputs = loop_inputs(kind, 1)
+    network = build(kind, inputs)
+    parents = draw(inputs, 3)
+    for live in ({"z", "x", "u", "v"}, {"z"}, {"x", "v"}):
+        found = {counts: by_stretches(network, parents, live, counts) for counts in ((2, 1, 3), (1, 4, 1), (6,))}
+        together = network(parents, T)
+        gradients = [
+            torch.autograd.grad(out.square().sum(), list(network.parameters()), allow_unused=True)
+            for out in (together, *found.values())
+        ]
+        for out, gradient in zip(found.values(), gradients[1:], strict=True):
+            torch.testing.assert_close((out, gradient), (together, gradients[0]), rtol=0, atol=1e-10)
+
+
+def test_a_recurrent_stretch_takes_no_steps(monkeypatch):
+    network = build("lstm", [Input("z", 2, Relation.parse("<t"))])
+    monkeypatch.setattr(network.memories[0], "step", None)
+    parents = draw(network.inputs, 3)
+    state = network.start({}, 3, T)
+    found, _ = network.stretch(state, 0, T, {"z": parents["z"].unbind(1)})
+    torch.testing.assert_close(found, network(parents, T), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("kind", ["linear", "attention", "attention, two layers"])
 def test_steps_agree_under_a_mask_of_ones_own(kind):
     relation = CUSTOM["past, even steps"]

@@ -23,6 +23,8 @@ NAN = np.nan
 SMALL = {"latent": 2, "warm_up": 1}
 WITHOUT_LATENTS = ("autoregressive", "moglow")
 METHODS = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae", *WITHOUT_LATENTS)
+PLAIN = ("erd", "aclstm")
+"""Of motion, and of no latents, but for any data."""
 TOLD = Columns(
     (
         Column("riders", family="overdispersed", unit="people"),
@@ -67,16 +69,16 @@ def data(tmp_path_factory):
 
 
 def options(name):
-    return {} if name in WITHOUT_LATENTS else SMALL
+    return {} if name in WITHOUT_LATENTS else {"width": 4} if name in PLAIN else SMALL
 
 
 def test_every_method_that_is_not_of_motion_is_tested():
     futures = {"cvae", "bom", "bom-parts", "pose-knows", "mt-vae", "rhp", "dlow", "dsf", "mix-and-match"}
     motion = {"hit-dvae", "gsps", "trajevae", "cvae-rnn", "motion-infilling", "motion-latent", *futures}
-    assert {*METHODS} == {*methods()} - motion - {"equations"}
+    assert {*METHODS, *PLAIN} == {*methods()} - motion - {"equations"}
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", [*METHODS, *PLAIN])
 def test_a_method_is_fitted_to_a_table_forecasts_it_and_does_not_see_what_is_missing(data, name):
     windows = data.windows("train")
     assert windows.schema.sizes == {"x": 7, "c": 1 + 1 + 2 + 1, "s": 1, "d": 1}
