@@ -41,7 +41,7 @@ def joined(files: Sequence[Path]) -> tuple[dvae.Evaluation, str]:
     """
     found = {file.stem.replace("-", " "): dvae.Evaluation.load(file) for file in files}
     first = next(iter(found.values()))
-    if any(_same(each) != _same(first) for each in found.values()):
+    if any(same(each) != same(first) for each in found.values()):
         sys.exit("these evaluations differ in windows, samples, seed, emission, multimodal threshold or judges")
     rows = {name: row for name, row in first.rows.items() if not row.config}
     for name, each in found.items():
@@ -50,7 +50,8 @@ def joined(files: Sequence[Path]) -> tuple[dvae.Evaluation, str]:
     return replace(first, rows=rows, metrics=metrics), next(iter(found))
 
 
-def _same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
+def same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
+    """What evaluations have in common whose scores stand in one table."""
     drawn = evaluation.samples, evaluation.seed, evaluation.emission, evaluation.bound_particles
     return evaluation.data, *drawn, evaluation.basis
 

@@ -25,8 +25,10 @@ from benchmarks.tables import (
     occlusion,
     overview,
     pages,
+    ranking,
     rotations,
     trajevae,
+    tuning,
 )
 from dvae import Descent, Evaluation, Training, method, motion
 from dvae.cli import main as command
@@ -351,6 +353,60 @@ def test_occlusion(folder, page, monkeypatch):
     assert all(float(cell.split()[0]) > 0 for row in errors[1:] for cell in row[1:3])
     error, line, more = (float(row[1].split()[0]) for row in (errors[3], errors[1], differences[2]))
     assert abs(error - line - more) < 0.11  # of three rounded numbers
+
+
+def test_ranking(folder, page, monkeypatch):
+    """Fitted and scored once; a difference of two rows is that of what they show; later runs join."""
+    methods = {"cvae": {"width": 4, "latent": 2}, "srnn": {"width": 4, "latent": 2, "warm_up": 1}}
+    small = {name: {**options, "steps": 2, "batch_size": 4} for name, options in methods.items()}
+    monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", small)})
+    monkeypatch.setattr(ranking, "fitted_judges", lambda data, runs: {})
+    page.write_text(page.read_text().replace("tables", "simulated"))
+    runs, options = folder / "ranked", {"page": page, "samples": 2, "sets": ("simulated",)}
+    ranking.main(runs, folder, seeds=(0,), **options)
+    ranking.main(runs, folder, seeds=(0, 1), methods=("srnn",), **options)
+    times = [file.stat().st_mtime_ns for file in sorted(runs.rglob("*.json"))]
+    ranking.main(runs, **options)
+    assert times == [file.stat().st_mtime_ns for file in sorted(runs.rglob("*.json"))]
+    page.write_text(page.read_text().replace("simulated", "tables"))
+    (rows,) = tables(page)
+    by_name = {row[0]: row for row in rows[1:]}
+    assert by_name.keys() == {"zero velocity", "nearest neighbours", *methods}
+    assert (by_name["cvae"][1], by_name["srnn"][1]) == ("1", "2")
+    energies = [float(row[5].split()[0]) for row in rows[1:]]
+    assert energies == sorted(energies)
+    for row, energy, before in zip(rows[2:], energies[1:], energies, strict=False):
+        assert abs(float(row[4].split()[0]) - (energy - before)) < 0.0016  # of three rounded numbers
+
+
+def test_tuning(folder, page, monkeypatch):
+    """Cases of one method, and of another with paths; scored once."""
+    training = Training(steps=2, batch_size=4)
+    cases = {"preset": {}, "wide, longer": {"width": 6, "steps": 3}}
+    paths = replace(motion.PROTOCOLS["simulated-trajectories"], name="paths")
+    sections = {
+        "cvae": tuning.Section("cvae", training, cases, motion.PROTOCOLS["simulated"], seeds=(0, 1)),
+        "cvae-rnn": tuning.Section("cvae-rnn", training, {"preset": {"width": 4}}, paths),
+    }
+    for name, value in {
+        "SECTIONS": sections,
+        "TUNING": motion.PROTOCOLS["simulated"],
+        "JOINTS": (),
+        "SAMPLES": 2,
+    }.items():
+        monkeypatch.setattr(tuning, name, value)
+    monkeypatch.setattr(tuning, "fitted_judges", lambda data, runs: {})
+    for name in sections:
+        page.write_text(
+            "\n".join([page.read_text(), *(mark.replace("tables", name) for mark in (pages.BEGIN, pages.END))])
+        )
+    for _ in range(2):
+        tuning.main(folder / "people.npz", folder / "tuned", tuple(sections), page=page)
+        rows = re.findall(r"^\| (preset|wide, longer) \| (.*) \|$", page.read_text(), re.MULTILINE)
+        assert [name for name, _ in rows] == ["preset", "wide, longer", "preset"]
+        assert re.match(r"[\d.]+ \([\d.]+, [\d.]+\)", rows[0][1])
+        assert rows[0][1] != rows[1][1]
+    assert len([*(folder / "tuned").rglob(tuning.SCORED)]) == 5
 
 
 def test_irregular(tmp_path, page, monkeypatch):

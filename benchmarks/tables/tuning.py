@@ -1,0 +1,202 @@
+"""Fits and scores what options of methods for motion are chosen by, and writes the tables of docs/results/tuning.md.
+
+Everything is under one protocol, bandai2-tuning: people of group A train, those of group B, whose styles are not
+those of training, judge, on every fourth window; nobody of the test group C is seen. Runs lie under `--runs`, each with
+scores.json in it: the script goes on where it was stopped, and tables are of what is there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import isnan, nan
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+import dvae
+from dvae import Training, motion
+from dvae.motion.dataset import MotionData
+from dvae.runs.directory import load
+from dvae.runs.sweep import sweep
+
+from .pages import table, write
+from .ranking import JOINTS, fitted_judges, judging
+
+TUNING = motion.PROTOCOLS["bandai2-tuning"]
+EVERY, SAMPLES = 4, 50
+SCORED = "scores.json"
+COLUMNS = ("ADE", "FDE", "ADEm", "APD", "energy score", "ACC content", "FID content", "pose NLL", "KL w", "KL z")
+"""Scores that pages show, where there are."""
+PATH_COLUMNS = tuple(f"{score}, {count} given" for score in ("ADE", "APD", "energy score") for count in range(5))
+
+
+@dataclass(frozen=True)
+class Section:
+    """What is compared with one another.
+
+    Args:
+        method: whose options.
+        training: of all its runs, where a case says nothing else.
+        cases: name to options; those of `Training` are among them.
+        protocol: of the windows.
+        judged: whether the pose prior is a part of the method.
+        seeds: of every case.
+    """
+
+    method: str
+    training: Training
+    cases: Mapping[str, Mapping[str, Any]]
+    protocol: motion.Protocol = TUNING
+    judged: bool = False
+    seeds: tuple[int, ...] = (0,)
+
+    def of(self, case: str, prior: Path) -> tuple[Any, Training]:
+        """The method of a case, and its training."""
+        options = dict(self.cases[case])
+        told = {name: options.pop(name) for name in [*options] if name in Training.__dataclass_fields__}
+        method = options.pop("method", self.method)
+        if self.judged and options.get("pose_prior") != 0:
+            options["pose_prior_run"] = str(prior)
+        return dvae.method(method, **options), replace(self.training, **told)
+
+
+PATHS = replace(motion.PROTOCOLS["bandai2-trajectories"], name="bandai2-paths-tuning", train=("A",), test=("B",))
+ABLATED: dict[str, dict[str, Any]] = {
+    "full": {},
+    "whole poses": {"complement": False},
+    "in time": {"complement": False, "cosine": False},
+    "standard prior": {"complement": False, "learned_prior": False},
+}
+"""TrajeVAE and its ablations; latents of all have 15 coefficients but those in time, which have 60 of a quarter."""
+BETAS = (1e-4, 1e-3, 1e-2)
+SECTIONS = {
+    "hit-dvae": Section(
+        "hit-dvae",
+        Training(steps=1200, batch_size=16, learning_rate=2e-3, decay=0.8, validate_every=400),
+        {
+            "preset": {},
+            "w .03": {"kl_static": 0.03},
+            "w .3": {"kl_static": 0.3},
+            "literal": {"kl_local": 0.0067, "kl_static": 0.1},
+            "no copies": {"nearest": False, "residual": 0.0},
+            "observed frames fed": {"feed_observed": True},
+            "no copies, no attention": {"nearest": False, "residual": 0.0, "attention": False},
+            "w .03, 2400 steps": {"kl_static": 0.03, "steps": 2400},
+            "rate 1e-3": {"learning_rate": 1e-3},
+            "rate 4e-3": {"learning_rate": 4e-3},
+        },
+        judged=True,
+    ),
+    "gsps": Section(
+        "gsps",
+        Training(steps=3000, batch_size=16, learning_rate=3e-3, decay=0.5, validate_every=500),
+        {
+            "preset": {},
+            "diversity 5 10": {"diversity": (5.0, 10.0)},
+            "diversity 1 2": {"diversity": (1.0, 2.0)},
+            "diversity 0": {"diversity": (0.0,)},
+            "20 coefficients": {"coefficients": 20},
+            "rate 1e-3": {"learning_rate": 1e-3},
+            "6 x 6 draws": {"draws": (6, 6)},
+            "width 256": {"width": 256},
+            "6500 steps": {"steps": 6500},
+        },
+        judged=True,
+    ),
+    "trajevae": Section(
+        "trajevae",
+        Training(steps=6000, batch_size=16, learning_rate=5e-4, decay=0.8, validate_every=1000),
+        {
+            **{f"{name}, {beta:g}": {**told, "beta": beta} for name, told in ABLATED.items() for beta in BETAS},
+            "in time, 8 each, .001": {**ABLATED["in time"], "latent": 8},
+            "full, keep .05": {"keep": 0.05},
+            "full, keep .3": {"keep": 0.3},
+            "full, 30 coefficients": {"components": 30},
+            "full, rate 1e-3": {"learning_rate": 1e-3},
+        },
+        protocol=PATHS,
+    ),
+    "cvae-rnn": Section(
+        "cvae-rnn",
+        Training(steps=3000, batch_size=16, learning_rate=1e-3, decay=0.5, validate_every=500),
+        {
+            **{f"{beta:g}": {"beta": beta} for beta in (1e-3, 1e-2, 0.1)},
+            "0.1, 12000 steps": {"steps": 12000},
+        },
+        protocol=PATHS,
+    ),
+}
+"""What was tried, by method."""
+
+
+def score(path: Path, data: MotionData, judged: Mapping[str, Path]) -> dict[str, float]:
+    """Means over every fourth window of the judging group, kept beside the run."""
+    file = path / SCORED
+    if not file.exists():
+        model, protocol = load(path).model, data.protocol
+        windows = motion.windows(data.motion, replace(protocol, test_stride=EVERY * protocol.test_stride), "test")
+        found: dict[str, float] = {}
+        if protocol.root == "drop":
+            found = evaluated(model, windows, judging(judged))
+        else:
+            for count in range(len(JOINTS) + 1):
+                one = evaluated(model, windows.given(JOINTS[:count]), motion.scores)
+                found |= {f"{name}, {count} given": value for name, value in one.items()}
+        file.write_text(json.dumps(found, indent=1), encoding="utf-8")
+    kept: dict[str, float] = json.loads(file.read_text(encoding="utf-8"))
+    return kept
+
+
+def evaluated(model: Any, windows: Any, scores: Any) -> dict[str, float]:
+    """Means of scores over windows."""
+    found = dvae.evaluate(model, windows, scores=scores, samples=SAMPLES, references=False, progress=False)
+    return {name: each.mean for name, each in found["model"].items()}
+
+
+def shown(scores: Sequence[Mapping[str, float]], name: str) -> str:
+    """The mean over seeds, with that of each where there are several."""
+    values = [each.get(name, nan) for each in scores]
+    if any(map(isnan, values)):
+        return "–"
+    each = ", ".join(f"{value:.3f}" for value in values)
+    return f"{sum(values) / len(values):.3f}" + (f" ({each})" if len(values) > 1 else "")
+
+
+def main(
+    data: Path,
+    runs: Path = Path("runs/tuning"),
+    sections: tuple[str, ...] = tuple(SECTIONS),
+    jobs: int = 1,
+    page: Path | None = None,
+) -> None:
+    """Fit, score, and write the tables.
+
+    Args:
+        data: bandai2.npz.
+        runs: where run directories lie.
+        sections: which.
+        jobs: runs at a time.
+        page: whose tables; without one they are printed.
+    """
+    opened = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
+    judged = fitted_judges(opened[TUNING.name], runs)
+    prior = judged.get("prior", Path()).absolute()
+    for name in sections:
+        section, lines = SECTIONS[name], []
+        own = opened[section.protocol.name]
+        columns = COLUMNS if section.protocol is TUNING else PATH_COLUMNS
+        for case in section.cases:
+            method, training = section.of(case, prior)
+            folder = case.replace(", ", "-").replace(" ", "-")
+            sweep({folder: method}, own, runs / name, section.seeds, training, jobs)
+            scores = [score(runs / name / f"{folder}-seed{seed}", own, judged) for seed in section.seeds]
+            lines.append([case, *(shown(scores, column) for column in columns)])
+            print(name, *lines[-1], sep=" | ", flush=True)
+        write(page, table([name, *columns], lines), name=name)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
