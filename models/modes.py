@@ -31,7 +31,7 @@ from ..inference.checkpoints import CONFIG, CheckpointError, Run, at_most, load_
 from ..inference.recipe import Recipe
 from ..inference.trackers import Bar
 from ..inference.training import Stage, Training
-from ..motion import Skeleton
+from ..motion import HUMAN36M, HUMANEVA, Skeleton
 from ..motion.protocols import Poses
 from ..networks import Input, Network, NetworkSpec
 from ..networks.base import once, perceptron
@@ -69,7 +69,10 @@ class ModesMethod(FutureMethod):
     """
 
     inference = ""
-    trainings: ClassVar[Mapping[str, Training]] = {"": Training(decay=0.5)}
+    trainings: ClassVar[Mapping[str, Training]] = {
+        **FutureMethod.trainings,
+        **dict.fromkeys((HUMAN36M.name, HUMANEVA.name), Training(15_625, 32, 1e-4, 0.8)),
+    }
 
     latent: Size | None = None
     width: Size | None = None
@@ -146,8 +149,8 @@ class ModesMethod(FutureMethod):
     def _fitted(self, train: Any, validation: Any, steps: int) -> FutureModel:
         method = CVAE(**{name: getattr(self, name) for name in OF_CVAE})
         model, seed = method.build(train), int(torch.randint(2**31, ()))
-        how: dict[str, Any] = {"seed": seed, "decay": 0.8, "progress": False, "trackers": [Bar("cvae", steps, True)]}
-        method.train(train, validation, steps).fit(model, **how)
+        training = replace(method.training(train), steps=steps, seed=seed, progress=False)
+        method.train(train, validation, steps).fit(model, trackers=[Bar("cvae", steps, True)], **vars(training))
         return model
 
 

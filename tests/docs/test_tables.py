@@ -14,6 +14,7 @@ from benchmarks.tables import (
     bones,
     bounds,
     completion,
+    control,
     demo,
     family,
     gsps,
@@ -124,10 +125,21 @@ def test_gsps(folder, page):
     again = shutil.copytree(run, folder / "the-same")
     files = tuple(evaluated(folder, each.name, runs=[each]) for each in (run, again))
     gsps.main(run, files, page, samples=2)
-    scores, differences, control = tables(page)
+    scores, differences, (_, free, held) = tables(page)
     assert [row[0] for row in scores[1:]] == ["zero velocity", "nearest neighbours", "gsps", "the same"]
     assert differences[2][:3] == ["the same", "0.000", "0.000"]
-    assert float(control[2][1]) == 0 < float(control[2][2])
+    assert float(held[2]) == 0 < float(held[3]) < float(free[1])
+
+
+def test_control(folder, page):
+    small = ("--modes", 2, "--latent", 4, "--width", 8, "--sampler-width", 8, "--sampler-hidden", 8)
+    run = fitted(folder, "dsf", "dsf", *small)
+    control.main((run, run), page, samples=2, every=5)
+    ((header, first, again),) = tables(page)
+    assert header == ["", "APD", "APD lower", "APD upper"]
+    assert first == again
+    whole, *parts = (float(cell) for cell in first[1:])
+    assert 0 < max(parts) < whole < sum(parts)
 
 
 def test_bones(folder, page):
