@@ -28,6 +28,7 @@ from benchmarks.tables import (
     pages,
     ranking,
     rotations,
+    static,
     trajevae,
     tuning,
 )
@@ -159,6 +160,36 @@ def test_hit_dvae(folder, page):
     hit_dvae.main(run, (evaluated(folder, "full", runs=[run]),), page, count=2, seconds=2.0)
     *_, seconds = tables(page)
     assert [row[0] for row in seconds[1:]] == ["1", "2"]
+
+
+def test_static(folder, page):
+    run = fitted(folder, "with-w", "hit-dvae", "--pose-prior", "0", "--width", "8")
+    static.main((run,), page, labels=("activity",), splits=("train",), count=5)
+    told, moved = tables(page)
+    assert [row[2] for row in told[1:]] == ["w", "z", "mean and spread of poses"]
+    assert [row[1:3] for row in moved[1:]] == [*(["w", f"{share:g}"] for share in static.SHARES), ["z", "1"]]
+    assert moved[1][3:5] == ["0", "0"]
+
+
+def test_probes_tell_what_is_there_and_nothing_else():
+    torch.manual_seed(0)
+    labels = [name for name in "abc" for _ in range(40)]
+    places = torch.arange(120) // 4
+    fitted = static.halves(labels, places)
+    assert [int(fitted[n : n + 40].sum()) for n in (0, 40, 80)] == [20] * 3
+    assert all(len({*fitted[places == place].tolist()}) == 1 for place in range(30))
+    features = torch.randn(120, 6)
+    chance = static.read_label(features, labels, fitted).mean()
+    features[:, 2] += 9 * torch.tensor(["abc".index(label) for label in labels])
+    assert abs(chance - 1 / 3) < 0.2
+    assert static.read_label(features, labels, fitted).mean() == 1
+    lengths = features[:, :2] @ torch.randn(2, 5) + 1
+    assert (
+        static.read_lengths(features, lengths.double(), fitted)
+        > 0.99
+        > 0.1
+        > static.read_lengths(torch.randn(120, 6), lengths.double(), fitted)
+    )
 
 
 def test_mix_and_match(tmp_path, page, monkeypatch):

@@ -1,0 +1,187 @@
+"""Prints what the static latent of runs knows, and what moves with it: linear probes, interpolations and swaps of w.
+
+A probe is fitted to the windows of every other clip of each class, and judged on the windows of the others: multinomial
+logistic regression to a label, and ridge regression to the lengths of bones, where people differ in these. Beside the
+posterior mean of w stand other things to read: the mean of z's posterior means over time, and of each window the mean
+and the spread of every coordinate over time, which are not made by a model.
+
+A swap decodes a window with one latent of another window, of another label; x runs free from its own past. What it
+moves is told apart: the mean pose over time, and the motion about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+from torch.nn import functional
+
+import dvae
+from dvae.inference.checks import decode
+from dvae.inference.held import clip_places, on_device_of, reproducibly
+from dvae.inference.uncertainty import clustered_variance, linearised
+from dvae.motion import Windows
+from dvae.program.batch import rows
+
+from .pages import table, write
+
+DRAWS, PENALTY, CHUNK = 8, 1e-3, 128
+ONE_BODY = 0.01
+"""Relative spread of bones' lengths over windows below which there is nothing to tell."""
+SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+
+def posterior_means(model: Any, batch: Mapping[str, Any], seed: int) -> dict[str, Tensor]:
+    """Means of the guide's draws, (N, D) of a static latent and (N, T, D) of a local one."""
+    found: dict[str, list[Tensor]] = {}
+    with reproducibly(model, seed):
+        for start in range(0, len(batch["x"]), CHUNK):
+            data = on_device_of(model, model.read(rows(batch, slice(start, start + CHUNK))))
+            drawn = [model.guide(data) for _ in range(DRAWS)]
+            for name in model.latents:
+                found.setdefault(name, []).append(torch.stack([each[name] for each in drawn]).mean(0).cpu())
+    return {name: torch.cat(values) for name, values in found.items()}
+
+
+def halves(labels: Sequence[str], places: Tensor) -> Tensor:
+    """(N,) True at windows of every other clip of each label, which a probe is fitted to."""
+    counts: dict[str, int] = {}
+    fitted: dict[int, bool] = {}
+    for label, place in zip(labels, places.tolist(), strict=True):
+        if place not in fitted:
+            fitted[place] = counts.setdefault(label, 0) % 2 == 0
+            counts[label] += 1
+    return torch.tensor([fitted[place] for place in places.tolist()])
+
+
+def read_label(features: Tensor, labels: Sequence[str], fitted: Tensor) -> Tensor:
+    """Whether a logistic probe of features (N, F) is right, of the windows it was not fitted to."""
+    names = sorted({*labels})
+    truth = torch.tensor([names.index(label) for label in labels])
+    x = standardised(features, fitted)
+    weights = torch.zeros(x.shape[1], len(names), dtype=x.dtype, requires_grad=True)
+    bias = torch.zeros(len(names), dtype=x.dtype, requires_grad=True)
+    search = torch.optim.LBFGS([weights, bias], max_iter=200, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        search.zero_grad()
+        value = functional.cross_entropy(x[fitted] @ weights + bias, truth[fitted]) + PENALTY * weights.square().sum()
+        value.backward()
+        return value
+
+    search.step(loss)
+    return ((x @ weights + bias).argmax(1) == truth)[~fitted].double()
+
+
+def read_lengths(features: Tensor, lengths: Tensor, fitted: Tensor) -> float:
+    """Share of the variance of lengths (N, B) that a ridge probe tells, of the windows it was not fitted to."""
+    x = standardised(features, fitted)
+    mean = lengths[fitted].mean(0)
+    gram = x[fitted].mT @ x[fitted] + PENALTY * len(x) * torch.eye(x.shape[1], dtype=x.dtype)
+    weights = torch.linalg.solve(gram, x[fitted].mT @ (lengths[fitted] - mean))
+    left = (lengths - mean - x @ weights)[~fitted].square().sum()
+    return float(1 - left / (lengths - lengths[~fitted].mean(0))[~fitted].square().sum())
+
+
+def standardised(features: Tensor, fitted: Tensor) -> Tensor:
+    """Features of mean 0 and variance 1 over what a probe is fitted to; those that do not vary are 0."""
+    x = features.double()
+    spread, mean = torch.std_mean(x[fitted], 0)
+    return (x - mean) / spread.clamp(min=1e-6)
+
+
+def probes(model: Any, windows: Windows, labels: Sequence[str], seed: int) -> list[list[str]]:
+    """For each thing to read, and for each label: the share of windows told rightly; then the bones."""
+    batch = windows.all()
+    inferred, x = posterior_means(model, batch, seed), batch["x"]
+    features = {name: value if value.dim() == 2 else value.mean(1) for name, value in inferred.items()}
+    features["mean and spread of poses"] = torch.cat([x.mean(1), x.std(1)], 1)
+    places = clip_places(windows.keys)
+    lengths = windows.skeleton.bone_lengths(windows.positions(x)).mean(1).double()
+    told = {label: windows.labels(label) for label in labels}
+    lines = []
+    for name, values in features.items():
+        cells = []
+        for label in labels:
+            fitted = halves(told[label], places)
+            cells.append(share(read_label(values, told[label], fitted), places[~fitted]))
+        varied = float((lengths.std(0) / lengths.mean(0)).mean())
+        fitted = halves([""] * len(x), places)
+        cells.append(f"{read_lengths(values, lengths, fitted):.2f}" if varied > ONE_BODY else "–")
+        lines.append([name, *cells])
+    return lines
+
+
+def share(right: Tensor, places: Tensor) -> str:
+    """A mean over windows with its standard error, clustered by clip."""
+    _, inverse = np.unique(places.numpy(), return_inverse=True)
+    weights = np.bincount(inverse).astype(float)
+    mean, deviations = linearised(np.bincount(inverse, right.numpy()) / weights, weights)
+    return f"{float(mean):.3f} ± {clustered_variance(deviations) ** 0.5:.3f}"
+
+
+def swaps(model: Any, windows: Windows, label: str, count: int, seed: int) -> list[list[str]]:
+    """By latent and share of the way to another's: how far the mean pose and the motion about it have gone, in mm."""
+    batch, named = windows.all(), np.array(windows.labels(label))
+    draw = np.random.default_rng(seed)
+    first = draw.permutation(len(named))[:count]
+    second = np.array([draw.choice(np.flatnonzero(named != named[place])) for place in first])
+    ours, theirs = (rows(batch, torch.from_numpy(places)) for places in (first, second))
+    goal = windows.positions(theirs["x"]).mean(1)
+    lines = []
+    with reproducibly(model, seed):
+        own, other = (model.guide(on_device_of(model, model.read(each))) for each in (ours, theirs))
+
+        def made(latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+            joints = windows.positions(decode(model, ours, {**own, **latents}, True).cpu())
+            mean = joints.mean(1)
+            return mean, joints - mean[:, None]
+
+        pose, motion = made({})
+        for latent in model.latents:
+            for amount in SHARES if own[latent].dim() == 2 else (1.0,):
+                mean, about = made({latent: torch.lerp(own[latent], other[latent], amount)})
+                moved = (mean - pose, about - motion, mean - goal)
+                lines.append([latent, f"{amount:g}", *(f"{1000 * each.norm(dim=-1).mean():.0f}" for each in moved)])
+    return lines
+
+
+def main(
+    runs: tyro.conf.Positional[tuple[Path, ...]],
+    page: Path | None = None,
+    labels: tuple[str, ...] = ("style", "content"),
+    splits: tuple[str, ...] = ("train", "test"),
+    count: int = 200,
+    seed: int = 0,
+) -> None:
+    """Print the tables.
+
+    Args:
+        runs: their directories.
+        page: where to write them, between marks.
+        labels: what probes are to tell.
+        splits: on whose windows; a probe is fitted on each anew.
+        count: windows that are decoded with a latent of another.
+        seed: of all draws.
+    """
+    told, swapped = [], []
+    for path in runs:
+        run = dvae.load(path)
+        for split in splits:
+            windows = run.data.windows(split)
+            told += [[path.name, split, *line] for line in probes(run.model, windows, labels, seed)]
+        windows = run.data.windows("test")
+        swapped += [[path.name, *line] for line in swaps(run.model, windows, labels[0], count, seed)]
+    read = table(["", "windows", "probe of", *labels, "bone lengths, R²"], told)
+    moved = ["mean pose moved, mm", "motion about it moved, mm", "mean pose from theirs, mm"]
+    header = ["", "latent", "share of another's", *moved]
+    write(page, read, table(header, swapped))
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
