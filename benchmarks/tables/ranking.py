@@ -110,8 +110,7 @@ def fit(data: MotionData, name: str, options: Mapping[str, Any], seed: int, runs
     Raises:
         RuntimeError: the run failed.
     """
-    told = dict(options)
-    training = {key: told.pop(key) for key in [*told] if key in Training.__dataclass_fields__ and key != "self_feeding"}
+    told, training = parted(options)
     method = told.pop("method", name)
     if method in ("gsps", "hit-dvae") and prior is not None:
         told["pose_prior_run"] = str(prior.absolute())
@@ -121,6 +120,16 @@ def fit(data: MotionData, name: str, options: Mapping[str, Any], seed: int, runs
     if outcome.status == "failed":
         raise RuntimeError(str(outcome))
     return runs / f"{name}-seed{seed}"
+
+
+def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Options of a method, and those of its training."""
+    # methods have options of that name, which make the schedule of training's
+    training = Training.__dataclass_fields__.keys() - {"self_feeding"}
+    return (
+        {name: value for name, value in options.items() if name not in training},
+        {name: value for name, value in options.items() if name in training},
+    )
 
 
 def score(

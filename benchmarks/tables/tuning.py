@@ -23,7 +23,7 @@ from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
 from .pages import table, write
-from .ranking import JOINTS, fitted_judges, judging
+from .ranking import FUTURES, JOINTS, fitted_judges, judging, parted
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
@@ -55,8 +55,7 @@ class Section:
 
     def of(self, case: str, prior: Path) -> tuple[Any, Training]:
         """The method of a case, and its training."""
-        options = dict(self.cases[case])
-        told = {name: options.pop(name) for name in [*options] if name in Training.__dataclass_fields__}
+        options, told = parted(self.cases[case])
         method = options.pop("method", self.method)
         if self.judged and options.get("pose_prior") != 0:
             options["pose_prior_run"] = str(prior)
@@ -72,6 +71,8 @@ ABLATED: dict[str, dict[str, Any]] = {
 }
 """TrajeVAE and its ablations; latents of all have 15 coefficients but those in time, which have 60 of a quarter."""
 BETAS = (1e-4, 1e-3, 1e-2)
+ALONE = ("cvae", "pose-knows", "mt-vae", "rhp", "erd", "aclstm", "moglow", "srnn")
+"""Baselines that are tuned; the others are a CVAE but for its prior, its objective or a second stage."""
 SECTIONS = {
     "hit-dvae": Section(
         "hit-dvae",
@@ -100,8 +101,6 @@ SECTIONS = {
             "diversity 0": {"diversity": (0.0,)},
             "20 coefficients": {"coefficients": 20},
             "rate 1e-3": {"learning_rate": 1e-3},
-            "6 x 6 draws": {"draws": (6, 6)},
-            "width 256": {"width": 256},
             "6500 steps": {"steps": 6500},
         },
         judged=True,
@@ -129,6 +128,15 @@ SECTIONS = {
             "0.1, 12000 steps": {"steps": 12000},
         },
         protocol=PATHS,
+    ),
+    "baselines": Section(
+        "cvae",
+        Training(batch_size=32, decay=0.5, validate_every=500),
+        {
+            f"{name}, {rate:g}": {"method": name, **FUTURES[name], "learning_rate": rate}
+            for name in ALONE
+            for rate in (1e-3, 3e-3)
+        },
     ),
 }
 """What was tried, by method."""
