@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import statistics
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -51,38 +51,73 @@ PATHS: dict[str, dict[str, Any]] = {"trajevae": {}, "cvae-rnn": {}, "motion-infi
 
 
 @dataclass(frozen=True)
+class View:
+    """What of the test windows is predicted, and how.
+
+    Args:
+        given: joints whose paths are known, those of `JOINTS` first; None where methods take no paths.
+        single: one motion, at the mean of the prior, in place of draws.
+        exchanged: metres within which the given joints are in another window's pose, from which motions begin; 0 for
+            the window's own.
+        observed: frames, in place of the protocol's.
+    """
+
+    given: int | None = None
+    single: bool = False
+    exchanged: float = 0.0
+    observed: int | None = None
+
+    def windows(self, data: MotionData, split: str) -> Any:
+        """Windows of a part of the data, and what is told of them."""
+        observed = self.observed or data.protocol.observed
+        windows = motion.windows(data.motion, replace(data.protocol, observed=observed), split)
+        if self.given is None:
+            return windows
+        others = [name for name in windows.joints if name not in JOINTS]
+        told = windows.given([*JOINTS, *others][: self.given])
+        return motion.Exchanged(told, self.exchanged) if self.exchanged and split == "test" else told
+
+    def evaluate(self, samples: int) -> dict[str, Any]:
+        """Arguments of `dvae.evaluate`."""
+        return {"samples": 1, "options": {"temperature": 0}} if self.single else {"samples": samples}
+
+    def __str__(self) -> str:
+        """The end of the names of its evaluations."""
+        told = [f"{name}-{value:g}" for name, value in vars(self).items() if value]
+        return "-".join(["", *told])
+
+
+@dataclass(frozen=True)
 class Set:
-    """A protocol, the file of its clips below the folder of data, and what is fitted."""
+    """A protocol, the file of its clips below the folder of data, and what is fitted and scored."""
 
     file: str
     methods: Mapping[str, Mapping[str, Any]]
-    given: tuple[int, ...] = ()
-    """Numbers of joints whose paths are known, of `JOINTS`; none where methods take no paths."""
-
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """The evaluations of a run."""
-        return self.given or (0,)
-
-    def told(self, windows: motion.Windows, count: int) -> motion.Windows:
-        """Windows with so many paths."""
-        return windows.given(JOINTS[:count]) if self.given else windows
+    views: tuple[View, ...] = (View(),)
+    judges: tuple[str, ...] = ()
 
 
 BANDAI, CMU = "bandai/bandai2.npz", "cmu/cmu8.npz"
+GIVEN = tuple(View(count) for count in range(5))
 SETS = {
-    "bandai2-by-style": Set(BANDAI, FUTURES),
-    "bandai2-by-take": Set(BANDAI, FUTURES),
-    "cmu8": Set(CMU, FUTURES),
-    "bandai2-trajectories": Set(BANDAI, PATHS, (0, 1, 2, 3, 4)),
-    "cmu8-trajectories": Set(CMU, PATHS, (0, 1, 2, 3, 4)),
+    "bandai2-by-style": Set(BANDAI, FUTURES, judges=("prior", "content", "style")),
+    "bandai2-by-take": Set(BANDAI, FUTURES, judges=("prior", "content")),
+    "cmu8": Set(CMU, FUTURES, judges=("prior", "content")),
+    "bandai2-trajectories": Set(BANDAI, PATHS, GIVEN),
+    "cmu8-trajectories": Set(CMU, PATHS, GIVEN),
 }
 JOINTS = ("RToe", "LToe", "LWrist", "RWrist")
-"""Whose paths are given, the first none to four of them, as in TrajeVAE's tables."""
+"""Whose paths are given first, as in TrajeVAE's tables."""
 JUDGES: dict[str, tuple[str, dict[str, Any], Training]] = {
     "prior": ("pose-prior", {"heading": True}, Training(steps=1000, learning_rate=0.01, decay=0.8)),
     "content": ("action-classifier", {}, Training(steps=3000, learning_rate=3e-3, decay=0.5, validate_every=250)),
+    "style": (
+        "action-classifier",
+        {"label": "style"},
+        Training(steps=1500, learning_rate=3e-3, decay=0.5, validate_every=250),
+    ),
 }
+"""Methods that judge, their options and their training."""
 COLUMNS = ("energy score", "ADE", "FDE", "ADEm", "MMADE", "APD", "APDE", "CMD", "limb stretch", "limb jitter")
 JUDGED = ("ACC content", "FID content", "pose NLL")
 RANKED = "energy score"
@@ -90,11 +125,12 @@ RANKED = "energy score"
 NEIGHBOURS = "nearest neighbours"
 
 
-def fitted_judges(data: MotionData, runs: Path) -> dict[str, Path]:
-    """Run directories of the pose prior and the classifier of contents, of the training clips; fitted once."""
-    for name, (method, options, training) in JUDGES.items():
+def fitted_judges(data: MotionData, runs: Path, names: Sequence[str] = ("prior", "content")) -> dict[str, Path]:
+    """Run directories of judges of the training clips, fitted once."""
+    for name in names:
+        method, options, training = JUDGES[name]
         sweep({name: registry.judges()[method](**options)}, data, runs / "judges", (0,), training, jobs=1)
-    return {name: runs / "judges" / f"{name}-seed0" for name in JUDGES}
+    return {name: runs / "judges" / f"{name}-seed0" for name in names}
 
 
 def judging(judged: Mapping[str, Path]) -> Any:
@@ -104,22 +140,22 @@ def judging(judged: Mapping[str, Path]) -> Any:
     return partial(motion.scores, pose_prior=prior, classifiers=models)
 
 
-def fit(data: MotionData, name: str, options: Mapping[str, Any], seed: int, runs: Path, prior: Path | None) -> Path:
+def fit(data: MotionData, row: str, options: Mapping[str, Any], seed: int, runs: Path, prior: Path | None) -> Path:
     """The run directory of a method, fitted once; second stages stand on the first of the same seed.
 
     Raises:
         RuntimeError: the run failed.
     """
     told, training = parted(options)
-    method = told.pop("method", name)
-    if method in ("gsps", "hit-dvae") and prior is not None:
+    method = told.pop("method", row)
+    if method in ("gsps", "hit-dvae") and prior is not None and told.get("pose_prior") != 0:
         told["pose_prior_run"] = str(prior.absolute())
     if method in ("dlow", "dsf"):
         told["cvae_run"] = str(fit(data, "cvae", FUTURES["cvae"], seed, runs, prior).absolute())
-    (outcome,) = sweep({name: dvae.method(method, **told)}, data, runs, (seed,), training, jobs=1)
+    (outcome,) = sweep({folder(row): dvae.method(method, **told)}, data, runs, (seed,), training, jobs=1)
     if outcome.status == "failed":
         raise RuntimeError(str(outcome))
-    return runs / f"{name}-seed{seed}"
+    return runs / f"{folder(row)}-seed{seed}"
 
 
 def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -132,40 +168,57 @@ def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     )
 
 
-def score(
-    file: Path, models: Mapping[str, Any], windows: motion.Windows, training: Any, scores: Any, samples: int
+def folder(row: str) -> str:
+    """What the runs of a row are called, before their seed."""
+    return row.replace(", ", "-").replace(" ", "-")
+
+
+def work(
+    data: Path,
+    runs: Path,
+    name: str,
+    methods: Mapping[str, Mapping[str, Any]],
+    views: Mapping[str, Sequence[View]],
+    seeds: Sequence[int],
+    samples: int,
 ) -> None:
-    """Evaluates once; without a model the reference rows."""
-    if not file.exists():
-        options: dict[str, Any] = {} if models else {"references": True, "training_windows": training}
-        dvae.evaluate(
-            models, windows, scores=scores, samples=samples, batch_size=64, **{"references": False, **options}
-        ).save(file)
+    """Fits and scores what is not there yet, seed by seed, so that every method has one before any has two.
 
-
-def work(data: Path, runs: Path, name: str, methods: Sequence[str], seeds: Sequence[int], samples: int) -> None:
-    """Fits and scores what is not there yet, seed by seed, so that every method has one before any has two."""
-    chosen = SETS[name]
-    opened = MotionData.open(data / chosen.file, motion.PROTOCOLS[name])
-    judged = fitted_judges(opened, runs / name) if opened.protocol.root == "drop" else {}
-    windows, training = opened.windows("test"), opened.windows("train+validation")
+    Args:
+        data: the folder of files.
+        runs: of all sets.
+        name: of the set.
+        methods: by the rows that they are.
+        views: in which each is scored; the reference rows in all of them.
+        seeds: of every method.
+        samples: futures of a window.
+    """
+    opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[name])
+    judged = fitted_judges(opened, runs / name, SETS[name].judges)
     scores = judging(judged)
-    for count in chosen.counts:
-        given = chosen.told(windows, count)
-        score(runs / name / f"references{stored(count)}", {}, given, training, scores, samples)
+
+    def score(path: Path, row: str | None, view: View) -> None:
+        file = evaluation(path, view)
+        if not file.exists():
+            models = {} if row is None else {row: load(path).model}
+            known: dict[str, Any] = {"training_windows": view.windows(opened, "train+validation")}
+            options = {"references": False} if models else known
+            windows, told = view.windows(opened, "test"), view.evaluate(samples)
+            dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **told).save(file)
+
+    for view in dict.fromkeys(view for each in views.values() for view in each):
+        if not (view.single or view.exchanged):
+            score(runs / name, None, view)
     for seed in seeds:
-        for method, options in chosen.methods.items():
-            if not methods or method in methods:
-                path = fit(opened, method, options, seed, runs / name, judged.get("prior"))
-                for count in chosen.counts:
-                    file = path / f"evaluation{stored(count)}"
-                    found = {} if file.exists() else {method: load(path).model}
-                    score(file, found, chosen.told(windows, count), None, scores, samples)
+        for row, options in methods.items():
+            path = fit(opened, row, options, seed, runs / name, judged.get("prior"))
+            for view in views[row]:
+                score(path, row, view)
 
 
-def stored(count: int) -> str:
-    """The end of the name of the file of an evaluation with so many paths given."""
-    return f"-{count}.json" if count else ".json"
+def evaluation(path: Path, view: View) -> Path:
+    """The file of scores of a run, or of the reference rows of a set."""
+    return path / f"evaluation{view}.json"
 
 
 @dataclass(frozen=True)
@@ -188,26 +241,30 @@ class Entry:
         return crossed if self.minutes else replace(crossed, seeds=0.0, rest=0.0, count=sys.maxsize)
 
 
-def entries(runs: Path, name: str, count: int) -> dict[str, Entry]:
-    """What has been scored on a set: the reference rows, and every method with its seeds.
+def entries(runs: Path, name: str, view: View, methods: Iterable[str]) -> dict[str, Entry]:
+    """What has been scored on a set: the reference rows, and methods with their seeds.
 
     Raises:
         ValueError: evaluations of other windows, samples, or judges.
     """
-    file = runs / name / f"references{stored(count)}"
-    if not file.exists():
-        return {}
-    references = Evaluation.load(file)
-    found = {row: Entry([replace(references, rows={row: value})], []) for row, value in references.rows.items()}
-    for method in SETS[name].methods:
-        paths = sorted(path.parent for path in (runs / name).glob(f"{method}-seed*/evaluation{stored(count)}"))
-        scored = [Evaluation.load(path / f"evaluation{stored(count)}") for path in paths]
-        if any(same(each) != same(references) for each in scored):
-            raise ValueError(
-                f"evaluations of {method} below {runs / name} are of other windows, samples, seed or judges"
-            )
+    found, basis = {}, None
+    file = evaluation(runs / name, view)
+    if file.exists():
+        references = Evaluation.load(file)
+        basis = same(references)
+        found = {row: Entry([replace(references, rows={row: value})], []) for row, value in references.rows.items()}
+    for row in methods:
+        files = sorted((runs / name).glob(f"{folder(row)}-seed*/evaluation{view}.json"))
+        scored = [Evaluation.load(file) for file in files]
+        for each in scored:
+            basis = basis or same(each)
+            if same(each) != basis:
+                raise ValueError(
+                    f"evaluations of {row} below {runs / name} are of other windows, samples, seed or judges"
+                )
         if scored:
-            found[method] = Entry(scored, [Run(path).state.get("processor_seconds", 0.0) / 60 for path in paths])
+            times = [Run(file.parent).state.get("processor_seconds", 0.0) / 60 for file in files]
+            found[row] = Entry(scored, times)
     return found
 
 
@@ -260,14 +317,15 @@ def main(
         page: whose tables; without one they are printed.
     """
     for name in sets:
+        chosen = SETS[name]
         if data is not None:
-            work(data, runs, name, methods, seeds, samples)
+            named = {row: options for row, options in chosen.methods.items() if not methods or row in methods}
+            work(data, runs, name, named, dict.fromkeys(named, chosen.views), seeds, samples)
         tables = []
-        for count in SETS[name].counts:
-            if found := entries(runs, name, count):
-                judged = JUDGED if motion.PROTOCOLS[name].root == "drop" else ()
-                heading = f"With {count} paths given:\n\n" if SETS[name].given else ""
-                tables.append(heading + ranking(found, [*COLUMNS, *judged]))
+        for view in chosen.views:
+            if found := entries(runs, name, view, chosen.methods):
+                heading = "" if view.given is None else f"With {view.given} paths given:\n\n"
+                tables.append(heading + ranking(found, [*COLUMNS, *(JUDGED if chosen.judges else ())]))
         if tables:
             write(page, *tables, name=name)
 

@@ -23,7 +23,7 @@ from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
 from .pages import table, write
-from .ranking import FUTURES, JOINTS, fitted_judges, judging, parted
+from .ranking import FUTURES, JOINTS, fitted_judges, folder, judging, parted
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
@@ -205,9 +205,8 @@ def main(
         columns = COLUMNS if section.protocol is TUNING else PATH_COLUMNS
         for case in section.cases:
             method, training = section.of(case, prior)
-            folder = case.replace(", ", "-").replace(" ", "-")
-            sweep({folder: method}, own, runs / name, section.seeds, training, jobs)
-            scores = [score(runs / name / f"{folder}-seed{seed}", own, judged) for seed in section.seeds]
+            sweep({folder(case): method}, own, runs / name, section.seeds, training, jobs)
+            scores = [score(runs / name / f"{folder(case)}-seed{seed}", own, judged) for seed in section.seeds]
             lines.append([case, *(shown(scores, column) for column in columns)])
             print(name, *lines[-1], sep=" | ", flush=True)
         write(page, table([name, *columns], lines), name=name)

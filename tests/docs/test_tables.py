@@ -26,6 +26,7 @@ from benchmarks.tables import (
     occlusion,
     overview,
     pages,
+    papers,
     ranking,
     rotations,
     static,
@@ -403,7 +404,7 @@ def test_ranking(folder, page, monkeypatch):
     methods = {"cvae": {"width": 4, "latent": 2}, "srnn": {"width": 4, "latent": 2, "warm_up": 1}}
     small = {name: {**options, "steps": 2, "batch_size": 4} for name, options in methods.items()}
     monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", small)})
-    monkeypatch.setattr(ranking, "fitted_judges", lambda data, runs: {})
+    monkeypatch.setattr(ranking, "fitted_judges", lambda *arguments: {})
     page.write_text(page.read_text().replace("tables", "simulated"))
     runs, options = folder / "ranked", {"page": page, "samples": 2, "sets": ("simulated",)}
     ranking.main(runs, folder, seeds=(0,), **options)
@@ -422,6 +423,41 @@ def test_ranking(folder, page, monkeypatch):
         assert abs(float(row[4].split()[0]) - (energy - before)) < 0.0016  # of three rounded numbers
 
 
+def test_papers(folder, page, monkeypatch):
+    """Rows, in views that some have alone; what a change does is the difference of its rows, and printed cells stay."""
+    small = {"latent": 2, "width": 4, "feedforward": 4, "steps": 2, "batch_size": 4}
+    paper = papers.Paper(
+        "simulated-trajectories",
+        {"trajevae": small, "whole poses": {**small, "method": "trajevae", "complement": False}},
+        (("APD", "ADE"),),
+        {"+ masked poses": ("trajevae", "whole poses")},
+        ("ADE",),
+        papers.printed("APD,ADE", "TrajeVAE, 0 | 8.462 .518"),
+        (ranking.View(0), ranking.View(1)),
+        {"single": ([ranking.View(1, single=True)], ["trajevae"]), "exchanged": ([ranking.View(1, exchanged=9.0)], [])},
+    )
+    monkeypatch.setattr(papers, "PAPERS", {"page": paper})
+    monkeypatch.setattr(ranking, "SETS", {paper.set: ranking.Set("people.npz", {})})
+    monkeypatch.setattr(ranking, "JOINTS", ("RFoot",))
+    monkeypatch.setattr(papers, "JOINTS", ("RFoot",))
+    page.write_text(page.read_text().replace("tables", "rows"))
+    for data in (folder, None):
+        papers.main(folder / "papers", data, ("page",), samples=3, seeds=(0, 1), pages=page.parent)
+    page.write_text(page.read_text().replace("rows", "tables"))
+    rows, compared, more, single = tables(page)
+    named = {(row[0], row[1]): row[2:] for row in rows[1:]}
+    runs = {(name, count) for name in paper.rows for count in "01"}
+    assert named.keys() == {("zero velocity", ""), ("nearest neighbours", ""), ("*TrajeVAE*", "0"), *runs}
+    assert named["*TrajeVAE*", "0"] == ["", "8.462", ".518"]
+    ades = {key: float(named[key][2].split()[0]) for key in runs}
+    for count, change in zip("01", compared[1][2:], strict=True):
+        assert abs(float(change.split()[0]) - (ades["trajevae", count] - ades["whole poses", count])) < 0.0016
+    assert more[0][2:] == ["RFoot too"]
+    assert float(more[1][2].split()[0]) == pytest.approx(ades["trajevae", "1"] - ades["trajevae", "0"], abs=0.0016)
+    assert [row[:2] for row in single[1:]] == [["trajevae", "1"]]
+    assert single[1][3].startswith("0.000")  # one motion has no diversity
+
+
 def test_tuning(folder, page, monkeypatch):
     """Cases of one method, and of another with paths; scored once."""
     training = Training(steps=2, batch_size=4)
@@ -438,7 +474,7 @@ def test_tuning(folder, page, monkeypatch):
         "SAMPLES": 2,
     }.items():
         monkeypatch.setattr(tuning, name, value)
-    monkeypatch.setattr(tuning, "fitted_judges", lambda data, runs: {})
+    monkeypatch.setattr(tuning, "fitted_judges", lambda *arguments: {})
     for name in sections:
         page.write_text(
             "\n".join([page.read_text(), *(mark.replace("tables", name) for mark in (pages.BEGIN, pages.END))])

@@ -1,0 +1,304 @@
+"""Fits and scores the methods of three papers with their ablations, and writes the papers' tables with these beside.
+
+What is fitted stands in the folders of `benchmarks.tables.ranking`, which fits the methods themselves; options and
+training are those of the presets but for what a row is called after. The script goes on where it was stopped, and
+without `--data` fits nothing: tables are of the runs that are there. Printed numbers are of other data.
+
+Sources: Bie et al., 2022, arXiv 2204.01565, tables 1 to 3; Mao, Liu and Salzmann, 2021, arXiv 2108.08422, tables 1 and
+3; Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, tables 1 and 3 to 6, and figure 6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from .pages import table, write
+from .ranking import JOINTS, Entry, View, cell, entries, work
+
+ERRORS = ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm")
+REAL = ("APDE", "CMD", "limb stretch", "limb jitter", "pose NLL")
+
+
+def printed(columns: str, text: str) -> dict[str, dict[str, str]]:
+    """A table of a paper: rows by their names, cells by columns."""
+    lines = (line.split("|") for line in text.strip().splitlines())
+    return {name.strip(): dict(zip(columns.split(","), cells.split(), strict=True)) for name, cells in lines}
+
+
+@dataclass(frozen=True)
+class Paper:
+    """A paper's tables.
+
+    Args:
+        set: of `SETS`, on which rows are fitted.
+        rows: to options of the method, as of `ranking.FUTURES`; the first is the paper's own.
+        columns: of each table of scores.
+        changes: to the rows with and without what is compared.
+        compared: columns of the table of changes.
+        printed: rows of the paper.
+        views: of all rows; those with paths have a line for each.
+        further: views of some rows, each of which has a table of its own.
+    """
+
+    set: str
+    rows: Mapping[str, Mapping[str, Any]]
+    columns: Sequence[Sequence[str]]
+    changes: Mapping[str, tuple[str, str]]
+    compared: Sequence[str]
+    printed: Mapping[str, Mapping[str, str]]
+    views: Sequence[View] = (View(),)
+    further: Mapping[str, tuple[Sequence[View], Sequence[str]]] = field(default_factory=dict)
+
+    def views_of(self, row: str) -> list[View]:
+        """In which a row is scored."""
+        return [*self.views, *(view for views, rows in self.further.values() if row in rows for view in views)]
+
+
+HIT, COPYING = "hit-dvae", {"nearest": False, "residual": 0.0}
+WITHOUT: dict[str, dict[str, Any]] = {
+    "no scheduled sampling": {"self_feeding": 0.0},
+    "no attention": {"attention": False},
+    "no w": {"static": 0},
+    "neither": {"attention": False, "static": 0},
+    "no copies": COPYING,
+    "no copies, no attention": {**COPYING, "attention": False},
+    "observed frames fed": {"feed_observed": True},
+    "weights read literally": {"kl_local": 0.0067, "kl_static": 0.1},
+}
+"""Ablations of HiT-DVAE: the paper's, then ours."""
+TERMS: dict[str, dict[str, Any]] = {
+    "no pose prior": {"pose_prior": 0.0},
+    "no angles": {"angles": 0.0},
+    "no diversity": {"diversity": (0.0,)},
+    "no reconstruction": {"reconstruction": 0.0},
+    "no multimodal": {"multimodal": 0.0},
+}
+"""Of GSPS's loss, each left out by itself."""
+FULL, WHOLE, TIME, STANDARD = "trajevae", "whole poses", "in time", "standard prior"
+PAPERS = {
+    "hit-dvae": Paper(
+        "bandai2-by-style",
+        {
+            HIT: {},
+            **{name: {"method": HIT, **options} for name, options in WITHOUT.items()},
+            "gsps": {},
+            "dlow": {},
+            "srnn": {"self_feeding": 1.0},
+        },
+        (("ACC content", "FID content", "FID style", "APD", "energy score", *REAL), ERRORS),
+        {name: (name, HIT) for name in (*WITHOUT, "gsps", "dlow", "srnn")},
+        ("ACC content", "FID content", "APD", "energy score", "ADE", "FDE", "MMADE", "ADEm"),
+        printed(
+            "ACC content,FID content,APD,ADE,FDE,MMADE,MMFDE,ADEm,FDEm,MMADEm,MMFDEm",
+            """
+            HumanEva-I: DLow | .527 3.472 4.853 .248 .262 .361 .337 .577 .717 .646 .753
+            HumanEva-I: GSPS | .516 1.604 5.825 .233 .244 .343 .311 .686 .794 .735 .825
+            HumanEva-I: HiT-DVAE | .726 .089 4.721 .282 .261 .335 .290 .579 .665 .610 .683
+            HumanEva-I: no scheduled sampling | .696 .359 4.777 .314 .300 .358 .315 .596 .708 .624 .727
+            HumanEva-I: no attention | .729 .264 3.921 .265 .243 .348 .295 .510 .604 .569 .650
+            HumanEva-I: no w | .740 .306 4.244 .287 .263 .360 .303 .535 .662 .591 .689
+            HumanEva-I: neither | .765 1.262 .023 .538 .621 .594 .660 .538 .622 .595 .662
+            Human3.6M: DLow | .659 1.412 11.741 .425 .518 .495 .531 .896 1.284 .948 1.289
+            Human3.6M: GSPS | .650 2.030 14.757 .389 .496 .476 .525 1.013 1.372 1.065 1.381
+            Human3.6M: HiT-DVAE | .700 1.708 8.942 .472 .505 .497 .514 .804 1.034 .812 1.028
+            Human3.6M: no scheduled sampling | .650 1.751 10.339 .477 .513 .501 .519 .867 1.108 .877 1.101
+            Human3.6M: no attention | .705 1.475 7.189 .537 .569 .555 .567 .805 1.060 .826 1.056
+            Human3.6M: no w | .711 1.565 6.249 .528 .582 .557 .590 .735 .942 .753 .942
+            Human3.6M: neither | .642 .659 2.688 .752 .892 .787 .896 .897 1.184 .934 1.186
+            """,
+        ),
+        further={"observed": ((View(observed=5), View(observed=30)), (HIT,))},
+    ),
+    "gsps": Paper(
+        "bandai2-by-style",
+        {
+            "gsps": {},
+            **{name: {"method": "gsps", **options} for name, options in TERMS.items()},
+            "diversity as in the paper": {"method": "gsps", "diversity": (5.0, 10.0)},
+            "20 coefficients": {"method": "gsps", "coefficients": 20},
+        },
+        (("APD", "energy score", *ERRORS[:4], *REAL),),
+        {name: (name, "gsps") for name in (*TERMS, "diversity as in the paper", "20 coefficients")},
+        ("APD", "energy score", *ERRORS[:4], "pose NLL"),
+        printed(
+            "APD,ADE,FDE,MMADE,MMFDE,pose NLL",
+            """
+            Human3.6M: GSPS | 14.757 .389 .496 .476 .525 74.872
+            Human3.6M: no pose prior | 15.257 .389 .497 .477 .527 251.186
+            Human3.6M: no angles | 19.608 .397 .534 .506 .575 97.774
+            Human3.6M: no diversity | 6.318 .370 .488 .478 .529 64.731
+            Human3.6M: no reconstruction | 20.030 .479 .562 .513 .569 89.726
+            Human3.6M: no multimodal | 18.079 .394 .538 .520 .587 91.977
+            HumanEva-I: GSPS | 5.826 .233 .244 .343 .331 103.306
+            HumanEva-I: no pose prior | 7.574 .245 .293 .416 .430 363.847
+            HumanEva-I: no angles | 6.569 .235 .276 .406 .410 119.673
+            HumanEva-I: no diversity | 2.048 .214 .259 .384 .398 75.375
+            HumanEva-I: no reconstruction | 6.778 .567 .625 .606 .633 109.777
+            HumanEva-I: no multimodal | 6.474 .234 .283 .415 .421 113.630
+            """,
+        ),
+    ),
+    "trajevae": Paper(
+        "bandai2-trajectories",
+        {
+            FULL: {},
+            WHOLE: {"method": FULL, "complement": False},
+            TIME: {"method": FULL, "complement": False, "cosine": False, "latent": 8},
+            STANDARD: {"method": FULL, "complement": False, "cosine": False, "latent": 8, "learned_prior": False},
+            "cvae-rnn": {},
+        },
+        (("APD", "energy score", *ERRORS[:4], "path error", "global ADE", "limb stretch", "limb jitter"),),
+        {
+            "+ learned prior": (TIME, STANDARD),
+            "+ cosine transform": (WHOLE, TIME),
+            "+ masked poses": (FULL, WHOLE),
+            "over CVAE-RNN": (FULL, "cvae-rnn"),
+        },
+        ("ADE", "APD"),
+        printed(
+            "APD,ADE,FDE,MMADE,MMFDE",
+            """
+            TrajeVAE, 0 | 8.462 .518 .678 .596 .703
+            TrajeVAE, 1 | 6.641 .463 .602 .581 .672
+            TrajeVAE, 2 | 6.334 .450 .581 .581 .668
+            TrajeVAE, 3 | 5.037 .375 .488 .579 .664
+            TrajeVAE, 4 | 4.069 .325 .428 .584 .674
+            + masked poses, 0 | 8.936 .539 .724 .616 .748
+            + masked poses, 1 | 6.803 .472 .623 .594 .695
+            + masked poses, 2 | 6.286 .448 .587 .587 .681
+            + masked poses, 3 | 4.861 .361 .474 .585 .674
+            + masked poses, 4 | 3.857 .312 .412 .594 .689
+            + cosine transform, 0 | 9.483 .560 .742 .634 .762
+            + cosine transform, 1 | 7.014 .487 .637 .602 .703
+            + cosine transform, 2 | 6.561 .465 .604 .594 .688
+            + cosine transform, 3 | 5.367 .389 .503 .590 .681
+            + cosine transform, 4 | 4.524 .338 .443 .595 .692
+            + learned prior, 0 | 1.860 .502 .694 .611 .740
+            + learned prior, 1 | 1.749 .448 .622 .618 .753
+            + learned prior, 2 | 1.719 .418 .577 .616 .750
+            + learned prior, 3 | 1.725 .327 .449 .632 .767
+            + learned prior, 4 | 1.720 .281 .385 .646 .783
+            standard prior, 0 | 1.237 .525 .749 .634 .801
+            standard prior, 1 | 1.220 .481 .695 .640 .811
+            standard prior, 2 | 1.217 .466 .672 .642 .812
+            standard prior, 3 | 1.248 .376 .549 .639 .802
+            standard prior, 4 | 1.261 .339 .498 .641 .805
+            CVAE-RNN, 0 | 9.579 .611 .723 .639 .724
+            CVAE-RNN, 1 | 9.498 .603 .733 .647 .753
+            CVAE-RNN, 2 | 9.496 .588 .714 .642 .745
+            CVAE-RNN, 3 | 9.309 .516 .626 .614 .699
+            CVAE-RNN, 4 | 9.242 .459 .560 .602 .679
+            """,
+        ),
+        tuple(map(View, range(5))),
+        {
+            "many": (tuple(map(View, (6, 8, 10, 13, 16, 19, 21))), (FULL,)),
+            "single": (
+                tuple(View(count, single=True) for count in range(5)),
+                (FULL, WHOLE, TIME, STANDARD, "cvae-rnn"),
+            ),
+            "exchanged": (tuple(View(count, exchanged=0.01) for count in range(1, 5)), (FULL, "cvae-rnn")),
+        },
+    ),
+}
+"""By the pages of docs/results on which their tables stand."""
+
+
+Found = Mapping[View, Mapping[str, Entry]]
+
+
+def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[str, str]]) -> str:
+    """Rows, in each view, and what is printed beside them; references know no paths."""
+    lines = []
+    views = list(found)
+    what = "given" if views[0].given is not None else "observed" if views[0].observed else ""
+    for row in dict.fromkeys(row for each in found.values() for row in each):
+        seen = [view for view in views if row in found[view]]
+        for view in seen[:1] if what == "given" and not found[seen[0]][row].minutes else seen:
+            entry = found[view][row]
+            means = [None if crossed is None else crossed.estimate() for crossed in map(entry.crossed, columns)]
+            told = [str(vars(view)[what]) if entry.minutes or what != "given" else ""] if what else []
+            lines.append([row, *told, str(len(entry.seeds)) if entry.minutes else "", *map(cell, means)])
+    for row, cells in beside.items():
+        name, _, given = row.partition(", ")
+        lines.append([f"*{name}*", *([given] if what else []), "", *(cells.get(column, "–") for column in columns)])
+    return table(["", *([what] if what else []), "seeds", *columns], lines)
+
+
+def changes(found: Found, paper: Paper) -> str:
+    """What each change does, paired: columns across, or, where there are several views, these."""
+
+    def change(view: View, pair: tuple[str, str], column: str) -> str:
+        having, lacking = (found[view][row].crossed(column) if row in found[view] else None for row in pair)
+        return "–" if having is None or lacking is None else str(having.estimate(lacking))
+
+    names = {name: pair for name, pair in paper.changes.items() if all(pair[0] in each for each in found.values())}
+    if len(found) == 1:
+        (view,) = found
+        lines = [[name, *(change(view, pair, column) for column in paper.compared)] for name, pair in names.items()]
+        return table([f"minus {next(iter(paper.rows))}", *paper.compared], lines)
+    lines = [
+        [name, column, *(change(view, pair, column) for view in found)]
+        for name, pair in names.items()
+        for column in paper.compared
+    ]
+    return table(["", "", *(f"{view.given} given" for view in found)], lines)
+
+
+def more_joints(found: Found, paper: Paper) -> str:
+    """What each further path changes, paired."""
+    views, lines = list(found), []
+    for row in paper.rows:
+        if all(row in each for each in found.values()):
+            for column in paper.compared:
+                crossed = [found[view][row].crossed(column) for view in views]
+                pairs = zip(crossed[1:], crossed, strict=False)
+                lines.append([row, column, *(str(more.estimate(fewer)) for more, fewer in pairs if more and fewer)])
+    header = [f"{JOINTS[view.given]} too" for view in views[:-1] if view.given is not None]
+    return table(["", "", *header], lines)
+
+
+def main(
+    runs: tyro.conf.Positional[Path],
+    data: Path | None = None,
+    papers: tuple[str, ...] = tuple(PAPERS),
+    rows: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (0, 1, 2),
+    samples: int = 50,
+    pages: Path | None = None,
+) -> None:
+    """Fit and score what is missing, and write the tables.
+
+    Args:
+        runs: where run directories lie.
+        data: the folder with bandai/ and cmu/; without it nothing is fitted.
+        papers: which.
+        rows: of these alone; all of a paper where none is named.
+        seeds: of every row.
+        samples: futures of a window.
+        pages: the folder of the pages; without one tables are printed.
+    """
+    for name in papers:
+        paper = PAPERS[name]
+        if data is not None:
+            chosen = {row: options for row, options in paper.rows.items() if not rows or row in rows}
+            views = {row: paper.views_of(row) for row in chosen}
+            work(data, runs, paper.set, chosen, views, seeds, samples)
+        found = {view: entries(runs, paper.set, view, paper.rows) for view in paper.views}
+        tables = [scores(found, columns, paper.printed) for columns in paper.columns]
+        tables.append(changes(found, paper))
+        if len(found) > 1:
+            tables.append(more_joints(found, paper))
+        for views, of in paper.further.values():
+            seen = {view: each for view in views if (each := entries(runs, paper.set, view, of))}
+            tables += [scores(seen, columns, {}) for columns in paper.columns] if seen else []
+        write(None if pages is None else pages / f"{name.replace('-', '_')}.md", *tables, name="rows")
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
