@@ -18,12 +18,13 @@ import tyro
 
 import dvae
 from dvae import Training, motion
+from dvae.models import registry
 from dvae.motion.dataset import MotionData
 from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
 from .pages import table, write
-from .ranking import FUTURES, JOINTS, fitted_judges, folder, judging, parted
+from .ranking import FUTURES, JOINTS, JUDGES, fitted_judges, folder, judging, parted
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
@@ -145,6 +146,27 @@ SECTIONS = {
 """What was tried, by method."""
 
 
+STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
+"""Steps of judges, who are to know poses and contents of people whom they have not seen."""
+
+
+def judges(data: MotionData, runs: Path, judged: Mapping[str, Path]) -> list[list[str]]:
+    """By steps: nats of a real pose by the pose prior, and real windows whose content is told, of the judging group."""
+    windows, lines = data.windows("test"), []
+    for name, tried in STEPS.items():
+        method, options, training = JUDGES[name]
+        for steps in tried:
+            row, told = f"{name}-{steps}-steps", replace(training, steps=steps)
+            sweep({row: registry.judges()[method](**options)}, data, runs, (0,), told, jobs=1)
+            scores = judging({**judged, name: runs / f"{row}-seed0"})
+            found = dvae.evaluate({}, windows, scores=scores, samples=1, references=["zero velocity"], progress=False)
+            real = found["real motion"]
+            lines.append(
+                [f"{name}, {steps} steps", *(str(real.get(each, "–")) for each in ("pose NLL", "ACC content"))]
+            )
+    return lines
+
+
 def score(path: Path, data: MotionData, judged: Mapping[str, Path]) -> dict[str, float]:
     """Means over every fourth window of the judging group, kept beside the run."""
     file = path / SCORED
@@ -181,7 +203,7 @@ def shown(scores: Sequence[Mapping[str, float]], name: str) -> str:
 def main(
     data: Path,
     runs: Path = Path("runs/tuning"),
-    sections: tuple[str, ...] = tuple(SECTIONS),
+    sections: tuple[str, ...] = ("judges", *SECTIONS),
     jobs: int = 1,
     page: Path | None = None,
 ) -> None:
@@ -198,6 +220,13 @@ def main(
     judged = fitted_judges(opened[TUNING.name], runs)
     prior = judged.get("prior", Path()).absolute()
     for name in sections:
+        if name == "judges":
+            write(
+                page,
+                table([name, "pose NLL", "ACC content"], judges(opened[TUNING.name], runs / name, judged)),
+                name=name,
+            )
+            continue
         section, lines = SECTIONS[name], []
         own = opened[section.protocol.name]
         columns = COLUMNS if section.protocol is TUNING else PATH_COLUMNS
