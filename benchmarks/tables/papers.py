@@ -203,6 +203,8 @@ PAPERS = {
                 (FULL, WHOLE, TIME, STANDARD, "cvae-rnn"),
             ),
             "exchanged": (tuple(View(count, exchanged=0.01) for count in range(1, 5)), (FULL, "cvae-rnn")),
+            "own": (tuple(View(count, exchanged=0.01, own=True) for count in range(1, 5)), (FULL, "cvae-rnn")),
+            "owner": (tuple(View(count, exchanged=0.01, truth="pose") for count in range(1, 5)), (FULL, "cvae-rnn")),
         },
     ),
 }

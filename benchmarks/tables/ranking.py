@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -59,12 +59,16 @@ class View:
         single: one motion, at the mean of the prior, in place of draws.
         exchanged: metres within which the given joints are in another window's pose, from which motions begin; 0 for
             the window's own.
+        own: of the windows that have such another one, with their own poses.
+        truth: see `motion.Exchanged`.
         observed: frames, in place of the protocol's.
     """
 
     given: int | None = None
     single: bool = False
     exchanged: float = 0.0
+    own: bool = False
+    truth: Literal["path", "pose"] = "path"
     observed: int | None = None
 
     def windows(self, data: MotionData, split: str) -> Any:
@@ -75,7 +79,9 @@ class View:
             return windows
         others = [name for name in windows.joints if name not in JOINTS]
         told = windows.given([*JOINTS, *others][: self.given])
-        return motion.Exchanged(told, self.exchanged) if self.exchanged and split == "test" else told
+        if not self.exchanged or split != "test":
+            return told
+        return motion.Exchanged(told, self.exchanged, own=self.own, truth=self.truth)
 
     def evaluate(self, samples: int) -> dict[str, Any]:
         """Arguments of `dvae.evaluate`."""
@@ -83,7 +89,7 @@ class View:
 
     def __str__(self) -> str:
         """The end of the names of its evaluations."""
-        told = [f"{name}-{value:g}" for name, value in vars(self).items() if value]
+        told = (f"{name}-{value}" for name, value in vars(self).items() if value != getattr(View, name))
         return "-".join(["", *told])
 
 

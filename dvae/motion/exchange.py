@@ -1,15 +1,16 @@
 """Exchange: one window's first pose with another's paths, to see whether motion follows what it is told.
 
 TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351) gives a pose the trajectories of another sequence whose
-given joints start at the same place, and compares with the sequence that the trajectories come from. (Its public code
-compares with the one that the pose comes from.) Ours: one partner for each window, of another clip.
+given joints start at the same place, and compares with the sequence that the trajectories come from; its public code,
+with the one that the pose comes from. Ours: one partner for each window, of another clip, and the same windows with
+their own poses, as those that have partners may be easier or harder than others.
 """
 
 from __future__ import annotations
 
 import hashlib
 from math import inf
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -28,13 +29,24 @@ class Exchanged:
         windows: with the same joints given everywhere, `windows.given(["LWrist"])`, and one observed frame.
         threshold: metres, within which each given joint is in both first frames.
         seed: of the choice among partners.
+        own: leave every window its own pose: the same windows, beside which to see what the exchange changes.
+        truth: the motion that is to be met is that of the window whose "path" it is, as TrajeVAE's text says, or of the
+            one whose "pose", as its public code has it.
 
     Raises:
         ValueError: windows without given joints or with more than one observed frame, a threshold that is no distance,
             or no window with a partner.
     """
 
-    def __init__(self, windows: Windows, threshold: float = 0.01, seed: int = 0):
+    def __init__(
+        self,
+        windows: Windows,
+        threshold: float = 0.01,
+        seed: int = 0,
+        *,
+        own: bool = False,
+        truth: Literal["path", "pose"] = "path",
+    ):
         if not windows.given_joints or windows.protocol.observed != 1:
             raise ValueError(
                 "what is exchanged is one pose among windows with the same given joints, as in "
@@ -48,10 +60,14 @@ class Exchanged:
             )
         if not threshold > 0:
             raise ValueError(f"the threshold is {threshold}; it must be a positive distance in metres")
+        if truth not in ("path", "pose"):
+            raise ValueError(f"truth is {truth!r}; expected 'path' or 'pose', whose window's motion it is")
         self.windows, self.threshold, self.seed, self.missing = windows, threshold, seed, False
+        self.own, self.truth = own, truth
         self.protocol, self.skeleton, self.joints = windows.protocol, windows.skeleton, windows.joints
         self.given_joints, self.positions = windows.given_joints, windows.positions
-        self._kept, self._partners = self._pairs()
+        self._kept, partners = self._pairs()
+        self._partners = self._kept if own else partners
 
     def _pairs(self) -> tuple[Tensor, Tensor]:
         """Windows that have a partner, and theirs."""
@@ -79,8 +95,8 @@ class Exchanged:
     def description(self) -> dict[str, Any]:
         """What a record says of these windows, and how poses were exchanged."""
         said, partners = self.windows.description, len(self._partners.unique())
-        exchanged = {"threshold": self.threshold, "seed": self.seed, "partners": partners}
-        title = [*said["title"], f"first poses of {partners} other windows"]
+        exchanged = {"threshold": self.threshold, "seed": self.seed, "partners": partners, "truth": self.truth}
+        title = [*said["title"], "with own poses" if self.own else f"first poses of {partners} other windows"]
         return {**said, "exchanged": exchanged, "title": title}
 
     def __len__(self) -> int:
@@ -96,7 +112,8 @@ class Exchanged:
         """The windows, as of `Windows.all`."""
         whole = self.windows.all()
         batch = {name: values[self._kept] for name, values in whole.items()}
-        batch["x"] = torch.cat([whole["x"][self._partners, :1], batch["x"][:, 1:]], 1)
+        poses = whole["x"][self._partners]
+        batch["x"] = poses if self.truth == "pose" else torch.cat([poses[:, :1], batch["x"][:, 1:]], 1)
         return batch
 
     def labels(self, name: str) -> list[str]:

@@ -775,10 +775,18 @@ def test_poses_are_exchanged_among_windows_whose_given_joints_agree(people):
     scores = evaluate(build(windows).float(), found, samples=2, references=False)
     assert math.isfinite(scores["model"]["path error"].mean)
     assert "MMADE" not in scores["model"]  # the windows that begin with that pose have other paths
-    assert scores.data["exchanged"] == {"threshold": 0.4, "seed": 0, "partners": len(partners)}
+    assert scores.data["exchanged"] == {"threshold": 0.4, "seed": 0, "partners": len(partners), "truth": "path"}
     assert len(partners) > 0.3 * len(x)
+    own, owner = (motion.Exchanged(windows, 0.4, **told).all() for told in ({"own": True}, {"truth": "pose"}))
+    kept = [keys.index(key) for key in found.keys]
+    assert torch.equal(own["x"], whole["x"][kept])
+    assert all(torch.equal(each["y"], y) for each in (own, owner))
+    assert torch.equal(owner["x"][:, 0], x[:, 0])
+    assert {row.numpy().tobytes() for row in owner["x"]} < {row.numpy().tobytes() for row in whole["x"]}
     with pytest.raises(ValueError, match=r"have RFoot, LFoot within 1e-09 m; the nearest two are 0\.\d+ m"):
         motion.Exchanged(windows, threshold=1e-9)
+    with pytest.raises(ValueError, match="truth is 'paths'; expected 'path' or 'pose'"):
+        motion.Exchanged(windows, truth="paths")
     with pytest.raises(ValueError, match="the threshold is -1; it must be a positive distance"):
         motion.Exchanged(windows, threshold=-1)
     with pytest.raises(ValueError, match="these have 1 observed frames and are given no joints"):
