@@ -257,10 +257,10 @@ def more_joints(found: Found, paper: Paper) -> str:
     views, lines = list(found), []
     for row in paper.rows:
         if all(row in each for each in found.values()):
+            steps = [(found[more][row], found[fewer][row]) for more, fewer in zip(views[1:], views, strict=False)]
             for column in paper.compared:
-                crossed = [found[view][row].crossed(column) for view in views]
-                pairs = zip(crossed[1:], crossed, strict=False)
-                lines.append([row, column, *(str(more.estimate(fewer)) for more, fewer in pairs if more and fewer)])
+                crossed = (more.crossed(column, fewer) for more, fewer in steps)
+                lines.append([row, column, *(cell(each and each.estimate()) for each in crossed)])
     header = [f"{JOINTS[view.given]} too" for view in views[:-1] if view.given is not None]
     return table(["", "", *header], lines)
 

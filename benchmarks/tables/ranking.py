@@ -234,13 +234,18 @@ class Entry:
     seeds: Sequence[Evaluation]
     minutes: Sequence[float]
 
-    def crossed(self, metric: str) -> Crossed | None:
-        """Means by seed and clip, where all have the score."""
+    def means(self, metric: str) -> np.ndarray | None:
+        """(S, C), by seed and clip, where all have the score."""
         (name,) = {name for each in self.seeds for name in each.rows}
         rows = [each.rows[name].clip_means for each in self.seeds]
-        if not all(metric in row for row in rows):
+        return np.array([row[metric] for row in rows]) if all(metric in row for row in rows) else None
+
+    def crossed(self, metric: str, minus: Entry | None = None) -> Crossed | None:
+        """A score, or what it is more than that of the same runs in another view of the same windows."""
+        means, others = self.means(metric), 0.0 if minus is None else minus.means(metric)
+        if means is None or others is None:
             return None
-        means, weights = np.array([row[metric] for row in rows]), np.array([*self.seeds[0].clips.values()])
+        means, weights = means - others, np.array([*self.seeds[0].clips.values()])
         known = ~np.isnan(means).any(0)
         crossed = Crossed.of(means[:, known], weights[known])
         # a reference is not trained: no seed of it differs from another
