@@ -108,6 +108,7 @@ SECTIONS = {
             "diversity 0": {"diversity": (0.0,)},
             "20 coefficients": {"coefficients": 20},
             "rate 1e-3": {"learning_rate": 1e-3},
+            "rate 1e-3, diversity 5 10": {"learning_rate": 1e-3, "diversity": (5.0, 10.0)},
             "6500 steps": {"steps": 6500},
         },
         judged=True,
@@ -139,7 +140,7 @@ SECTIONS = {
         {
             f"{name}, {rate:g}": {"method": name, **FUTURES[name], "learning_rate": rate}
             for name in ALONE
-            for rate in (1e-3, 3e-3)
+            for rate in (1e-3, 3e-3, 1e-2)
         },
     ),
 }
