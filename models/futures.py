@@ -59,7 +59,7 @@ class FutureMethod(PoseMethod):
     trainings: ClassVar[Mapping[str, Training]] = {
         HUMAN36M.name: Training(39_063, 64, 1e-3, 0.8),
         "humaneva": Training(7813, 64, 1e-3, 0.8),
-        "": Training(decay=0.5),
+        "": Training(learning_rate=3e-3, decay=0.5),
     }
 
     latent: Size | None = 128

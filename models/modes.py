@@ -72,6 +72,7 @@ class ModesMethod(FutureMethod):
     trainings: ClassVar[Mapping[str, Training]] = {
         **FutureMethod.trainings,
         **dict.fromkeys((HUMAN36M.name, HUMANEVA.name), Training(15_625, 32, 1e-4, 0.8)),
+        "": Training(decay=0.5),
     }
 
     latent: Size | None = None
