@@ -29,6 +29,7 @@ from .ranking import FUTURES, JOINTS, JUDGES, fitted_judges, folder, judging, pa
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
 SCORED = "scores.json"
+COLUMNS_OF_JUDGES = ("pose NLL", "ACC content")
 COLUMNS = ("ADE", "FDE", "ADEm", "APD", "energy score", "ACC content", "FID content", "pose NLL", "KL w", "KL z")
 """Scores that pages show, where there are."""
 PATH_COLUMNS = tuple(f"{score}, {count} given" for score in ("ADE", "APD", "energy score") for count in range(5))
@@ -151,45 +152,55 @@ STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
 """Steps of judges, who are to know poses and contents of people whom they have not seen."""
 
 
-def judges(data: MotionData, runs: Path, judged: Mapping[str, Path]) -> list[list[str]]:
-    """By steps: nats of a real pose by the pose prior, and real windows whose content is told, of the judging group."""
-    windows, lines = data.windows("test"), []
+def of_judges(data: MotionData, runs: Path, judged: Mapping[str, Path]) -> None:
+    """Fits judges for other numbers of steps, and scores real motion of the judging group by each."""
     for name, tried in STEPS.items():
         method, options, training = JUDGES[name]
         for steps in tried:
             row, told = f"{name}-{steps}-steps", replace(training, steps=steps)
             sweep({row: registry.judges()[method](**options)}, data, runs, (0,), told, jobs=1)
-            scores = judging({**judged, name: runs / f"{row}-seed0"})
-            found = dvae.evaluate({}, windows, scores=scores, samples=1, references=["zero velocity"], progress=False)
-            real = found["real motion"]
-            lines.append(
-                [f"{name}, {steps} steps", *(str(real.get(each, "–")) for each in ("pose NLL", "ACC content"))]
-            )
-    return lines
+            path = runs / f"{row}-seed0"
+            if not (path / SCORED).exists():
+                scores, real = judging({**judged, name: path}), ["zero velocity"]
+                found = dvae.evaluate({}, seen(data), scores=scores, samples=1, references=real, progress=False)
+                keep(path, {each: score.mean for each, score in found["real motion"].items()})
 
 
-def score(path: Path, data: MotionData, judged: Mapping[str, Path]) -> dict[str, float]:
-    """Means over every fourth window of the judging group, kept beside the run."""
-    file = path / SCORED
-    if not file.exists():
-        model, protocol = load(path).model, data.protocol
-        windows = motion.windows(data.motion, replace(protocol, test_stride=EVERY * protocol.test_stride), "test")
-        found: dict[str, float] = {}
-        if protocol.root == "drop":
-            found = evaluated(model, windows, judging(judged))
-        else:
-            for count in range(len(JOINTS) + 1):
-                one = evaluated(model, windows.given(JOINTS[:count]), motion.scores)
-                found |= {f"{name}, {count} given": value for name, value in one.items()}
-        file.write_text(json.dumps(found, indent=1), encoding="utf-8")
-    kept: dict[str, float] = json.loads(file.read_text(encoding="utf-8"))
-    return kept
+def seen(data: MotionData) -> motion.Windows:
+    """Every fourth window of the judging group."""
+    protocol = replace(data.protocol, test_stride=EVERY * data.protocol.test_stride)
+    return motion.windows(data.motion, protocol, "test")
+
+
+def keep(path: Path, found: Mapping[str, float]) -> None:
+    """Beside a run."""
+    (path / SCORED).write_text(json.dumps(found, indent=1), encoding="utf-8")
+
+
+def score(path: Path, data: MotionData, judged: Mapping[str, Path]) -> None:
+    """Means over these windows."""
+    if (path / SCORED).exists():
+        return
+    model, windows, found = load(path).model, seen(data), {}
+    if data.protocol.root == "drop":
+        found = evaluated(model, windows, judging(judged))
+    else:
+        for count in range(len(JOINTS) + 1):
+            one = evaluated(model, windows.given(JOINTS[:count]), motion.scores)
+            found |= {f"{name}, {count} given": value for name, value in one.items()}
+    keep(path, found)
 
 
 def evaluated(model: Any, windows: Any, scores: Any) -> dict[str, float]:
     """Means of scores over windows."""
     found = dvae.evaluate(model, windows, scores=scores, samples=SAMPLES, references=False, progress=False)
     return {name: each.mean for name, each in found["model"].items()}
+
+
+def kept(runs: Path, case: str, seeds: Sequence[int]) -> list[dict[str, float]]:
+    """What has been scored of a case, by seed."""
+    files = (runs / f"{folder(case)}-seed{seed}" / SCORED for seed in seeds)
+    return [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
 
 
 def shown(scores: Sequence[Mapping[str, float]], name: str) -> str:
@@ -201,42 +212,52 @@ def shown(scores: Sequence[Mapping[str, float]], name: str) -> str:
     return f"{sum(values) / len(values):.3f}" + (f" ({each})" if len(values) > 1 else "")
 
 
-def main(
-    data: Path,
-    runs: Path = Path("runs/tuning"),
-    sections: tuple[str, ...] = ("judges", *SECTIONS),
-    jobs: int = 1,
-    page: Path | None = None,
-) -> None:
-    """Fit, score, and write the tables.
-
-    Args:
-        data: bandai2.npz.
-        runs: where run directories lie.
-        sections: which.
-        jobs: runs at a time.
-        page: whose tables; without one they are printed.
-    """
+def work(data: Path, runs: Path, sections: Sequence[str], jobs: int) -> None:
+    """Fits and scores what is not there yet."""
     opened = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
     judged = fitted_judges(opened[TUNING.name], runs)
     prior = judged.get("prior", Path()).absolute()
     for name in sections:
         if name == "judges":
-            write(
-                page,
-                table([name, "pose NLL", "ACC content"], judges(opened[TUNING.name], runs / name, judged)),
-                name=name,
-            )
+            of_judges(opened[TUNING.name], runs / name, judged)
             continue
-        section, lines = SECTIONS[name], []
+        section = SECTIONS[name]
         own = opened[section.protocol.name]
-        columns = COLUMNS if section.protocol is TUNING else PATH_COLUMNS
         for case in section.cases:
             method, training = section.of(case, prior)
             sweep({folder(case): method}, own, runs / name, section.seeds, training, jobs)
-            scores = [score(runs / name / f"{folder(case)}-seed{seed}", own, judged) for seed in section.seeds]
-            lines.append([case, *(shown(scores, column) for column in columns)])
-            print(name, *lines[-1], sep=" | ", flush=True)
+            for seed in section.seeds:
+                score(runs / name / f"{folder(case)}-seed{seed}", own, judged)
+
+
+def main(
+    runs: tyro.conf.Positional[Path],
+    data: Path | None = None,
+    sections: tuple[str, ...] = ("judges", *SECTIONS),
+    jobs: int = 1,
+    page: Path | None = None,
+) -> None:
+    """Fit and score what is missing, and write the tables.
+
+    Args:
+        runs: where run directories lie.
+        data: bandai2.npz; without it nothing is fitted.
+        sections: which.
+        jobs: runs at a time.
+        page: whose tables; without one they are printed.
+    """
+    if data is not None:
+        work(data, runs, sections, jobs)
+    for name in sections:
+        if name == "judges":
+            columns, seeds = COLUMNS_OF_JUDGES, (0,)
+            cases = [f"{judge} {steps} steps" for judge, tried in STEPS.items() for steps in tried]
+        else:
+            section = SECTIONS[name]
+            columns = COLUMNS if section.protocol.root == "drop" else PATH_COLUMNS
+            cases, seeds = [*section.cases], section.seeds
+        scored = {case: found for case in cases if (found := kept(runs / name, case, seeds))}
+        lines = [[case, *(shown(found, column) for column in columns)] for case, found in scored.items()]
         write(page, table([name, *columns], lines), name=name)
 
 

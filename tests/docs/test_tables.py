@@ -479,8 +479,8 @@ def test_tuning(folder, page, monkeypatch):
         page.write_text(
             "\n".join([page.read_text(), *(mark.replace("tables", name) for mark in (pages.BEGIN, pages.END))])
         )
-    for _ in range(2):
-        tuning.main(folder / "people.npz", folder / "tuned", tuple(sections), page=page)
+    for data in (folder / "people.npz", None):
+        tuning.main(folder / "tuned", data, tuple(sections), page=page)
         rows = re.findall(r"^\| (preset|wide, longer) \| (.*) \|$", page.read_text(), re.MULTILINE)
         assert [name for name, _ in rows] == ["preset", "wide, longer", "preset"]
         assert re.match(r"[\d.]+ \([\d.]+, [\d.]+\)", rows[0][1])
