@@ -479,7 +479,11 @@ def test_the_documented_method_is_one_and_is_not_there_already():
     assert torch.isfinite(dvae.SequenceELBO().terms(kind(latent=2).build({"x": 3}), torch.randn(2, 4, 3)).bound).all()
 
 
-RESULTS = sorted(page for page in (DOCS / "results").glob("*.md") if "ADE" in page.read_text())  # scores of windows
+CHOSEN = {"index", "tuning"}
+"""Pages that are about nothing else."""
+RESULTS = sorted(  # of scores of windows
+    page for page in (DOCS / "results").glob("*.md") if page.stem not in CHOSEN and "ADE" in page.read_text()
+)
 
 
 @pytest.mark.parametrize("page", RESULTS, ids=lambda page: page.stem)
