@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import isnan, nan
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,7 @@ class Section:
         method: whose options.
         training: of all its runs, where a case says nothing else.
         cases: name to options; those of `Training` are among them.
+        options: of all cases, where one says nothing else: what a preset was need not be what it becomes.
         protocol: of the windows.
         judged: whether the pose prior is a part of the method.
         seeds: of every case.
@@ -51,13 +52,14 @@ class Section:
     method: str
     training: Training
     cases: Mapping[str, Mapping[str, Any]]
+    options: Mapping[str, Any] = field(default_factory=dict)
     protocol: motion.Protocol = TUNING
     judged: bool = False
     seeds: tuple[int, ...] = (0,)
 
     def of(self, case: str, prior: Path) -> tuple[Any, Training]:
         """The method of a case, and its training."""
-        options, told = parted(self.cases[case])
+        options, told = parted({**self.options, **self.cases[case]})
         method = options.pop("method", self.method)
         if self.judged and options.get("pose_prior") != 0:
             options["pose_prior_run"] = str(prior)
@@ -85,7 +87,7 @@ SECTIONS = {
         "hit-dvae",
         Training(steps=1200, batch_size=16, learning_rate=2e-3, decay=0.8, validate_every=400),
         {
-            "preset": {},
+            "w 7.5": {},
             "w .03": {"kl_static": 0.03},
             "w .3": {"kl_static": 0.3},
             "literal": {"kl_local": 0.0067, "kl_static": 0.1},
@@ -97,13 +99,14 @@ SECTIONS = {
             "rate 1e-3": {"learning_rate": 1e-3},
             "rate 4e-3": {"learning_rate": 4e-3},
         },
+        options={"kl_static": 7.5},
         judged=True,
     ),
     "gsps": Section(
         "gsps",
         Training(steps=3000, batch_size=16, learning_rate=3e-3, decay=0.5, validate_every=500),
         {
-            "preset": {},
+            "diversity 2 4": {},
             "diversity 5 10": {"diversity": (5.0, 10.0)},
             "diversity 1 2": {"diversity": (1.0, 2.0)},
             "diversity 0": {"diversity": (0.0,)},
@@ -112,6 +115,7 @@ SECTIONS = {
             "rate 1e-3, diversity 5 10": {"learning_rate": 1e-3, "diversity": (5.0, 10.0)},
             "6500 steps": {"steps": 6500},
         },
+        options={"diversity": (2.0, 4.0)},
         judged=True,
     ),
     "trajevae": Section(
@@ -224,6 +228,8 @@ def work(data: Path, runs: Path, sections: Sequence[str], jobs: int) -> None:
         section = SECTIONS[name]
         own = opened[section.protocol.name]
         for case in section.cases:
+            if len(kept(runs / name, case, section.seeds)) == len(section.seeds):
+                continue
             method, training = section.of(case, prior)
             sweep({folder(case): method}, own, runs / name, section.seeds, training, jobs)
             for seed in section.seeds:

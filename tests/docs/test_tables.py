@@ -464,8 +464,8 @@ def test_tuning(folder, page, monkeypatch):
     cases = {"preset": {}, "wide, longer": {"width": 6, "steps": 3}}
     paths = replace(motion.PROTOCOLS["simulated-trajectories"], name="paths")
     sections = {
-        "cvae": tuning.Section("cvae", training, cases, motion.PROTOCOLS["simulated"], seeds=(0, 1)),
-        "cvae-rnn": tuning.Section("cvae-rnn", training, {"preset": {"width": 4}}, paths),
+        "cvae": tuning.Section("cvae", training, cases, protocol=motion.PROTOCOLS["simulated"], seeds=(0, 1)),
+        "cvae-rnn": tuning.Section("cvae-rnn", training, {"preset": {}}, {"width": 4}, paths),
     }
     for name, value in {
         "SECTIONS": sections,
