@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 from typing_extensions import override
 
 from ..inference.schedules import Schedule
+from ..inference.training import Training
 from ..networks import NetworkSpec, Recurrent
 from ..options import Layers, Share, Size
 from ..program.rollout import SelfFeeding
@@ -41,6 +42,10 @@ class ACLSTM(DeterministicMethod):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = table(
         "width heading", {"human36m": (1024, False), "humaneva": (1024, False), "": (256, True)}
     )
+    trainings: ClassVar[Mapping[str, Training]] = {
+        **DeterministicMethod.trainings,
+        "": Training(learning_rate=1e-2, decay=0.5),
+    }
 
     layers: Layers = 3
     shown: Size = 5

@@ -53,7 +53,7 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
 
     trainings: ClassVar[Mapping[str, Training]] = {
         **dict.fromkeys(("human36m", "humaneva"), Training(batch_size=32, learning_rate=1e-4)),
-        "": Training(decay=0.5),
+        "": Training(learning_rate=3e-3, decay=0.5),
     }
 
     latent: None = None

@@ -54,7 +54,7 @@ PRESETS = table(
     {
         "human36m": (10, 256, (10, 10), (8.0, 25.0), (100.0, 300.0), 0.1, 20, False),
         "humaneva": (8, 256, (10, 10), (5.0, 10.0), (15.0, 50.0), 0.01, 15, False),
-        "": (8, 128, (4, 4), (2.0, 4.0), (15.0, 50.0), 0.02, 10, True),
+        "": (8, 128, (4, 4), (5.0, 10.0), (15.0, 50.0), 0.02, 10, True),
     },
 )
 """Skeleton to options: the paper's; and for others, at 30 frames a second, 15 observed and 60 predicted frames."""
@@ -86,7 +86,7 @@ class GSPS(EnergyMethod):
     trainings: ClassVar[Mapping[str, Training]] = {
         "human36m": Training(156_000, 16, 1e-3, 0.8, gradient_clip=100.0),
         "humaneva": Training(62_500, 16, 1e-3, 0.8, gradient_clip=100.0),
-        "": Training(6500, 16, 3e-3, 0.5),
+        "": Training(6500, 16, 1e-3, 0.5),
     }
     latent: Size = 64
     parts: tuple[str, ...] = ("lower", "upper")

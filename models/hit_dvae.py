@@ -67,7 +67,7 @@ ENERGIES = table(
     {
         "humaneva": (10.0, 5.0, (0.1, 0.2), (15.0, 50.0), 100.0, 1.0, 0.001, 0.5, 7.5, 0.01),
         "human36m": (20.0, 10.0, (0.1, 0.2), (100.0, 300.0), 100.0, 1.0, 0.01, 0.5, 12.5, 0.1),
-        "": (10.0, 5.0, (0.1, 0.2), (15.0, 50.0), 100.0, 1.0, 0.001, 0.03, 7.5, 0.02),
+        "": (10.0, 5.0, (0.1, 0.2), (15.0, 50.0), 100.0, 1.0, 0.001, 0.03, 0.03, 0.02),
     },
 )
 NETWORKS = table(
@@ -126,7 +126,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
     trainings: ClassVar[Mapping[str, Training]] = {
         "human36m": Training(15_625, 32, 1e-3),
         "humaneva": Training(7813, 64, 1e-3),
-        "": Training(1200, 16, 2e-3, 0.8),
+        "": Training(2400, 16, 2e-3, 0.8),
     }
     residual: Share = 0.5
     self_feeding: Share = 1.0

@@ -1,8 +1,9 @@
 """Fits and scores the methods of three papers with their ablations, and writes the papers' tables with these beside.
 
 What is fitted stands in the folders of `benchmarks.tables.ranking`, which fits the methods themselves; options and
-training are those of the presets but for what a row is called after. The script goes on where it was stopped, and
-without `--data` fits nothing: tables are of the runs that are there. Printed numbers are of other data.
+training are those of the presets but for what a row is called after. Ablations have fewer steps than the presets, and
+stand beside the full method with as few. The script goes on where it was stopped, and without `--data` fits nothing:
+tables are of the runs that are there. Printed numbers are of other data.
 
 Sources: Bie et al., 2022, arXiv 2204.01565, tables 1 to 3; Mao, Liu and Salzmann, 2021, arXiv 2108.08422, tables 1 and
 3; Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, tables 1 and 3 to 6, and figure 6.
@@ -18,7 +19,7 @@ from typing import Any
 import tyro
 
 from .pages import table, write
-from .ranking import JOINTS, Entry, View, cell, entries, work
+from .ranking import JOINTS, TRAINED, Entry, View, cell, entries, trained, work
 
 ERRORS = ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm")
 REAL = ("APDE", "CMD", "limb stretch", "limb jitter", "pose NLL")
@@ -38,7 +39,7 @@ class Paper:
         set: of `SETS`, on which rows are fitted.
         rows: to options of the method, as of `ranking.FUTURES`; the first is the paper's own.
         columns: of each table of scores.
-        changes: to the rows with and without what is compared.
+        changes: rows, each with the one that it is compared with.
         compared: columns of the table of changes.
         printed: rows of the paper.
         views: of all rows; those with paths have a line for each.
@@ -48,7 +49,7 @@ class Paper:
     set: str
     rows: Mapping[str, Mapping[str, Any]]
     columns: Sequence[Sequence[str]]
-    changes: Mapping[str, tuple[str, str]]
+    changes: Sequence[tuple[str, str]]
     compared: Sequence[str]
     printed: Mapping[str, Mapping[str, str]]
     views: Sequence[View] = (View(),)
@@ -60,6 +61,12 @@ class Paper:
 
 
 HIT, COPYING = "hit-dvae", {"nearest": False, "residual": 0.0}
+SHORT: dict[str, dict[str, dict[str, Any]]] = {
+    "hit-dvae": {"1,200 steps": {"method": "hit-dvae", "steps": 1200}},
+    "gsps": {"3,000 steps": {"method": "gsps", "steps": 3000}},
+    "trajevae": {"6,000 steps": {"method": "trajevae", "steps": 6000}},
+}
+"""What ablations are beside: as long as what was tuned."""
 WITHOUT: dict[str, dict[str, Any]] = {
     "no scheduled sampling": {"self_feeding": 0.0},
     "no attention": {"attention": False},
@@ -77,21 +84,30 @@ TERMS: dict[str, dict[str, Any]] = {
     "no diversity": {"diversity": (0.0,)},
     "no reconstruction": {"reconstruction": 0.0},
     "no multimodal": {"multimodal": 0.0},
+    "diversity 2 and 4": {"diversity": (2.0, 4.0)},
+    "20 coefficients": {"coefficients": 20},
 }
-"""Of GSPS's loss, each left out by itself."""
+"""Of GSPS's loss, each left out by itself; and what else was asked."""
 FULL, WHOLE, TIME, STANDARD = "trajevae", "whole poses", "in time", "standard prior"
+SIMPLER: dict[str, dict[str, Any]] = {
+    WHOLE: {"complement": False},
+    TIME: {"complement": False, "cosine": False, "latent": 8},
+    STANDARD: {"complement": False, "cosine": False, "latent": 8, "learned_prior": False, "beta": 0.1},
+}
+"""TrajeVAE without what it adds, one after the other; latents of all have 480 numbers."""
 PAPERS = {
     "hit-dvae": Paper(
         "bandai2-by-style",
         {
             HIT: {},
-            **{name: {"method": HIT, **options} for name, options in WITHOUT.items()},
+            **SHORT[HIT],
+            **{name: {**SHORT[HIT]["1,200 steps"], **options} for name, options in WITHOUT.items()},
             "gsps": {},
             "dlow": {},
             "srnn": {"self_feeding": 1.0},
         },
         (("ACC content", "FID content", "FID style", "APD", "energy score", *REAL), ERRORS),
-        {name: (name, HIT) for name in (*WITHOUT, "gsps", "dlow", "srnn")},
+        [*((name, "1,200 steps") for name in WITHOUT), *((name, HIT) for name in ("gsps", "dlow", "srnn"))],
         ("ACC content", "FID content", "APD", "energy score", "ADE", "FDE", "MMADE", "ADEm"),
         printed(
             "ACC content,FID content,APD,ADE,FDE,MMADE,MMFDE,ADEm,FDEm,MMADEm,MMFDEm",
@@ -118,12 +134,11 @@ PAPERS = {
         "bandai2-by-style",
         {
             "gsps": {},
-            **{name: {"method": "gsps", **options} for name, options in TERMS.items()},
-            "diversity as in the paper": {"method": "gsps", "diversity": (5.0, 10.0)},
-            "20 coefficients": {"method": "gsps", "coefficients": 20},
+            **SHORT["gsps"],
+            **{name: {**SHORT["gsps"]["3,000 steps"], **options} for name, options in TERMS.items()},
         },
         (("APD", "energy score", *ERRORS[:4], *REAL),),
-        {name: (name, "gsps") for name in (*TERMS, "diversity as in the paper", "20 coefficients")},
+        [(name, "3,000 steps") for name in TERMS],
         ("APD", "energy score", *ERRORS[:4], "pose NLL"),
         printed(
             "APD,ADE,FDE,MMADE,MMFDE,pose NLL",
@@ -147,18 +162,12 @@ PAPERS = {
         "bandai2-trajectories",
         {
             FULL: {},
-            WHOLE: {"method": FULL, "complement": False},
-            TIME: {"method": FULL, "complement": False, "cosine": False, "latent": 8},
-            STANDARD: {"method": FULL, "complement": False, "cosine": False, "latent": 8, "learned_prior": False},
+            **SHORT[FULL],
+            **{name: {**SHORT[FULL]["6,000 steps"], **options} for name, options in SIMPLER.items()},
             "cvae-rnn": {},
         },
         (("APD", "energy score", *ERRORS[:4], "path error", "global ADE", "limb stretch", "limb jitter"),),
-        {
-            "+ learned prior": (TIME, STANDARD),
-            "+ cosine transform": (WHOLE, TIME),
-            "+ masked poses": (FULL, WHOLE),
-            "over CVAE-RNN": (FULL, "cvae-rnn"),
-        },
+        [("6,000 steps", WHOLE), (WHOLE, TIME), (TIME, STANDARD), (FULL, "cvae-rnn")],
         ("ADE", "APD"),
         printed(
             "APD,ADE,FDE,MMADE,MMFDE",
@@ -200,7 +209,7 @@ PAPERS = {
             "many": (tuple(map(View, (6, 8, 10, 13, 16, 19, 21))), (FULL,)),
             "single": (
                 tuple(View(count, single=True) for count in range(5)),
-                (FULL, WHOLE, TIME, STANDARD, "cvae-rnn"),
+                (FULL, "6,000 steps", WHOLE, TIME, STANDARD, "cvae-rnn"),
             ),
             "exchanged": (tuple(View(count, exchanged=0.01) for count in range(1, 5)), (FULL, "cvae-rnn")),
             "own": (tuple(View(count, exchanged=0.01, own=True) for count in range(1, 5)), (FULL, "cvae-rnn")),
@@ -225,11 +234,11 @@ def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[st
             entry = found[view][row]
             means = [None if crossed is None else crossed.estimate() for crossed in map(entry.crossed, columns)]
             told = [str(vars(view)[what]) if entry.minutes or what != "given" else ""] if what else []
-            lines.append([row, *told, str(len(entry.seeds)) if entry.minutes else "", *map(cell, means)])
+            lines.append([row, *told, *trained(entry), *map(cell, means)])
     for row, cells in beside.items():
         name, _, given = row.partition(", ")
-        lines.append([f"*{name}*", *([given] if what else []), "", *(cells.get(column, "–") for column in columns)])
-    return table(["", *([what] if what else []), "seeds", *columns], lines)
+        lines.append([f"*{name}*", *([given] if what else []), "", "", *(cells.get(column, "–") for column in columns)])
+    return table(["", *([what] if what else []), *TRAINED, *columns], lines)
 
 
 def changes(found: Found, paper: Paper) -> str:
@@ -239,17 +248,15 @@ def changes(found: Found, paper: Paper) -> str:
         having, lacking = (found[view][row].crossed(column) if row in found[view] else None for row in pair)
         return "–" if having is None or lacking is None else str(having.estimate(lacking))
 
-    names = {name: pair for name, pair in paper.changes.items() if all(pair[0] in each for each in found.values())}
+    pairs = [pair for pair in paper.changes if all(pair[0] in each for each in found.values())]
     if len(found) == 1:
         (view,) = found
-        lines = [[name, *(change(view, pair, column) for column in paper.compared)] for name, pair in names.items()]
-        return table([f"minus {next(iter(paper.rows))}", *paper.compared], lines)
+        lines = [[*pair, *(change(view, pair, column) for column in paper.compared)] for pair in pairs]
+        return table(["", "minus", *paper.compared], lines)
     lines = [
-        [name, column, *(change(view, pair, column) for view in found)]
-        for name, pair in names.items()
-        for column in paper.compared
+        [*pair, column, *(change(view, pair, column) for view in found)] for pair in pairs for column in paper.compared
     ]
-    return table(["", "", *(f"{view.given} given" for view in found)], lines)
+    return table(["", "minus", "", *(f"{view.given} given" for view in found)], lines)
 
 
 def more_joints(found: Found, paper: Paper) -> str:

@@ -286,6 +286,14 @@ def cell(estimate: Estimate | None) -> str:
     return str(estimate) if estimate.seeds else str(estimate).rpartition(" ± ")[0]
 
 
+TRAINED = ("seeds", "CPU minutes")
+
+
+def trained(entry: Entry) -> tuple[str, str]:
+    """How many seeds were trained, and how long each took."""
+    return (str(len(entry.seeds)), f"{statistics.fmean(entry.minutes):.1f}") if entry.minutes else ("–", "–")
+
+
 def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
     """Rows in order of the energy score, each with what it has more than the neighbours and than the next better."""
 
@@ -295,15 +303,14 @@ def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
         return crossed
 
     order = sorted((name for name in found if name != "real motion"), key=lambda name: score_of(name).mean)
-    header = ["", "seeds", "CPU minutes", f"{RANKED} minus neighbours'", "minus the one above", *columns]
+    header = ["", *TRAINED, f"{RANKED} minus neighbours'", "minus the one above", *columns]
     lines = []
     for place, name in enumerate(order):
         own = found[name]
         minus = [None if name == NEIGHBOURS else NEIGHBOURS, order[place - 1] if place else None]
         behind = [None if other is None else score_of(name).estimate(score_of(other)) for other in minus]
-        took = f"{statistics.fmean(own.minutes):.1f}" if own.minutes else "–"
         means = [None if crossed is None else crossed.estimate() for crossed in map(own.crossed, columns)]
-        lines.append([name, str(len(own.seeds)) if own.minutes else "–", took, *map(cell, [*behind, *means])])
+        lines.append([name, *trained(own), *map(cell, [*behind, *means])])
     return table(header, lines)
 
 

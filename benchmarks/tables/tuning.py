@@ -136,7 +136,10 @@ SECTIONS = {
     "cvae-rnn": Section(
         "cvae-rnn",
         Training(steps=3000, batch_size=16, learning_rate=1e-3, decay=0.5, validate_every=500),
-        {f"{beta:g}": {"beta": beta} for beta in (1e-3, 1e-2, 0.1)},
+        {
+            **{f"{beta:g}": {"beta": beta} for beta in (1e-3, 1e-2, 0.1)},
+            "0.001, keep .05": {"beta": 1e-3, "keep": 0.05},
+        },
         protocol=PATHS,
     ),
     "baselines": Section(
@@ -146,6 +149,14 @@ SECTIONS = {
             f"{name}, {rate:g}": {"method": name, **FUTURES[name], "learning_rate": rate}
             for name in ALONE
             for rate in (1e-3, 3e-3, 1e-2)
+        }
+        | {
+            f"moglow, 0.001, {name}": {"method": "moglow", "learning_rate": 1e-3, **options}
+            for name, options in {
+                "bound 1": {"bound": 1.0},
+                "bound .5": {"bound": 0.5},
+                "frames dropped": {"frame_dropout": 0.3},
+            }.items()
         },
     ),
 }
