@@ -157,7 +157,8 @@ SECTIONS = {
                 "bound .5": {"bound": 0.5},
                 "frames dropped": {"frame_dropout": 0.3},
             }.items()
-        },
+        }
+        | {f"srnn, 0.001, {n} steps": {"method": "srnn", **FUTURES["srnn"], "steps": n} for n in (3000, 16000)},
     ),
 }
 """What was tried, by method."""
