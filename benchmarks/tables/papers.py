@@ -19,7 +19,7 @@ from typing import Any
 import tyro
 
 from .pages import table, write
-from .ranking import JOINTS, TRAINED, Entry, View, cell, entries, trained, work
+from .ranking import FUTURES, JOINTS, TRAINED, Entry, View, cell, entries, trained, work
 
 ERRORS = ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm")
 REAL = ("APDE", "CMD", "limb stretch", "limb jitter", "pose NLL")
@@ -102,9 +102,7 @@ PAPERS = {
             HIT: {},
             **SHORT[HIT],
             **{name: {**SHORT[HIT]["1,200 steps"], **options} for name, options in WITHOUT.items()},
-            "gsps": {},
-            "dlow": {},
-            "srnn": {"self_feeding": 1.0},
+            **{row: FUTURES[row] for row in ("gsps", "dlow", "srnn")},
         },
         (("ACC content", "FID content", "FID style", "APD", "energy score", *REAL), ERRORS),
         [*((name, "1,200 steps") for name in WITHOUT), *((name, HIT) for name in ("gsps", "dlow", "srnn"))],

@@ -44,7 +44,7 @@ FUTURES: dict[str, dict[str, Any]] = {
     "erd": {},
     "aclstm": {},
     "moglow": {},
-    "srnn": {"self_feeding": 1.0},
+    "srnn": {"self_feeding": 1.0, "learning_rate": 3e-3},
 }
 """Methods by what rows are called, with what their options are beside the presets."""
 STEPS = {

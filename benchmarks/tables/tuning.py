@@ -158,7 +158,15 @@ SECTIONS = {
                 "frames dropped": {"frame_dropout": 0.3},
             }.items()
         }
-        | {f"srnn, 0.001, {n} steps": {"method": "srnn", **FUTURES["srnn"], "steps": n} for n in (3000, 16000)},
+        | {
+            f"srnn, 0.001, {steps} steps": {
+                "method": "srnn",
+                "self_feeding": 1.0,
+                "learning_rate": 1e-3,
+                "steps": steps,
+            }
+            for steps in (3000, 16000)
+        },
     ),
 }
 """What was tried, by method."""
