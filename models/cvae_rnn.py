@@ -27,7 +27,7 @@ from ..inference.training import Training
 from ..motion import Windows
 from ..networks import Input, Network, NetworkSpec
 from ..networks.base import once, perceptron, share_modules
-from ..options import Amount, Size
+from ..options import Size
 from ..program.rollout import SelfFeeding
 from ..views import WHOLE
 from .futures import FedBackNetwork
@@ -49,13 +49,16 @@ class CVAERNN(LatentTrajectoryMethod):
     source = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
     generative = "p(w) p(x_t | x_{<t}, y_{1:T}, w, s)"
     inference = "q(w | r_{1:T}, y_{1:T}, s)"
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        skeleton: {**preset, "beta": 0.1 if skeleton else 0.001}
+        for skeleton, preset in LatentTrajectoryMethod.presets.items()
+    }
     trainings: ClassVar[Mapping[str, Training]] = {
         **LatentTrajectoryMethod.trainings,
         "": Training(6000, 16, 1e-3, 0.5),
     }
 
     latent: Size | None = 256
-    beta: Amount | None = 0.1
     summary: Size = 64
     width: Size = 128
     hidden: tuple[Size, ...] = (300, 200, 128)
