@@ -43,8 +43,8 @@ FUTURES: dict[str, dict[str, Any]] = {
     "dsf": {},
     "erd": {},
     "aclstm": {},
-    "moglow": {},
-    "srnn": {"self_feeding": 1.0, "learning_rate": 3e-3},
+    "moglow": {"decay": 0.5},
+    "srnn": {"self_feeding": 1.0, "steps": 3000, "decay": 0.5},
 }
 """Methods by what rows are called, with what their options are beside the presets."""
 STEPS = {
