@@ -52,7 +52,7 @@ class TrajectoryMethod(PoseMethod):
 
     Args:
         latent: size of the latent.
-        keep: probability with which a joint is given, in training; None for what the skeleton has.
+        keep: probability with which a joint is given, in training.
         rotate: turn every training window about the up axis by a uniform angle.
         heading: turn every window so that its first pose faces one way, and the motion back. Turned windows then have
             turned motions, exactly, and `rotate` changes nothing. None for not with Human3.6M's poses, as in the
@@ -60,12 +60,12 @@ class TrajectoryMethod(PoseMethod):
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        HUMAN36M.name: {"heading": False, "keep": 0.15},
-        "": {"heading": True, "keep": 0.15},
+        HUMAN36M.name: {"heading": False},
+        "": {"heading": True},
     }
 
     latent: Size | None = None
-    keep: Share | None = None
+    keep: Share = 0.15
     rotate: bool = True
     heading: bool | None = None
 
@@ -120,9 +120,8 @@ class TrajectoryMethod(PoseMethod):
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
         """Maximises the bound, on windows that are turned anyhow, with some paths given."""
-        keep: Any = self.suited(train).keep
         turned = train.with_protocol(replace(train.protocol, rotate=self.rotate))
-        return Recipe(turned.given(keep), validation and validation.given(keep), [Stage(steps)])
+        return Recipe(turned.given(self.keep), validation and validation.given(self.keep), [Stage(steps)])
 
 
 @dataclass(frozen=True)

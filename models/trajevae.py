@@ -39,8 +39,8 @@ from .poses import table
 from .trajectories import LatentTrajectoryMethod
 
 PRESETS = table(
-    "latent beta components width feedforward layers dropout heading keep",
-    {"human36m": (512, 0.01, 0, 256, 512, 2, 0.1, False, 0.15), "": (32, 0.001, 15, 32, 128, 1, 0.0, True, 0.05)},
+    "latent beta components width feedforward layers dropout heading",
+    {"human36m": (512, 0.01, 0, 256, 512, 2, 0.1, False), "": (32, 0.001, 15, 32, 128, 1, 0.0, True)},
 )
 """Skeleton to options: the paper's; and for others what learns in minutes on a processor."""
 

@@ -134,7 +134,6 @@ SECTIONS = {
             "full, rate 2e-3, 8000 steps of 64": {"learning_rate": 2e-3, "batch_size": 64, "steps": 8000},
             "full, keep .05, 24000 steps": {"keep": 0.05, "steps": 24000},
         },
-        options={"keep": 0.15},
         protocol=PATHS,
     ),
     "cvae-rnn": Section(
