@@ -53,6 +53,7 @@ class CVAERNN(LatentTrajectoryMethod):
         skeleton: {**preset, "beta": 0.1 if skeleton else 0.001}
         for skeleton, preset in LatentTrajectoryMethod.presets.items()
     }
+    """The weight of the KL is the paper's on a paper's skeleton, else the tuning split's (docs/results/tuning.md)."""
     trainings: ClassVar[Mapping[str, Training]] = {
         **LatentTrajectoryMethod.trainings,
         "": Training(6000, 16, 1e-3, 0.5),

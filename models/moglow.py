@@ -19,7 +19,8 @@ not as well:
 * Location and scale before the flow read h_t too, and the location keeps a share of x_{t-1} (`residual`). In the paper
   couplings alone read the past, and a frame is a pose; the baseline of TrajeVAE adds what it draws to the last pose.
 * A coupling multiplies by no more than exp(`bound`) and no less than exp(-bound), in the paper by
-  sigmoid(k + 2) + 1e-6. Draws divide by it: with a bound of 2 one in nine left the data and never returned.
+  sigmoid(k + 2) + 1e-6. Draws divide by it: with a bound of 2 one in nine left the data and never returned
+  (bandai2's tuning split, docs/results/tuning.md).
 """
 
 from __future__ import annotations

@@ -59,10 +59,7 @@ class TrajectoryMethod(PoseMethod):
             paper, where that is left to learn, and for so with others whose left and right are known.
     """
 
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        HUMAN36M.name: {"heading": False},
-        "": {"heading": True},
-    }
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
 
     latent: Size | None = None
     keep: Share = 0.15

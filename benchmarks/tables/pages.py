@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +32,14 @@ def write(page: Path | None, *tables: str, name: str = "tables") -> None:
     begin, end = (mark.replace("tables", name) for mark in (BEGIN, END))
     before, rest = page.read_text(encoding="utf-8").split(begin)
     page.write_text(before + begin + "\n" + "\n".join(tables) + "\n" + end + rest.split(end)[1], encoding="utf-8")
+
+
+def refuse_unknown(what: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """Ends the script where something is asked for that is not there."""
+    known = [*known]
+    for name in names:
+        if name not in known:
+            sys.exit(f"unknown {what} {name!r}; known: {', '.join(known)}")
 
 
 def joined(files: Sequence[Path]) -> tuple[dvae.Evaluation, str]:

@@ -2,11 +2,11 @@
 
 What is fitted stands in the folders of `benchmarks.tables.ranking`, which fits the methods themselves; options and
 training are those of the presets but for what a row is called after. Ablations have fewer steps than the presets, and
-stand beside the full method with as few. The script goes on where it was stopped, and without `--data` fits nothing:
-tables are of the runs that are there. Printed numbers are of other data.
+stand beside the full method with as few. Scores are kept, and the script goes on where it was stopped, as there;
+without `--data` nothing is fitted. Printed numbers are of other data.
 
-Sources: Bie et al., 2022, arXiv 2204.01565, tables 1 to 3; Mao, Liu and Salzmann, 2021, arXiv 2108.08422, tables 1 and
-3; Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, tables 1 and 3 to 6, and figure 6.
+Sources: Bie et al., 2022, arXiv 2204.01565, tables 1 to 3 and 5; Mao, Liu and Salzmann, 2021, arXiv 2108.08422,
+tables 1 to 3; Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, tables 1 and 3 to 6, and figure 6.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import Any
 
 import tyro
 
-from .pages import table, write
-from .ranking import FUTURES, JOINTS, TRAINED, Entry, View, cell, entries, trained, work
+from .pages import refuse_unknown, table, write
+from .ranking import FUTURES, GROUPED, JOINTS, PARTED, PATHS, SCORES, TRAINED, Entry, View, cell, entries, trained, work
 
 ERRORS = ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm")
 REAL = ("APDE", "CMD", "limb stretch", "limb jitter", "pose NLL")
@@ -29,6 +29,23 @@ def printed(columns: str, text: str) -> dict[str, dict[str, str]]:
     """A table of a paper: rows by their names, cells by columns."""
     lines = (line.split("|") for line in text.strip().splitlines())
     return {name.strip(): dict(zip(columns.split(","), cells.split(), strict=True)) for name, cells in lines}
+
+
+@dataclass(frozen=True)
+class Further:
+    """Views of some rows, with a table of their own.
+
+    Args:
+        views: the views.
+        rows: of the paper's.
+        columns: of that table; none for those of all its tables.
+        printed: rows of the paper.
+    """
+
+    views: Sequence[View]
+    rows: Sequence[str]
+    columns: Sequence[str] = ()
+    printed: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -43,7 +60,7 @@ class Paper:
         compared: columns of the table of changes.
         printed: rows of the paper.
         views: of all rows; those with paths have a line for each.
-        further: views of some rows, each of which has a table of its own.
+        further: views of some rows.
     """
 
     set: str
@@ -53,11 +70,11 @@ class Paper:
     compared: Sequence[str]
     printed: Mapping[str, Mapping[str, str]]
     views: Sequence[View] = (View(),)
-    further: Mapping[str, tuple[Sequence[View], Sequence[str]]] = field(default_factory=dict)
+    further: Sequence[Further] = ()
 
     def views_of(self, row: str) -> list[View]:
         """In which a row is scored."""
-        return [*self.views, *(view for views, rows in self.further.values() if row in rows for view in views)]
+        return [*self.views, *(view for each in self.further if row in each.rows for view in each.views)]
 
 
 HIT, COPYING = "hit-dvae", {"nearest": False, "residual": 0.0}
@@ -88,6 +105,8 @@ TERMS: dict[str, dict[str, Any]] = {
     "20 coefficients": {"coefficients": 20},
 }
 """Of GSPS's loss, each left out by itself; and what else was asked."""
+BASELINES = ("erd", "aclstm", "pose-knows", "mt-vae", "rhp", "bom", "bom-parts", "gmvae", "dsf", "dlow")
+LOWER = "dlow, lower held"
 FULL, WHOLE, TIME, STANDARD = "trajevae", "whole poses", "in time", "standard prior"
 SIMPLER: dict[str, dict[str, Any]] = {
     WHOLE: {"complement": False},
@@ -95,6 +114,17 @@ SIMPLER: dict[str, dict[str, Any]] = {
     STANDARD: {"complement": False, "cosine": False, "latent": 8, "learned_prior": False, "beta": 0.1},
 }
 """TrajeVAE without what it adds, one after the other; latents of all have 480 numbers."""
+EXCHANGES: tuple[dict[str, Any], ...] = ({}, {"own": True}, {"truth": "pose"})
+"""Another's pose and the paths' motion as the truth; own poses of the same windows; the truth of the public code."""
+ANOTHERS = printed(
+    "APD,ADE,FDE",
+    """
+    TrajeVAE, 1 | 5.373 .370 .476
+    TrajeVAE, 2 | 5.400 .362 .472
+    TrajeVAE, 3 | 5.096 .375 .491
+    TrajeVAE, 4 | 4.175 .332 .433
+    """,
+)
 PAPERS = {
     "hit-dvae": Paper(
         "bandai2-by-style",
@@ -104,7 +134,7 @@ PAPERS = {
             **{name: {**SHORT[HIT]["1,200 steps"], **options} for name, options in WITHOUT.items()},
             **{row: FUTURES[row] for row in ("gsps", "dlow", "srnn")},
         },
-        (("ACC content", "FID content", "FID style", "APD", "energy score", *REAL), ERRORS),
+        (("ACC content", "FID content", "APD", "energy score", *REAL), ERRORS),
         [*((name, "1,200 steps") for name in WITHOUT), *((name, HIT) for name in ("gsps", "dlow", "srnn"))],
         ("ACC content", "FID content", "APD", "energy score", "ADE", "FDE", "MMADE", "ADEm"),
         printed(
@@ -126,7 +156,23 @@ PAPERS = {
             Human3.6M: neither | .642 .659 2.688 .752 .892 .787 .896 .897 1.184 .934 1.186
             """,
         ),
-        further={"observed": ((View(observed=5), View(observed=30)), (HIT,))},
+        further=(
+            Further((View(observed=5), View(observed=30)), (HIT,)),
+            Further(
+                (View(judges="content+group"),),
+                (HIT, "gsps", "dlow"),
+                (*GROUPED, "ACC content", "FID content"),
+                printed(
+                    "ACC group,FID group,ACC content,FID content",
+                    """
+                    Human3.6M: real motion | .855 – .481 –
+                    Human3.6M: DLow | .659 1.412 .227 1.566
+                    Human3.6M: GSPS | .650 2.030 .222 1.915
+                    Human3.6M: HiT-DVAE | .700 1.708 .281 1.466
+                    """,
+                ),
+            ),
+        ),
     ),
     "gsps": Paper(
         "bandai2-by-style",
@@ -134,6 +180,8 @@ PAPERS = {
             "gsps": {},
             **SHORT["gsps"],
             **{name: {**SHORT["gsps"]["3,000 steps"], **options} for name, options in TERMS.items()},
+            **{row: FUTURES[row] for row in BASELINES},
+            LOWER: {"method": "dlow", "held": "lower"},
         },
         (("APD", "energy score", *ERRORS[:4], *REAL),),
         [(name, "3,000 steps") for name in TERMS],
@@ -141,12 +189,32 @@ PAPERS = {
         printed(
             "APD,ADE,FDE,MMADE,MMFDE,pose NLL",
             """
+            Human3.6M: ERD | 0 .722 .969 .776 .995 –
+            Human3.6M: acLSTM | 0 .789 1.126 .849 1.139 –
+            Human3.6M: Pose-Knows | 6.723 .461 .560 .522 .569 –
+            Human3.6M: MT-VAE | .403 .457 .595 .716 .883 –
+            Human3.6M: HP-GAN | 7.214 .858 .867 .847 .858 –
+            Human3.6M: BoM | 6.265 .448 .533 .514 .544 –
+            Human3.6M: GMVAE | 6.769 .461 .555 .524 .566 –
+            Human3.6M: DeLiGAN | 6.509 .483 .534 .520 .545 –
+            Human3.6M: DSF | 9.330 .493 .592 .550 .599 –
+            Human3.6M: DLow | 11.741 .425 .518 .495 .531 –
             Human3.6M: GSPS | 14.757 .389 .496 .476 .525 74.872
             Human3.6M: no pose prior | 15.257 .389 .497 .477 .527 251.186
             Human3.6M: no angles | 19.608 .397 .534 .506 .575 97.774
             Human3.6M: no diversity | 6.318 .370 .488 .478 .529 64.731
             Human3.6M: no reconstruction | 20.030 .479 .562 .513 .569 89.726
             Human3.6M: no multimodal | 18.079 .394 .538 .520 .587 91.977
+            HumanEva-I: ERD | 0 .382 .461 .521 .595 –
+            HumanEva-I: acLSTM | 0 .429 .541 .530 .608 –
+            HumanEva-I: Pose-Knows | 2.308 .269 .296 .384 .375 –
+            HumanEva-I: MT-VAE | .021 .345 .403 .518 .577 –
+            HumanEva-I: HP-GAN | 1.139 .772 .749 .776 .769 –
+            HumanEva-I: BoM | 2.846 .271 .279 .373 .351 –
+            HumanEva-I: GMVAE | 2.443 .305 .345 .408 .410 –
+            HumanEva-I: DeLiGAN | 2.177 .306 .322 .385 .371 –
+            HumanEva-I: DSF | 4.538 .273 .290 .364 .340 –
+            HumanEva-I: DLow | 4.855 .251 .268 .362 .339 –
             HumanEva-I: GSPS | 5.826 .233 .244 .343 .331 103.306
             HumanEva-I: no pose prior | 7.574 .245 .293 .416 .430 363.847
             HumanEva-I: no angles | 6.569 .235 .276 .406 .410 119.673
@@ -154,6 +222,27 @@ PAPERS = {
             HumanEva-I: no reconstruction | 6.778 .567 .625 .606 .633 109.777
             HumanEva-I: no multimodal | 6.474 .234 .283 .415 .421 113.630
             """,
+        ),
+        further=(
+            Further((View(parts="free"),), ("gsps", "bom-parts", "dlow", LOWER), ("APD", *PARTED)),
+            Further(
+                (View(parts="held"),),
+                ("gsps", "bom-parts"),
+                ("APD", *PARTED),
+                printed(
+                    ",".join(PARTED),
+                    """
+                    Human3.6M: BoM with parts | 0 4.408
+                    Human3.6M: DLow, lower held | 1.071 12.741
+                    Human3.6M: DLow, 50 of 1,000 | .780 7.280
+                    Human3.6M: GSPS | 0 13.150
+                    HumanEva-I: BoM with parts | 0 1.319
+                    HumanEva-I: DLow, lower held | .937 4.671
+                    HumanEva-I: DLow, 50 of 1,000 | .571 1.821
+                    HumanEva-I: GSPS | 0 5.096
+                    """,
+                ),
+            ),
         ),
     ),
     "trajevae": Paper(
@@ -163,6 +252,7 @@ PAPERS = {
             **SHORT[FULL],
             **{name: {**SHORT[FULL]["6,000 steps"], **options} for name, options in SIMPLER.items()},
             "cvae-rnn": {},
+            "motion-infilling": PATHS["motion-infilling"],
         },
         (("APD", "energy score", *ERRORS[:4], "path error", "global ADE", "limb stretch", "limb jitter"),),
         [("6,000 steps", WHOLE), (WHOLE, TIME), (TIME, STANDARD), (FULL, "cvae-rnn")],
@@ -200,19 +290,39 @@ PAPERS = {
             CVAE-RNN, 2 | 9.496 .588 .714 .642 .745
             CVAE-RNN, 3 | 9.309 .516 .626 .614 .699
             CVAE-RNN, 4 | 9.242 .459 .560 .602 .679
+            Motion Infilling, 0 | 0 1.203 1.209 1.197 1.207
+            Motion Infilling, 1 | 0 >10⁴ >10⁴ >10⁴ >10⁴
+            Motion Infilling, 2 | 0 >10⁴ >10⁴ >10⁴ >10⁴
+            Motion Infilling, 3 | 0 22.727 76.233 22.801 76.326
+            Motion Infilling, 4 | 0 1.067 1.220 1.258 1.468
             """,
         ),
         tuple(map(View, range(5))),
-        {
-            "many": (tuple(map(View, (6, 8, 10, 13, 16, 19, 21))), (FULL,)),
-            "single": (
+        (
+            Further(tuple(map(View, (6, 8, 10, 13, 16, 19, 21))), (FULL,)),
+            Further(
                 tuple(View(count, single=True) for count in range(5)),
                 (FULL, "6,000 steps", WHOLE, TIME, STANDARD, "cvae-rnn"),
+                printed=printed(
+                    "ADE,FDE",
+                    """
+                    TrajeVAE, 0 | .529 .779
+                    TrajeVAE, 1 | .491 .735
+                    TrajeVAE, 2 | .477 .710
+                    TrajeVAE, 3 | .396 .593
+                    TrajeVAE, 4 | .345 .522
+                    """,
+                ),
             ),
-            "exchanged": (tuple(View(count, exchanged=0.01) for count in range(1, 5)), (FULL, "cvae-rnn")),
-            "own": (tuple(View(count, exchanged=0.01, own=True) for count in range(1, 5)), (FULL, "cvae-rnn")),
-            "owner": (tuple(View(count, exchanged=0.01, truth="pose") for count in range(1, 5)), (FULL, "cvae-rnn")),
-        },
+            *(
+                Further(
+                    tuple(View(count, exchanged=0.01, **how) for count in range(1, 5)),
+                    (FULL, "cvae-rnn"),
+                    printed={} if how else ANOTHERS,
+                )
+                for how in EXCHANGES
+            ),
+        ),
     ),
 }
 """By the pages of docs/results on which their tables stand."""
@@ -234,7 +344,7 @@ def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[st
             told = [str(vars(view)[what]) if entry.minutes or what != "given" else ""] if what else []
             lines.append([row, *told, *trained(entry), *map(cell, means)])
     for row, cells in beside.items():
-        name, _, given = row.partition(", ")
+        name, _, given = row.rpartition(", ") if what else (row, "", "")
         lines.append([f"*{name}*", *([given] if what else []), "", "", *(cells.get(column, "–") for column in columns)])
     return table(["", *([what] if what else []), *TRAINED, *columns], lines)
 
@@ -277,6 +387,7 @@ def main(
     rows: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0, 1, 2),
     samples: int = 50,
+    stored: Path = SCORES,
     pages: Path | None = None,
 ) -> None:
     """Fit and score what is missing, and write the tables.
@@ -288,22 +399,26 @@ def main(
         rows: of these alone; all of a paper where none is named.
         seeds: of every row.
         samples: futures of a window.
+        stored: the folder of scores and judges.
         pages: the folder of the pages; without one tables are printed.
     """
+    refuse_unknown("paper", papers, PAPERS)
+    refuse_unknown("row", rows, (row for name in papers for row in PAPERS[name].rows))
     for name in papers:
         paper = PAPERS[name]
         if data is not None:
-            chosen = {row: options for row, options in paper.rows.items() if not rows or row in rows}
-            views = {row: paper.views_of(row) for row in chosen}
-            work(data, runs, paper.set, chosen, views, seeds, samples)
-        found = {view: entries(runs, paper.set, view, paper.rows) for view in paper.views}
+            fitted = {row: options for row, options in paper.rows.items() if not rows or row in rows}
+            views = {row: paper.views_of(row) for row in fitted}
+            work(data, runs, stored, paper.set, fitted, views, seeds, samples)
+        found = {view: entries(stored, paper.set, view, paper.rows) for view in paper.views}
         tables = [scores(found, columns, paper.printed) for columns in paper.columns]
         tables.append(changes(found, paper))
         if len(found) > 1:
             tables.append(more_joints(found, paper))
-        for views, of in paper.further.values():
-            seen = {view: each for view in views if (each := entries(runs, paper.set, view, of))}
-            tables += [scores(seen, columns, {}) for columns in paper.columns] if seen else []
+        for each in paper.further:
+            seen = {view: rows for view in each.views if (rows := entries(stored, paper.set, view, each.rows))}
+            chosen = [each.columns] if each.columns else paper.columns
+            tables += [scores(seen, columns, each.printed) for columns in chosen] if seen else []
         write(None if pages is None else pages / f"{name.replace('-', '_')}.md", *tables, name="rows")
 
 

@@ -1,33 +1,41 @@
 """Fits every method for motion on every set, scores it on the test windows, and ranks them.
 
 Methods have the options and the training of their presets, which the tuning protocol chose (docs/results/tuning.md);
-runs lie in `RUNS/SET/METHOD-seedN`, each with evaluation.json in it. The script goes on where it was stopped, and
-without `--data` fits nothing: tables are of the runs that are there.
+runs lie in `RUNS/SET/METHOD-seedN`. What tables are made of, scores by clip, is kept in `SCORES/SET` beside the judges
+that gave them: the script goes on where it was stopped, there or on another machine, a further method is scored by the
+same judges, and without `--data` nothing is fitted.
 """
 
 from __future__ import annotations
 
+import gzip
+import json
 import statistics
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import tyro
+from torch import nn
 
 import dvae
 from dvae import Evaluation, Training, motion
 from dvae.inference.checkpoints import Run
 from dvae.inference.comparison import Crossed, Estimate
+from dvae.inference.metrics import average_pairwise_distance
+from dvae.inference.scores import Measure
 from dvae.models import registry
 from dvae.motion.dataset import MotionData
+from dvae.motion.parts import UNIONS, body_parts
 from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
-from .pages import same, table, write
+from .pages import refuse_unknown, same, table, write
+
+SCORES = Path(__file__).parents[1] / "scores"
 
 FUTURES: dict[str, dict[str, Any]] = {
     "hit-dvae": {},
@@ -82,6 +90,9 @@ class View:
         own: of the windows that have such another one, with their own poses.
         truth: see `motion.Exchanged`.
         observed: frames, in place of the protocol's.
+        judges: names with + between, in place of the set's.
+        parts: how diverse the parts of the body are, alone, in "free" futures, or in those that have the lower body's
+            draw "held", that of the first.
     """
 
     given: int | None = None
@@ -90,6 +101,8 @@ class View:
     own: bool = False
     truth: Literal["path", "pose"] = "path"
     observed: int | None = None
+    judges: str = ""
+    parts: Literal["", "free", "held"] = ""
 
     def windows(self, data: MotionData, split: str) -> Any:
         """Windows of a part of the data, and what is told of them."""
@@ -126,7 +139,7 @@ class Set:
 BANDAI, CMU = "bandai/bandai2.npz", "cmu/cmu8.npz"
 GIVEN = tuple(View(count) for count in range(5))
 SETS = {
-    "bandai2-by-style": Set(BANDAI, FUTURES, judges=("prior", "content", "style")),
+    "bandai2-by-style": Set(BANDAI, FUTURES, judges=("prior", "content")),
     "bandai2-by-take": Set(BANDAI, ALIKE, judges=("prior", "content")),
     "cmu8": Set(CMU, ALIKE, judges=("prior", "content")),
     "bandai2-trajectories": Set(BANDAI, PATHS, GIVEN),
@@ -134,36 +147,101 @@ SETS = {
 }
 JOINTS = ("RToe", "LToe", "LWrist", "RWrist")
 """Whose paths are given first, as in TrajeVAE's tables."""
+CLASSIFIER = Training(steps=3000, learning_rate=3e-3, decay=0.5, validate_every=250)
 JUDGES: dict[str, tuple[str, dict[str, Any], Training]] = {
     "prior": ("pose-prior", {"heading": True}, Training(steps=1000, learning_rate=0.01, decay=0.8)),
-    "content": ("action-classifier", {}, Training(steps=3000, learning_rate=3e-3, decay=0.5, validate_every=250)),
-    "style": (
-        "action-classifier",
-        {"label": "style"},
-        Training(steps=1500, learning_rate=3e-3, decay=0.5, validate_every=250),
-    ),
+    "content": ("action-classifier", {}, CLASSIFIER),
+    "group": ("action-classifier", {"label": "group"}, CLASSIFIER),
 }
 """Methods that judge, their options and their training."""
 COLUMNS = ("energy score", "ADE", "FDE", "ADEm", "MMADE", "APD", "APDE", "CMD", "limb stretch", "limb jitter")
 JUDGED = ("ACC content", "FID content", "pose NLL")
+OTHERS = ("FDEm", "MMFDE", "MMADEm", "MMFDEm", "path error", "global ADE")
+"""Scores that the papers' tables show beside those."""
+GROUPED = ("ACC group", "FID group")
+PARTED = tuple(f"APD {part}" for part in UNIONS)
+SHOWN = {*COLUMNS, *JUDGED, *OTHERS, *GROUPED, *PARTED}
 RANKED = "energy score"
 """By which rows stand in order; it is proper, and the lowest is best."""
 NEIGHBOURS = "nearest neighbours"
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Scores of a run by clip, or of all reference rows.
+
+    Attributes:
+        basis: windows, draws and judges, which all rows of a table share.
+        clips: windows of each.
+        rows: `{row: {score: means by clip}}`, of four digits.
+        minutes: of processor time that the fit took.
+        config: method and training of the run, without paths to others.
+    """
+
+    basis: Sequence[Any]
+    clips: Mapping[str, int]
+    rows: Mapping[str, Mapping[str, Sequence[float]]]
+    minutes: float = 0.0
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, evaluation: Evaluation, run: Path | None) -> Self:
+        """What tables show of an evaluation, and what was fitted."""
+        rows = {
+            name: {
+                score: [float(f"{value:.4g}") for value in values]
+                for score, values in row.clip_means.items()
+                if score in SHOWN
+            }
+            for name, row in evaluation.rows.items()
+        }
+        basis = json.loads(json.dumps(same(evaluation)))
+        if run is None:
+            return cls(basis, evaluation.clips, rows)
+        fitted = Run(run)
+        options = {name: value for name, value in fitted.config["method"].items() if not name.endswith("_run")}
+        config = {"method": options, "training": fitted.config["training"]}
+        return cls(basis, evaluation.clips, rows, fitted.state.get("processor_seconds", 0.0) / 60, config)
+
+    @classmethod
+    def load(cls, file: Path) -> Self:
+        """As saved."""
+        return cls(**json.loads(gzip.decompress(file.read_bytes())))
+
+    def save(self, file: Path) -> None:
+        """As compressed JSON, the same bytes for the same scores."""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(gzip.compress(json.dumps(vars(self), separators=(",", ":")).encode(), mtime=0))
 
 
 def fitted_judges(data: MotionData, runs: Path, names: Sequence[str] = ("prior", "content")) -> dict[str, Path]:
     """Run directories of judges of the training clips, fitted once."""
     for name in names:
         method, options, training = JUDGES[name]
-        sweep({name: registry.judges()[method](**options)}, data, runs / "judges", (0,), training, jobs=1)
+        clips = grouped(data) if options.get("label") == "group" else data
+        (judge,) = sweep({name: registry.judges()[method](**options)}, clips, runs / "judges", (0,), training, jobs=1)
+        config = judge.path / "config.json"  # is kept, and says nothing of this machine
+        text = config.read_text(encoding="utf-8").replace(json.dumps(data.path), json.dumps(Path(data.path).name))
+        config.write_text(text, encoding="utf-8")
     return {name: runs / "judges" / f"{name}-seed0" for name in names}
 
 
+def grouped(data: MotionData) -> MotionData:
+    """Clips with the group of their content as a label, too: ways to walk are one, and so are those to wave."""
+    labels = [{**clip.labels, "group": clip.labels["content"].split("-")[0]} for clip in data.motion]
+    clips = [replace(clip, labels=each) for clip, each in zip(data.motion, labels, strict=True)]
+    return replace(data, motion=motion.MotionSet(clips, data.motion.skeleton, data.motion.name, copy=False))
+
+
 def judging(judged: Mapping[str, Path]) -> Any:
-    """The scores of motion, with those of judges where there are some."""
+    """The scores of motion that tables show, with those of judges where there are some."""
     models = {name: load(path).model for name, path in judged.items()}
     prior = models.pop("prior", None)
-    return partial(motion.scores, pose_prior=prior, classifiers=models)
+
+    def scores(windows: Any) -> list[Measure]:
+        return [each for each in motion.scores(windows, prior, models) if each.name in SHOWN]
+
+    return scores
 
 
 def fit(
@@ -204,6 +282,7 @@ def folder(row: str) -> str:
 def work(
     data: Path,
     runs: Path,
+    stored: Path,
     name: str,
     methods: Mapping[str, Mapping[str, Any]],
     views: Mapping[str, Sequence[View]],
@@ -215,6 +294,7 @@ def work(
     Args:
         data: the folder of files.
         runs: of all sets.
+        stored: scores of all sets.
         name: of the set.
         methods: by the rows that they are.
         views: in which each is scored; the reference rows in all of them.
@@ -222,44 +302,84 @@ def work(
         samples: futures of a window.
     """
     opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[name])
-    judged = fitted_judges(opened, runs / name, SETS[name].judges)
-    scores = judging(judged)
+    judged = fitted_judges(opened, stored / name, SETS[name].judges)
 
-    def score(path: Path, row: str | None, view: View) -> None:
-        file = evaluation(path, view)
-        if not file.exists():
-            models = {} if row is None else {row: load(path).model}
-            known: dict[str, Any] = {"training_windows": view.windows(opened, "train+validation")}
-            options = {"references": False} if models else known
-            windows, told = view.windows(opened, "test"), view.evaluate(samples)
-            dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **told).save(file)
+    def score(path: Path | None, row: str, view: View, file: Path) -> None:
+        data, by = opened, judged
+        if view.judges:
+            data, by = grouped(opened), fitted_judges(opened, stored / name, view.judges.split("+"))
+        elif view.observed:  # a pose prior reads windows turned at the last frame that its own protocol observes
+            by = {judge: run for judge, run in judged.items() if judge != "prior"}
+        models = {} if path is None else {row: load(path).model}
+        known: dict[str, Any] = {"training_windows": view.windows(data, "train+validation")}
+        options = {"references": False} if models else known
+        windows, told = view.windows(data, "test"), view.evaluate(samples)
+        if view.parts:
+            models = {name: Held(model) if view.parts == "held" else model for name, model in models.items()}
+        scores = diversities if view.parts else judging(by)
+        found = dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **told)
+        Scored.of(found, path).save(file)
 
     for view in dict.fromkeys(view for each in views.values() for view in each):
-        if not (view.single or view.exchanged):
-            score(runs / name, None, view)
+        file = kept(stored / name, REFERENCES, view)
+        if not (view.single or view.exchanged or view.parts == "held" or file.exists()):
+            score(None, REFERENCES, view, file)
     for seed in seeds:
         for row in methods:
-            path = fit(opened, row, methods, seed, runs / name, judged.get("prior"))
-            for view in views[row]:
-                score(path, row, view)
+            files = {view: kept(stored / name, f"{folder(row)}-seed{seed}", view) for view in views[row]}
+            if missing := {view: file for view, file in files.items() if not file.exists()}:
+                path = fit(opened, row, methods, seed, runs / name, judged.get("prior"))
+                for view, file in missing.items():
+                    score(path, row, view, file)
 
 
-def evaluation(path: Path, view: View) -> Path:
+class Held(nn.Module):
+    """A model whose futures share the first one's draw of the lower body."""
+
+    likelihood = False
+
+    def __init__(self, model: Any) -> None:
+        super().__init__()
+        self.model, self.generative, self.inference = model, model.generative, model.inference
+
+    def forecast(self, past: Any, horizon: int, samples: int, **options: Any) -> Any:
+        """Futures, of a model that has a latent of the lower body."""
+        lower = self.model.forecast(past, horizon, 1, **options)["lower"][0]
+        return self.model.forecast(past, horizon, samples, fix={"lower": lower}, **options)
+
+
+def diversities(windows: Any) -> list[Measure]:
+    """The diversity of futures, and of the coordinates of each part of the body alone."""
+
+    def of(place: Any) -> Any:
+        return lambda forecasts, *_: average_pairwise_distance(forecasts[..., place])
+
+    parts = body_parts(windows.skeleton, tuple(UNIONS))
+    places = {"APD": slice(None)} | {
+        f"APD {part}": [3 * joint + axis for joint in joints for axis in range(3)] for part, joints in parts.items()
+    }
+    return [Measure(name, of(place), "m", "higher") for name, place in places.items()]
+
+
+REFERENCES = "references"
+
+
+def kept(path: Path, name: str, view: View) -> Path:
     """The file of scores of a run, or of the reference rows of a set."""
-    return path / f"evaluation{view}.json"
+    return path / name / f"scores{view}.json.gz"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of a ranking: the evaluations of its seeds, and the minutes of processor time that each fit took."""
+    """A row of a ranking: the scores of its seeds, and the minutes of processor time that each fit took."""
 
-    seeds: Sequence[Evaluation]
+    seeds: Sequence[Scored]
     minutes: Sequence[float]
 
     def means(self, metric: str) -> np.ndarray | None:
         """(S, C), by seed and clip, where all have the score."""
         (name,) = {name for each in self.seeds for name in each.rows}
-        rows = [each.rows[name].clip_means for each in self.seeds]
+        rows = [each.rows[name] for each in self.seeds]
         return np.array([row[metric] for row in rows]) if all(metric in row for row in rows) else None
 
     def crossed(self, metric: str, minus: Entry | None = None) -> Crossed | None:
@@ -274,30 +394,25 @@ class Entry:
         return crossed if self.minutes else replace(crossed, seeds=0.0, rest=0.0, count=sys.maxsize)
 
 
-def entries(runs: Path, name: str, view: View, methods: Iterable[str]) -> dict[str, Entry]:
+def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict[str, Entry]:
     """What has been scored on a set: the reference rows, and methods with their seeds.
 
     Raises:
-        ValueError: evaluations of other windows, samples, or judges.
+        ValueError: scores of other windows, samples, or judges.
     """
     found, basis = {}, None
-    file = evaluation(runs / name, view)
+    file = kept(stored / name, REFERENCES, view)
     if file.exists():
-        references = Evaluation.load(file)
-        basis = same(references)
+        references = Scored.load(file)
+        basis = references.basis
         found = {row: Entry([replace(references, rows={row: value})], []) for row, value in references.rows.items()}
     for row in methods:
-        files = sorted((runs / name).glob(f"{folder(row)}-seed*/evaluation{view}.json"))
-        scored = [Evaluation.load(file) for file in files]
-        for each in scored:
-            basis = basis or same(each)
-            if same(each) != basis:
-                raise ValueError(
-                    f"evaluations of {row} below {runs / name} are of other windows, samples, seed or judges"
-                )
-        if scored:
-            times = [Run(file.parent).state.get("processor_seconds", 0.0) / 60 for file in files]
-            found[row] = Entry(scored, times)
+        files = sorted((stored / name).glob(str(kept(Path(), f"{folder(row)}-seed*", view))))
+        if scored := [Scored.load(file) for file in files]:
+            basis = basis or scored[0].basis
+            if any(each.basis != basis for each in scored):
+                raise ValueError(f"scores of {row} in {stored / name} are of other windows, samples, seed or judges")
+            found[row] = Entry(scored, [each.minutes for each in scored])
     return found
 
 
@@ -343,6 +458,7 @@ def main(
     methods: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0, 1, 2),
     samples: int = 50,
+    scores: Path = SCORES,
     page: Path | None = None,
 ) -> None:
     """Fit and score what is missing, and write the tables.
@@ -354,16 +470,19 @@ def main(
         methods: of these alone; all of a set where none is named.
         seeds: of every method.
         samples: futures of a window.
+        scores: the folder of scores and judges; in another than the project's own, all is fitted anew.
         page: whose tables; without one they are printed.
     """
+    refuse_unknown("set", sets, SETS)
+    refuse_unknown("method", methods, {**FUTURES, **PATHS})
     for name in sets:
         chosen = SETS[name]
         if data is not None:
             named = {row: options for row, options in chosen.methods.items() if not methods or row in methods}
-            work(data, runs, name, named, dict.fromkeys(named, chosen.views), seeds, samples)
+            work(data, runs, scores, name, named, dict.fromkeys(named, chosen.views), seeds, samples)
         tables = []
         for view in chosen.views:
-            if found := entries(runs, name, view, chosen.methods):
+            if found := entries(scores, name, view, chosen.methods):
                 heading = "" if view.given is None else f"With {view.given} paths given:\n\n"
                 tables.append(heading + ranking(found, [*COLUMNS, *(JUDGED if chosen.judges else ())]))
         if tables:

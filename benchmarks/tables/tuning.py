@@ -1,8 +1,8 @@
 """Fits and scores what options of methods for motion are chosen by, and writes the tables of docs/results/tuning.md.
 
 Everything is under one protocol, bandai2-tuning: people of group A train, those of group B, whose styles are not
-those of training, judge, on every fourth window; nobody of the test group C is seen. Runs lie under `--runs`, each with
-scores.json in it: the script goes on where it was stopped, and tables are of what is there.
+those of training, judge, on every fourth window; nobody of the test group C is seen. Scores are kept, by section, in
+`benchmarks/scores/tuning`: the script goes on where it was stopped, and tables are of what is there.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ from dvae.motion.dataset import MotionData
 from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
-from .pages import table, write
-from .ranking import JOINTS, JUDGES, fitted_judges, folder, judging, parted
+from .pages import refuse_unknown, table, write
+from .ranking import JOINTS, JUDGES, SCORES, fitted_judges, folder, judging, parted
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
-SCORED = "scores.json"
 COLUMNS_OF_JUDGES = ("pose NLL", "ACC content")
 COLUMNS = ("ADE", "FDE", "ADEm", "APD", "energy score", "ACC content", "FID content", "pose NLL", "KL w", "KL z")
 """Scores that pages show, where there are."""
@@ -56,6 +55,11 @@ class Section:
     protocol: motion.Protocol = TUNING
     judged: bool = False
     seeds: tuple[int, ...] = (0,)
+
+    @property
+    def columns(self) -> Sequence[str]:
+        """Of its table."""
+        return COLUMNS if self.protocol.root == "drop" else PATH_COLUMNS
 
     def of(self, case: str, prior: Path) -> tuple[Any, Training]:
         """The method of a case, and its training."""
@@ -125,7 +129,18 @@ SECTIONS = {
         Training(steps=6000, batch_size=16, learning_rate=5e-4, decay=0.8, validate_every=1000),
         {
             **{f"{name}, {beta:g}": {**ABLATED[name], "beta": beta} for name, beta in WEIGHED},
-            "in time, 8 each, .001": {**ABLATED["in time"], "latent": 8},
+            **{
+                f"in time, 8 each, {beta:g}": {**ABLATED["in time"], "latent": 8, "beta": beta} for beta in (1e-4, 1e-3)
+            },
+            **{
+                f"in time, 8 each, standard prior, {beta:g}": {
+                    **ABLATED["in time"],
+                    "latent": 8,
+                    "learned_prior": False,
+                    "beta": beta,
+                }
+                for beta in (1e-3, 1e-2, 0.1)
+            },
             "full, keep .05": {"keep": 0.05},
             "full, keep .5": {"keep": 0.5},
             "full, rate 1e-3": {"learning_rate": 1e-3},
@@ -162,12 +177,7 @@ SECTIONS = {
             }.items()
         }
         | {
-            f"srnn, 0.001, {steps} steps": {
-                "method": "srnn",
-                "self_feeding": 1.0,
-                "learning_rate": 1e-3,
-                "steps": steps,
-            }
+            f"srnn, 0.001, {steps} steps": {**BEFORE["srnn"], "method": "srnn", "learning_rate": 1e-3, "steps": steps}
             for steps in (3000, 16000)
         },
     ),
@@ -177,20 +187,47 @@ SECTIONS = {
 
 STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
 """Steps of judges, who are to know poses and contents of people whom they have not seen."""
+OF_JUDGES = [f"{judge} {steps} steps" for judge, tried in STEPS.items() for steps in tried]
 
 
-def of_judges(data: MotionData, runs: Path, judged: Mapping[str, Path]) -> None:
+Kept = dict[str, dict[str, dict[str, float]]]
+"""Means of scores, by case and seed."""
+
+
+class Store:
+    """The scores of a section, in a file of JSON."""
+
+    def __init__(self, folder: Path, section: str) -> None:
+        self.file = folder / f"{section}.json"
+
+    @property
+    def found(self) -> Kept:
+        """By case and seed; none before the first."""
+        return json.loads(self.file.read_text(encoding="utf-8")) if self.file.exists() else {}
+
+    def add(self, case: str, seed: int, scores: Mapping[str, float]) -> None:
+        """Beside what there is."""
+        found = self.found
+        found.setdefault(case, {})[str(seed)] = {name: round(value, 4) for name, value in scores.items()}
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        self.file.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+    def lacks(self, case: str, seed: int) -> bool:
+        """Whether it has not been scored."""
+        return str(seed) not in self.found.get(case, {})
+
+
+def of_judges(data: MotionData, runs: Path, store: Store, judged: Mapping[str, Path]) -> None:
     """Fits judges for other numbers of steps, and scores real motion of the judging group by each."""
     for name, tried in STEPS.items():
         method, options, training = JUDGES[name]
         for steps in tried:
-            row, told = f"{name}-{steps}-steps", replace(training, steps=steps)
-            sweep({row: registry.judges()[method](**options)}, data, runs, (0,), told, jobs=1)
-            path = runs / f"{row}-seed0"
-            if not (path / SCORED).exists():
-                scores, real = judging({**judged, name: path}), ["zero velocity"]
+            row, told = f"{name} {steps} steps", replace(training, steps=steps)
+            if store.lacks(row, 0):
+                sweep({folder(row): registry.judges()[method](**options)}, data, runs, (0,), told, jobs=1)
+                scores, real = judging({**judged, name: runs / f"{folder(row)}-seed0"}), ["zero velocity"]
                 found = dvae.evaluate({}, seen(data), scores=scores, samples=1, references=real, progress=False)
-                keep(path, {each: score.mean for each, score in found["real motion"].items()})
+                store.add(row, 0, {each: score.mean for each, score in found["real motion"].items()})
 
 
 def seen(data: MotionData) -> motion.Windows:
@@ -199,35 +236,21 @@ def seen(data: MotionData) -> motion.Windows:
     return motion.windows(data.motion, protocol, "test")
 
 
-def keep(path: Path, found: Mapping[str, float]) -> None:
-    """Beside a run."""
-    (path / SCORED).write_text(json.dumps(found, indent=1), encoding="utf-8")
-
-
-def score(path: Path, data: MotionData, judged: Mapping[str, Path]) -> None:
+def score(path: Path, data: MotionData, judged: Mapping[str, Path]) -> dict[str, float]:
     """Means over these windows."""
-    if (path / SCORED).exists():
-        return
     model, windows, found = load(path).model, seen(data), {}
     if data.protocol.root == "drop":
-        found = evaluated(model, windows, judging(judged))
-    else:
-        for count in range(len(JOINTS) + 1):
-            one = evaluated(model, windows.given(JOINTS[:count]), motion.scores)
-            found |= {f"{name}, {count} given": value for name, value in one.items()}
-    keep(path, found)
+        return evaluated(model, windows, judging(judged))
+    for count in range(len(JOINTS) + 1):
+        one = evaluated(model, windows.given(JOINTS[:count]), motion.scores)
+        found |= {f"{name}, {count} given": value for name, value in one.items()}
+    return found
 
 
 def evaluated(model: Any, windows: Any, scores: Any) -> dict[str, float]:
     """Means of scores over windows."""
     found = dvae.evaluate(model, windows, scores=scores, samples=SAMPLES, references=False, progress=False)
     return {name: each.mean for name, each in found["model"].items()}
-
-
-def kept(runs: Path, case: str, seeds: Sequence[int]) -> list[dict[str, float]]:
-    """What has been scored of a case, by seed."""
-    files = (runs / f"{folder(case)}-seed{seed}" / SCORED for seed in seeds)
-    return [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
 
 
 def shown(scores: Sequence[Mapping[str, float]], name: str) -> str:
@@ -239,24 +262,25 @@ def shown(scores: Sequence[Mapping[str, float]], name: str) -> str:
     return f"{sum(values) / len(values):.3f}" + (f" ({each})" if len(values) > 1 else "")
 
 
-def work(data: Path, runs: Path, sections: Sequence[str], jobs: int) -> None:
+def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: int) -> None:
     """Fits and scores what is not there yet."""
     opened = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
-    judged = fitted_judges(opened[TUNING.name], runs)
+    asked = [TUNING if name == "judges" else SECTIONS[name].protocol for name in sections]
+    judged = fitted_judges(opened[TUNING.name], runs) if any(each.root == "drop" for each in asked) else {}
     prior = judged.get("prior", Path()).absolute()
     for name in sections:
+        store = Store(stored, name)
         if name == "judges":
-            of_judges(opened[TUNING.name], runs / name, judged)
+            of_judges(opened[TUNING.name], runs / name, store, judged)
             continue
         section = SECTIONS[name]
         own = opened[section.protocol.name]
         for case in section.cases:
-            if len(kept(runs / name, case, section.seeds)) == len(section.seeds):
-                continue
-            method, training = section.of(case, prior)
-            sweep({folder(case): method}, own, runs / name, section.seeds, training, jobs)
-            for seed in section.seeds:
-                score(runs / name / f"{folder(case)}-seed{seed}", own, judged)
+            if seeds := [seed for seed in section.seeds if store.lacks(case, seed)]:
+                method, training = section.of(case, prior)
+                sweep({folder(case): method}, own, runs / name, seeds, training, jobs)
+                for seed in seeds:
+                    store.add(case, seed, score(runs / name / f"{folder(case)}-seed{seed}", own, judged))
 
 
 def main(
@@ -264,6 +288,7 @@ def main(
     data: Path | None = None,
     sections: tuple[str, ...] = ("judges", *SECTIONS),
     jobs: int = 1,
+    stored: Path = SCORES / "tuning",
     page: Path | None = None,
 ) -> None:
     """Fit and score what is missing, and write the tables.
@@ -273,19 +298,17 @@ def main(
         data: bandai2.npz; without it nothing is fitted.
         sections: which.
         jobs: runs at a time.
+        stored: the folder of scores.
         page: whose tables; without one they are printed.
     """
+    refuse_unknown("section", sections, ("judges", *SECTIONS))
     if data is not None:
-        work(data, runs, sections, jobs)
+        work(data, runs, stored, sections, jobs)
     for name in sections:
-        if name == "judges":
-            columns, seeds = COLUMNS_OF_JUDGES, (0,)
-            cases = [f"{judge} {steps} steps" for judge, tried in STEPS.items() for steps in tried]
-        else:
-            section = SECTIONS[name]
-            columns = COLUMNS if section.protocol.root == "drop" else PATH_COLUMNS
-            cases, seeds = [*section.cases], section.seeds
-        scored = {case: found for case in cases if (found := kept(runs / name, case, seeds))}
+        columns = COLUMNS_OF_JUDGES if name == "judges" else SECTIONS[name].columns
+        found = Store(stored, name).found
+        cases = OF_JUDGES if name == "judges" else SECTIONS[name].cases
+        scored = {case: [*found[case].values()] for case in cases if case in found}
         lines = [[case, *(shown(found, column) for column in columns)] for case, found in scored.items()]
         write(page, table([name, *columns], lines), name=name)
 

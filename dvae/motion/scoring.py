@@ -92,7 +92,7 @@ def scores(
     if windows.given_joints:
         found.append(_path_error(windows))
     bones = _bones(windows)
-    found += [_bone_length_error(windows, *bones), *_limbs(windows, *bones)]
+    found += _limbs(windows, *bones)
     if windows.protocol.predicted > 1:
         found.append(_cumulative_motion(windows))
     if windows.protocol.observed + windows.protocol.predicted > SEAM:
@@ -195,21 +195,11 @@ def _bones(windows: Windows | Exchanged) -> tuple[list[int], str]:
     return (~short).nonzero()[:, 0].tolist(), note if short.any() else ""
 
 
-def _bone_length_error(windows: Windows | Exchanged, bones: list[int], note: str) -> Measure:
-    """Mean of |length / observed length - 1| over samples, frames and bones."""
-
-    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        both = forecasts, gapped(past)
-        lengths, reference = (windows.skeleton.bone_lengths(windows.positions(poses))[..., bones] for poses in both)
-        return mean_of_known((lengths / mean_of_known(reference, 1)[:, None, None] - 1).abs(), (1, 2, 3))
-
-    return Measure("bone-length error", function, "relative", partial=windows.missing, note=note)
-
-
 def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Measure]:
-    """Stretch and jitter of limbs, and errors of the angles between them."""
+    """Errors of bone lengths, stretch and jitter of limbs, and errors of the angles between them."""
     skeleton = windows.skeleton
 
+    @lru_cache(maxsize=2)  # of forecasts and futures, for all scores of a batch
     def lengths(x: Tensor) -> Tensor:
         found: Tensor = skeleton.bone_lengths(windows.positions(x))[..., bones]
         return found
@@ -231,8 +221,14 @@ def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Me
     if windows.protocol.predicted > 1:
         scores["limb jitter"] = lambda errors: errors.diff(dim=2).abs().mean(2)
         scores["limb jitter RMS"] = lambda errors: errors.diff(dim=2).square().mean(2).sqrt()
+
+    def bone_length_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        reference = mean_of_known(skeleton.bone_lengths(windows.positions(gapped(past)))[..., bones], 1)
+        return mean_of_known((lengths(forecasts) / reference[:, None, None] - 1).abs(), (1, 2, 3))
+
     shared: Any = {"partial": windows.missing, "note": note}
-    found = [Measure(name, of_errors(score), "relative", **shared) for name, score in scores.items()]
+    functions = {"bone-length error": bone_length_error, **{name: of_errors(score) for name, score in scores.items()}}
+    found = [Measure(name, function, "relative", **shared) for name, function in functions.items()]
 
     edges = [skeleton.edges[bone] for bone in bones]
     starts, ends = (list(joints) for joints in zip(*edges, strict=True))

@@ -39,6 +39,12 @@ def test_a_page_links_to_what_is_there(page):
         assert there.is_relative_to(ROOT / "docs"), f"{target} is not on the site"
 
 
+@pytest.mark.parametrize("page", sorted(ROOT.glob("*.md")), ids=lambda page: page.stem)
+def test_a_file_of_the_root_links_to_what_is_there(page):
+    for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text(encoding="utf-8")):
+        assert (ROOT / target).exists(), target
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_what_a_page_names_is_there(page):
     for name in re.findall(r"\bdvae(?:\.[A-Za-z_]\w*)+", page.read_text(encoding="utf-8")):

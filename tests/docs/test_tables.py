@@ -406,12 +406,17 @@ def test_ranking(folder, page, monkeypatch):
     monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", small)})
     monkeypatch.setattr(ranking, "fitted_judges", lambda *arguments: {})
     page.write_text(page.read_text().replace("tables", "simulated"))
-    runs, options = folder / "ranked", {"page": page, "samples": 2, "sets": ("simulated",)}
+    runs, scores = folder / "ranked", folder / "scores"
+    options = {"scores": scores, "page": page, "samples": 2, "sets": ("simulated",)}
     ranking.main(runs, folder, seeds=(0,), **options)
     ranking.main(runs, folder, seeds=(0, 1), methods=("srnn",), **options)
-    times = [file.stat().st_mtime_ns for file in sorted(runs.rglob("*.json"))]
+    before = {file: file.stat().st_mtime_ns for file in scores.rglob("*.json.gz")}
+    assert len(before) == 4  # of three runs, and of the references
+    shutil.rmtree(runs)
+    ranking.main(runs, folder, seeds=(0, 1), methods=("srnn",), **options)  # scored, which is enough
+    assert not runs.exists()
     ranking.main(runs, **options)
-    assert times == [file.stat().st_mtime_ns for file in sorted(runs.rglob("*.json"))]
+    assert before == {file: file.stat().st_mtime_ns for file in scores.rglob("*.json.gz")}
     page.write_text(page.read_text().replace("simulated", "tables"))
     (rows,) = tables(page)
     by_name = {row[0]: row for row in rows[1:]}
@@ -421,6 +426,31 @@ def test_ranking(folder, page, monkeypatch):
     assert energies == sorted(energies)
     for row, energy, before in zip(rows[2:], energies[1:], energies, strict=False):
         assert abs(float(row[4].split()[0]) - (energy - before)) < 0.0016  # of three rounded numbers
+
+
+def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
+    """Of the lower body, whose motion is then one and the same."""
+    small = {"pose_prior": 0.0, "draws": (2, 2), "latent": 4, "width": 4, "steps": 2, "batch_size": 4}
+    monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", {})})
+    views = [ranking.View(parts=parts) for parts in ("free", "held")]
+    ranking.work(folder, folder / "parts", folder / "parts", "simulated", {"gsps": small}, {"gsps": views}, (0,), 3)
+    free, held = (ranking.entries(folder / "parts", "simulated", view, ["gsps"]) for view in views)
+    assert "nearest neighbours" in free
+    assert held.keys() == {"gsps"}
+    assert (held["gsps"].means("APD lower") == 0).all()
+    assert (free["gsps"].means("APD lower") > 0).all()
+    assert (held["gsps"].means("APD upper") > 0).all()
+
+
+def test_groups_are_of_the_first_word():
+    people = motion.simulate(clips=2, frames=80, seed=1)
+    contents = ("walk-turn-left", "run")
+    clips = [replace(clip, labels={"content": name}) for clip, name in zip(people, contents, strict=True)]
+    data = ranking.grouped(
+        motion.dataset.MotionData("", motion.MotionSet(clips, people.skeleton), motion.PROTOCOLS["simulated"])
+    )
+    assert [clip.labels["group"] for clip in data.motion] == ["walk", "run"]
+    assert [clip.labels["content"] for clip in data.motion] == list(contents)
 
 
 def test_papers(folder, page, monkeypatch):
@@ -434,7 +464,10 @@ def test_papers(folder, page, monkeypatch):
         ("ADE",),
         papers.printed("APD,ADE", "TrajeVAE, 0 | 8.462 .518"),
         (ranking.View(0), ranking.View(1)),
-        {"single": ([ranking.View(1, single=True)], ["trajevae"]), "exchanged": ([ranking.View(1, exchanged=9.0)], [])},
+        [
+            papers.Further([ranking.View(1, single=True)], ["trajevae"]),
+            papers.Further([ranking.View(1, exchanged=9.0)], []),
+        ],
     )
     monkeypatch.setattr(papers, "PAPERS", {"page": paper})
     monkeypatch.setattr(ranking, "SETS", {paper.set: ranking.Set("people.npz", {})})
@@ -442,7 +475,8 @@ def test_papers(folder, page, monkeypatch):
     monkeypatch.setattr(papers, "JOINTS", ("RFoot",))
     page.write_text(page.read_text().replace("tables", "rows"))
     for data in (folder, None):
-        papers.main(folder / "papers", data, ("page",), samples=3, seeds=(0, 1), pages=page.parent)
+        where = {"stored": folder / "scores", "pages": page.parent}
+        papers.main(folder / "papers", data, ("page",), samples=3, seeds=(0, 1), **where)
     page.write_text(page.read_text().replace("rows", "tables"))
     rows, compared, more, single = tables(page)
     named = {(row[0], row[1]): row[2:] for row in rows[1:]}
@@ -480,12 +514,13 @@ def test_tuning(folder, page, monkeypatch):
             "\n".join([page.read_text(), *(mark.replace("tables", name) for mark in (pages.BEGIN, pages.END))])
         )
     for data in (folder / "people.npz", None):
-        tuning.main(folder / "tuned", data, tuple(sections), page=page)
+        tuning.main(folder / "tuned", data, tuple(sections), stored=folder / "tuning", page=page)
         rows = re.findall(r"^\| (preset|wide, longer) \| (.*) \|$", page.read_text(), re.MULTILINE)
         assert [name for name, _ in rows] == ["preset", "wide, longer", "preset"]
         assert re.match(r"[\d.]+ \([\d.]+, [\d.]+\)", rows[0][1])
         assert rows[0][1] != rows[1][1]
-    assert len([*(folder / "tuned").rglob(tuning.SCORED)]) == 5
+        assert tuning.Store(folder / "tuning", "cvae").found.keys() == cases.keys()
+        shutil.rmtree(folder / "tuned", ignore_errors=True)  # scored, which is enough
 
 
 def test_irregular(tmp_path, page, monkeypatch):

@@ -258,9 +258,7 @@ def test_the_curriculum_rises_over_its_share_of_training(windows):
 
 
 def test_without_gaps_training_is_that_of_the_neighbours(windows):
-    ours, theirs = (
-        method.train(windows).batches for method in (small(gap=0.0, keep=0.15), dvae.method("trajevae", keep=0.15))
-    )
+    ours, theirs = (method.train(windows).batches for method in (small(gap=0.0, keep=0.15), dvae.method("trajevae")))
     drawn = [batches.sample(4, torch.Generator().manual_seed(0)) for batches in (ours, theirs)]
     assert drawn[0].keys() == drawn[1].keys()
     assert all(torch.equal(drawn[0][name], drawn[1][name]) for name in drawn[0])

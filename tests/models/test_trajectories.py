@@ -225,7 +225,7 @@ def test_windows_that_do_not_suit(people):
 
 
 def test_every_joint_is_given_over_a_whole_window_or_not_at_all(windows):
-    x, y = small(keep=0.15).train(windows).batches.sample(400, torch.Generator().manual_seed(0)).values()
+    x, y = small().train(windows).batches.sample(400, torch.Generator().manual_seed(0)).values()
     joints, given = x.unflatten(-1, (-1, 3)), y.unflatten(-1, (-1, 3))
     shown = (given != 0).any(-1).any(1)
     assert torch.equal(given, joints * shown[:, None, :, None])

@@ -34,6 +34,8 @@ from ..protocols import Poses, Protocol, Windows
 from ..skeleton import Skeleton
 
 CLASS = "c"
+IN_CACHE = 512
+"""Sequences that the GRU reads at a time, whose gates stay in a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,7 @@ class ActionClassifierModel(nn.Module):
             raise ValueError(
                 f"frames have {futures.shape[-1]} numbers; this classifier was fitted to frames of {self.size}"
             )
-        outputs, _ = self.gru(futures.reshape(-1, *futures.shape[-2:]))
-        found: Tensor = torch.tanh(self.project(outputs[:, -1])).unflatten(0, futures.shape[:-2])
+        parts = futures.reshape(-1, *futures.shape[-2:]).split(IN_CACHE)
+        last = torch.cat([self.gru(part)[0][:, -1] for part in parts])
+        found: Tensor = torch.tanh(self.project(last)).unflatten(0, futures.shape[:-2])
         return found

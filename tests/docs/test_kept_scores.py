@@ -1,0 +1,66 @@
+"""Scores that are kept are of what methods are today, and tell nothing of the machines that made them."""
+
+import gzip
+import json
+
+import pytest
+
+import dvae
+from benchmarks.tables import papers, ranking, tuning
+
+FILES = sorted(ranking.SCORES.rglob("scores*.json.gz"))
+
+
+def named(file):
+    return "/".join(file.relative_to(ranking.SCORES).parts)
+
+
+@pytest.mark.parametrize("file", FILES, ids=named)
+def test_scores_name_no_place(file):
+    text = gzip.decompress(file.read_bytes()).decode()
+    assert '"/' not in text
+    (clips,) = {len(means) for row in json.loads(text)["rows"].values() for means in row.values()}
+    assert clips == len(json.loads(text)["clips"])
+
+
+@pytest.mark.parametrize("file", sorted(ranking.SCORES.rglob("judges/*/config.json")), ids=named)
+def test_judges_name_no_place(file):
+    assert '"/' not in file.read_text(encoding="utf-8")
+    assert (file.parent / "best.safetensors").stat().st_size < 2**20
+    assert json.loads((file.parent / "state.json").read_text(encoding="utf-8"))["status"] in (
+        "finished",
+        "stopped early",
+    )
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if "seed" in file.parent.name], ids=named)
+def test_scores_are_of_the_presets(file):
+    """With the options of their rows, as if fitted now; where a preset changes, its rows are to be made again."""
+    of, row = file.parts[-3], file.parent.name.rpartition("-seed")[0]
+    (options,) = {
+        json.dumps(options): options
+        for methods in (ranking.SETS[of].methods, *(paper.rows for paper in papers.PAPERS.values() if paper.set == of))
+        for name, options in methods.items()
+        if ranking.folder(name) == row
+    }.values()
+    told, training = ranking.parted(options)
+    method = dvae.method(told.pop("method", row), **told)
+    stored = ranking.Scored.load(file).config
+    now = {name: value for name, value in method.config().items() if value is not None and not name.endswith("_run")}
+    preset = {name: value for name, value in getattr(method, "presets", {}).get("", {}).items() if name not in now}
+    for name, value in json.loads(json.dumps({**preset, **now})).items():
+        assert stored["method"][name] == value, name
+    now = {**vars(method.trainings[""]), **training}
+    for name in ("steps", "batch_size", "learning_rate", "decay"):
+        assert stored["training"][name] == now[name], name
+
+
+@pytest.mark.parametrize("name", ["judges", *tuning.SECTIONS])
+def test_what_was_tuned_stands_on_the_page(name):
+    """Every case that was scored, by the name that it has there."""
+    page = (ranking.SCORES.parents[1] / "docs" / "results" / "tuning.md").read_text(encoding="utf-8")
+    found = tuning.Store(ranking.SCORES / "tuning", name).found
+    assert found
+    assert found.keys() <= set(tuning.OF_JUDGES if name == "judges" else tuning.SECTIONS[name].cases)
+    for case in found:
+        assert f"| {case} |" in page
