@@ -7,6 +7,8 @@ import pytest
 
 import dvae
 from benchmarks.tables import papers, ranking, tuning
+from dvae.models.poses import PoseMethod
+from dvae.motion import WALKER
 
 FILES = sorted(ranking.SCORES.rglob("scores*.json.gz"))
 
@@ -47,7 +49,7 @@ def test_scores_are_of_the_presets(file):
     method = dvae.method(told.pop("method", row), **told)
     stored = ranking.Scored.load(file).config
     now = {name: value for name, value in method.config().items() if value is not None and not name.endswith("_run")}
-    preset = {name: value for name, value in getattr(method, "presets", {}).get("", {}).items() if name not in now}
+    preset = method.preset(WALKER) if isinstance(method, PoseMethod) else {}
     for name, value in json.loads(json.dumps({**preset, **now})).items():
         assert stored["method"][name] == value, name
     now = {**vars(method.trainings[""]), **training}
