@@ -79,32 +79,43 @@ def median_final_displacement_error(samples: Array, truth: Array) -> Tensor:
     return _per_window(_observed(lambda x, y: _median(_displacement(x[:, -1], y[-1]))), *_paired(samples, truth))
 
 
-def multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMADE: the ADE to each of M admissible futures, averaged over them.
+def multimodal_errors(samples: Array, truths: Array) -> Tensor:
+    """MMADE, MMFDE, MMADEm and MMFDEm at once: errors to each of M admissible futures, averaged over them.
 
     Args:
         samples: `(..., K, T, D)`.
-        truths: `(..., M, T, D)`, the futures that `evaluate.multimodal_truths` finds, the true one among them.
+        truths: `(..., M, T, D)`, the futures that `references.multimodal_truths` finds, the true one among them.
 
     Returns:
-        `(...)`, in the unit of the data.
+        `(..., 4)`, in the unit of the data.
     """
-    return _per_window(lambda x, y: _cross(x, y).amin(0).mean(), *_multimodal(samples, truths))
+
+    def errors(x: Tensor, y: Tensor) -> Tensor:
+        apart = torch.stack([_cross(x, y), _cross(x, y, LAST)])  # (2, K, M)
+        return torch.cat([apart.amin(1), _median(apart, 1)]).mean(-1)
+
+    samples, truths = _multimodal(samples, truths)
+    return _per_window(errors, samples, truths)
+
+
+def multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
+    """MMADE: the ADE to each of the admissible futures, averaged over them: `(...)`, see `multimodal_errors`."""
+    return multimodal_errors(samples, truths)[..., 0]
 
 
 def multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMFDE: the FDE to each of M admissible futures, averaged over them. Shapes as in MMADE."""
-    return _per_window(lambda x, y: _cross(x, y, LAST).amin(0).mean(), *_multimodal(samples, truths))
+    """MMFDE: the FDE to each of the admissible futures, averaged over them. Shapes as in MMADE."""
+    return multimodal_errors(samples, truths)[..., 1]
 
 
 def median_multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMADEm: the ADEm to each of M admissible futures, averaged over them. Shapes as in MMADE."""
-    return _per_window(lambda x, y: _median(_cross(x, y)).mean(), *_multimodal(samples, truths))
+    """MMADEm: the ADEm to each of the admissible futures, averaged over them. Shapes as in MMADE."""
+    return multimodal_errors(samples, truths)[..., 2]
 
 
 def median_multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMFDEm: the FDEm to each of M admissible futures, averaged over them. Shapes as in MMADE."""
-    return _per_window(lambda x, y: _median(_cross(x, y, LAST)).mean(), *_multimodal(samples, truths))
+    """MMFDEm: the FDEm to each of the admissible futures, averaged over them. Shapes as in MMADE."""
+    return multimodal_errors(samples, truths)[..., 3]
 
 
 def average_pairwise_distance_error(samples: Array, truths: Array) -> Tensor:
@@ -549,14 +560,15 @@ def _cross(samples: Tensor, truths: Tensor, frames: slice = slice(None)) -> Tens
     return torch.cdist((samples - centre).transpose(0, 1), (truths - centre).transpose(0, 1)).mean(0)
 
 
-def _median(errors: Tensor) -> Tensor:
-    return errors.quantile(0.5, dim=0)
+def _median(errors: Tensor, dim: int = 0) -> Tensor:
+    return errors.quantile(0.5, dim=dim)
 
 
 def _per_window(score: Callable[..., Tensor], samples: Tensor, *truth: Tensor) -> Tensor:
     lead = samples.shape[:-3]
     windows = [part.reshape(-1, *part.shape[len(lead) :]) for part in (samples, *truth)]
-    return torch.stack([score(*window) for window in zip(*windows, strict=True)]).reshape(lead)
+    found = torch.stack([score(*window) for window in zip(*windows, strict=True)])
+    return found.reshape((*lead, *found.shape[1:]))
 
 
 def _samples(samples: Array) -> Tensor:

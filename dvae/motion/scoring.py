@@ -38,7 +38,7 @@ K generated ones of all windows together, a number of the whole set, whose stand
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -114,13 +114,8 @@ _MEDIAN = (
     Measure("ADEm", paired(metrics.median_average_displacement_error), "m"),
     Measure("FDEm", paired(metrics.median_final_displacement_error), "m"),
 )
-_MULTIMODAL = {
-    "MMADE": metrics.multimodal_average_displacement_error,
-    "MMFDE": metrics.multimodal_final_displacement_error,
-    "MMADEm": metrics.median_multimodal_average_displacement_error,
-    "MMFDEm": metrics.median_multimodal_final_displacement_error,
-    "APDE": metrics.average_pairwise_distance_error,
-}
+_MULTIMODAL = ("MMADE", "MMFDE", "MMADEm", "MMFDEm")
+"""In the order of `metrics.multimodal_errors`."""
 
 
 def displacements(windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = lambda x: x) -> list[Measure]:
@@ -143,25 +138,51 @@ def displacements(windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = la
 
 
 def _multimodal(windows: HeldOutWindows, body: Callable[[Tensor], Tensor]) -> list[Measure]:
-    """Errors averaged over the futures of all windows in almost the same pose."""
+    """Errors averaged over the futures of all windows in almost the same pose, and the APDE."""
     truths = multimodal_truths(windows)
     futures = body(gapped(windows.all())[:, windows.protocol.observed :])
     lonely = sum(len(found) == 1 for found in truths)
     said = {"threshold": windows.protocol.multimodal_threshold, "itself": True, "alone": lonely}
     shared: Any = {"unit": "m", "note": multimodal_note(**said, windows=len(truths)), "basis": {"multimodal": said}}
 
-    def over(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
-        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-            pairs = zip(forecasts, index.tolist(), strict=True)
-            return torch.stack([score(window, futures[truths[n]]) for window, n in pairs])
+    @lru_cache(maxsize=1)  # for all scores of a batch
+    def errors(forecasts: Tensor, index: Tensor) -> Tensor:
+        pairs = zip(forecasts, index.tolist(), strict=True)
+        return torch.stack([metrics.multimodal_errors(window, futures[truths[n]]) for window, n in pairs])
 
-        return function
+    def error(place: int) -> Callable[..., Tensor]:
+        return lambda forecasts, truth, past, index: errors(forecasts, index)[:, place]
 
-    shown = "MMADE", "MMFDE"
-    *errors, diversity = (
-        Measure(name, over(score), headline=name in shown, **shared) for name, score in _MULTIMODAL.items()
-    )
-    return [*errors, *([replace(diversity, pool=means_of_those_that_count)] if lonely < len(truths) else [])]
+    def diversity_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        real = _diversities(futures, [truths[n] for n in index.tolist()])
+        return (metrics.average_pairwise_distance(forecasts) - real).abs()
+
+    found = [
+        Measure(name, error(place), headline=name in ("MMADE", "MMFDE"), **shared)
+        for place, name in enumerate(_MULTIMODAL)
+    ]
+    diversity = Measure("APDE", diversity_error, pool=means_of_those_that_count, **shared)
+    return [*found, *([diversity] if lonely < len(truths) else [])]
+
+
+def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
+    """The APD of each of some sets of futures; sets have many pairs in common, whose distance is found once.
+
+    Args:
+        futures: (N, T, D).
+        sets: which of them; of one future alone the diversity is NaN.
+    """
+    if futures.isnan().any():
+        apds = [metrics.average_pairwise_distance(futures[held]) if len(held) > 1 else None for held in sets]
+        return torch.stack([futures.new_tensor(math.nan) if apd is None else apd for apd in apds])
+    among = torch.cat([*sets]).unique()
+    rows = futures[among].flatten(1).double()
+    rows = rows - rows.mean(0)  # cdist takes products, in which distances that are small beside the rows blur
+    apart = torch.cdist(rows, rows).fill_diagonal_(0.0)
+    places = [torch.searchsorted(among, held) for held in sets]
+    sums = torch.stack([apart[held[:, None], held].sum() for held in places])
+    counts = torch.tensor([len(held) for held in sets])
+    return (sums / (counts * (counts - 1))).to(futures)
 
 
 def _body(skeleton: Skeleton) -> Callable[[Tensor], Tensor]:
