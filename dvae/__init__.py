@@ -26,7 +26,7 @@ if sys.flags.optimize > 1:  # Pyro fills in its docstrings as it is imported
 if TYPE_CHECKING:
     from . import laws, motion, networks, tables, views
     from .data import ArrayWindows
-    from .graph import Audit, audit
+    from .graph import Alternatives, Audit, alternatives, audit
     from .inference import schedules
     from .inference.bounds import SequenceELBO, Terms, importance_bound
     from .inference.calibration import calibrate
@@ -43,15 +43,17 @@ if TYPE_CHECKING:
     from .inference.svi import SVI
     from .inference.training import Stage, Training
     from .inference.traversal import traverse
+    from .inversion import faithful
     from .models.registry import method, methods
     from .notation import Factorization
-    from .oracle import Oracle, price, twin
+    from .oracle import Oracle, arrow_prices, price, twin
     from .program.model import DynamicalVAE
     from .program.rollout import InputNoise, SelfFeeding
     from .runs.directory import load
 
 __all__ = [
     "SVI",
+    "Alternatives",
     "ArrayWindows",
     "Audit",
     "Comparison",
@@ -70,10 +72,13 @@ __all__ = [
     "Stage",
     "Terms",
     "Training",
+    "alternatives",
+    "arrow_prices",
     "audit",
     "calibrate",
     "compare",
     "evaluate",
+    "faithful",
     "fit",
     "importance_bound",
     "laws",
@@ -97,7 +102,7 @@ _PLACES = {
     name: module
     for module, names in {
         "data": "ArrayWindows",
-        "graph": "Audit audit",
+        "graph": "Alternatives Audit alternatives audit",
         "inference": "schedules",
         "inference.bounds": "SequenceELBO Terms importance_bound",
         "inference.calibration": "calibrate",
@@ -116,7 +121,8 @@ _PLACES = {
         "inference.traversal": "traverse",
         "models.registry": "method methods",
         "notation": "Factorization",
-        "oracle": "Oracle price twin",
+        "inversion": "faithful",
+        "oracle": "Oracle arrow_prices price twin",
         "program.model": "DynamicalVAE",
         "program.rollout": "InputNoise SelfFeeding",
         "runs.directory": "load",

@@ -1,67 +1,29 @@
 """Factorizations as graphs: is a guide rich enough for its model, and what do both look like.
 
-The exact posterior of a latent, given what the guide has drawn before it and all that is given, depends on
-its Markov boundary among them, found by d-separation in the generative graph unrolled over time (Pearl, 1988;
-by the moral-graph criterion of Lauritzen, Dawid, Larsen and Leimer, 1990). A guide that cannot read all of it
-pays in the bound, however large its networks are.
+The exact posterior of a latent, given what the guide has drawn before it and all that is given, depends on its Markov
+boundary among them (`dvae.inversion`). A guide that cannot read all of it pays in the bound, however large its networks
+are.
 """
 
 from __future__ import annotations
 
 import html
-import math
-from collections.abc import Iterable, Mapping
-from collections.abc import Set as AbstractSet
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import reduce
 from operator import or_
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import networkx as nx
-import numpy as np
 
 from .drawing import Edge, Node, draw_dag
-from .notation import Factor, Factorization, Parent, check_pair, unrolled
-from .relations import ALL, Relation
+from .inversion import Order, Unrolled, faithful, guide, markov_boundary, orders, spelled
+from .notation import Factor, Factorization, Parent, check_pair
+from .relations import Relation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from rich.table import Table
-
-# ----------------------------------------------------------------------------------------------- d-separation
-
-
-def markov_boundary(dag: nx.DiGraph, node: Node, given: AbstractSet[Node]) -> set[Node]:
-    """The smallest part of `given` that makes `node` independent of the rest of `given`.
-
-    u is in it exactly when node and u are not d-separated by the others. What is not given is integrated out.
-
-    Args:
-        dag: directed acyclic graph, edges from parent to child.
-        node: a node that is not in given.
-        given: nodes whose values are known.
-    """
-    kept: set[Node] = set()
-    frontier = [node, *given]
-    while frontier:
-        current = frontier.pop()
-        if current not in kept:
-            kept.add(current)
-            frontier.extend(dag.predecessors(current))
-    # In the moral graph of these a child and its parents, a family, are neighbours; given nodes stop a path.
-    boundary: set[Node] = set()
-    walked, families = {node}, set()
-    frontier = [node]
-    while frontier:
-        current = frontier.pop()
-        for child in (current, *dag.successors(current)):
-            if child in kept and child not in families:
-                families.add(child)
-                family = {child, *dag.predecessors(child)}
-                boundary |= family & given
-                frontier.extend(family - given - walked)
-                walked |= family - given
-    return boundary
 
 
 def analytic_kl(
@@ -111,8 +73,27 @@ def _relations(*factorizations: Factorization) -> list[Relation]:
 # ------------------------------------------------------------------------------------------------------ audit
 
 
+class _Tabled:
+    """What prints as lines of text, and in a notebook as a table, with a sentence."""
+
+    header: ClassVar[tuple[str, ...]]
+    rows: Any
+    verdict: Any
+
+    def __str__(self) -> str:
+        rows = [self.header, *self.rows]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+        return "\n".join(line.rstrip() for line in [*lines, self.verdict])
+
+    def _repr_html_(self) -> str:
+        head = "".join(f"<th>{cell}</th>" for cell in self.header)
+        body = "".join(f"<tr>{''.join(f'<td>{html.escape(c)}</td>' for c in row)}</tr>" for row in self.rows)
+        return f"<table><caption>{self.verdict}</caption><tr>{head}</tr>{body}</table>"
+
+
 @dataclass(frozen=True)
-class Audit:
+class Audit(_Tabled):
     """What a guide reads, against what the exact posterior depends on.
 
     Args:
@@ -131,6 +112,8 @@ class Audit:
         >>> found.exact, found.missing
         (False, {'z': ('z_{t-1}',)})
     """
+
+    header = ("guide factor", "missing", "redundant")
 
     generative: Factorization
     inference: Factorization
@@ -183,22 +166,20 @@ class Audit:
         from rich.text import Text
 
         table = Table(title=f"audit: {'exact' if self.exact else 'not exact'}", title_justify="left")
-        for name in HEADER:
+        for name in self.header:
             table.add_column(name)
         for factor, missing, redundant in self.rows:
             table.add_row(Text(factor), Text(missing, style="" if missing == "-" else "red"), Text(redundant))
         return table
 
-    def __str__(self) -> str:
-        rows = [HEADER, *self.rows]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
-        return "\n".join(line.rstrip() for line in [*lines, self.verdict])
+    @property
+    def repaired(self) -> Factorization:
+        """The guide that reads what this one misses and nothing that is redundant, drawn in the same order.
 
-    def _repr_html_(self) -> str:
-        head = "".join(f"<th>{cell}</th>" for cell in HEADER)
-        body = "".join(f"<tr>{''.join(f'<td>{html.escape(c)}</td>' for c in row)}</tr>" for row in self.rows)
-        return f"<table><caption>{self.verdict}</caption><tr>{head}</tr>{body}</table>"
+        Raises:
+            ValueError: a mask of the user's own in the model.
+        """
+        return faithful(self.generative, self.observed, self.inference.blocks)
 
     def draw(self, T: int = 3, ax: Axes | None = None) -> Axes:
         """Draws the guide over T steps: missing arrows dashed red, redundant ones dotted grey."""
@@ -213,9 +194,6 @@ class Audit:
     def _edges(self, parents: dict[str, tuple[Parent, ...]], T: int) -> list[Edge]:
         factors = [Factor("q", name, self.inference.local(name), reads) for name, reads in parents.items()]
         return [edge for factor in factors for edge in factor.edges(T)]
-
-
-HEADER = ("guide factor", "missing", "redundant")
 
 
 def _terms(parents: dict[str, tuple[Parent, ...]]) -> dict[str, tuple[str, ...]]:
@@ -254,7 +232,7 @@ def audit(
     """
     generative = Factorization.parse(generative)
     observed = tuple(observed)
-    inference = generative.guide(inference, observed)
+    inference = guide(generative, inference, observed)
     latents, data, context = check_pair(generative, inference, observed)
     relations = _relations(generative, inference)
     custom = any(relation.intervals is None for relation in relations)
@@ -263,56 +241,142 @@ def audit(
     else:
         lag = max((relation.lag for relation in relations), default=0)
         width, margin = max(steps or 5, 2 * lag + 3), 2 * lag + 2
-    T = width + 2 * margin
     local = {name: (inference if name in inference.context else generative).local(name) for name in context}
     local |= {name: generative.local(name) for name in (*data, *latents)}
-
-    def nodes(name: str) -> list[Node]:
-        return unrolled(name, local[name], T)
-
-    model, guide = generative.dag(T), inference.dag(T)
-    given = {node for name in (*data, *context) for node in nodes(name)}
+    view = Unrolled(local, width, margin)
+    model, read = generative.dag(view.length), inference.dag(view.length)
+    given = {node for name in (*data, *context) for node in view.nodes(name)}
     model.add_nodes_from(given)
-    guide.add_nodes_from(given)
+    read.add_nodes_from(given)
     needs, uses = {}, {}
-    for block in inference.blocks:
-        steps_of = zip(*(nodes(name)[:: block.direction or 1] for name in block.names), strict=True)
-        for node in (node for step in steps_of for node in step):
-            needs[node] = markov_boundary(model, node, given)
-            uses[node] = markov_boundary(model, node, set(guide.predecessors(node)))
-            given.add(node)
-
-    def inner(edges: Mapping[Node, Iterable[Node]], child: str, parent: str) -> np.ndarray:
-        """The arrows between the inner steps, as a bool array (width or 1, width or 1)."""
-        rows, columns = (nodes(name)[margin : margin + width] or nodes(name) for name in (child, parent))
-        return np.array([[column in edges[row] for column in columns] for row in rows])
+    for node in view.drawn(inference.blocks):
+        needs[node] = markov_boundary(model, node, given)
+        uses[node] = markov_boundary(model, node, set(read.predecessors(node)))
+        given.add(node)
+    lacks = {node: boundary - set(read.predecessors(node)) for node, boundary in needs.items()}
 
     missing: dict[str, tuple[Parent, ...]] = {}
     redundant: dict[str, tuple[Parent, ...]] = {}
     for child in latents:
         for name in local:
-            in_time = local[child] and local[name]
-            reads = inner(guide.pred, child, name)
-            lacking = _by_offset(inner(needs, child, name) & ~reads, in_time)
+            lacking = view.offsets(lacks, child, name)
             # An offset used anywhere is not redundant: near the edges of a chain any reading may be idle.
-            unused = _by_offset(reads, in_time) & ~_by_offset(inner(uses, child, name), in_time)
+            unused = view.offsets(read.pred, child, name) & ~view.offsets(uses, child, name)
             for found, offsets in ((missing, lacking), (redundant, unused)):
                 if offsets.any():
-                    relation = (_relation(offsets) if in_time else ALL) if local[name] else None
-                    found[child] = (*found.get(child, ()), Parent(name, local[name], relation))
-    return Audit(generative, inference, data, missing, redundant, T if custom else None)
+                    found[child] = (*found.get(child, ()), view.parent(child, name, offsets))
+    return Audit(generative, inference, data, missing, redundant, view.length if custom else None)
 
 
-def _by_offset(arrows: np.ndarray, in_time: bool) -> np.ndarray:
-    """Whether there is any arrow at each offset s - t = -(W-1), ..., W-1; (1,) any at all if not in_time."""
-    if not in_time:
-        return np.array([arrows.any()])
-    width = len(arrows)
-    return np.array([arrows.diagonal(offset).any() for offset in range(1 - width, width)])
+# --------------------------------------------------------------------------------------------- derived guides
 
 
-def _relation(offsets: np.ndarray) -> Relation:
-    """The smallest relation with these offsets; one that reaches the last offset in view has no end."""
-    far = len(offsets) // 2
-    steps = [int(step) - far for step in np.flatnonzero(offsets)]
-    return Relation.of((-math.inf if k == -far else k, math.inf if k == far else k) for k in steps)
+@dataclass(frozen=True)
+class Derived:
+    """A guide that misses nothing, as `faithful` derives it.
+
+    Args:
+        order: in which it draws.
+        inference: the guide.
+        arrows: of its graph unrolled, how much it reads.
+        looped: latents that it draws step by step; the others are drawn at all steps at once.
+        sampled: latents whose KL has no closed form under this guide, so that the bound has the noise of their draws.
+    """
+
+    order: Order
+    inference: Factorization
+    arrows: int
+    looped: tuple[str, ...]
+    sampled: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Alternatives(_Tabled):
+    """The guides of a model that miss nothing, the one with the fewest arrows first; those without a loop before it.
+
+    Attributes:
+        generative: the model.
+        guides: what there is to choose from.
+        steps: T of the graphs whose arrows were counted.
+    """
+
+    header = ("guide", "drawn", "arrows", "looped", "KL by draws")
+
+    generative: Factorization
+    guides: tuple[Derived, ...]
+    steps: int
+
+    @property
+    def rows(self) -> list[tuple[str, ...]]:
+        """(guide, order, arrows, latents in a loop, latents whose KL is averaged over draws) as text."""
+        return [
+            (
+                each.inference.text,
+                spelled(each.order),
+                str(each.arrows),
+                ", ".join(each.looped) or "-",
+                ", ".join(each.sampled) or "-",
+            )
+            for each in self.guides
+        ]
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        return f"each reads what the exact posterior depends on in its order, and no more; arrows of {self.steps} steps"
+
+    def table(self) -> Table:
+        """A rich table with one row per guide."""
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(title="guides that miss nothing", title_justify="left", caption=self.verdict)
+        for name in self.header:
+            table.add_column(name, justify="right" if name == "arrows" else "left")
+        for row in self.rows:
+            table.add_row(*map(Text, row))
+        return table
+
+    def __getitem__(self, place: int) -> Factorization:
+        return self.guides[place].inference
+
+    def __len__(self) -> int:
+        return len(self.guides)
+
+
+def alternatives(generative: Factorization | str, observed: Iterable[str] = ("x",), steps: int = 10) -> Alternatives:
+    """All guides that `faithful` derives, one for each order of drawing; one for those that have the same.
+
+    Args:
+        generative: p, a factorization or its text.
+        observed: names of the observed variables.
+        steps: T at which arrows are counted.
+
+    Raises:
+        ValueError: as `faithful`; a model without latents.
+
+    Example:
+        >>> print(dvae.alternatives("p(z_t | z_{t-1}) p(x_t | z_t)"))
+        guide                      drawn       arrows  looped  KL by draws
+        q(z_t | z_{t-1}, x_{>=t})  z forward   64      z       -
+        q(z_t | z_{t+1}, x_{<=t})  z backward  64      z       z
+        each reads what the exact posterior depends on in its order, and no more; arrows of 10 steps
+    """
+    generative, observed = Factorization.parse(generative), tuple(observed)
+    found: dict[frozenset[Factor], Derived] = {}
+    for order in orders(generative, observed):
+        inference = faithful(generative, observed, order)
+        if not inference.factors:
+            raise ValueError(f"nothing is latent in {generative.text!r}: there is no guide to derive")
+        looped = tuple(name for block in inference.blocks if block.direction for name in block.names)
+        closed = analytic_kl(generative, inference)
+        derived = Derived(
+            order,
+            inference,
+            inference.dag(steps).number_of_edges(),
+            looped,
+            tuple(name for name, exact in closed.items() if not exact),
+        )
+        found.setdefault(frozenset(inference.factors), derived)
+    guides = sorted(found.values(), key=lambda each: (bool(each.looped), each.arrows, len(each.sampled)))
+    return Alternatives(generative, tuple(guides), steps)

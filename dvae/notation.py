@@ -225,23 +225,6 @@ class Factorization:
         observed = tuple(observed)
         return Factorization("q", tuple(replace(f, kind="q") for f in self.factors if f.child not in observed))
 
-    def guide(
-        self,
-        inference: Factorization | str | None,
-        observed: Iterable[str] = ("x",),
-        masks: Mapping[str, Relation | MaskFunction] | None = None,
-    ) -> Factorization:
-        """The guide that is meant: a factorization, its text, None for the prior, or "" where nothing is latent.
-
-        Raises:
-            NotationError, ValueError, TypeError: as in `parse`.
-        """
-        if inference is None:
-            return self.prior_guide(observed)
-        if isinstance(inference, str) and not inference.strip():
-            return Factorization("q", ())
-        return Factorization.parse(inference, masks)
-
     def given(self, local: Iterable[str], static: Iterable[str], but: Collection[str] = ()) -> Factorization:
         """The same with context that factors read too: those of local variables at t, those of static latents nothing.
 
@@ -292,6 +275,46 @@ class Factorization:
         if factor.parent(parent) is None:
             return np.zeros((T if factor.local else 1, T if self.local(parent) else 1), dtype=bool)
         return factor.mask(parent, T)
+
+    @property
+    def arrows(self) -> tuple[tuple[str, Parent], ...]:
+        """(child, parent) for all that is read, the past, the same step and the future apart.
+
+        Of q(z_t | x_{1:T}, w) these are x_{<t}, x_t, x_{>t} and w. What a static variable reads is one arrow, and so is
+        a mask of the user's own.
+        """
+
+        def sides(factor: Factor, read: Relation | None) -> Iterable[Relation | None]:
+            if read is None or read.intervals is None or not factor.local:
+                return (read,)
+            return (part for side in (PAST, NOW, FUTURE) for part in (read & side).parts)
+
+        return tuple(
+            (factor.child, replace(parent, relation=relation))
+            for factor in self.factors
+            for parent in factor.parents
+            for relation in sides(factor, parent.relation)
+        )
+
+    def without(self, child: str, parent: Parent) -> Factorization:
+        """The same less one of its `arrows`.
+
+        Raises:
+            ValueError: an arrow that it does not have.
+        """
+        factor = self.factor(child)
+        if (child, parent) not in self.arrows:
+            raise ValueError(f"{factor} has no arrow from {parent}")
+
+        def less(read: Parent) -> Parent | None:
+            if read.relation == parent.relation or read.relation is None or parent.relation is None:
+                return None
+            rest = read.relation & ~parent.relation
+            return None if rest.intervals == () else replace(read, relation=rest)
+
+        reads = (less(read) if read.name == parent.name else read for read in factor.parents)
+        fewer = replace(factor, parents=tuple(read for read in reads if read is not None))
+        return replace(self, factors=tuple(fewer if each is factor else each for each in self.factors))
 
     # how it is drawn ---------------------------------------------------------------------------------------
 

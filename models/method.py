@@ -15,6 +15,7 @@ from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe, Trainable
 from ..inference.schedules import Cosine, Logistic, Ramp, Schedule
 from ..inference.training import Stage
+from ..inversion import guide
 from ..laws import FixedNormal, Flow, LawSpec, Mixture, Normal, StudentT, Vamp
 from ..laws.priors import VampLaw
 from ..networks import NetworkSpec
@@ -47,7 +48,7 @@ class Method(Trainable):
     def equations(self) -> tuple[Factorization, Factorization]:
         """The generative model and the guide, which has no factor where there are no latents."""
         generative = Factorization.parse(self.generative)
-        return generative, generative.guide(self.inference)
+        return generative, guide(generative, self.inference)
 
     def sizes(self) -> dict[str, int]:
         """Sizes of the latents."""

@@ -5,7 +5,6 @@ import re
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import networkx as nx
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -14,7 +13,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 import dvae.graph
 import dvae.notation
 from benchmarks.tables.audits import FAMILY
-from dvae.graph import analytic_kl, audit, markov_boundary
+from dvae.graph import analytic_kl, audit
 from dvae.models.method import LatentMethod
 from dvae.notation import Factorization
 from dvae.relations import Relation
@@ -99,18 +98,6 @@ def test_guides_of_the_literature(name):
 def test_what_else_an_audit_tells(generative, inference, missing, redundant):
     result = audit(generative, inference)
     assert (result.missing, result.redundant) == (missing, redundant)
-
-
-@settings(max_examples=30, deadline=None)
-@given(factorizations())
-def test_markov_boundary_is_d_separation(pair):
-    dag = Factorization.parse(pair[0]).dag(3)
-    known = {node for node in dag if node[0] == "x"}
-    for node in sorted(set(dag) - known, key=str):
-        boundary = markov_boundary(dag, node, known)
-        assert boundary == {u for u in known if not nx.is_d_separator(dag, {node}, {u}, known - {u})}
-        assert nx.is_d_separator(dag, {node}, known - boundary, boundary) or boundary == known
-        known = known | {node}
 
 
 @settings(max_examples=60, deadline=None)

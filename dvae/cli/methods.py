@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ..graph import audit
+from ..graph import alternatives, audit
 from ..inference.result import Table
+from ..inversion import guide
 from ..models import registry
 from ..models.registry import judges, methods
 from ..notation import Factorization
@@ -44,8 +45,9 @@ def show(
 
     Args:
         method: name of a method, or give two equations instead.
-        generative: the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)".
-        inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; "" of a model without latents.
+        generative: the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)"; alone, with the guides that miss nothing.
+        inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; "faithful" for one that misses nothing, "" of a model
+            without latents.
         steps: time steps in the figure.
         out: save the unrolled graphs of model and guide to this file (png, pdf, svg).
     """
@@ -60,13 +62,19 @@ def show(
             raise UsageError(f"{method} has no equations of its own; give --generative and --inference")
         pair = kind.equations()
         observed = [name for name in pair[0].variables if name not in pair[1].variables]
-    elif generative and inference is not None:
+    elif generative and inference is None:
+        with arguments():
+            choice = alternatives(generative)
+        OUT.print(str(choice.generative), highlight=False, markup=False, soft_wrap=True)
+        OUT.print(choice.table())
+        return
+    elif generative:
         with arguments():
             model = Factorization.parse(generative)
-            pair = model, model.guide(inference)
+            pair = model, guide(model, inference)
         observed = ["x"]
     else:
-        raise UsageError("give the name of a method, or both --generative and --inference")
+        raise UsageError("give the name of a method, or --generative, with --inference for the audit of a guide")
     with arguments():
         found = audit(*pair, observed=observed)
     OUT.print(str(found.generative), highlight=False, markup=False, soft_wrap=True)
@@ -83,9 +91,9 @@ def show(
 
         graphs = 2 if found.inference.factors else 1
         figure = Figure(figsize=(graphs * (0.85 * steps + 1.6), 4.2 if graphs == 2 else 1.6), layout="constrained")
-        model, *guide = figure.subplots(1, graphs, squeeze=False)[0]
+        model, *guides = figure.subplots(1, graphs, squeeze=False)[0]
         found.generative.draw(steps, ax=model, observed=observed).set_title("model")
-        for axes in guide:
+        for axes in guides:
             title = "guide" if found.exact else "guide (dashed: what the exact posterior also reads)"
             found.draw(steps, ax=axes).set_title(title)
         save_figure(figure, out)

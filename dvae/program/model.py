@@ -20,6 +20,7 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
+from ..inversion import guide
 from ..laws.base import LawSpec
 from ..laws.families import Normal, StandardNormal
 from ..laws.subset import Subset
@@ -45,8 +46,9 @@ class DynamicalVAE(nn.Module):
 
     Args:
         generative: such as "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", as text or a `Factorization`.
-        inference: such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)"; "" where nothing is latent. None for no
-            inference network: the guide is the prior, so that every KL term is exactly zero.
+        inference: such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)"; "" where nothing is latent. "faithful" for the
+            smallest guide that misses nothing of what the posterior depends on (`faithful`). None for no inference
+            network: the guide is the prior, so that every KL term is exactly zero.
         sizes: dimension of every variable, context included.
         network: description of the networks, or a mapping from factors to descriptions. Its keys are "p(x)" for one
             factor, "p" for all generative ones, "q" for the guide's, and "default".
@@ -100,7 +102,7 @@ class DynamicalVAE(nn.Module):
         self.feeding: SelfFeeding | InputNoise = SelfFeeding(0.0)
         self.view = view or View()
         observed = tuple(self.view.parts or observed)
-        self.inference = self.generative.guide(inference, observed, masks)
+        self.inference = guide(self.generative, inference, observed, masks)
         self.sizes = dict(sizes)
         self.latents, self.observed, self.context = check_pair(self.generative, self.inference, observed, sizes)
         for name, size in self.sizes.items():

@@ -53,6 +53,8 @@ def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
     equations = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t)", "--inference", "q(z_t | z_{t-1}, x_{t:T})"]
     assert main(["show", *equations]) == 0
     assert "exact: the guide reads everything" in capsys.readouterr().out
+    assert main(["show", *equations[:2]]) == 0
+    assert "q(z_t | z_{t-1}, x_{>=t})" in capsys.readouterr().out
     assert main(["show", "--generative", "p(x_t | x_{<t})", "--inference", ""]) == 0
     assert "nothing is latent" in capsys.readouterr().out
 
@@ -60,7 +62,7 @@ def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
 def test_wrong_arguments_exit_with_2(capsys, tmp_path):
     out = ["--out", str(tmp_path / "run")]
     assert "did you mean 'hit-dvae'" in failure(capsys, "show", "hitdvae", code=2)
-    assert "both --generative and --inference" in failure(capsys, "show", code=2)
+    assert "--generative, with --inference" in failure(capsys, "show", code=2)
     assert "not both" in failure(capsys, "show", "srnn", "--generative", "p(z_t) p(x_t | z_t)", code=2)
     unknown = failure(capsys, "fit", "hitdvae", *out, code=2)
     assert all(name in unknown for name in dvae.methods())
