@@ -33,7 +33,7 @@ from torch import Tensor
 import dvae
 from dvae import motion
 from dvae.inference.checkpoints import LAST, load_weights
-from dvae.inference.comparison import Crossed, Estimate
+from dvae.inference.estimates import Crossed, Estimate
 from dvae.inference.held import plain
 from dvae.inference.result import canvas
 from dvae.motion import bodies

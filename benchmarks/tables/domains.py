@@ -24,7 +24,7 @@ from torch import Tensor
 import dvae
 from dvae.data import each
 from dvae.inference.checkpoints import Run
-from dvae.inference.comparison import Crossed, Estimate
+from dvae.inference.estimates import Crossed, Estimate
 from dvae.inference.evaluation import Row
 from dvae.inference.scores import CRPS, ENERGY, LEVELS, Measure, coverage_at
 from dvae.inference.uncertainty import decimals

@@ -22,7 +22,7 @@ import dvae
 from dvae import laws
 from dvae.data import gaps
 from dvae.inference.checkpoints import Run, load_weights
-from dvae.inference.comparison import Crossed
+from dvae.inference.estimates import Crossed
 from dvae.networks import Dense, LinearSDE, LinearSDEGuide, Recurrent
 from dvae.networks.base import share_modules
 from dvae.tables.domains import domain

@@ -25,7 +25,7 @@ import dvae
 from dvae import motion
 from dvae.data import past_of
 from dvae.inference.checkpoints import LAST, load_weights
-from dvae.inference.comparison import Crossed, Estimate
+from dvae.inference.estimates import Crossed, Estimate
 from dvae.inference.held import reproducibly
 from dvae.inference.probe import Redrawn
 from dvae.inference.result import canvas

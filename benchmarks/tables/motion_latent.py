@@ -23,7 +23,7 @@ import dvae
 from dvae import motion
 from dvae.data import each
 from dvae.inference.checkpoints import Run
-from dvae.inference.comparison import Crossed, Estimate
+from dvae.inference.estimates import Crossed, Estimate
 from dvae.inference.held import clip_places, plain
 from dvae.inference.result import canvas
 from dvae.inference.scores import clip_means

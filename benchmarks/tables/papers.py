@@ -19,7 +19,22 @@ from typing import Any
 import tyro
 
 from .pages import refuse_unknown, table, write
-from .ranking import FUTURES, GROUPED, JOINTS, PARTED, PATHS, SCORES, TRAINED, Entry, View, cell, entries, trained, work
+from .ranking import (
+    FUTURES,
+    GROUPED,
+    JOINTS,
+    PARTED,
+    PATHS,
+    SCORES,
+    TRAINED,
+    Entry,
+    View,
+    cell,
+    entries,
+    titled,
+    trained,
+    work,
+)
 
 ERRORS = ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm")
 REAL = ("APDE", "CMD", "limb stretch", "limb jitter", "pose NLL")
@@ -342,7 +357,7 @@ def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[st
             entry = found[view][row]
             means = [None if crossed is None else crossed.estimate() for crossed in map(entry.crossed, columns)]
             told = [str(vars(view)[what]) if entry.minutes or what != "given" else ""] if what else []
-            lines.append([row, *told, *trained(entry), *map(cell, means)])
+            lines.append([titled(row, entry), *told, *trained(entry), *map(cell, means)])
     for row, cells in beside.items():
         name, _, given = row.rpartition(", ") if what else (row, "", "")
         lines.append([f"*{name}*", *([given] if what else []), "", "", *(cells.get(column, "–") for column in columns)])

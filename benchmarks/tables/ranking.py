@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import statistics
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,7 +25,8 @@ from torch import nn
 import dvae
 from dvae import Evaluation, Training, motion
 from dvae.inference.checkpoints import Run
-from dvae.inference.comparison import Crossed, Estimate
+from dvae.inference.estimates import Crossed, Estimate
+from dvae.inference.many import confidence_set
 from dvae.inference.metrics import average_pairwise_distance
 from dvae.inference.scores import Measure
 from dvae.models import registry
@@ -410,10 +412,24 @@ def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict
         files = sorted((stored / name).glob(str(kept(Path(), f"{folder(row)}-seed*", view))))
         if scored := [Scored.load(file) for file in files]:
             basis = basis or scored[0].basis
-            if any(each.basis != basis for each in scored):
+            if any(alike(each.basis) != alike(basis) for each in scored):
                 raise ValueError(f"scores of {row} in {stored / name} are of other windows, samples, seed or judges")
             found[row] = Entry(scored, [each.minutes for each in scored])
     return found
+
+
+EMISSION = 3
+"""In a basis, whether forecasts were means or draws."""
+
+
+def alike(basis: Sequence[Any]) -> list[Any]:
+    """What rows of a table must share: all but whether a model's law has a mean to forecast."""
+    return [*basis[:EMISSION], *basis[EMISSION + 1 :]]
+
+
+def titled(name: str, entry: Entry) -> str:
+    """A row as it is called, with what sets it apart."""
+    return f"{name} (drawn)" if entry.seeds[0].basis[EMISSION] == "drawn" else name
 
 
 def cell(estimate: Estimate | None) -> str:
@@ -432,7 +448,10 @@ def trained(entry: Entry) -> tuple[str, str]:
 
 
 def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
-    """Rows in order of the energy score, each with what it has more than the neighbours and than the next better."""
+    """Rows in order of the energy score, each with what it has more than the neighbours and than the next better.
+
+    And below, the model confidence set.
+    """
 
     def score_of(name: str) -> Crossed:
         crossed = found[name].crossed(RANKED)
@@ -447,8 +466,11 @@ def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
         minus = [None if name == NEIGHBOURS else NEIGHBOURS, order[place - 1] if place else None]
         behind = [None if other is None else score_of(name).estimate(score_of(other)) for other in minus]
         means = [None if crossed is None else crossed.estimate() for crossed in map(own.crossed, columns)]
-        lines.append([name, *trained(own), *map(cell, [*behind, *means])])
-    return table(header, lines)
+        lines.append([titled(name, own), *trained(own), *map(cell, [*behind, *means])])
+    scores = {name: score_of(name) for name in order}
+    members = confidence_set({name: score for name, score in scores.items() if not math.isnan(score.seeds)}).members
+    best = f"\nMay be the best, at 90 % over clips and seeds, of rows with two seeds or more: {', '.join(members)}.\n"
+    return table(header, lines) + best
 
 
 def main(

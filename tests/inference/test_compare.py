@@ -19,7 +19,8 @@ from dvae import Comparison, DynamicalVAE, Oracle, motion, twin
 from dvae.cli import main
 from dvae.data import ArrayWindows
 from dvae.inference.compare import compare
-from dvae.inference.comparison import Contender, Estimate
+from dvae.inference.comparison import Contender
+from dvae.inference.estimates import Estimate
 from dvae.inference.evaluate import evaluate
 from dvae.tables import Column, Columns, Cut, PanelData
 
@@ -846,3 +847,15 @@ def test_runs_of_other_windows_are_not_compared(runs, capsys, tmp_path):
     assert main(["fit", "vae", *other, "--steps", "2", "--batch-size", "2", "--warm-up", "1"]) == 0
     assert main(["compare", str(runs / "a0"), str(tmp_path / "other")]) == 1
     assert "other test windows" in " ".join(capsys.readouterr().err.split())
+
+
+def test_many_models_are_compared_by_the_metric_and_its_direction():
+    random = np.random.default_rng(0)
+    values = {name: mean + 0.1 * random.standard_normal((3, 12)) for name, mean in (("a", 0.0), ("b", 1.0), ("c", 5.0))}
+    found = record(values)
+    assert found.confidence_set().members == ["c"]  # of bounds the higher is better
+    assert found.pairs().differences["a", "c"] == found.difference("a", "c")
+    assert all(p < 0.01 for p in found.pairs().p_values.values())
+    assert found.required("b", "a").achieved > 0.9
+    with pytest.raises(KeyError, match="no score 'ADE'"):
+        found.confidence_set("ADE")

@@ -44,7 +44,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from ...data import Batch
-from ...inference.comparison import Crossed, Estimate
+from ...inference.estimates import Crossed, Estimate
 from ...inference.held import Held, clip_places, hold, on_device_of, plain, refuse_non_finite, reproducibly
 from ...inference.recipe import Recipe, Trainable
 from ...inference.references import zero_velocity

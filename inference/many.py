@@ -1,0 +1,311 @@
+"""Many models at once: all their differences, those that may be the best, and what would tell two of them apart.
+
+Of twenty differences one is beyond its 95 % by chance alone. `pairs` has p-values by Holm's step-down procedure (1979),
+which are right for all pairs at once whatever their dependence. `confidence_set` is the model confidence set (Hansen,
+Lunde and Nason, 2011): models of which none is significantly worse than another one, found by leaving out the one that
+is most surely worse until that holds. It holds the best one with at least its level, and the less the data tell, the
+more models. `required` is the power of a paired difference, by the noncentral t distribution, at other numbers of seeds
+and clips.
+
+Errors are those of `estimates`: over clips, which models share, and over training seeds, which they do not. The null
+distribution of the confidence set is simulated from them: means are drawn from the normal of these variances, and the
+variances themselves, by chi-squared of their degrees of freedom, as few seeds tell little of theirs (a parametric
+bootstrap-t in place of the block bootstrap of the paper, which two or three seeds would not feed). Models of which two
+seeds tell have far heavier tails than references, which have no seeds: each t statistic is therefore judged by its own
+null distribution, and the least of these p-values by that of the least (Westfall and Young, 1993), where the paper
+takes the largest t of all pairs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy import special, stats
+
+from .estimates import Crossed, Estimate, number
+from .result import Table
+
+
+def holm(p_values: Sequence[float]) -> np.ndarray:
+    """P-values for all hypotheses at once, by Holm's step-down procedure; NaN where one is, which counts for none.
+
+    Args:
+        p_values: (N,).
+
+    Returns:
+        (N,), each at least its own, in the same order.
+
+    >>> holm([0.01, 0.04, 0.03]).round(2).tolist()
+    [0.03, 0.06, 0.06]
+    """
+    found = np.array(p_values, dtype=float)
+    known = np.flatnonzero(~np.isnan(found))
+    ascending = known[np.argsort(found[known], kind="stable")]
+    factors = np.arange(len(ascending), 0, -1)
+    found[ascending] = np.minimum(np.maximum.accumulate(factors * found[ascending]), 1.0)
+    return found
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """All paired differences of some models, first minus second.
+
+    Attributes:
+        differences: (first, second) to the estimate.
+        p_values: (first, second) to the p-value of no difference, for all pairs at once (`holm`).
+    """
+
+    differences: dict[tuple[str, str], Estimate]
+    p_values: dict[tuple[str, str], float]
+
+    def table(self) -> Table:
+        """A line for each pair, the surest first."""
+        table = Table(
+            title="paired differences",
+            caption="mean ± standard error over sequences ± over seeds; p: for all pairs at once, by Holm's procedure",
+        )
+        for name in ("first", "minus second", "difference", "95 %", "p"):
+            table.add_column(name, justify="left" if name in ("first", "minus second") else "right")
+        for pair in sorted(self.differences, key=lambda pair: (math.isnan(self.p_values[pair]), self.p_values[pair])):
+            low, high = map(number, self.differences[pair].interval())
+            reach = low if low == "–" else f"{low} to {high}"
+            table.add_row(*pair, str(self.differences[pair]), reach, number(self.p_values[pair]))
+        return table
+
+
+def pairs(contenders: Mapping[str, Crossed]) -> Pairs:
+    """All paired differences, with p-values for as many as there are.
+
+    Args:
+        contenders: name to a score on the same clips.
+
+    Returns:
+        Differences of each with those after it; p-values are NaN where a model has one seed.
+    """
+    found = {
+        (first, second): contenders[first].estimate(contenders[second]) for first, second in combinations(contenders, 2)
+    }
+    adjusted = holm([estimate.p_value() for estimate in found.values()])
+    return Pairs(found, dict(zip(found, map(float, adjusted), strict=True)))
+
+
+@dataclass(frozen=True)
+class ConfidenceSet:
+    """Models that may be the best.
+
+    Attributes:
+        p_values: name to the largest level at which a model is left out, less 1: it is in the set of level L where this
+            is at least 1 - L. The last that is left has 1. Those that are left out first come first.
+        level: of `members`.
+    """
+
+    p_values: dict[str, float]
+    level: float
+
+    @property
+    def members(self) -> list[str]:
+        """Names of those that may be the best, the likeliest first."""
+        return [name for name, p in reversed(self.p_values.items()) if p >= 1 - self.level]
+
+    def table(self) -> Table:
+        """A line for each model, those that may be the best first."""
+        table = Table(
+            title=f"models that may be the best, at {100 * self.level:g} %",
+            caption=f"p: of none being the worse, when it would be left out; in the set from {1 - self.level:.3g} on",
+        )
+        for name in ("model", "p", "in the set"):
+            table.add_column(name, justify="right" if name == "p" else "left")
+        for name, p in reversed(self.p_values.items()):
+            table.add_row(name, number(p), "yes" if name in self.members else "no")
+        return table
+
+
+def confidence_set(
+    contenders: Mapping[str, Crossed],
+    better: str = "lower",
+    level: float = 0.9,
+    *,
+    over_seeds: bool = True,
+    draws: int = 10_000,
+    seed: int = 0,
+) -> ConfidenceSet:
+    """The model confidence set, by t statistics of all pairs that are left.
+
+    Args:
+        contenders: name to a score on the same clips.
+        better: "lower" or "higher".
+        level: with which the best model is in the set.
+        over_seeds: whether another training seed may change what is best; without, of these very weights.
+        draws: of the null distribution.
+        seed: of the draws.
+
+    Raises:
+        ValueError: no models; a level that is not between 0 and 1; one clip; with `over_seeds`, a model of one seed; a
+            score that is neither the lower nor the higher the better.
+    """
+    if not contenders or not 0 < level < 1 or draws < 1:
+        raise ValueError(
+            f"a confidence set is of some models, at a level between 0 and 1, not of {len(contenders)} at {level}"
+        )
+    if better not in ("lower", "higher"):
+        raise ValueError(
+            f"of a score of which neither the lower nor the higher is better, no model is the best: {better!r}"
+        )
+    names, rows = list(contenders), list(contenders.values())
+    if over_seeds and (single := [name for name in names if math.isnan(contenders[name].seeds)]):
+        raise ValueError(
+            f"of {', '.join(single)} there is one training seed, which tells nothing of others; give more, or take "
+            "over_seeds=False for these very weights"
+        )
+    clips = len(rows[0].deviations)
+    if clips < 2:
+        raise ValueError("all windows are of one clip: there is no error over clips; give more clips")
+    means = np.array([row.mean for row in rows]) * (1 if better == "lower" else -1)
+    deviations = np.stack([row.deviations for row in rows]) * math.sqrt(clips / (clips - 1))
+    between, rest = (
+        np.array([getattr(row, part) if over_seeds else 0.0 for row in rows]) for part in ("seeds", "rest")
+    )
+    freedom = np.array([min(row.count - 1, 10**9) if over_seeds else 10**9 for row in rows])
+
+    random = np.random.default_rng(seed)
+    together = random.standard_normal((draws, clips)) @ deviations.T
+    alone = random.standard_normal((draws, len(rows))) * np.sqrt(np.maximum(between - rest, 0))
+    drawn = together + alone
+    scale_clips = random.chisquare(clips - 1, draws) / (clips - 1)
+    drawn_seeds = np.maximum(between * random.chisquare(freedom, (draws, len(rows))) / freedom - rest, 0)
+    own = np.maximum(between - rest, 0)
+
+    worse, other = (places.ravel() for places in np.indices((len(rows), len(rows))))  # than which, of all pairs
+    over = np.square(deviations[worse] - deviations[other]).sum(1)
+    drawn_variance = scale_clips[:, None] * over + drawn_seeds[:, worse] + drawn_seeds[:, other]
+    statistic = _over(means[worse] - means[other], np.sqrt(over + own[worse] + own[other]))
+    null = _over(drawn[:, worse] - drawn[:, other], np.sqrt(drawn_variance))
+    single = (null >= statistic).mean(0)
+    null = stats.rankdata(-null, "max", axis=0) / draws
+    left, p_values, running = np.ones(len(rows), bool), {}, 0.0
+    while left.sum() > 1:
+        (pairs_left,) = np.nonzero(left[worse] & left[other] & (worse != other))
+        worst = pairs_left[np.lexsort((-statistic[pairs_left], single[pairs_left]))[0]]
+        running = max(running, float((null[:, pairs_left].min(1) <= single[worst]).mean()))
+        p_values[names[worse[worst]]] = running
+        left[worse[worst]] = False
+    p_values[names[int(left.argmax())]] = 1.0
+    return ConfidenceSet(p_values, level)
+
+
+def _over(differences: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Differences in errors; 0 where neither is anything, as of two models that are one."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((differences == 0) & (errors == 0), 0.0, differences / errors)
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """What it takes to tell two models apart.
+
+    Attributes:
+        difference: that is to be found.
+        power: with which it is to be found.
+        level: of the two-sided interval that is not to hold 0.
+        clips: number of training seeds of each model to that of clips, infinite where no number is enough.
+        now: the numbers of clips, and of seeds of the two, that there are.
+        achieved: the power of these.
+    """
+
+    difference: float
+    power: float
+    level: float
+    clips: dict[int, float]
+    now: tuple[int, int, int]
+    achieved: float
+
+    def table(self) -> Table:
+        """A line for each number of seeds."""
+        clips, *seeds = self.now
+        table = Table(
+            title=f"to find a difference of {number(self.difference, 4)} with a probability of {100 * self.power:g} %",
+            caption=f"with {clips} clips and {seeds[0]} and {seeds[1]} seeds it is {100 * self.achieved:.0f} %, "
+            f"at a level of {100 * self.level:g} %",
+        )
+        for name in ("seeds of each", "clips"):
+            table.add_column(name, justify="right")
+        for count, needed in self.clips.items():
+            table.add_row(str(count), f"{needed:.0f}" if math.isfinite(needed) else "no number is enough")
+        return table
+
+
+def required(
+    first: Crossed,
+    second: Crossed,
+    *,
+    difference: float | None = None,
+    power: float = 0.8,
+    level: float = 0.95,
+    seeds: Sequence[int] = (2, 3, 4, 5, 7, 10, 15, 20),
+) -> Requirement:
+    """How many training seeds and clips would tell two models apart, from the variances of those that there are.
+
+    The variances are themselves estimates: of three seeds, one of them may well be off by a factor of two. Clips are
+    taken to be as long as these.
+
+    Args:
+        first, second: a score of two models on the same clips, with at least two seeds each.
+        difference: to be found; by default the one that was measured.
+        power: probability of finding it.
+        level: of the interval that is not to hold 0.
+        seeds: of each model, for which clips are counted.
+
+    Raises:
+        ValueError: a model of one seed; a difference of 0; a power or level that is not between 0 and 1.
+    """
+    if not (0 < power < 1 and 0 < level < 1) or min(seeds) < 2:
+        raise ValueError(
+            f"power and level are between 0 and 1, and seeds at least 2, not {power}, {level} and {[*seeds]}"
+        )
+    measured = first.estimate(second)
+    sought = abs(measured.mean if difference is None else difference)
+    if math.isnan(measured.total) or not sought:
+        raise ValueError(
+            "both models need two seeds or more and several clips, and a difference that is not 0: "
+            f"it is {sought}, with a standard error of {measured.total}"
+        )
+    rows, count = (first, second), len(first.deviations)
+    rest = [row.rest * row.count * count for row in rows]  # variances of single seeds and clips
+    own = [max(row.count * row.seeds - r / count, 0.0) for row, r in zip(rows, rest, strict=True)]
+    common = max(count * measured.sequences**2 - sum(row.rest * count for row in rows), 0.0)
+
+    def reached(clips: int, *numbers: int) -> float:
+        over = (common + sum(r / n for r, n in zip(rest, numbers, strict=True))) / clips
+        total = over + sum(o / n for o, n in zip(own, numbers, strict=True))
+        between = [(o + r / clips) / n for o, r, n in zip(own, rest, numbers, strict=True)]
+        uncertain = over**2 / (clips - 1) + sum(v**2 / (n - 1) for v, n in zip(between, numbers, strict=True))
+        if not uncertain:
+            return 1.0
+        freedom = max(total**2 / uncertain, min(clips, *numbers) - 1)
+        beyond = special.stdtrit(freedom, (1 + level) / 2) * np.sqrt(special.chdtri(freedom, RANKS) / freedom)
+        shift = sought / math.sqrt(total)
+        return float((special.ndtr(shift - beyond) + special.ndtr(-shift - beyond)).mean())
+
+    def least(number: int) -> float:
+        low = high = FEWEST
+        while reached(high, number, number) < power:
+            if high > MOST_CLIPS:
+                return math.inf
+            low, high = high + 1, 2 * high
+        while low < high:
+            middle = (low + high) // 2
+            low, high = (low, middle) if reached(middle, number, number) >= power else (middle + 1, high)
+        return float(high)
+
+    now = (count, first.count, second.count)
+    return Requirement(sought, power, level, {number: least(number) for number in seeds}, now, reached(*now))
+
+
+FEWEST, MOST_CLIPS = 5, 10**7
+"""Clips of which errors can be told, and beyond which no number counts as enough."""
+RANKS = (np.arange(4000) + 0.5) / 4000
+"""Over whose quantiles of chi-squared the noncentral t is averaged; scipy's own fails where it is nearly certain."""
