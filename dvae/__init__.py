@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .data import ArrayWindows
     from .graph import Alternatives, Audit, alternatives, audit
     from .inference import schedules
+    from .inference.annealing import annealed_bound
     from .inference.bounds import SequenceELBO, Terms, importance_bound
     from .inference.calibration import calibrate
     from .inference.checks import predictive_checks
@@ -73,6 +74,7 @@ __all__ = [
     "Terms",
     "Training",
     "alternatives",
+    "annealed_bound",
     "arrow_prices",
     "audit",
     "calibrate",
@@ -104,6 +106,7 @@ _PLACES = {
         "data": "ArrayWindows",
         "graph": "Alternatives Audit alternatives audit",
         "inference": "schedules",
+        "inference.annealing": "annealed_bound",
         "inference.bounds": "SequenceELBO Terms importance_bound",
         "inference.calibration": "calibrate",
         "inference.checks": "predictive_checks",
