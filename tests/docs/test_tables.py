@@ -101,8 +101,16 @@ def test_audits(page, monkeypatch):
     assert prices["VAE"][1] == prices["DKF"][1] == 0 < prices["HiT-DVAE"][1]
 
 
-def test_bounds(page):
-    bounds.main(page, steps=3, sequences=4, particles=2, fitting=20)
+def test_bounds(page, monkeypatch):
+    monkeypatch.setattr(bounds, "TEMPERATURES", (2, 6))
+    begin, end = (mark.replace("tables", "sides") for mark in (pages.BEGIN, pages.END))
+    page.write_text(page.read_text() + begin + end)
+    bounds.main(page, steps=3, sequences=4, particles=2, fitting=20, sides=3)
+    before, sides = page.read_text().split(begin)
+    page.write_text(before)
+    rows = [line.split("|")[1:-1] for line in sides.splitlines() if line.startswith("| `")]
+    assert len(rows) == len(bounds.GUIDES)
+    assert all(abs(float(cell.split()[0])) < 1 for row in rows for cell in row[-2:])
     (table,) = tables(page)
     gaps = [float(row[1]) for row in table[1:]]
     assert len(gaps) == len(bounds.GUIDES)
