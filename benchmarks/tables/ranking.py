@@ -468,9 +468,13 @@ def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
         means = [None if crossed is None else crossed.estimate() for crossed in map(own.crossed, columns)]
         lines.append([titled(name, own), *trained(own), *map(cell, [*behind, *means])])
     scores = {name: score_of(name) for name in order}
-    members = confidence_set({name: score for name, score in scores.items() if not math.isnan(score.seeds)}).members
-    best = f"\nMay be the best, at 90 % over clips and seeds, of rows with two seeds or more: {', '.join(members)}.\n"
-    return table(header, lines) + best
+    known = {name: score for name, score in scores.items() if not math.isnan(score.seeds)}
+    if not any(found[name].minutes for name in known):
+        return table(header, lines)
+    members = ", ".join(confidence_set(known).members)
+    return (
+        table(header, lines) + f"\nMay be the best, at 90 % over clips and seeds, of rows with two seeds: {members}.\n"
+    )
 
 
 def main(

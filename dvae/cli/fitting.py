@@ -29,6 +29,7 @@ from ..motion.protocols import Representation
 from ..motion.segments.dataset import Segmentation
 from ..options import Amount, Frames, Share
 from ..runs import directory as runs
+from ..runs.grid import Grid
 from ..runs.kinds import DATA
 from ..runs.sweep import sweep as sweep_methods
 from ..tables.dataset import PanelData
@@ -239,7 +240,8 @@ def sweep(
     model: MethodOptions,
     training: SweepOptions,
     source: DataOptions,
-    seeds: tuple[int, ...] = (0, 1, 2),
+    grid: Path | None = None,
+    seeds: tuple[int, ...] | None = None,
     latent: tuple[int, ...] = (),
     jobs: int = 2,
     scheduler: str | None = None,
@@ -249,38 +251,46 @@ def sweep(
     The same command continues a sweep that was stopped: finished runs are left as they are.
 
     Args:
-        method: names of methods.
+        method: names of methods; none where a grid says what to fit.
         out: directory of the run directories, such as srnn-seed0, or srnn-z8-seed0 where sizes differ.
         model: options of all methods, in place of their defaults.
         training: options of the runs; what is not given is each method's own, see `dvae show METHOD`.
-        source: the motion data.
-        seeds: of initial weights, batches and draws; a run for each.
+        source: the data.
+        grid: TOML file of named equations and methods, each with its options and their values; see docs/sweeps.md.
+        seeds: of initial weights, batches and draws, a run for each; by default the grid's, or 0, 1 and 2.
         latent: sizes of z; a run for each.
         jobs: runs at a time.
         scheduler: address of a dask scheduler, such as tcp://host:8786, whose workers fit the runs in place of --jobs.
     """
-    if not method or not seeds:
-        raise UsageError("give at least one method and one seed")
+    if bool(method) == bool(grid) or seeds == ():
+        raise UsageError("give at least one method and one seed, or no method and --grid")
+    if grid is not None and latent:
+        raise UsageError("--latent is of methods that are named; in a grid write each.latent = [8, 16]")
     at_least(1, jobs=jobs)
     if out.is_file():
         raise UsageError(f"--out {out} is a file; name a directory for the runs")
     given = {name: value for name, value in vars(model).items() if value is not None}
     with arguments():
-        sizes: list[dict[str, int]] = [{"latent": size} for size in latent] or [{}]
-        chosen = [registry.method(name, **given, **size) for name in method for size in sizes]
-        for each in chosen:
-            each.check()
         how = _given(training)
-    opened = source.open(*chosen)
+        sizes: list[dict[str, int]] = [{"latent": size} for size in latent] or [{}]
+        chosen: Any = [registry.method(name, **given, **size) for name in method for size in sizes]
+        if grid is not None:
+            told = Grid.read(grid, given)
+            chosen, seeds, how = told.methods, seeds or told.seeds, {**told.training, **how}
+            Training(**how)
+        fitted = [*chosen.values()] if isinstance(chosen, dict) else chosen
+        for each in fitted:
+            each.check()
+    opened = source.open(*fitted)
     with nullcontext() if scheduler is None else _cluster(scheduler):
-        results = sweep_methods(chosen, opened, out, seeds, how, jobs)
+        results = sweep_methods(chosen, opened, out, seeds or (0, 1, 2), how, jobs)
     if failed := [result for result in results if result.status == "failed"]:
         raise RuntimeError(
             f"{len(failed)} of {len(results)} runs failed, the same command tries them again\n"
             + "\n".join(map(str, failed))
         )
     then = f"score them with: dvae evaluate {out}/*"
-    if chosen[0].fitted_on == "motion":
+    if fitted[0].fitted_on == "motion":
         then += f", and bounds, where all have one: dvae compare {out}/*"
     OUT.print(f"all {len(results)} runs have ended; {then}", soft_wrap=True)
 

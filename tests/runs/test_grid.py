@@ -1,0 +1,120 @@
+"""Grids: what a file says is what a sweep fits, under the file's names, and the same command continues it."""
+
+import pytest
+
+import dvae
+from dvae.cli import main
+from dvae.runs.grid import Grid
+
+STUDY = """
+seeds = [0, 1]
+[training]
+steps = 2
+batch_size = 4
+
+[filter]
+generative = "p(z_t | z_{t-1}) p(x_t | z_t)"
+inference = "q(z_t | z_{t-1}, x_{<=t})"
+latent = 2
+width = 4
+
+[smoother]
+generative = "p(z_t | z_{t-1}) p(x_t | z_t)"
+inference = "faithful"
+width = 4
+each.latent = [2, 3]
+
+[vae]
+method = "vae"
+latent = 2
+"""
+
+
+@pytest.fixture
+def study(tmp_path):
+    file = tmp_path / "study.toml"
+    file.write_text(STUDY, encoding="utf-8")
+    return file
+
+
+def test_a_grid_is_what_its_file_says(study):
+    grid = Grid.read(study)
+    assert list(grid.methods) == ["filter", "smoother-latent=2", "smoother-latent=3", "vae"]
+    assert (grid.seeds, grid.training) == ((0, 1), {"steps": 2, "batch_size": 4})
+    assert grid.methods["vae"] == dvae.method("vae", latent=2)
+    assert grid.methods["smoother-latent=3"].equations()[1] == dvae.faithful("p(z_t | z_{t-1}) p(x_t | z_t)")
+    study.write_text(STUDY + "\n[more]\nmethod = 'srnn'\neach.latent = [1, 2]\neach.width = [3, 4]\n")
+    more = [name for name in Grid.read(study).methods if name.startswith("more")]
+    assert more == [f"more-latent={latent}-width={width}" for latent in (1, 2) for width in (3, 4)]
+
+
+def test_options_of_all_give_way_to_those_of_the_file(study):
+    methods = Grid.read(study, {"latent": 7, "warm_up": 5}).methods
+    assert {name: (method.latent, method.warm_up) for name, method in methods.items()} == {
+        "filter": (2, 5),
+        "smoother-latent=2": (2, 5),
+        "smoother-latent=3": (3, 5),
+        "vae": (2, 5),
+    }
+
+
+def test_a_sweep_of_a_grid_is_fitted_and_continued(study, table, tmp_path, capsys):
+    out = tmp_path / "runs"
+    command = ["sweep", "--grid", str(study), "--data", str(table), "--out", str(out), "--jobs", "1", "--warm-up", "1"]
+    assert main(command) == 0
+    names = {f"{name}-seed{seed}" for name in Grid.read(study).methods for seed in (0, 1)}
+    assert {path.name for path in out.iterdir() if path.is_dir()} == names
+    assert dvae.load(out / "smoother-latent=3-seed1").model.sizes["z"] == 3
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("best.safetensors")}
+    assert main([*command, "--seeds", "0"]) == 0
+    assert "by an earlier sweep" in capsys.readouterr().err
+    assert before == {path: path.stat().st_mtime_ns for path in out.rglob("best.safetensors")}
+    assert main(["compare", *(str(out / name) for name in sorted(names)), "--particles", "2", "--no-forecasts"]) == 0
+    assert "teacher-forced" in capsys.readouterr().out
+
+
+@pytest.fixture
+def table(tmp_path):
+    file = tmp_path / "table.csv"
+    rows = [f"{s},{t},{(s * 7 + t * t) % 5 / 3},{(s + t) % 3}" for s in range(12) for t in range(8)]
+    file.write_text("\n".join(["id,t,a,b", *rows]))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[a", "is not TOML"),
+        ("", "names nothing to fit"),
+        ("seeds = 3\n[a]\nmethod='vae'", "seeds are some whole numbers"),
+        ("seeds = [true]\n[a]\nmethod='vae'", "seeds are some whole numbers"),
+        ("training = 3\n[a]\nmethod='vae'", r"\[training\] is a table"),
+        ("steps = 3\n[a]\nmethod='vae'", "steps = 3 is in no table"),
+        ("[a]\nmethod='srn'", r"\[a\]: unknown method 'srn' \(did you mean 'srnn'\?\)"),
+        ("[a]\nmethod='vae'\nlatnt=3", "did you mean 'latent'"),
+        ("[a]\nmethod='vae'\nlatent='3'", "latent is '3'"),
+        ("[a]\nmethod='vae'\neach.latent=3", "must be a list of values"),
+        ("[a]\nmethod='vae'\neach=3", "each a table"),
+        ("[a]\nmethod='vae'\neach.latent=[3, 3]", "a value twice"),
+        ("[a]\ngenerative='p(z_t'", r"\[a\]:"),
+        (f"[a]\nmethod='vae'\neach.latent={list(range(1, 102))}\neach.warm_up={list(range(100))}", "over 10000"),
+    ],
+)
+def test_what_is_no_grid_is_refused_by_table(study, text, told):
+    study.write_text(text)
+    with pytest.raises(ValueError, match=told):
+        Grid.read(study)
+
+
+def test_the_command_line_takes_methods_or_a_grid(study, tmp_path, capsys):
+    out = ["--out", str(tmp_path / "runs")]
+    for words, told in (
+        (["vae", "--grid", str(study)], "no method and --grid"),
+        (["--grid", str(study), "--latent", "3"], "each.latent"),
+        (["--grid", str(tmp_path / "none.toml")], "none.toml"),
+    ):
+        assert main(["sweep", *words, *out]) != 0
+        assert told in capsys.readouterr().err
+    study.write_text(STUDY.replace("steps = 2", "steps = 0"))
+    assert main(["sweep", "--grid", str(study), *out]) == 2
+    assert "steps is 0" in capsys.readouterr().err
