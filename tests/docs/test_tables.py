@@ -33,7 +33,7 @@ from benchmarks.tables import (
     trajevae,
     tuning,
 )
-from dvae import Descent, Evaluation, Training, method, motion
+from dvae import Descent, Evaluation, Training, alternatives, method, motion
 from dvae.cli import main as command
 from dvae.motion.segments import dataset
 from dvae.runs.directory import fit_run
@@ -94,7 +94,15 @@ def tables(page):
 
 def test_audits(page, monkeypatch):
     monkeypatch.setattr(audits, "FAMILY", {name: audits.FAMILY[name] for name in ("VAE", "DKF", "HiT-DVAE")})
+    marks = [mark.replace("tables", name) for name in ("derived", "arrows") for mark in (pages.BEGIN, pages.END)]
+    page.write_text(page.read_text() + "".join(marks))
     audits.main(page, steps=2, seeds=1)
+    before, derived = page.read_text().split(marks[0])
+    page.write_text(before)
+    guides = [line for line in derived.splitlines() if line.startswith("| DKF | `q(")]
+    assert len(guides) == len(alternatives(audits.FAMILY["DKF"][0]))
+    prices = [line for line in derived.splitlines() if line.startswith("| DKF | `") and " to z_t`" in line]
+    assert len(prices) == 3  # of z_{t-1}, x_t and x_{>t}
     (table,) = tables(page)
     prices = {row[0]: (row[3], float(row[5].split()[0])) for row in table[1:]}
     assert [missing for missing, _ in prices.values()] == ["–", "–", "`z_{<t}`"]
