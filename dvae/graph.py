@@ -174,7 +174,7 @@ class Audit(_Tabled):
 
     @property
     def repaired(self) -> Factorization:
-        """The guide that reads what this one misses and nothing that is redundant, drawn in the same order.
+        """The guide that reads what this one misses and not what is redundant, in the same order (see `faithful`).
 
         Raises:
             ValueError: a mask of the user's own in the model.
@@ -323,7 +323,7 @@ class Alternatives(_Tabled):
     @property
     def verdict(self) -> str:
         """One sentence."""
-        return f"each reads what the exact posterior depends on in its order, and no more; arrows of {self.steps} steps"
+        return f"each reads what the posterior depends on in its order (see `faithful`); arrows of {self.steps} steps"
 
     def table(self) -> Table:
         """A rich table with one row per guide."""
@@ -360,9 +360,11 @@ def alternatives(generative: Factorization | str, observed: Iterable[str] = ("x"
         guide                      drawn       arrows  looped  KL by draws
         q(z_t | z_{t-1}, x_{>=t})  z forward   64      z       -
         q(z_t | z_{t+1}, x_{<=t})  z backward  64      z       z
-        each reads what the exact posterior depends on in its order, and no more; arrows of 10 steps
+        each reads what the posterior depends on in its order (see `faithful`); arrows of 10 steps
     """
     generative, observed = Factorization.parse(generative), tuple(observed)
+    if steps < 1:
+        raise ValueError(f"arrows are counted in at least 1 step, not {steps}")
     found: dict[frozenset[Factor], Derived] = {}
     for order in orders(generative, observed):
         inference = faithful(generative, observed, order)

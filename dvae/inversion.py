@@ -123,8 +123,9 @@ def faithful(
 ) -> Factorization:
     """The smallest guide that misses nothing of what the exact posterior depends on, drawn in this order.
 
-    Without one of its arrows it could not be exact. A pattern that is periodic in time (a lag of 2 without one of 1)
-    has no end in this notation: beyond twice the lags of the model it reads all steps, more than it needs.
+    Without one of its arrows it could not be exact, with one exception: a pattern that is periodic in time (a lag of 2
+    without one of 1) has no end in this notation, and far away, beyond twice the sum of the model's lags for each
+    latent, the guide reads all steps, more than it needs.
 
     Args:
         generative: p, a factorization or its text.
@@ -133,8 +134,9 @@ def faithful(
             step as the model draws them.
 
     Raises:
-        ValueError: an observed variable that the model lacks; an order that is not of its latents, each once; a mask
-            of the user's own, which is known at one length alone.
+        ValueError: an observed variable that the model lacks; an order that is not of its latents, each once, or mixes
+            static and local ones; a mask of the user's own, which is known at one length alone.
+        TypeError: an order of something else than blocks.
 
     >>> print(dvae.faithful("p(z_t | z_{t-1}) p(x_t | z_t)").text)
     q(z_t | z_{t-1}, x_{>=t})
@@ -143,8 +145,12 @@ def faithful(
     data = tuple(observed)
     latents = _latents(generative, data)
     order = tuple(order) if order is not None else next(iter(orders(generative, data)))
+    if not all(isinstance(block, Block) for block in order):
+        raise TypeError(f"an order is of blocks, such as those of dvae.inversion.orders, not {order!r}")
+    if mixed := [b for b in order if len({generative.local(n) for n in b.names if n in latents}) > 1]:
+        raise ValueError(f"{spelled(mixed)} mixes static and local latents; give static ones a block of their own")
     if sorted(name for block in order for name in block.names) != sorted(latents):
-        raise ValueError(f"the order {spelled(order)} is not one of the latents {', '.join(latents)}, each once")
+        raise ValueError(f"the order '{spelled(order)}' is not one of the latents {', '.join(latents)}, each once")
     relations = [p.relation for f in generative.factors for p in f.parents if p.relation is not None]
     if own := [relation for relation in relations if relation.intervals is None]:
         raise ValueError(

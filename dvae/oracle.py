@@ -253,6 +253,8 @@ def price(
         >>> dvae.price("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, steps=3, seeds=1) > 0
         tensor([True])
     """
+    if min(steps, seeds) < 1:
+        raise ValueError(f"a price is of at least 1 step and 1 model, not of {steps} and {seeds}")
     gaps = [
         Oracle(twin(generative, inference, sizes, steps, seed, observed), steps).fit_guide() for seed in range(seeds)
     ]

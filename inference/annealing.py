@@ -21,6 +21,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from operator import itemgetter
+from typing import Any
 
 import torch
 from pyro import poutine
@@ -28,6 +29,7 @@ from torch import Tensor
 
 from ..data import each
 from ..program.batch import AnyBatch, repeat
+from ..program.conditional import like
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from ..turns import alone
@@ -50,8 +52,10 @@ class AnnealedBound:
 
     Args:
         bound: (B,) log of the estimated evidence, in nats; below it on average, or above it where chains ran backward.
-        error: (B,) standard error of that, by the spread of the weights; of few effective chains it is too small.
-        effective: (B,) effective number of chains, between 1 and K.
+        error: (B,) standard error of that, by the spread of the weights; of few effective chains it is too small. NaN
+            of chains that ran backward: those of a sequence start at one draw, whose own chance their spread does not
+            tell. The error of a mean over sequences is by the spread of their bounds.
+        effective: (B,) effective number of chains, between 1 and K, or NaN, likewise.
         accepted: (B,) share of the proposals that were accepted.
         chains: K.
         temperatures: L.
@@ -119,21 +123,41 @@ def annealed_bound(
     needed = (*model.observed, *model.context)
     if missing := [name for name in needed if name not in data]:
         raise ValueError(f"the bound needs {', '.join(needed)}; missing in the batch are {', '.join(missing)}")
-    if latents is not None and (lacking := [name for name in model.latents if name not in latents]):
-        raise ValueError(f"chains that go back start from all latents; missing are {', '.join(lacking)}")
     size = len(data[model.observed[0]])
+    if not size:
+        raise ValueError("the batch holds no sequences")
+    given = None if latents is None else _exact(model, data, latents)
     at_once = max(1, chunk // chains)
     found = []
     with model._evaluating(), torch.random.fork_rng(), progress_bar(progress) as bar:
         torch.manual_seed(seed)
         for first in bar.track(range(0, size, at_once), description="annealing"):
             part = slice(first, first + at_once)
-            start = None if latents is None else {name: latents[name][part] for name in model.latents}
+            start = None if given is None else {name: value[part] for name, value in given.items()}
             some = each(data, itemgetter(part))
             lengths = _Annealing(model, some, temperatures, min(chains, TRIED), leaps).lengths()
             found.append(_Annealing(model, some, temperatures, chains, leaps).run(lengths, start))
     bound, error, effective, accepted = (torch.cat(parts) for parts in zip(*found, strict=True))
     return AnnealedBound(bound, error, effective, accepted, chains, temperatures)
+
+
+def _exact(model: DynamicalVAE, data: Mapping[str, Any], latents: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Latents from which chains go back, as the model has them.
+
+    Raises:
+        ValueError: one that is missing, or of another shape.
+    """
+    if lacking := [name for name in model.latents if name not in latents]:
+        raise ValueError(f"chains that go back start from all latents; missing are {', '.join(lacking)}")
+    first = data[model.observed[0]]
+    found = {}
+    for name in model.latents:
+        found[name] = torch.as_tensor(latents[name]).to(like(model))
+        steps = first.shape[1:2] if model.generative.local(name) else ()
+        expected = (len(first), *steps, model.sizes[name])
+        if found[name].shape != expected:
+            raise ValueError(f"the latent {name} has shape {tuple(found[name].shape)}, expected {tuple(expected)}")
+    return found
 
 
 class _Annealing:
@@ -183,7 +207,9 @@ class _Annealing:
         effective = shares.sum(0).square() / shares.square().sum(0)
         spread = shares.std(0) / shares.mean(0) / math.sqrt(self.chains) if self.chains > 1 else bound * math.nan
         accepted = torch.stack(rate).mean(0) if rate else torch.ones_like(bound)
-        return -bound if back else bound, spread, effective, accepted
+        if back:
+            return -bound, bound * math.nan, bound * math.nan, accepted
+        return bound, spread, effective, accepted
 
     def _move(self, points: Tensor, inverse: float, step: Tensor) -> tuple[Tensor, Tensor]:
         """A Hamiltonian transition that leaves f_b as it is; and the share that was accepted, by sequence."""
@@ -202,7 +228,8 @@ class _Annealing:
 
     def _slope(self, points: Tensor, inverse: float) -> tuple[Tensor, Tensor]:
         """log f_b, (R,), and its gradient."""
-        with torch.enable_grad():
+        # cuDNN has no gradients of recurrent networks in evaluation
+        with torch.enable_grad(), torch.backends.cudnn.flags(enabled=False):
             points = points.detach().requires_grad_()
             joint, own = self._densities(points)
             tempered = (1 - inverse) * own + inverse * joint

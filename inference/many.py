@@ -4,21 +4,21 @@ Of twenty differences one is beyond its 95 % by chance alone. `pairs` has p-valu
 which are right for all pairs at once whatever their dependence. `confidence_set` is the model confidence set (Hansen,
 Lunde and Nason, 2011): models of which none is significantly worse than another one, found by leaving out the one that
 is most surely worse until that holds. It holds the best one with at least its level, and the less the data tell, the
-more models. `required` is the power of a paired difference, by the noncentral t distribution, at other numbers of seeds
-and clips.
+more models. `required` is the power of a paired difference at other numbers of seeds and clips.
 
-Errors are those of `estimates`: over clips, which models share, and over training seeds, which they do not. The null
-distribution of the confidence set is simulated from them: means are drawn from the normal of these variances, and the
-variances themselves, by chi-squared of their degrees of freedom, as few seeds tell little of theirs (a parametric
-bootstrap-t in place of the block bootstrap of the paper, which two or three seeds would not feed). Models of which two
-seeds tell have far heavier tails than references, which have no seeds: each t statistic is therefore judged by its own
-null distribution, and the least of these p-values by that of the least (Westfall and Young, 1993), where the paper
+Errors are those of `estimates`: over clips, which models share, and over training seeds, which they do not. Few seeds
+tell little of their variances, and where these are small by chance, differences look sure that are not. The null
+distribution of the confidence set is therefore of draws with variances drawn first, each the measured one times f over
+chi-squared of its f degrees of freedom: of a single difference that is Student's t (the fiducial distribution of
+Behrens and Fisher; the paper's block bootstrap has nothing to draw from of two or three seeds). Each pair is judged by
+its own distribution, and the least of these p-values by that of the least (Westfall and Young, 1993), where the paper
 takes the largest t of all pairs.
 """
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -161,7 +161,7 @@ def confidence_set(
             f"of {', '.join(single)} there is one training seed, which tells nothing of others; give more, or take "
             "over_seeds=False for these very weights"
         )
-    clips = len(rows[0].deviations)
+    clips = _check(contenders)
     if clips < 2:
         raise ValueError("all windows are of one clip: there is no error over clips; give more clips")
     means = np.array([row.mean for row in rows]) * (1 if better == "lower" else -1)
@@ -172,24 +172,19 @@ def confidence_set(
     freedom = np.array([min(row.count - 1, 10**9) if over_seeds else 10**9 for row in rows])
 
     random = np.random.default_rng(seed)
-    together = random.standard_normal((draws, clips)) @ deviations.T
-    alone = random.standard_normal((draws, len(rows))) * np.sqrt(np.maximum(between - rest, 0))
-    drawn = together + alone
-    scale_clips = random.chisquare(clips - 1, draws) / (clips - 1)
-    drawn_seeds = np.maximum(between * random.chisquare(freedom, (draws, len(rows))) / freedom - rest, 0)
-    own = np.maximum(between - rest, 0)
+    wider = np.sqrt((clips - 1) / random.chisquare(clips - 1, (draws, 1)))
+    together = wider * (random.standard_normal((draws, clips)) @ deviations.T)
+    variances = np.maximum(between * freedom / random.chisquare(freedom, (draws, len(rows))) - rest, 0)
+    drawn = together + np.sqrt(variances) * random.standard_normal((draws, len(rows)))
 
     worse, other = (places.ravel() for places in np.indices((len(rows), len(rows))))  # than which, of all pairs
-    over = np.square(deviations[worse] - deviations[other]).sum(1)
-    drawn_variance = scale_clips[:, None] * over + drawn_seeds[:, worse] + drawn_seeds[:, other]
-    statistic = _over(means[worse] - means[other], np.sqrt(over + own[worse] + own[other]))
-    null = _over(drawn[:, worse] - drawn[:, other], np.sqrt(drawn_variance))
-    single = (null >= statistic).mean(0)
+    null = drawn[:, worse] - drawn[:, other]
+    single = (null >= means[worse] - means[other]).mean(0)
     null = stats.rankdata(-null, "max", axis=0) / draws
     left, p_values, running = np.ones(len(rows), bool), {}, 0.0
     while left.sum() > 1:
         (pairs_left,) = np.nonzero(left[worse] & left[other] & (worse != other))
-        worst = pairs_left[np.lexsort((-statistic[pairs_left], single[pairs_left]))[0]]
+        worst = pairs_left[np.lexsort(((means[other] - means[worse])[pairs_left], single[pairs_left]))[0]]
         running = max(running, float((null[:, pairs_left].min(1) <= single[worst]).mean()))
         p_values[names[worse[worst]]] = running
         left[worse[worst]] = False
@@ -197,10 +192,19 @@ def confidence_set(
     return ConfidenceSet(p_values, level)
 
 
-def _over(differences: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Differences in errors; 0 where neither is anything, as of two models that are one."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where((differences == 0) & (errors == 0), 0.0, differences / errors)
+def _check(rows: Mapping[str, Crossed]) -> int:
+    """The number of clips of scores that can be compared.
+
+    Raises:
+        ValueError: scores on other clips, or that are not finite.
+    """
+    counts = {name: len(row.deviations) for name, row in rows.items()}
+    if len(set(counts.values())) > 1:
+        raise ValueError(f"scores to compare are on the same clips, but there are {counts}")
+    for name, row in rows.items():
+        if not (math.isfinite(row.mean) and np.isfinite(row.deviations).all()):
+            raise ValueError(f"the score of {name} is not finite: its mean is {row.mean}")
+    return next(iter(counts.values()))
 
 
 @dataclass(frozen=True)
@@ -228,7 +232,7 @@ class Requirement:
         clips, *seeds = self.now
         table = Table(
             title=f"to find a difference of {number(self.difference, 4)} with a probability of {100 * self.power:g} %",
-            caption=f"with {clips} clips and {seeds[0]} and {seeds[1]} seeds it is {100 * self.achieved:.0f} %, "
+            caption=f"with {clips} clips and {' and '.join(map(_seeds, seeds))} it is {100 * self.achieved:.0f} %, "
             f"at a level of {100 * self.level:g} %",
         )
         for name in ("seeds of each", "clips"):
@@ -236,6 +240,10 @@ class Requirement:
         for count, needed in self.clips.items():
             table.add_row(str(count), f"{needed:.0f}" if math.isfinite(needed) else "no number is enough")
         return table
+
+
+def _seeds(count: int) -> str:
+    return "none that is trained" if count == sys.maxsize else f"{count} seeds"
 
 
 def required(
@@ -262,33 +270,43 @@ def required(
     Raises:
         ValueError: a model of one seed; a difference of 0; a power or level that is not between 0 and 1.
     """
-    if not (0 < power < 1 and 0 < level < 1) or min(seeds) < 2:
+    if not (0 < power < 1 and 0 < level < 1) or min(seeds, default=0) < 2 or any(int(each) != each for each in seeds):
         raise ValueError(
-            f"power and level are between 0 and 1, and seeds at least 2, not {power}, {level} and {[*seeds]}"
+            f"power and level are between 0 and 1 and seeds whole numbers from 2 on, not {power}, {level}, {[*seeds]}"
         )
+    count = _check({"the first": first, "the second": second})
     measured = first.estimate(second)
     sought = abs(measured.mean if difference is None else difference)
-    if math.isnan(measured.total) or not sought:
+    if math.isnan(measured.total) or not 0 < sought < math.inf:
         raise ValueError(
-            "both models need two seeds or more and several clips, and a difference that is not 0: "
+            "both models need two seeds or more and several clips, and a finite difference that is not 0: "
             f"it is {sought}, with a standard error of {measured.total}"
         )
-    rows, count = (first, second), len(first.deviations)
+    rows = (first, second)
     rest = [row.rest * row.count * count for row in rows]  # variances of single seeds and clips
     own = [max(row.count * row.seeds - r / count, 0.0) for row, r in zip(rows, rest, strict=True)]
     common = max(count * measured.sequences**2 - sum(row.rest * count for row in rows), 0.0)
 
     def reached(clips: int, *numbers: int) -> float:
-        over = (common + sum(r / n for r, n in zip(rest, numbers, strict=True))) / clips
-        total = over + sum(o / n for o, n in zip(own, numbers, strict=True))
-        between = [(o + r / clips) / n for o, r, n in zip(own, rest, numbers, strict=True)]
-        uncertain = over**2 / (clips - 1) + sum(v**2 / (n - 1) for v, n in zip(between, numbers, strict=True))
-        if not uncertain:
+        """As `Crossed.estimate` will judge: errors and degrees of freedom are drawn as they will be measured."""
+        both = [*zip(rest, own, numbers, strict=True)]
+        over = (common + sum(r / n for r, _, n in both)) / clips
+        between = [(o + r / clips) / n for r, o, n in both]
+        shared = sum(r / n for r, _, n in both) / clips
+        found = over * special.chdtri(clips - 1, RANKS[0]) / (clips - 1)
+        of_seeds = [
+            v * special.chdtri(n - 1, ranks) / (n - 1)
+            for v, (*_, n), ranks in zip(between, both, RANKS[1:], strict=True)
+        ]
+        total = np.maximum(found + sum(of_seeds) - shared, np.maximum(found, sum(of_seeds)))
+        uncertain = found**2 / (clips - 1) + sum(v**2 / (n - 1) for v, n in zip(of_seeds, numbers, strict=True))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            freedom = np.maximum(np.nan_to_num(total**2 / uncertain, nan=1e9), min(clips, *numbers) - 1)
+        beyond = special.stdtrit(np.minimum(freedom, 1e9), (1 + level) / 2) * np.sqrt(total)
+        scale = math.sqrt(over + sum(o / n for _, o, n in both))
+        if not scale:
             return 1.0
-        freedom = max(total**2 / uncertain, min(clips, *numbers) - 1)
-        beyond = special.stdtrit(freedom, (1 + level) / 2) * np.sqrt(special.chdtri(freedom, RANKS) / freedom)
-        shift = sought / math.sqrt(total)
-        return float((special.ndtr(shift - beyond) + special.ndtr(-shift - beyond)).mean())
+        return float((special.ndtr((sought - beyond) / scale) + special.ndtr((-sought - beyond) / scale)).mean())
 
     def least(number: int) -> float:
         low = high = FEWEST
@@ -307,5 +325,5 @@ def required(
 
 FEWEST, MOST_CLIPS = 5, 10**7
 """Clips of which errors can be told, and beyond which no number counts as enough."""
-RANKS = (np.arange(4000) + 0.5) / 4000
-"""Over whose quantiles of chi-squared the noncentral t is averaged; scipy's own fails where it is nearly certain."""
+RANKS = stats.qmc.Halton(3, seed=0).random(2000).T
+"""Of the measured variances over clips and of two models' seeds, over which power is averaged."""

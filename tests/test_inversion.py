@@ -162,9 +162,12 @@ def test_a_model_takes_the_word():
 @pytest.mark.parametrize(
     ("call", "told"),
     [
-        (lambda: faithful(DKF, order=[Block(("u",), 1)]), "order u forward is not one of the latents z, each once"),
+        (lambda: faithful(DKF, order=[Block(("u",), 1)]), "order 'u forward' is not one of the latents z, each once"),
         (lambda: faithful(DKF, order=[Block(("z", "z"), 1)]), "each once"),
         (lambda: faithful(DKF, observed=("y",)), "no factor for 'y'"),
+        (lambda: faithful(HIT_DVAE, order=[Block(("w", "z"), 1)]), "mixes static and local"),
+        (lambda: dvae.alternatives(DKF, steps=0), "at least 1 step"),
+        (lambda: dvae.arrow_prices(DKF, seeds=0), "at least 1"),
         (
             lambda: faithful(Factorization.parse("p(z_t | z_{own}) p(x_t | z_t)", {"own": Relation.parse("<t").mask})),
             "a mask of your own",

@@ -60,7 +60,7 @@ def test_weights_are_unbiased_for_the_evidence_and_their_inverses_for_its_invers
 
     mean, covariance = oracle.posterior(x)
     exact = torch.distributions.MultivariateNormal(mean[0], covariance).sample((600,))
-    back = annealed_bound(model, many, temperatures, chains=1, latents={"z": exact.unflatten(1, (T, 1))})
+    back = annealed_bound(model, many, temperatures, chains=1, chunk=250, latents={"z": exact.unflatten(1, (T, 1))})
     weights = (evidence - back.bound).exp()
     assert abs(weights.mean() - 1) < 4 * weights.std() / math.sqrt(len(weights))
 
@@ -128,6 +128,8 @@ def test_chains_depend_on_their_seed_and_on_nothing_else():
         (lambda m, x: annealed_bound(m, x, 0), "at least 1"),
         (lambda m, x: annealed_bound(m, {}, 2), "holds no|neither|missing"),
         (lambda m, x: annealed_bound(m, x, 2, latents={}), "missing are z"),
+        (lambda m, x: annealed_bound(m, x, 2, latents={"z": x[:, :2]}), "z has shape .* expected"),
+        (lambda m, x: annealed_bound(m, x[:0], 2), "no sequences"),
         (
             lambda m, x: annealed_bound(dvae.DynamicalVAE("p(x_t | x_{t-1})", "", {"x": 2}).double(), x, 2),
             "nothing is latent",
