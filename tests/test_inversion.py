@@ -57,12 +57,12 @@ def test_a_derived_guide_is_exact_and_no_smaller_one_is(pair, data):
     generative = pair[0]
     order = data.draw(st.sampled_from(list(orders(generative))), label="order")
     found = faithful(generative, order=order)
-    assert dvae.audit(generative, found, steps=data.draw(st.sampled_from([5, 9, 17]))).exact
+    assert dvae.audit(generative, found, steps=data.draw(st.sampled_from([5, 9]))).exact
     # A lag of 2 alone makes patterns periodic in time, of which relations have no end.
     if "{t-2}" not in generative:
         assert not dvae.audit(generative, found).redundant
         smaller = list(fewer(found, width=4))
-        for less in data.draw(st.permutations(smaller))[:3]:
+        for less in data.draw(st.permutations(smaller))[:2]:
             assert not dvae.audit(generative, less).exact, less.text
 
 

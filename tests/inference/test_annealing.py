@@ -37,13 +37,13 @@ def fitted(model):
 @pytest.mark.parametrize("pair", PAIRS)
 def test_the_evidence_lies_between_the_two(pair):
     """Within their errors on average, and near: guides are random, and their own bounds far below."""
-    model, x, latents = simulated(pair, 30)
+    model, x, latents = simulated(pair, 24)
     evidence = Oracle(model, T).evidence(x)
     assert (importance_bound(model, x, 16).bound - evidence).mean() < -1
-    below = annealed_bound(model, x, 80, 8).bound - evidence
-    above = annealed_bound(model, x, 80, 8, latents=latents).bound - evidence
+    below = annealed_bound(model, x, 50, 8).bound - evidence
+    above = annealed_bound(model, x, 50, 8, latents=latents).bound - evidence
     for gap, sign in ((below, 1), (above, -1)):
-        assert abs(gap.mean()) < 0.25
+        assert abs(gap.mean()) < 0.4
         assert sign * gap.mean() < 3 * gap.std() / math.sqrt(len(gap))
 
 
@@ -68,7 +68,7 @@ def test_weights_are_unbiased_for_the_evidence_and_their_inverses_for_its_invers
 def test_more_temperatures_come_nearer():
     model, x, _ = simulated("hit-dvae", 12)
     evidence = Oracle(model, T).evidence(x)
-    gaps = [float((evidence - annealed_bound(model, x, number, chains=4).bound).mean()) for number in (1, 10, 60)]
+    gaps = [float((evidence - annealed_bound(model, x, number, chains=4).bound).mean()) for number in (1, 5, 30)]
     assert gaps == sorted(gaps, reverse=True)
 
 
@@ -103,7 +103,7 @@ def test_other_likelihoods_than_normals():
     with torch.no_grad():
         logs = model.log_joint({"x": x.expand(len(grid), -1, -1)}, {"w": grid})
     evidence = sum(log.sum(-1) if log.dim() == 2 else log for log in logs.values()).logsumexp(0) + math.log(16 / 4000)
-    found = annealed_bound(model, x, 60, 64)
+    found = annealed_bound(model, x, 30, 64)
     assert abs(found.bound - evidence) < 5 * found.error
 
 
