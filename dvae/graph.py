@@ -298,6 +298,11 @@ class Alternatives(_Tabled):
         generative: the model.
         guides: what there is to choose from.
         steps: T of the graphs whose arrows were counted.
+
+    Example:
+        >>> found = dvae.alternatives("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")
+        >>> len(found), found[0].text
+        (4, 'q(w | x_{1:T}) q(z_t | z_{t-1}, x_{>=t}, w)')
     """
 
     header = ("guide", "drawn", "arrows", "looped", "KL by draws")

@@ -57,12 +57,13 @@ def test_a_derived_guide_is_exact_and_no_smaller_one_is(pair, data):
     generative = pair[0]
     order = data.draw(st.sampled_from(list(orders(generative))), label="order")
     found = faithful(generative, order=order)
-    assert dvae.audit(generative, found, steps=data.draw(st.sampled_from([5, 9]))).exact
+    audit = dvae.audit(generative, found)
+    assert audit.exact
     # A lag of 2 alone makes patterns periodic in time, of which relations have no end.
     if "{t-2}" not in generative:
-        assert not dvae.audit(generative, found).redundant
+        assert not audit.redundant
         smaller = list(fewer(found, width=4))
-        for less in data.draw(st.permutations(smaller))[:2]:
+        for less in data.draw(st.permutations(smaller))[:1]:
             assert not dvae.audit(generative, less).exact, less.text
 
 

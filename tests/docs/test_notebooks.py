@@ -32,7 +32,7 @@ def shown(notebook):
 @pytest.mark.timeout(1200)
 @pytest.mark.slow
 def test_a_run_shows_what_is_stored(path):
-    stored, run = nbformat.read(path, as_version=4), notebooks.execute(path, share=0.03)
+    stored, run = nbformat.read(path, as_version=4), notebooks.execute(path, share=0.02)
     for cell, before, now in zip(
         (cell for cell in run.cells if cell.cell_type == "code"), shown(stored), shown(run), strict=True
     ):
