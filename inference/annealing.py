@@ -33,7 +33,8 @@ from ..program.conditional import like
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from ..turns import alone
-from .bounds import log_densities, require_likelihood, total
+from .bounds import log_densities, require_data, require_likelihood, total
+from .held import reproducibly
 from .result import progress_bar
 
 ACCEPTED = 0.8
@@ -120,17 +121,13 @@ def annealed_bound(
         raise ValueError(f"nothing is latent in {model.generative}: its bound is the log evidence itself")
     if model.grouped and GROUP in data:
         raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")
-    needed = (*model.observed, *model.context)
-    if missing := [name for name in needed if name not in data]:
-        raise ValueError(f"the bound needs {', '.join(needed)}; missing in the batch are {', '.join(missing)}")
-    size = len(data[model.observed[0]])
+    size = require_data(model, data)
     if not size:
         raise ValueError("the batch holds no sequences")
     given = None if latents is None else _exact(model, data, latents)
     at_once = max(1, chunk // chains)
     found = []
-    with model._evaluating(), torch.random.fork_rng(), progress_bar(progress) as bar:
-        torch.manual_seed(seed)
+    with reproducibly(model, seed), progress_bar(progress) as bar:
         for first in bar.track(range(0, size, at_once), description="annealing"):
             part = slice(first, first + at_once)
             start = None if given is None else {name: value[part] for name, value in given.items()}
@@ -169,24 +166,21 @@ class _Annealing:
         # slow at both ends, where little of one law is mixed into the other
         self.inverse = (1 - torch.cos(math.pi * torch.arange(temperatures + 1) / temperatures)).double() / 2
         self.levels = range(1, temperatures)
-        with torch.no_grad():
-            draws = [model.guide(self.data) for _ in range(math.ceil(DRAWS / chains))]
+        draws = [model.guide(self.data) for _ in range(math.ceil(DRAWS / chains))]
         self.shapes = {name: draws[0][name].shape[1:] for name in model.latents}
         joined = torch.stack([self._joined(each) for each in draws]).unflatten(1, (chains, -1))
         self.scale = joined.flatten(0, 1).std(0).clamp(min=1e-6).repeat(chains, 1)
 
-    @torch.no_grad()
     def lengths(self) -> dict[int, Tensor]:
         """Of steps at each temperature, (B,), by chains that count for nothing else."""
         points = self._joined(self.model.guide(self.data))
         step, found = points.new_full((len(points) // self.chains,), FIRST), {}
         for level in self.levels:
-            points, accepted = self._move(points, float(self.inverse[level]), step)
+            points, accepted, _ = self._move(points, float(self.inverse[level]), step)
             step = (step * torch.exp(accepted - ACCEPTED)).clamp(LEAST, MOST)
             found[level] = step
         return found
 
-    @torch.no_grad()
     def run(
         self, lengths: Mapping[int, Tensor], start: Mapping[str, Tensor] | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -196,11 +190,13 @@ class _Annealing:
         weights, rate = points.new_zeros(len(points)), []
         gaps = self.inverse.diff().to(points)
         for level in [*reversed(self.levels), 0] if back else [*self.levels, len(gaps)]:
-            joint, own = self._densities(points)
-            weights += gaps[level if back else level - 1] * (joint - own)
             if level in lengths:
-                points, accepted = self._move(points, float(self.inverse[level]), lengths[level])
+                points, accepted, ratio = self._move(points, float(self.inverse[level]), lengths[level])
                 rate.append(accepted)
+            else:  # the last one, after which nothing moves
+                joint, own = self._densities(points)
+                ratio = joint - own
+            weights += gaps[level if back else level - 1] * ratio
         log_weights = weights.unflatten(0, (self.chains, -1)) * (-1 if back else 1)
         bound = log_weights.logsumexp(0) - math.log(self.chains)
         shares = (log_weights - log_weights.amax(0)).exp()
@@ -211,30 +207,40 @@ class _Annealing:
             return -bound, bound * math.nan, bound * math.nan, accepted
         return bound, spread, effective, accepted
 
-    def _move(self, points: Tensor, inverse: float, step: Tensor) -> tuple[Tensor, Tensor]:
-        """A Hamiltonian transition that leaves f_b as it is; and the share that was accepted, by sequence."""
+    def _move(self, points: Tensor, inverse: float, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A Hamiltonian transition that leaves f_b as it is.
+
+        Args:
+            points: (R, N).
+            inverse: b, an inverse temperature.
+            step: (B,), lengths in the guide's deviations.
+
+        Returns:
+            Points (R, N); the share that was accepted (B,); and log p(x, z) - log q(z | x), (R,), where they were.
+        """
         length = step.repeat(self.chains)[:, None]
         momentum = torch.randn_like(points)
-        before, slope = self._slope(points, inverse)
+        before, slope, weight = self._slope(points, inverse)
         moved, kicked = points, momentum + 0.5 * length * self.scale * slope
         for leap in range(self.leaps):
             moved = moved + length * self.scale * kicked
-            after, slope = self._slope(moved, inverse)
+            after, slope, _ = self._slope(moved, inverse)
             kicked = kicked + (0.5 if leap == self.leaps - 1 else 1.0) * length * self.scale * slope
         ratio = after - before - 0.5 * (kicked.square() - momentum.square()).sum(1)
         chance = ratio.nan_to_num(-math.inf).clamp(max=0).exp()
         taken = torch.rand_like(chance) < chance
-        return torch.where(taken[:, None], moved, points), chance.unflatten(0, (self.chains, -1)).mean(0)
+        points = torch.where(taken[:, None], moved, points)
+        return points, chance.unflatten(0, (self.chains, -1)).mean(0), weight
 
-    def _slope(self, points: Tensor, inverse: float) -> tuple[Tensor, Tensor]:
-        """log f_b, (R,), and its gradient."""
+    def _slope(self, points: Tensor, inverse: float) -> tuple[Tensor, Tensor, Tensor]:
+        """log f_b (R,), its gradient (R, N), and log p(x, z) - log q(z | x), (R,)."""
         # cuDNN has no gradients of recurrent networks in evaluation
         with torch.enable_grad(), torch.backends.cudnn.flags(enabled=False):
             points = points.detach().requires_grad_()
             joint, own = self._densities(points)
             tempered = (1 - inverse) * own + inverse * joint
             (slope,) = torch.autograd.grad(tempered.sum(), points)
-        return tempered.detach(), slope.nan_to_num()
+        return tempered.detach(), slope.nan_to_num(), (joint - own).detach()
 
     def _densities(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """log p(x, z) and log q(z | x), (R,) each."""

@@ -289,6 +289,18 @@ def require_likelihood(model: DynamicalVAE) -> None:
         )
 
 
+def require_data(model: DynamicalVAE, data: AnyBatch) -> int:
+    """The number of sequences of a batch that holds all that a bound needs.
+
+    Raises:
+        ValueError: data or context are missing.
+    """
+    needed = (*model.observed, *model.context)
+    if missing := [name for name in needed if name not in data]:
+        raise ValueError(f"the bound needs {', '.join(needed)}; missing in the batch are {', '.join(missing)}")
+    return len(data[model.observed[0]])  # type: ignore[call-overload, index]
+
+
 KHAT_PARTICLES = 25
 """Particles below which k-hat is not estimated: arviz_stats fits the tail to a fifth of them, and needs five."""
 

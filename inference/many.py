@@ -133,7 +133,7 @@ def confidence_set(
     draws: int = 10_000,
     seed: int = 0,
 ) -> ConfidenceSet:
-    """The model confidence set, by t statistics of all pairs that are left.
+    """The model confidence set, by the differences of all pairs that are left.
 
     Args:
         contenders: name to a score on the same clips.
@@ -144,8 +144,8 @@ def confidence_set(
         seed: of the draws.
 
     Raises:
-        ValueError: no models; a level that is not between 0 and 1; one clip; with `over_seeds`, a model of one seed; a
-            score that is neither the lower nor the higher the better.
+        ValueError: no models; a level that is not between 0 and 1; one clip; scores on other clips, or that are not
+            finite; with `over_seeds`, a model of one seed; a score that is neither the lower nor the higher the better.
     """
     if not contenders or not 0 < level < 1 or draws < 1:
         raise ValueError(
@@ -268,7 +268,8 @@ def required(
         seeds: of each model, for which clips are counted.
 
     Raises:
-        ValueError: a model of one seed; a difference of 0; a power or level that is not between 0 and 1.
+        ValueError: a model of one seed; scores on other clips, or that are not finite; a difference that is 0 or not
+            finite; seeds below 2; a power or level that is not between 0 and 1.
     """
     if not (0 < power < 1 and 0 < level < 1) or min(seeds, default=0) < 2 or any(int(each) != each for each in seeds):
         raise ValueError(

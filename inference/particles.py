@@ -32,7 +32,7 @@ from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout
 from ..turns import alone
 from ..views import LOG_DET, volume
-from .bounds import require_likelihood
+from .bounds import require_data, require_likelihood
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,7 @@ def particle_bound(
         raise ValueError(f"resample_below is a share of the particles, between 0 and 1, got {resample_below}")
     require_likelihood(model)
     data = model.read(batch)
-    needed = (*model.observed, *model.context)
-    if missing := [name for name in needed if name not in data]:
-        raise ValueError(f"the bound needs {', '.join(needed)}; missing in the batch are {', '.join(missing)}")
-    size = len(data[model.observed[0]])
+    size = require_data(model, data)
     at_once = max(1, chunk // particles)
     with model._evaluating():
         run = model._rollout(model.generative, model.generator, data, None, 1)  # refuses what cannot be read

@@ -272,15 +272,17 @@ def sweep(
     given = {name: value for name, value in vars(model).items() if value is not None}
     with arguments():
         how = _given(training)
-        sizes: list[dict[str, int]] = [{"latent": size} for size in latent] or [{}]
-        chosen: Any = [registry.method(name, **given, **size) for name in method for size in sizes]
-        if grid is not None:
+        chosen: Any
+        if grid is None:
+            sizes: list[dict[str, int]] = [{"latent": size} for size in latent] or [{}]
+            chosen = fitted = [registry.method(name, **given, **size) for name in method for size in sizes]
+            for each in fitted:
+                each.check()
+        else:
             told = Grid.read(grid, given)
             chosen, seeds, how = told.methods, seeds or told.seeds, {**told.training, **how}
+            fitted = [*told.methods.values()]
             Training(**how)
-        fitted = [*chosen.values()] if isinstance(chosen, dict) else chosen
-        for each in fitted:
-            each.check()
     opened = source.open(*fitted)
     with nullcontext() if scheduler is None else _cluster(scheduler):
         results = sweep_methods(chosen, opened, out, seeds or (0, 1, 2), how, jobs)
