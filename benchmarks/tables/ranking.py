@@ -473,7 +473,8 @@ def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
         return table(header, lines)
     members = ", ".join(confidence_set(known).members)
     return (
-        table(header, lines) + f"\nMay be the best, at 90 % over clips and seeds, of rows with two seeds: {members}.\n"
+        table(header, lines)
+        + f"\nMay be the best, at 90 % over clips and seeds, of rows with two seeds or more: {members}.\n"
     )
 
 
