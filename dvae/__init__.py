@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from .oracle import Oracle, arrow_prices, price, twin
     from .program.model import DynamicalVAE
     from .program.rollout import InputNoise, SelfFeeding
+    from .program.summed import Discrete
     from .runs.directory import load
 
 __all__ = [
@@ -59,6 +60,7 @@ __all__ = [
     "Audit",
     "Comparison",
     "Descent",
+    "Discrete",
     "DynamicalVAE",
     "Evaluation",
     "Evidence",
@@ -128,6 +130,7 @@ _PLACES = {
         "oracle": "Oracle arrow_prices price twin",
         "program.model": "DynamicalVAE",
         "program.rollout": "InputNoise SelfFeeding",
+        "program.summed": "Discrete",
         "runs.directory": "load",
     }.items()
     for name in names.split()

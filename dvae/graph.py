@@ -106,6 +106,7 @@ class Audit(_Tabled):
             given the rest of what that factor reads. Harmless: nothing is lost by dropping it.
         steps: the one length T that it holds for, where a mask is the user's own and may be another at every length;
             None where it holds for all.
+        summed: names of latents that are summed out.
 
     Example:
         >>> found = dvae.audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})")
@@ -121,6 +122,7 @@ class Audit(_Tabled):
     missing_parents: dict[str, tuple[Parent, ...]] = field(repr=False)
     redundant_parents: dict[str, tuple[Parent, ...]] = field(repr=False)
     steps: int | None = None
+    summed: tuple[str, ...] = ()
 
     @property
     def missing(self) -> dict[str, tuple[str, ...]]:
@@ -179,7 +181,7 @@ class Audit(_Tabled):
         Raises:
             ValueError: a mask of the user's own in the model.
         """
-        return faithful(self.generative, self.observed, self.inference.blocks)
+        return faithful(self.generative, self.observed, self.inference.blocks, self.summed)
 
     def draw(self, T: int = 3, ax: Axes | None = None) -> Axes:
         """Draws the guide over T steps: missing arrows dashed red, redundant ones dotted grey."""
@@ -205,6 +207,7 @@ def audit(
     inference: Factorization | str | None,
     steps: int | None = None,
     observed: Iterable[str] = ("x",),
+    summed: Iterable[str] = (),
 ) -> Audit:
     """Compares what each factor of a guide reads with what the exact posterior factor depends on.
 
@@ -223,6 +226,7 @@ def audit(
         steps: number of inner steps compared, 5 if None; with masks of the user's own T, the length that they will
             be used at, 16 if None.
         observed: names of the observed variables.
+        summed: names of latents that are summed out (`Discrete`), which the posterior of the others does not wait for.
 
     Raises:
         ValueError: the two do not fit each other (see `dvae.notation.check_pair`).
@@ -231,9 +235,9 @@ def audit(
     {'z': ('z_{t-1}',)}
     """
     generative = Factorization.parse(generative)
-    observed = tuple(observed)
-    inference = guide(generative, inference, observed)
-    latents, data, context = check_pair(generative, inference, observed)
+    observed, summed = tuple(observed), tuple(summed)
+    inference = guide(generative, inference, observed, summed=summed)
+    latents, data, context = check_pair(generative, inference, observed, summed=summed)
     relations = _relations(generative, inference)
     custom = any(relation.intervals is None for relation in relations)
     if custom:
@@ -265,7 +269,7 @@ def audit(
             for found, offsets in ((missing, lacking), (redundant, unused)):
                 if offsets.any():
                     found[child] = (*found.get(child, ()), view.parent(child, name, offsets))
-    return Audit(generative, inference, data, missing, redundant, view.length if custom else None)
+    return Audit(generative, inference, data, missing, redundant, view.length if custom else None, summed)
 
 
 # --------------------------------------------------------------------------------------------- derived guides
@@ -349,13 +353,16 @@ class Alternatives(_Tabled):
         return len(self.guides)
 
 
-def alternatives(generative: Factorization | str, observed: Iterable[str] = ("x",), steps: int = 10) -> Alternatives:
+def alternatives(
+    generative: Factorization | str, observed: Iterable[str] = ("x",), steps: int = 10, summed: Iterable[str] = ()
+) -> Alternatives:
     """All guides that `faithful` derives, one for each order of drawing; one for those that have the same.
 
     Args:
         generative: p, a factorization or its text.
         observed: names of the observed variables.
         steps: T at which arrows are counted.
+        summed: see `faithful`.
 
     Raises:
         ValueError: as `faithful`; a model without latents.
@@ -367,12 +374,12 @@ def alternatives(generative: Factorization | str, observed: Iterable[str] = ("x"
         q(z_t | z_{t+1}, x_{<=t})  z backward  64      z       z
         each reads what the posterior depends on in its order (see `faithful`); arrows of 10 steps
     """
-    generative, observed = Factorization.parse(generative), tuple(observed)
+    generative, observed, summed = Factorization.parse(generative), tuple(observed), tuple(summed)
     if steps < 1:
         raise ValueError(f"arrows are counted in at least 1 step, not {steps}")
     found: dict[frozenset[Factor], Derived] = {}
-    for order in orders(generative, observed):
-        inference = faithful(generative, observed, order)
+    for order in orders(generative, observed, summed):
+        inference = faithful(generative, observed, order, summed)
         if not inference.factors:
             raise ValueError(f"nothing is latent in {generative.text!r}: there is no guide to derive")
         looped = tuple(name for block in inference.blocks if block.direction for name in block.names)

@@ -119,7 +119,10 @@ class Unrolled:
 
 
 def faithful(
-    generative: Factorization | str, observed: Iterable[str] = ("x",), order: Sequence[Block] | None = None
+    generative: Factorization | str,
+    observed: Iterable[str] = ("x",),
+    order: Sequence[Block] | None = None,
+    summed: Iterable[str] = (),
 ) -> Factorization:
     """The smallest guide that misses nothing of what the exact posterior depends on, drawn in this order.
 
@@ -132,6 +135,7 @@ def faithful(
         observed: names of the observed variables.
         order: of the latents, see `orders`; by default static ones first, then step by step forward in time, within a
             step as the model draws them.
+        summed: names of latents that are summed out (`Discrete`), which no guide draws.
 
     Raises:
         ValueError: an observed variable that the model lacks; an order that is not of its latents, each once, or mixes
@@ -143,8 +147,8 @@ def faithful(
     """
     generative = Factorization.parse(generative)
     data = tuple(observed)
-    latents = _latents(generative, data)
-    order = tuple(order) if order is not None else next(iter(orders(generative, data)))
+    latents = _latents(generative, data, summed := tuple(summed))
+    order = tuple(order) if order is not None else next(iter(orders(generative, data, summed)))
     if not all(isinstance(block, Block) for block in order):
         raise TypeError(f"an order is of blocks, such as those of dvae.inversion.orders, not {order!r}")
     if mixed := [b for b in order if len({generative.local(n) for n in b.names if n in latents}) > 1]:
@@ -185,7 +189,9 @@ def faithful(
     return Factorization("q", tuple(factor(name) for block in order for name in block.names))
 
 
-def orders(generative: Factorization | str, observed: Iterable[str] = ("x",)) -> Iterator[Order]:
+def orders(
+    generative: Factorization | str, observed: Iterable[str] = ("x",), summed: Iterable[str] = ()
+) -> Iterator[Order]:
     """In which latents may be drawn: static ones first or last, the others forward or backward in time.
 
     Several local latents are drawn together, step by step, in every order within a step, or one at all of its steps
@@ -194,12 +200,13 @@ def orders(generative: Factorization | str, observed: Iterable[str] = ("x",)) ->
     Args:
         generative: p, a factorization or its text.
         observed: names of the observed variables.
+        summed: see `faithful`.
 
     >>> [spelled(order) for order in orders("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")]
     ['w, z forward', 'w, z backward', 'z forward, w', 'z backward, w']
     """
     generative = Factorization.parse(generative)
-    latents = _latents(generative, tuple(observed))
+    latents = _latents(generative, tuple(observed), tuple(summed))
     statics = tuple(Block((name,), 0) for name in latents if not generative.local(name))
     local = [name for name in latents if generative.local(name)]
     for last in (False, True) if statics and local else (False,):
@@ -217,11 +224,11 @@ def spelled(order: Sequence[Block]) -> str:
     return ", ".join(" with ".join(block.names) + ways[block.direction] for block in order)
 
 
-def _latents(generative: Factorization, observed: tuple[str, ...]) -> list[str]:
-    """As the model draws them."""
-    for name in observed:
+def _latents(generative: Factorization, observed: tuple[str, ...], summed: tuple[str, ...]) -> list[str]:
+    """As the model draws them, but for what is summed out."""
+    for name in (*observed, *summed):
         generative.factor(name)
-    return [name for block in generative.blocks for name in block.names if name not in observed]
+    return [name for block in generative.blocks for name in block.names if name not in (*observed, *summed)]
 
 
 def guide(
@@ -229,6 +236,7 @@ def guide(
     inference: Factorization | str | None,
     observed: Iterable[str] = ("x",),
     masks: Mapping[str, Relation | MaskFunction] | None = None,
+    summed: Iterable[str] = (),
 ) -> Factorization:
     """The guide that is meant.
 
@@ -238,14 +246,15 @@ def guide(
             "" where nothing is latent.
         observed: names of the observed variables.
         masks: see `Factorization.parse`.
+        summed: see `faithful`.
 
     Raises:
         NotationError, ValueError, TypeError: as in `Factorization.parse` and `faithful`.
     """
     if inference is None:
-        return generative.prior_guide(observed)
+        return generative.prior_guide((*observed, *summed))
     if isinstance(inference, str) and not inference.strip():
         return Factorization("q", ())
     if isinstance(inference, str) and inference.strip() == FAITHFUL:
-        return faithful(generative, observed)
+        return faithful(generative, observed, summed=summed)
     return Factorization.parse(inference, masks)

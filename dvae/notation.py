@@ -221,7 +221,11 @@ class Factorization:
         raise ValueError(f"no factor for {name!r} in {self.text!r}; there are factors for {_names(self.variables)}")
 
     def prior_guide(self, observed: Iterable[str] = ("x",)) -> Factorization:
-        """The prior as a guide: the factors of the latents, as q. Without latents it has no factor."""
+        """The prior as a guide: the factors of the latents, as q. Without latents it has no factor.
+
+        Args:
+            observed: names of what has no factor in it, and of what is summed out.
+        """
         observed = tuple(observed)
         return Factorization("q", tuple(replace(f, kind="q") for f in self.factors if f.child not in observed))
 
@@ -600,6 +604,7 @@ def check_pair(
     inference: Factorization,
     observed: Iterable[str] = ("x",),
     sizes: Mapping[str, int] | None = None,
+    summed: Collection[str] = (),
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Checks that a guide fits a generative model.
 
@@ -608,6 +613,7 @@ def check_pair(
         inference: q over the latents, given the data.
         observed: names of the observed variables.
         sizes: dimension of every variable, context included; not checked if None.
+        summed: names of latents that are summed out, which the guide neither draws nor reads.
 
     Returns:
         Names (latents, observed, context): latents in the order in which the guide draws them.
@@ -621,7 +627,16 @@ def check_pair(
             "expected p(...) for the generative model and q(...) for the guide, got "
             f"{generative.text!r} and {inference.text!r}"
         )
-    latents = tuple(name for name in generative.variables if name not in observed)
+    latents = tuple(name for name in generative.variables if name not in (*observed, *summed))
+    for name in summed:
+        if name not in generative.variables or name in observed:
+            raise ValueError(f"{name} is to be summed out, but it is no latent of {generative.text!r}")
+        for factor in inference.factors:
+            if name == factor.child or factor.parent(name) is not None:
+                raise ValueError(
+                    f"{factor} {'draws' if name == factor.child else 'reads'} {name}, which is summed out: the guide "
+                    "knows nothing of it; remove it"
+                )
     for name in observed:
         if name not in generative.variables:
             raise ValueError(f"the observed {name} has no factor in {generative.text!r}; add p({name}_t | ...)")
@@ -636,7 +651,10 @@ def check_pair(
     for name in latents:
         if name not in inference.variables:
             add = _head("q", name, generative.local(name))
-            raise ValueError(f"the latent {name} has no factor in the guide; add {add}, or name {name} as observed")
+            raise ValueError(
+                f"the latent {name} has no factor in the guide; add {add}, or name {name} as observed; a discrete one "
+                f"is summed out and needs none: sizes={{{name!r}: dvae.Discrete(states)}}"
+            )
     everything = dict.fromkeys((*generative.variables, *generative.context, *inference.context))
     for name in everything:
         locality = {f.kind: f.local(name) for f in (generative, inference) if name in f.variables + f.context}

@@ -4,6 +4,9 @@ With `networks.Linear` and normals of fixed scale, any factorization is one dens
 posterior, and the evidence lower bound of any linear guide are closed forms; so is the expected gap between bound and
 evidence, over data from the model. Minimised over guides, that gap is what the guide's factorization costs: the price
 of its dropped arrows, in nats.
+
+Discrete latents that move locations make the joint a mixture of such normals, one for each course of their states.
+Where these can be counted, evidence and posterior moments are known still; bounds of a guide are not.
 """
 
 from __future__ import annotations
@@ -17,9 +20,11 @@ from torch import Tensor, nn
 
 from .inversion import FAITHFUL, guide
 from .laws.families import FixedNormal, FixedNormalLaw, Gaussian
+from .laws.family import Family
 from .networks.linear import Linear, LinearNetwork
 from .notation import Factorization
 from .program.model import DynamicalVAE
+from .program.summed import Discrete
 from .turns import alone
 from .views import LOG_DET, volume
 
@@ -48,11 +53,12 @@ def twin(
         torch.Size([5, 4, 2])
     """
     model = Factorization.parse(generative)
-    equations = (model, guide(model, inference, observed))
+    summed = tuple(name for name, size in sizes.items() if isinstance(size, Discrete) and name not in observed)
+    equations = (model, guide(model, inference, observed, summed=summed))
     laws = {
-        f"{factor.kind}({factor.child})": FixedNormal(
-            scale=0.7, learned=True, project=False, steps=steps if factor.local else 0
-        )
+        f"{factor.kind}({factor.child})": Family("OneHotCategorical", project=False)
+        if factor.child in summed
+        else FixedNormal(scale=0.7, learned=True, project=False, steps=steps if factor.local else 0)
         for equation in equations
         for factor in equation.factors
         if factor.parents or factor.kind == "q"
@@ -80,7 +86,7 @@ class Oracle:
         steps: T.
 
     Raises:
-        ValueError: a model that is not linear-Gaussian, or has context.
+        ValueError: a model that is not linear-Gaussian, given the states of what is summed out, or has context.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
@@ -92,6 +98,12 @@ class Oracle:
         if model.context:
             raise ValueError(f"the oracle knows no law of the context {', '.join(model.context)}")
         self.model, self.steps = model, steps
+        for name in model.summed:
+            if other := [parent for parent in model.generator[name].parents if parent not in model.summed]:
+                raise ValueError(
+                    f"{model.generator[name].factor} reads {', '.join(other)}, so that states depend on what is "
+                    "continuous, and nothing of it is known exactly; the oracle knows states that read states"
+                )
 
     def _size(self, name: str) -> int:
         return self.model.sizes[name] * (self.steps if self.model.generative.local(name) else 1)
@@ -135,11 +147,38 @@ class Oracle:
         return _System(stack(names), stack(data), torch.cat(biases), torch.cat(scales))
 
     def _joint(self) -> tuple[Tensor, Tensor]:
-        """Mean and precision of (latents, data) under the model, both stacked variable by variable."""
-        system = self._system(self.model.generator, (*self.model.latents, *self.model.observed), ())
+        """Mean and precision of (latents, data) under the model, both stacked variable by variable.
+
+        Raises:
+            ValueError: a mixture of such.
+        """
+        if self.model.summed:
+            raise ValueError(
+                f"with {', '.join(self.model.summed)} summed out the posterior is a mixture of normals, from which the "
+                "divergence of a normal guide is not known exactly; evidence and posterior moments are"
+            )
+        _, means, precision = self._mixture()
+        return means[0], precision
+
+    def _mixture(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Of every course that the states may take: log probability (C,) and mean (C, N), and the precision of all."""
+        model = self.model
+        system = self._system(model.generator, (*model.latents, *model.observed), model.summed)
         rest = torch.eye(len(system.bias), dtype=torch.float64) - system.weights
         white = rest / system.scale[:, None]
-        return torch.linalg.solve(rest, system.bias), white.t() @ white
+        moved, logs = system.bias[None], torch.zeros(1, dtype=torch.float64)
+        if model.sums is not None:
+            states = model.sums.courses(self.steps)
+            logs = sum((self._log_probability(name, states) for name in model.summed), logs)
+            moved = moved + self._stack(states, model.summed) @ system.data_weights.t()
+        return logs, torch.linalg.solve(rest, moved.t()).t(), white.t() @ white
+
+    def _log_probability(self, name: str, states: Mapping[str, Tensor]) -> Tensor:
+        """(C,), of courses of a variable that is summed out given those of the others."""
+        conditional, value = self.model.generator[name], states[name]
+        law = conditional.law.distribution(conditional(states, len(value), self.steps))
+        logs: Tensor = (law.logits * value).flatten(1).sum(1)
+        return logs
 
     def _guide(self) -> tuple[Tensor, Tensor, Tensor]:
         """Gain on the data, offset, and a root R of the covariance R R' of q(latents | data)."""
@@ -156,20 +195,35 @@ class Oracle:
     def evidence(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
         """log p(x), (B,), of data (B, T, D)."""
         seen = self.model.read(x)
-        data = self._stack(seen, self.model.observed)
-        mean, precision = self._joint()
-        start = len(mean) - data.shape[1]
-        covariance = torch.linalg.inv(precision)[start:, start:]
-        evidence: Tensor = torch.distributions.MultivariateNormal(mean[start:], covariance).log_prob(data)
+        evidence: Tensor = self._weighed(self._stack(seen, self.model.observed)).logsumexp(1)
         return evidence + volume(seen) if LOG_DET in seen else evidence
 
+    def _weighed(self, data: Tensor) -> Tensor:
+        """(B, C): log joint of data (B, N) and each course that the states may take."""
+        logs, means, precision = self._mixture()
+        start = means.shape[1] - data.shape[1]
+        covariance = torch.linalg.inv(precision)[start:, start:]
+        law = torch.distributions.MultivariateNormal(means[:, start:], covariance)
+        weighed: Tensor = logs + law.log_prob(data[:, None])
+        return weighed
+
     def posterior(self, x: Tensor | Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Mean (B, N) and covariance (N, N) of the latents, stacked in the guide's order, given data (B, T, D)."""
+        """Mean (B, N) and covariance (N, N) of the latents, stacked in the guide's order, given data (B, T, D).
+
+        With discrete latents summed out the posterior is a mixture, and the covariance each sequence's own, (B, N, N).
+        """
         data = self._stack(self.model.read(x), self.model.observed)
-        mean, precision = self._joint()
-        n = len(mean) - data.shape[1]
-        gain = -torch.linalg.solve(precision[:n, :n], precision[:n, n:])
-        return mean[:n] + (data - mean[n:]) @ gain.t(), torch.linalg.inv(precision[:n, :n])
+        _, means, precision = self._mixture()
+        n = means.shape[1] - data.shape[1]
+        within = torch.linalg.inv(precision[:n, :n])
+        gain = -within @ precision[:n, n:]
+        found = means[:, :n] + (data[:, None] - means[:, n:]) @ gain.t()  # (B, C, N)
+        if not self.model.summed:
+            return found[:, 0], within
+        weights = self._weighed(data).softmax(1)
+        mean = torch.einsum("bc,bci->bi", weights, found)
+        away = found - mean[:, None]
+        return mean, within + torch.einsum("bc,bci,bcj->bij", weights, away, away)
 
     def bound(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
         """The exact evidence lower bound of the model's guide, (B,): no draws are taken."""

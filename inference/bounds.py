@@ -193,9 +193,7 @@ def sites_of(trace: Any) -> dict[str, dict[str, Any]]:
 
 def site_log_prob(fn: Any, value: Tensor) -> Tensor:
     """(B, T) of a local variable, (B,) of a static one."""
-    if not isinstance(fn, Sequence):
-        return fn.log_prob(value)
-    return _over_entries(fn.steps(value).log_prob(fn.scored(value)), fn)
+    return fn.by_step(value) if isinstance(fn, Sequence) else fn.log_prob(value)
 
 
 def log_densities(trace: Any) -> dict[str, Tensor]:
@@ -207,13 +205,6 @@ def log_densities(trace: Any) -> dict[str, Tensor]:
 def total(logs: Mapping[str, Tensor]) -> Tensor:
     """(B,), the sum over variables and steps."""
     return sum(log.sum(-1) if log.dim() == 2 else log for log in logs.values())  # type: ignore[return-value]
-
-
-def _over_entries(entries: Tensor, fn: Sequence) -> Tensor:
-    mask = fn.rollout.mask(fn.name)
-    # where, not a product: an entry that does not count may be infinite
-    entries = entries if mask is None else torch.where(mask, entries, 0.0)
-    return entries.sum(-1) if entries.dim() == 3 else entries
 
 
 def _closed_forms(model_sites: Mapping[str, Any], guide_sites: Mapping[str, Any]) -> set[str]:
@@ -239,7 +230,7 @@ def _kl(p: Any, q: Any, value: Tensor, closed: bool) -> Tensor:
     if closed:
         try:
             if isinstance(p, Sequence) and isinstance(q, Sequence):
-                return _over_entries(kl_divergence(q.steps(value), p.steps(value)), p)
+                return p.counted(kl_divergence(q.steps(value), p.steps(value)))
             return kl_divergence(q, p)
         except NotImplementedError:  # no closed form for this pair of families
             pass

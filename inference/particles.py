@@ -91,6 +91,10 @@ def particle_bound(
     if not 0 <= resample_below <= 1:
         raise ValueError(f"resample_below is a share of the particles, between 0 and 1, got {resample_below}")
     require_likelihood(model)
+    if model.summed:
+        raise ValueError(
+            f"{', '.join(model.summed)} is summed out, exactly, and not followed by particles; use importance_bound"
+        )
     data = model.read(batch)
     size = require_data(model, data)
     at_once = max(1, chunk // particles)

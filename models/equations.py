@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from typing_extensions import override
 
 from ..networks import Attention, Dense, Linear, NetworkSpec, Recurrent
-from ..options import Size, nearest
+from ..options import Range, Size, nearest
 from ..program.model import DynamicalVAE
+from ..program.summed import LARGEST, Discrete
 from ..schema import Schema
 from .method import LatentMethod
 
@@ -26,6 +27,7 @@ class Equations(LatentMethod):
         network: "recurrent", "attention", "dense" or "linear", for every factor.
         width: of the networks.
         latents: sizes of the latents, where they differ from `latent`.
+        states: of discrete latents, which are summed out and have no factor in the guide: their numbers of states.
         grouped: static latents that the sequences of a group share, see `dvae.program.groups`.
     """
 
@@ -38,6 +40,7 @@ class Equations(LatentMethod):
     network: str = "recurrent"
     width: Size = 64
     latents: dict[str, Size] = field(default_factory=dict)
+    states: dict[str, Annotated[int, Range(2, LARGEST)]] = field(default_factory=dict)
     grouped: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -51,7 +54,8 @@ class Equations(LatentMethod):
     @override
     def sizes(self) -> dict[str, int]:
         """Sizes of all variables; the data tell their own."""
-        return {name: self.latents.get(name, self.latent) for name in self.equations()[0].variables}
+        sizes = {name: self.latents.get(name, self.latent) for name in self.equations()[0].variables}
+        return {**sizes, **{name: Discrete(states) for name, states in self.states.items()}}
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:

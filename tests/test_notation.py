@@ -449,7 +449,8 @@ def test_a_pair_that_fits():
             "q(w)",
             ["x"],
             None,
-            "the latent z has no factor in the guide; add q(z_t | ...), or name z as observed",
+            "the latent z has no factor in the guide; add q(z_t | ...), or name z as observed; a discrete one is "
+            "summed out and needs none: sizes={'z': dvae.Discrete(states)}",
         ),
         ("q(z_t)", ["x"], None, "the latent w has no factor in the guide; add q(w | ...)"),
         ("q(w) q(z_t) q(u_t)", ["x"], None, "q(u_t): no latent u in"),

@@ -62,18 +62,20 @@ def forecast(
         if past:
             latents = poutine.condition(model.guide, latents)(observed)
         statics = {name: value for name, value in latents.items() if not model.generative.local(name)}
+        if past and model.summed:
+            latents = latents | _given(model, observed, latents).summation.draw()
         program = poutine.condition(model.model, data=statics) if statics else model.model
         prefix = {name: value for name, value in latents.items() if name not in statics}
         known |= {name: value for name, value in held.items() if name in model.observed}
         out = program(known, length=past + horizon, prefix=prefix, mean_emission=means)
-        made = {name: out[name].unflatten(0, (count, -1)) for name in (*model.observed, *model.latents)}
+        made = {name: out[name].unflatten(0, (count, -1)) for name in (*model.observed, *model.latents, *model.summed)}
         made |= {name: made[name][:, :, past:] for name in model.observed}
         made = model.shown(made, rows(data, part))
         again = {n: rows(v, part).expand_as(made[n]) for n, v in given.items() if n in model.observed}
         return model.shown({**made, **again}) if again else made  # as it was given: the way there and back rounds
 
     # Samples that are all the same are one: rows of one product may differ in their last bits.
-    distinct = samples if model.latents or redrawn or any(drawn.values()) else 1
+    distinct = samples if model.latents or model.summed or redrawn or any(drawn.values()) else 1
     with model._evaluating():
         out = in_chunks(futures, size, distinct, _together(model, data, size, chunk))
     return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
@@ -107,8 +109,9 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
     def means(part: slice, count: int) -> dict[str, Tensor]:
         some = repeat(rows(data, part), count)
         latents = model.guide(some)
-        rollout = model._rollout(model.generative, model.generator, some, None, 1)
-        rollout.values.update(latents)
+        rollout = _given(model, some, latents)
+        if model.summed:
+            rollout.states = rollout.summation.draw()
         found = {}
         for name in model.generative.variables:
             if name in model.observed and name not in rollout.values:  # a function of its parents
@@ -120,6 +123,29 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
 
     with model._evaluating():
         return in_chunks(means, whole.batch, samples, _together(model, data, whole.batch, chunk))
+
+
+def states(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
+    """Probabilities of the states that are summed out, given the data and latents from the guide."""
+    if not model.summed:
+        raise ValueError(f"nothing is summed out in {model.generative}; discrete latents have sizes of dvae.Discrete")
+    data = model.read(batch)
+    whole = model._rollout(model.inference, model.encoder, data, None, 1)  # refuses what cannot be read
+
+    def probabilities(part: slice, count: int) -> dict[str, Tensor]:
+        some = repeat(rows(data, part), count)
+        found = _given(model, some, model.guide(some)).summation.probabilities()
+        return {name: value.unflatten(0, (count, -1)) for name, value in found.items()}
+
+    with model._evaluating():
+        return in_chunks(probabilities, whole.batch, samples, _together(model, data, whole.batch, chunk))
+
+
+def _given(model: Any, batch: AnyBatch, latents: Mapping[str, Tensor]) -> Any:
+    """The generative run in which data and latents are known."""
+    rollout = model._rollout(model.generative, model.generator, batch, None, 1)
+    rollout.values.update(latents)
+    return rollout
 
 
 def impute(
@@ -155,14 +181,16 @@ def _filled(model: Any, batch: AnyBatch, samples: int, chunk: int, particles: in
 
     def draws(part: slice, count: int) -> dict[str, Tensor]:
         some = repeat(rows(data, part), count)
-        rollout = model._rollout(model.generative, model.generator, some, None, 1)
-        rollout.drawing = True
         guide = poutine.trace(model.guide).get_trace(some)
-        rollout.values.update({name: guide.nodes[name]["value"] for name in model.latents})
+        rollout = _given(model, some, {name: guide.nodes[name]["value"] for name in model.latents})
+        if model.summed:
+            rollout.states = rollout.summation.draw()
+        rollout.drawing = True
         values = {name: {**rollout.values, **rollout.history(name)}[name] for name in model.observed}
         made = model.shown({n: v.unflatten(0, (count, -1)) for n, v in values.items()}, rows(data, part))
         if particles > 1:
-            ratio = sum(rollout.law(name).log_prob(rollout.values[name]) for name in model.generative.variables)
+            drawn = (*model.latents, *model.observed)
+            ratio = sum(rollout.law(name).log_prob(rollout.values[name]) for name in drawn)
             ratio = ratio - sum(guide.nodes[name]["fn"].log_prob(guide.nodes[name]["value"]) for name in model.latents)
             made[WEIGHT] = ratio.unflatten(0, (count, -1))
         return made

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from ..inversion import guide
 from ..laws.base import LawSpec
 from ..laws.families import Normal, StandardNormal
+from ..laws.family import FAMILIES
 from ..laws.subset import Subset
 from ..networks import NetworkSpec, Recurrent
 from ..networks.base import once
@@ -33,8 +34,9 @@ from ..units import Coordinate, Units
 from ..views import LOG_DET, View, volume
 from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
-from .forecast import forecast, impute, reconstruct
+from .forecast import forecast, impute, reconstruct, states
 from .rollout import InputNoise, Rollout, SelfFeeding
+from .summed import Discrete, Sums
 
 _COUNT = itertools.count()
 SHARED: Any = {"shared": True}
@@ -49,7 +51,7 @@ class DynamicalVAE(nn.Module):
         inference: such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)"; "" where nothing is latent. "faithful" for the
             smallest guide that misses nothing of what the posterior depends on (`faithful`). None for no inference
             network: the guide is the prior, so that every KL term is exactly zero.
-        sizes: dimension of every variable, context included.
+        sizes: dimension of every variable, context included; `Discrete` of a latent that is categorical and summed out.
         network: description of the networks, or a mapping from factors to descriptions. Its keys are "p(x)" for one
             factor, "p" for all generative ones, "q" for the guide's, and "default".
         laws: the same for the laws; `laws.Normal()` where nothing is said. A generative factor without parents is
@@ -102,9 +104,13 @@ class DynamicalVAE(nn.Module):
         self.feeding: SelfFeeding | InputNoise = SelfFeeding(0.0)
         self.view = view or View()
         observed = tuple(self.view.parts or observed)
-        self.inference = guide(self.generative, inference, observed, masks)
         self.sizes = dict(sizes)
-        self.latents, self.observed, self.context = check_pair(self.generative, self.inference, observed, sizes)
+        self.summed = tuple(n for n, size in self.sizes.items() if isinstance(size, Discrete) and n not in observed)
+        self.inference = guide(self.generative, inference, observed, masks, self.summed)
+        self.latents, self.observed, self.context = check_pair(
+            self.generative, self.inference, observed, sizes, self.summed
+        )
+        self.sums = Sums(self.generative, {name: self.sizes[name] for name in self.summed}) if self.summed else None
         for name, size in self.sizes.items():
             if size < 1:
                 raise ValueError(f"the size of {name} is {size}; sizes are positive")
@@ -158,6 +164,8 @@ class DynamicalVAE(nn.Module):
     def _conditionals(self, factors: Iterable[Factor], guides: Mapping[str, Conditional] | None = None) -> Any:
         def pick(table: Mapping[str, Any], factor: Factor) -> Any:
             own = f"{factor.kind}({factor.child})"
+            if table is self.laws and isinstance(self.sizes[factor.child], Discrete):
+                return table.get(own, FAMILIES["category"])
             if table is self.laws and factor.kind == "p" and not factor.parents:
                 return table.get(own, StandardNormal())
             return table.get(own, table.get(factor.kind, table["default"]))
@@ -197,8 +205,15 @@ class DynamicalVAE(nn.Module):
                     raise ValueError(
                         f"the draws of the latent {name} {what} by the law of {conditional.factor}, so that no "
                         f"gradient would reach the guide through them; give it a continuous law such as "
-                        f"laws.Normal(), or name {name} as observed where it is data"
+                        f"laws.Normal(), name {name} as observed where it is data, or have a categorical one summed "
+                        f"out: sizes={{{name!r}: dvae.Discrete(states)}}"
                     )
+        for name in self.summed:
+            if self.generator[name].family != "OneHotCategorical":
+                raise ValueError(
+                    f"{name} is summed out over its {self.sizes[name]} states, but the law of "
+                    f"{self.generator[name].factor} is {self.generator[name].family}; leave it to be that of categories"
+                )
 
     def standardise(self, name: str, coordinates: Sequence[Coordinate] = ()) -> Units:
         """Has networks read a variable without unit, by a mean and a scale that `fit` of the result takes.
@@ -262,7 +277,8 @@ class DynamicalVAE(nn.Module):
                 mean of a variable with units. Arrays are taken as tensors, in the model's precision.
             length: T. Beyond the length of the data, the data are a prefix from which the program continues.
             size: B, where the batch does not tell.
-            prefix: name to the first values (B, O, D) of a latent.
+            prefix: name to the first values (B, O, D) of a latent, or the value (B, C) of a static one that is summed
+                out.
             mean_emission: a free run sets the data variables, or those named, to their means and does not draw them.
             self_feeding: what stands in for the data's history: a `SelfFeeding` (scheduled sampling), an `InputNoise`,
                 or a number, the probability or the share of the noise, in the way of the model's attribute `feeding`.
@@ -277,14 +293,19 @@ class DynamicalVAE(nn.Module):
         self._check_draws(draws or {})
         data = self.read(batch, size=size, curriculum=curriculum)
         rollout = self._rollout(self.generative, self.generator, data, length, size)
+        prefixed = dict(rollout.prefix)
         for name, value in (prefix or {}).items():
-            if name not in self.latents or value.dim() != 3 or value.shape[1] > rollout.length:
+            told = name in self.summed and not self.generative.local(name)
+            if not told and (
+                name not in (*self.latents, *self.summed) or value.dim() != 3 or value.shape[1] > rollout.length
+            ):
                 raise ValueError(
                     f"the prefix of {name} has shape {tuple(value.shape)}; expected the first values (B, O, D) of one "
                     f"of the latents {', '.join(self.latents)}, O at most {rollout.length}"
                 )
             self.reader.check(name, value)
-        rollout.prefix = {**rollout.prefix, **(prefix or {})}
+            (rollout.states if told else prefixed)[name] = value
+        rollout.prefix = prefixed
         names = self.observed if mean_emission else ()
         rollout.mean_emission = names if isinstance(mean_emission, bool) else mean_emission
         if isinstance(self_feeding, int | float):
@@ -292,6 +313,8 @@ class DynamicalVAE(nn.Module):
         rollout.feeding = self_feeding
         for block in self.generative.blocks:
             for name in block.names:
+                if name in self.summed:
+                    continue
                 rollout = rollout.fork((draws or {}).get(name, 1))
                 with rollout.plate:
                     rollout.know(name, self._site(name, rollout))
@@ -301,7 +324,7 @@ class DynamicalVAE(nn.Module):
         with pyro.plate("windows", rollout.batch // rollout.draws, dim=-1) if factors else nullcontext():
             for name, value in factors.items():
                 pyro.factor(name, value)
-        return dict(rollout.values)
+        return rollout.states | rollout.values
 
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> Mapping[str, Tensor]:
         """Energies that the program adds at its end as `pyro.factor` sites; none, unless a subclass has some.
@@ -463,6 +486,26 @@ class DynamicalVAE(nn.Module):
 
     @alone
     @torch.no_grad()
+    def states(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
+        """Probabilities of the states that are summed out, given the whole data and draws of the latents.
+
+        Their mean over draws is the posterior's as far as the guide is; without other latents they are exact.
+
+        Args:
+            batch: see `model`.
+            samples: S, draws of the latents for each sequence.
+            chunk: sequences times samples to hold at once, beside the result.
+
+        Returns:
+            Name to (S, B, T, C), or (S, B, C) of a static one.
+
+        Raises:
+            ValueError: a model that sums nothing out.
+        """
+        return states(self, batch, samples, chunk)
+
+    @alone
+    @torch.no_grad()
     def log_joint(self, batch: AnyBatch, latents: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint.
 
@@ -534,7 +577,9 @@ class DynamicalVAE(nn.Module):
     def _rollout(
         self, factorization: Factorization, conditionals: Any, batch: AnyBatch | None, length: int | None, size: int
     ) -> Rollout:
-        return self.reader.rollout(factorization, conditionals, self.read(batch), length, size)
+        rollout = self.reader.rollout(factorization, conditionals, self.read(batch), length, size)
+        rollout.sums = self.sums if factorization is self.generative else None
+        return rollout
 
 
 def _locality(factorization: Factorization) -> dict[str, bool]:

@@ -24,6 +24,7 @@ from ..networks.base import indicator, presence, valid_steps
 from ..notation import Block, Factorization
 from .conditional import Conditional, like
 from .groups import Grouped, Groups
+from .summed import Summation, Sums
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,8 @@ class Rollout:
         drawing: what the model may not read is drawn, in place of the model's own mean.
         groups: which sequences share values of the `grouped` variables, or None where each is a group.
         grouped: names of static latents that groups share.
+        sums: how discrete latents are summed out, if there are any.
+        states: name to values of these that were drawn, for what reads them to be drawn; densities do not heed them.
     """
 
     factorization: Factorization
@@ -157,6 +160,8 @@ class Rollout:
     drawing: bool = False
     groups: Groups | None = None
     grouped: Collection[str] = ()
+    sums: Sums | None = None
+    states: dict[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_custom_masks(self.factorization, self.length)
@@ -166,6 +171,7 @@ class Rollout:
         self._drawn: dict[str, Tensor] = {}
         self._evaluated: dict[str, tuple[Tensor, Parameters]] = {}
         self._unfed = list(self.factorization.blocks)
+        self._summation: Summation | None = None
         self._valid = None if self.lengths is None else valid_steps(self.lengths, self.length)[..., None]
 
     @cached_property
@@ -175,8 +181,10 @@ class Rollout:
 
     def fork(self, n: int) -> Rollout:
         """The run with every row n times over, draw by draw: what is known so far is shared by n continuations."""
-        if n == 1:
-            return self
+        return self if n == 1 else self.again(n)
+
+    def again(self, n: int) -> Rollout:
+        """Another run, with every row n times over, draw by draw."""
 
         def again(values: Any) -> Any:
             return {name: value.repeat(n, *[1] * (value.dim() - 1)) for name, value in values.items()}
@@ -186,6 +194,7 @@ class Rollout:
             batch=n * self.batch,
             draws=n * self.draws,
             values=again(self.values),
+            states=again(self.states),
             lengths=None if self.lengths is None else self.lengths.repeat(n),
             observed=again(self.observed),
             present=again(self.present),
@@ -201,6 +210,12 @@ class Rollout:
                 them: one that is random in training, such as a summary of a window somewhere, is the same for all
                 draws of a sequence, as it is in a forecast.
         """
+        if self.sums is not None and name in self.sums.readers:
+            return Marginal(self, name)
+        return self.conditional_law(name, draws)
+
+    def conditional_law(self, name: str, draws: int = 1) -> TorchDistribution:
+        """The same given the states of what is summed out."""
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)
@@ -215,7 +230,12 @@ class Rollout:
     def known(self) -> dict[str, Tensor]:
         """The values, at which steps latents are there, and which entries of the data were observed."""
         there = {presence(name): steps for name, steps in self.present.items()}
-        return {**self.values, **there, **{indicator(name): seen for name, seen in self.observed.items()}}
+        return {
+            **self.states,
+            **self.values,
+            **there,
+            **{indicator(name): seen for name, seen in self.observed.items()},
+        }
 
     def know(self, name: str, value: Tensor) -> None:
         """Record the value of a site, which later sites read."""
@@ -268,8 +288,39 @@ class Rollout:
             for other, value in self._drawn.items()
             if other in self._block[name].names
         ):
+            if self.sums is not None:
+                self._draw_states(self._block[name])
             self._drawn.update(self._run(self._block[name]))
+            self.states |= {n: v for n, v in self._drawn.items() if self.sums is not None and n in self.sums.sizes}
         return self._drawn[name]
+
+    def state(self, name: str) -> Tensor:
+        """A draw of what is summed out, (B, T, C) or (B, C), given what was drawn before it."""
+        if name not in self.states:
+            local = self.conditionals[name].factor.local
+            self.states[name] = self.draw(name) if local else self.conditional_law(name).sample()
+        return self.states[name]
+
+    def _draw_states(self, block: Block) -> None:
+        """Draws what a block reads of what is summed out, but for what is drawn with it."""
+        for name in block.names:
+            for parent in self.conditionals[name].parents:
+                if self.sums is not None and parent in self.sums.sizes and parent not in block.names:
+                    self.state(parent)
+
+    @property
+    def summation(self) -> Summation:
+        """The sum over discrete latents, all else being known."""
+        assert self.sums is not None
+        made = self._summation
+        if made is None or any(made.values.get(name) is not value for name, value in self.values.items()):
+            self._summation = made = Summation(self.sums, self)
+        return made
+
+    @property
+    def noisy(self) -> Collection[str]:
+        """Names of the data whose history has noise."""
+        return () if not isinstance(self.feeding, InputNoise) or not self.feeding.scale else self.data
 
     def history(self, name: str) -> dict[str, Tensor]:
         """What a variable reads as the data's past where the model may not read them: its own means, or noisy data.
@@ -337,7 +388,8 @@ class Rollout:
         self, block: Block, fed: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Hidden] | None = None
     ) -> dict[str, Tensor]:
         """Values of the unknown variables of a block; with `hidden`, of its data, with own means at those entries."""
-        live = [name for name in block.names if (name not in self.values if hidden is None else name in hidden)]
+        known_here = self.values.keys() | self.states.keys()
+        live = [name for name in block.names if (name not in known_here if hidden is None else name in hidden)]
         told = {**self.known, **(fed or {})}
         given = {name: value for name, value in told.items() if name not in live}
         loop = any(parent in live for name in live for parent in self.conditionals[name].parents)
@@ -496,6 +548,17 @@ class Sequence(TorchDistribution):
         """(B,)."""
         return self.given(value).log_prob(self.scored(value))
 
+    def by_step(self, value: Tensor) -> Tensor:
+        """`log_prob` of every step, (B, T)."""
+        return self.counted(self.steps(value).log_prob(self.scored(value)))
+
+    def counted(self, entries: Tensor) -> Tensor:
+        """The sum (B, T) of what belongs to entries (B, T, D), or to steps (B, T), without what does not count."""
+        mask = self.rollout.mask(self.name)
+        # where, not a product: an entry that does not count may be infinite
+        entries = entries if mask is None else torch.where(mask, entries, 0.0)
+        return entries.sum(-1) if entries.dim() == 3 else entries
+
     def scored(self, value: Tensor) -> Tensor:
         """The value at which densities are evaluated, see `Conditional.scored`."""
         return self.rollout.conditionals[self.name].scored(value, self.rollout.mask(self.name))
@@ -508,6 +571,48 @@ class Sequence(TorchDistribution):
                 "vectorised particles are had by repeating the batch (importance_bound(particles=...))"
             )
         return self
+
+
+class Marginal(Sequence):
+    """The law of a variable that reads discrete latents, these summed out: event (T, D), or (D,) of a static one.
+
+    Its density is that given all that comes before it, whatever the states; what is drawn reads states that are drawn.
+    """
+
+    def __init__(self, rollout: Rollout, name: str):
+        super().__init__(rollout, name)
+        if not rollout.conditionals[name].factor.local:
+            self._event_shape = self._event_shape[1:]
+
+    @constraints.dependent_property(is_discrete=False)
+    def support(self) -> constraints.Constraint:
+        """Real values."""
+        return constraints.independent(constraints.real, len(self._event_shape))
+
+    def rsample(self, sample_shape: Any = ()) -> Tensor:
+        """A draw (B, T, D) or (B, D)."""
+        if len(self._event_shape) == 2:
+            return super().rsample(sample_shape)
+        for parent in self.rollout.conditionals[self.name].parents:
+            if parent in self.rollout.sums.sizes:  # type: ignore[union-attr]
+                self.rollout.state(parent)
+        law = self.rollout.conditional_law(self.name)
+        return law.rsample() if law.has_rsample else law.sample()  # type: ignore[no-any-return]
+
+    def steps(self, value: Tensor) -> TorchDistribution:
+        """There are none: with states summed out, steps depend on one another."""
+        raise NotImplementedError(f"with what {self.name} reads summed out, its steps have no laws by themselves")
+
+    def by_step(self, value: Tensor) -> Tensor:
+        """Of every step given all before it, (B, T); (B,) of a static variable."""
+        run = self.rollout
+        if run.values.get(self.name) is not value:
+            run = replace(run, values={**run.values, self.name: value})
+        return run.summation.shares[self.name]
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """(B,)."""
+        return self.by_step(value).flatten(1).sum(-1) if len(self._event_shape) == 2 else self.by_step(value)
 
 
 def _runs(known: list[bool], direction: int, ahead: bool) -> Iterator[tuple[int, int]]:

@@ -1,0 +1,344 @@
+"""Discrete latents, summed out: the density of all else by the forward algorithm, and their posterior from it.
+
+    p(v, x) = sum over k of prod_t p(k_t | k_{t-1}, ...) p(v_t | k_t, ...) p(x_t | k_t, ...)
+
+with v, latents that are drawn, and x, the data, given (Rabiner, 1989). A factor reads few steps of k, at lags up to L,
+so that the states of L + 1 steps are all that is held at once. Its densities at all of these come from few evaluations
+of all steps in parallel: at courses of k that repeat with the period of what the factor reads, every step sees one
+state of its window. What is left to a loop is the recursion itself, three small operations a step.
+
+Static latents are enumerated beside the chain. Every variable has a share of the log joint, its density given all that
+comes before it with the states summed out, log p(x_t | v_{<=t}, x_{<t}), so that bounds have their terms.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from ..notation import Factor, Factorization
+from .conditional import like
+
+if TYPE_CHECKING:
+    from .rollout import Rollout
+
+LARGEST = 4096
+"""States of a window, with those of static latents, that are summed over at once."""
+COURSES = 2**17
+"""Of states over a whole sequence, that are counted one by one, where that is asked for."""
+
+
+class Discrete(int):
+    """The size of a latent that is categorical and summed out: its number of states; values are one-hot vectors.
+
+    It has a factor in the generative model, and none in the guide.
+
+    Example:
+        >>> model = dvae.DynamicalVAE(
+        ...     "p(k_t | k_{t-1}) p(x_t | k_t)", "", {"k": dvae.Discrete(3), "x": 2}
+        ... )
+        >>> model.summed, model.latents
+        (('k',), ())
+
+    Raises:
+        ValueError: fewer than two states.
+    """
+
+    def __new__(cls, states: int) -> Self:
+        """A number of states."""
+        if int(states) != states or states < 2:
+            raise ValueError(f"a discrete latent has at least two states, a whole number of them, not {states}")
+        return super().__new__(cls, states)
+
+    def __repr__(self) -> str:
+        return f"Discrete({self})"
+
+    __str__ = int.__repr__
+
+
+@dataclass(frozen=True)
+class Window:
+    """What a factor sees of the latents that are summed out.
+
+    Args:
+        factor: it.
+        statics, chain: names of those it reads, with one value a sequence, and with one a step.
+        low, high: least and largest lag at which it reads the latter.
+    """
+
+    factor: Factor
+    statics: tuple[str, ...]
+    chain: tuple[str, ...]
+    low: int = 0
+    high: int = 0
+
+    @property
+    def period(self) -> int:
+        """Of the sequences at which it is evaluated."""
+        return self.high - self.low + 1
+
+
+@dataclass(frozen=True)
+class Sums:
+    """How the latents of a model are summed out.
+
+    Args:
+        generative: the model.
+        sizes: of those that are summed out, by name.
+
+    Raises:
+        ValueError: what cannot be summed, with the number of states that it would take.
+    """
+
+    generative: Factorization
+    sizes: Mapping[str, int]
+
+    def __post_init__(self) -> None:
+        states = self.kept * self.width ** (self.lag + 1)
+        if states > LARGEST:
+            each = ", ".join(f"{name} has {size}" for name, size in self.sizes.items())
+            raise ValueError(
+                f"at every step {states:,} states would be summed over, of {self.lag + 1} steps ({each}), and at most "
+                f"{LARGEST:,} are; take fewer states, or shorter lags"
+            )
+
+    @cached_property
+    def statics(self) -> tuple[str, ...]:
+        """Names of those with one value a sequence."""
+        return tuple(name for name in self.sizes if not self.generative.local(name))
+
+    @cached_property
+    def chain(self) -> tuple[str, ...]:
+        """Names of those with a value for every step."""
+        return tuple(name for name in self.sizes if self.generative.local(name))
+
+    @cached_property
+    def width(self) -> int:
+        """States of a step, of all of the chain together."""
+        return math.prod(self.sizes[name] for name in self.chain)
+
+    @cached_property
+    def kept(self) -> int:
+        """M, states of the static latents together."""
+        return math.prod(self.sizes[name] for name in self.statics)
+
+    @cached_property
+    def windows(self) -> dict[str, Window]:
+        """By child, of the factors of what is summed out and of those that read it, in the order of the model."""
+        ordered = (self.generative.factor(name) for block in self.generative.blocks for name in block.names)
+        found = {factor.child: self._window(factor) for factor in ordered}
+        return {name: w for name, w in found.items() if name in self.sizes or w.statics or w.chain}
+
+    @cached_property
+    def readers(self) -> tuple[str, ...]:
+        """Names of what reads it, and is not summed out itself."""
+        return tuple(name for name in self.windows if name not in self.sizes)
+
+    @cached_property
+    def lag(self) -> int:
+        """L."""
+        return max((window.high for window in self.windows.values()), default=0)
+
+    def _window(self, factor: Factor) -> Window:
+        statics, chain, lags = [], [], [0]
+        for parent in factor.parents:
+            if parent.name not in self.sizes:
+                continue
+            if parent.relation is None:
+                statics.append(parent.name)
+                continue
+            ends = [end for interval in parent.relation.intervals or [(-math.inf, 0)] for end in interval]
+            if not factor.local or not all(-math.inf < end <= 0 for end in ends):
+                raise ValueError(
+                    f"{factor} reads {parent}: {parent.name} cannot be summed out, since that takes its "
+                    f"{self.sizes[parent.name]}^T states at all T steps at once; of a discrete latent a factor reads a "
+                    f"few steps up to its own, such as {parent.name}_t or {parent.name}_{{t-1}}"
+                )
+            chain.append(parent.name)
+            lags = [*(lags if len(chain) > 1 else []), *(int(-end) for end in ends)]
+        return Window(factor, tuple(statics), tuple(chain), min(lags), max(lags))
+
+    def courses(self, length: int) -> dict[str, Tensor]:
+        """All that the states may be over a sequence: name to one-hot values (C, T, states), or (C, states).
+
+        Raises:
+            ValueError: too many to count one by one.
+        """
+        sizes = [self.sizes[name] for name in self.sizes for _ in range(length if name in self.chain else 1)]
+        if (count := math.prod(sizes)) > COURSES:
+            raise ValueError(
+                f"{', '.join(self.sizes)} may take {count:.3g} courses in {length} steps, and at most {COURSES:,} are "
+                "counted one by one; take fewer steps"
+            )
+        digits = np.stack(np.unravel_index(np.arange(count), sizes)).T
+        found = {}
+        for name, size in self.sizes.items():
+            own, digits = np.split(digits, [length if name in self.chain else 1], 1)
+            values = one_hot(torch.from_numpy(own.astype(np.int64)), size).double()
+            found[name] = values if name in self.chain else values[:, 0]
+        return found
+
+    def patterns(self, window: Window, length: int) -> dict[str, Tensor]:
+        """Values at which a factor is evaluated: name to whole numbers (n, T), or (n,) of static latents."""
+        sizes = [self.sizes[name] for name in window.statics]
+        sizes += [self.sizes[name] for name in window.chain for _ in range(window.period)]
+        digits = np.stack(np.unravel_index(np.arange(math.prod(sizes)), sizes or [1])).astype(np.int64)
+        found = {name: torch.from_numpy(row) for name, row in zip(window.statics, digits, strict=False)}
+        repeated = np.arange(length) % window.period
+        for name, rows in zip(
+            window.chain, np.split(digits[len(window.statics) :], len(window.chain) or 1), strict=False
+        ):
+            found[name] = torch.from_numpy(rows.T[:, repeated].copy())
+        return found
+
+    def places(self, window: Window, length: int) -> Tensor:
+        """(T, J): in which pattern, and with its own state where it is summed out, a factor sees each joint state.
+
+        Joint states J are of the static latents, then of the chain at lags L to 0, the last one fastest.
+        """
+        names: list[tuple[str, int | None]] = [(name, None) for name in self.statics]
+        names += [(name, lag) for lag in range(self.lag, -1, -1) for name in self.chain]
+        sizes = [self.sizes[name] for name, _ in names]
+        digits = dict(zip(names, np.unravel_index(np.arange(math.prod(sizes)), sizes or [1]), strict=False))
+        t = np.arange(length)[:, None] if window.factor.local else np.zeros((1, 1), int)
+        place = np.zeros((len(t), math.prod(sizes)), np.int64)
+        for name in window.statics:
+            place = place * self.sizes[name] + digits[name, None]
+        for name in window.chain:
+            for residue in range(window.period):  # which lag is the step of this residue, seen from t?
+                lag = window.low + (t - window.low - residue) % window.period
+                rows = np.stack([digits[name, own] for own in range(window.low, window.high + 1)])
+                place = place * self.sizes[name] + rows[lag[:, 0] - window.low]
+        own = window.factor.child
+        if own in self.sizes:
+            place = place * self.sizes[own] + digits[own, 0 if window.factor.local else None]
+        return torch.from_numpy(place)
+
+
+class Summation:
+    """The sum over discrete latents in one run, all else being known.
+
+    Args:
+        sums: how they are summed out.
+        rollout: the run, with values of all that they and their readers read.
+
+    Raises:
+        ValueError: a model that reads its own means, or noise, in place of data, which depend on the states.
+    """
+
+    def __init__(self, sums: Sums, rollout: Rollout):
+        self.sums, self.rollout, self.values = sums, rollout, dict(rollout.values)
+        read = {parent.name for factor in sums.generative.factors for parent in factor.parents}
+        if fed := sorted((rollout.hidden.keys() | rollout.noisy) & read):
+            raise ValueError(
+                f"{', '.join(sums.sizes)} cannot be summed out where the model reads its own means, or noise, in place "
+                f"of {', '.join(fed)}, as of missing entries and in self-feeding: these depend on the states; fill the "
+                "entries in, or let no factor read them"
+            )
+        logs = {name: self._logs(name, window) for name, window in sums.windows.items()}
+        self._static = {name: value for name, value in logs.items() if not sums.generative.local(name)}
+        self._local = {name: value for name, value in logs.items() if sums.generative.local(name)}
+        none = like(next(iter(rollout.conditionals.values()))).new_zeros(())
+        shape = (rollout.batch, rollout.length, sums.kept, sums.width**sums.lag, sums.width)
+        self._start = sum(self._static.values(), none).expand(shape[0], sums.kept)
+        self._steps = sum(self._local.values(), none).expand(shape)
+
+    def _logs(self, name: str, window: Window) -> Tensor:
+        """Log densities or probabilities in all joint states: (B or 1, T, M, K^L, K); (B or 1, M) of a static one."""
+        sums, run, local = self.sums, self.rollout, window.factor.local
+        conditional, own = run.conditionals[name], name in sums.sizes
+        told = sums.patterns(window, run.length)
+        count = len(next(iter(told.values()))) if told else 1
+        values = {n: one_hot(v, sums.sizes[n]).to(like(conditional)) for n, v in told.items()}
+        if values.keys() == {*conditional.parents}:  # the same for all sequences
+            parameters = conditional(values, count, run.length)
+        else:
+            again = run.again(count)
+            again.values |= {n: v.repeat_interleave(run.batch, 0) for n, v in values.items()}
+            parameters = conditional(again.known, again.batch, run.length, again.lengths)
+        law = conditional.law.distribution(tuple(p.unflatten(0, (count, -1)) for p in parameters))
+        if own:
+            logs = law.logits  # type: ignore[attr-defined]
+        else:
+            mask = run.mask(name)
+            logs = law.log_prob(conditional.scored(run.values[name], mask))
+            logs = logs if mask is None else torch.where(mask, logs, 0.0)
+            logs = logs if conditional.whole else logs.sum(-1)
+        places = sums.places(window, run.length).to(logs.device)
+        logs = logs.reshape(count, -1, len(places), self.sums.sizes.get(name, 1)).permute(1, 2, 0, 3).flatten(2)
+        logs = logs.gather(2, places.expand(len(logs), -1, -1))
+        shape = (sums.kept, sums.width**sums.lag, sums.width)
+        return logs.unflatten(2, shape) if local else logs[:, 0].unflatten(1, shape)[..., 0, 0]
+
+    @cached_property
+    def shares(self) -> dict[str, Tensor]:
+        """Log density by variable that reads what is summed out, given all before it: (B, T), or (B,) if static."""
+        before = self._filtered(self._start, self._steps)[:, :-1, ..., None].expand_as(self._steps)
+        found = {}
+        for logs, sofar in ((self._static, torch.zeros_like(self._start)), (self._local, before)):
+            states = tuple(range(1 if logs is self._static else 2, sofar.dim()))
+            for name, each in logs.items():
+                last, sofar = sofar, sofar + each
+                if name not in self.sums.sizes:
+                    found[name] = sofar.logsumexp(states) - last.logsumexp(states)
+        return found
+
+    def _filtered(self, start: Tensor, steps: Tensor) -> Tensor:
+        """(B, T + 1, M, K^L): log joint of states with all up to each step, but for a constant of every step."""
+        alpha = start[..., None].expand(*start.shape, self.sums.width**self.sums.lag)
+        steps = steps - steps.detach().amax((2, 3, 4), keepdim=True)  # as they add up, digits are lost
+        if not self.sums.lag:  # no step looks back
+            return torch.cat([alpha[:, None], alpha[:, None] + steps.logsumexp(-1).cumsum(1)], 1)
+        alphas = [alpha]
+        for step in steps.unbind(1):
+            joint = alphas[-1][..., None] + step
+            alphas.append(joint.flatten(2).unflatten(2, (self.sums.width, -1)).logsumexp(2))
+        return torch.stack(alphas, 1)
+
+    @torch.no_grad()
+    def draw(self) -> dict[str, Tensor]:
+        """States from their posterior given all else, one-hot: (B, T, C), or (B, C) of static latents."""
+        width, rows = self.sums.width, torch.arange(len(self._start), device=self._start.device)
+        joint = (self._filtered(self._start, self._steps)[:, :-1, ..., None] + self._steps).flatten(3)
+        last = _drawn(joint[:, -1].flatten(1))
+        static, window = last // joint.shape[-1], last % joint.shape[-1]
+        symbols = [window % width]
+        for t in reversed(range(joint.shape[1] - 1)):  # a step is in the windows of those after it
+            known = window // width
+            oldest = _drawn(joint[rows, t, static].unflatten(1, (width, -1))[rows, :, known])
+            window = oldest * width**self.sums.lag + known
+            symbols.append(window % width)
+        found = {}
+        for names, number in ((self.sums.statics, static), (self.sums.chain, torch.stack(symbols[::-1], 1))):
+            for name in reversed(names):
+                found[name] = one_hot(number % self.sums.sizes[name], self.sums.sizes[name]).to(self._start)
+                number = number // self.sums.sizes[name]
+        return found
+
+    @torch.enable_grad()
+    def probabilities(self) -> dict[str, Tensor]:
+        """Of the states given all else: (B, T, C), or (B, C) of static latents. They are slopes of the log density."""
+        parts = [part.detach().contiguous().requires_grad_() for part in (self._start, self._steps)]
+        total = self._filtered(*parts)[:, -1].flatten(1).logsumexp(1).sum()
+        static, steps = torch.autograd.grad(total, parts)
+        found = {}
+        for names, each in ((self.sums.statics, static), (self.sums.chain, steps.sum((2, 3)))):
+            apart = each.unflatten(-1, [self.sums.sizes[name] for name in names] or [1])
+            first = each.dim() - 1
+            for place, name in enumerate(names):
+                others = [first + other for other in range(len(names)) if other != place]
+                found[name] = apart.sum(others) if others else apart
+        return found
+
+
+def _drawn(logits: Tensor) -> Tensor:
+    """A place in the last dimension, by its probability."""
+    return torch.multinomial(logits.softmax(-1), 1)[:, 0]

@@ -1,0 +1,283 @@
+"""Discrete latents, summed out: the sum is that over every course of the states, and what follows from it."""
+
+import math
+from typing import ClassVar
+
+import pyro
+import pytest
+import torch
+from pyro import poutine
+from pyro.infer import Trace_ELBO
+
+import dvae
+from dvae import Discrete
+from dvae.networks import Dense, Recurrent
+from dvae.program.reference import reference
+from dvae.testing import FactorizationContract
+
+HMM = ("p(k_t | k_{t-1}) p(x_t | k_t)", "")
+SWITCHING = ("p(k_t | k_{t-1}) p(z_t | z_{t-1}, k_t) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})")
+CASES = [
+    (HMM, {"k": 3}),
+    (("p(k_t) p(x_t | k_t, x_{t-1})", ""), {"k": 3}),
+    (("p(k_t | k_{t-2}, x_{t-1}) p(x_t | k_{t-1:t}, x_{<t})", ""), {"k": 2}),
+    (("p(m) p(x_t | m, x_{<t})", ""), {"m": 3}),
+    (("p(m) p(w | m) p(n | w) p(x_t | n, m, w)", "q(w | x_{1:T})"), {"m": 3, "n": 2}),
+    (SWITCHING, {"k": 3}),
+    (("p(k_t | k_{t-1}, z_{t-1}) p(z_t | z_{t-1}, k_t) p(x_t | z_t)", "q(z_t | x_{1:T})"), {"k": 3}),
+    (("p(m) p(k_t | k_{t-1}, m) p(z_t | z_{<t}, k_{t-1}) p(x_t | z_t, k_t)", "faithful"), {"m": 2, "k": 2}),
+    (
+        ("p(k_t | k_{t-1}) p(s_t | s_{t-1}, k_t) p(z_t | s_t) p(x_t | z_t, k_{t-2}, c_t)", "q(z_t | x_{1:T}, c_{1:T})"),
+        {"k": 2, "s": 2},
+    ),
+]
+STEPS, BATCH = 3, 2
+
+
+def build(equations, states, **more):
+    sizes = {"w": 2, "z": 2, "x": 2, "c": 1}
+    sizes = {name: size for name, size in sizes.items() if name in "".join(equations)}
+    sizes |= {name: Discrete(size) for name, size in states.items()}
+    model = dvae.DynamicalVAE(*equations, sizes, more.pop("network", Recurrent(4)), **more)
+    return model.double().eval()
+
+
+def data_of(model, batch=BATCH, steps=STEPS):
+    return {n: torch.randn(batch, steps, model.sizes[n]).double() for n in (*model.observed, *model.context)}
+
+
+def joints(model, data, latents):
+    """(C, B) the log joint of every course of the states, by the program that runs step by step."""
+    courses = model.sums.courses(STEPS)
+    found = []
+    for place in range(len(next(iter(courses.values())))):
+        sites = {}
+        for name, value in {
+            **latents,
+            **{n: v[place].expand(BATCH, *v[place].shape) for n, v in courses.items()},
+        }.items():
+            sites |= (
+                {name: value} if value.dim() == 2 else {f"{name}_{t + 1}": v for t, v in enumerate(value.unbind(1))}
+            )
+        with torch.no_grad():
+            trace = poutine.trace(poutine.condition(reference, data=sites)).get_trace(model, data)
+            trace.compute_log_prob(site_filter=lambda name, site: name != "sequences")
+        found.append(sum(s["log_prob"] for s in trace.nodes.values() if "log_prob" in s))
+    return torch.stack(found)
+
+
+class TestSwitching(FactorizationContract):
+    """A chain of states that chooses the dynamics of a continuous latent."""
+
+    missing: ClassVar = {"z": ("z_{<=t-2}",)}
+
+    def build(self, size):
+        sizes = {"k": Discrete(max(size, 2)), "z": size, "x": size}
+        return dvae.DynamicalVAE(*SWITCHING, sizes, Recurrent(4, hidden=(4,)))
+
+
+class TestMixture(FactorizationContract):
+    """A state of the sequence, of which a static latent and the data are told."""
+
+    def build(self, size):
+        equations = "p(m) p(w | m) p(x_t | m, w)", "q(w | x_{1:T})"
+        return dvae.DynamicalVAE(*equations, {"m": Discrete(3), "w": size, "x": size}, Recurrent(4, hidden=(4,)))
+
+
+@pytest.mark.parametrize(("equations", "states"), CASES, ids=[equations[0] for equations, _ in CASES])
+def test_the_sum_is_that_over_all_courses(equations, states):
+    model = build(equations, states)
+    data = data_of(model)
+    latents = model.guide(data)
+    every = joints(model, data, latents)
+    summed = torch.stack(list(model.log_joint(data, latents).values())).sum(0)
+    torch.testing.assert_close(summed, every.logsumexp(0), rtol=0, atol=1e-10)
+    posterior = every.softmax(0)
+    courses, run = model.sums.courses(STEPS), model._rollout(model.generative, model.generator, data, None, 1)
+    run.values.update(latents)
+    for name, found in run.summation.probabilities().items():
+        torch.testing.assert_close(
+            found, torch.einsum("cb,c...->b...", posterior, courses[name]), rtol=0, atol=1e-10, msg=name
+        )
+        assert found.shape == (BATCH, *([STEPS] * model.generative.local(name)), states[name])
+
+
+@pytest.mark.parametrize(("equations", "states"), [CASES[2], CASES[7]], ids=["two lags", "static and chain"])
+def test_states_are_drawn_from_their_posterior(equations, states):
+    model = build(equations, states)
+    data = {name: value[:1].repeat(4000, 1, 1) for name, value in data_of(model).items()}
+    run = model._rollout(model.generative, model.generator, data, None, 1)
+    run.values.update({name: value[:1].expand_as(value) for name, value in model.guide(data).items()})
+    drawn, courses = run.summation.draw(), model.sums.courses(STEPS)
+    whole = torch.cat([drawn[name].flatten(1) for name in courses], 1)
+    every = torch.cat([value.flatten(1) for value in courses.values()], 1)
+    shares = (whole @ every.t() == every.sum(1)).double().mean(0)
+    few = {name: value[:BATCH] for name, value in data.items()}
+    posterior = joints(model, few, {name: run.values[name][:BATCH] for name in model.latents}).softmax(0)[:, 0]
+    assert abs(shares.sum() - 1) < 1e-12
+    errors = (posterior * (1 - posterior) / len(whole)).sqrt()
+    assert ((shares - posterior).abs() <= 4.5 * errors + 1e-12).all()
+
+
+def test_every_bound_agrees():
+    """Pyro's own, and that of terms, whose shares are of data given what came before them."""
+    model = build(SWITCHING, {"k": 3})
+    data = data_of(model)
+    pyro.set_rng_seed(1)
+    terms = dvae.SequenceELBO().terms(model, data)
+    pyro.set_rng_seed(1)
+    assert Trace_ELBO().loss(model.model, model.guide, data) == pytest.approx(-terms.bound.sum().item(), abs=1e-10)
+    assert set(terms.kl) == {"z"}
+    assert terms.steps["x"].shape == terms.steps["z"].shape == (BATCH, STEPS)
+    hmm = build(HMM, {"k": 3})
+    data = data_of(hmm)
+    whole = dvae.SequenceELBO().terms(hmm, data).steps["x"]
+    past = dvae.SequenceELBO().terms(hmm, {"x": data["x"][:, :2]}).steps["x"]
+    torch.testing.assert_close(whole[:, :2], past)
+    assert torch.equal(dvae.importance_bound(hmm, data, 3).bound, dvae.importance_bound(hmm, data, 3).bound)
+
+
+def test_the_slope_of_the_sum_is_right():
+    model = build(CASES[2][0], CASES[2][1])
+    data = data_of(model)
+    parameters = [p for p in model.parameters() if p.requires_grad]
+    directions = [torch.randn_like(p) for p in parameters]
+
+    def moved(by):
+        with torch.no_grad():
+            for parameter, direction in zip(parameters, directions, strict=True):
+                parameter.add_(direction, alpha=by)
+        return sum(model.log_joint(data, {}).values()).sum().item()
+
+    slope = (moved(1e-5) - moved(-2e-5)) / 2e-5
+    moved(1e-5)
+    dvae.SequenceELBO().differentiable_loss(model, model.guide, data).backward()
+    gradient = -sum((p.grad * d).sum() for p, d in zip(parameters, directions, strict=True)).item()
+    assert gradient == pytest.approx(slope, rel=1e-6)
+
+
+def test_a_forecast_goes_on_from_the_states_of_the_past():
+    """Of a chain that stays where it is, and of data that tell its state."""
+    model = build(HMM, {"k": 2}, network=Dense(()))
+    with torch.no_grad():
+        for name, parameter in model.generator.named_parameters():
+            parameter.zero_()
+            if name == "k.law.out.weight":
+                parameter.copy_(40 * torch.eye(2))
+            if name == "x.law.out.weight":
+                parameter[0] = torch.tensor([-8.0, 8.0])
+    past = torch.tensor([[-8.0], [8.0]])[:, None].expand(-1, 4, 2).double()
+    found = model.forecast(past, 5, 50)
+    assert (found["k"][:, 0, :, 0] == 1).all()
+    assert (found["k"][:, 1, :, 1] == 1).all()
+    assert (found["x"][..., 0].sign() == torch.tensor([-1.0, 1.0])[:, None]).all()
+    assert model.states(past)["k"][0, 0, :, 0] == pytest.approx(torch.ones(4).double())
+    assert (model.reconstruct(past)["x"][0, :, :, 0].sign() == torch.tensor([-1.0, 1.0])[:, None]).all()
+    static = build(("p(m) p(x_t | m)", ""), {"m": 2}, network=Dense(()))
+    assert (static.forecast(past, 2, 7)["m"].sum(-1) == 1).all()
+
+
+def test_missing_entries_leave_the_sum():
+    """The state at a step of which nothing was seen is told by its neighbours alone."""
+    model = build(HMM, {"k": 3})
+    data = data_of(model)["x"]
+    seen = torch.ones_like(data, dtype=torch.bool)
+    seen[:, 1] = False
+    found = dvae.importance_bound(model, {"x": data, "mask": seen}, 1).bound
+    assert torch.equal(found, dvae.importance_bound(model, {"x": torch.where(seen, data, 9.0), "mask": seen}, 1).bound)
+    every = []
+    for value in torch.linspace(-30, 30, 1201, dtype=torch.float64):  # the integral over one unseen coordinate
+        filled = data.clone()
+        filled[:, 1, 0] = value
+        every.append(dvae.importance_bound(model, {"x": filled, "mask": _but(seen, data)}, 1).bound)
+    total = torch.stack(every).logsumexp(0) + math.log(60 / 1200)
+    torch.testing.assert_close(total, found, rtol=0, atol=1e-3)
+    assert model.impute({"x": data, "mask": seen}, 3)["x"].shape == (3, *data.shape)
+
+
+def _but(seen, data):
+    mask = seen.clone()
+    mask[:, 1, 0] = True
+    return mask
+
+
+def test_the_oracle_counts_all_courses():
+    """Evidence and moments of a mixture of normals, by quadrature where nothing else is latent."""
+    sizes = {"m": Discrete(2), "k": Discrete(3), "x": 1}
+    pair = dvae.twin("p(m) p(k_t | k_{t-1}, m) p(x_t | k_t, m, x_{t-1})", "", sizes, 3, scale=1.0)
+    x = pair.sample(4, 3)["x"]
+    oracle = dvae.Oracle(pair, 3)
+    torch.testing.assert_close(oracle.evidence(x), sum(pair.log_joint(x, {}).values()), rtol=0, atol=1e-10)
+    torch.testing.assert_close(oracle.bound(x), oracle.evidence(x))
+    pair = dvae.twin(SWITCHING[0], "faithful", {"k": Discrete(3), "z": 1, "x": 1}, 1, scale=1.5)
+    oracle, x = dvae.Oracle(pair, 1), pair.sample(4, 1)["x"]
+    grid = torch.linspace(-15, 15, 3001, dtype=torch.float64)
+    joint = [sum(pair.log_joint(x, {"z": z.expand(4, 1, 1)}).values()) for z in grid]
+    weights = torch.stack(joint).softmax(0)
+    torch.testing.assert_close(oracle.evidence(x), torch.stack(joint).logsumexp(0) + math.log(0.01), rtol=0, atol=1e-8)
+    mean, covariance = oracle.posterior(x)
+    torch.testing.assert_close(mean[:, 0], (weights * grid[:, None]).sum(0), rtol=0, atol=1e-8)
+    square = (weights * grid[:, None] ** 2).sum(0)
+    torch.testing.assert_close(covariance[:, 0, 0], square - mean[:, 0] ** 2, rtol=0, atol=1e-8)
+    with pytest.raises(ValueError, match="with k summed out the posterior is a mixture of normals"):
+        oracle.fit_guide()
+    wild = dvae.twin("p(k_t | x_{t-1}) p(x_t | k_t)", "", {"k": Discrete(2), "x": 1}, 3)
+    with pytest.raises(ValueError, match="the oracle knows states that read states"):
+        dvae.Oracle(wild, 3)
+    with pytest.raises(ValueError, match=r"may take 1.1e\+12 courses in 40 steps"):
+        build(HMM, {"k": 2}).sums.courses(40)
+
+
+def test_what_a_chain_of_states_leaves_to_depend_on():
+    """Summed out, it is a path through time: the posterior of z_t reads all of the past, not its last step."""
+    found = dvae.audit(*SWITCHING, summed=("k",))
+    assert found.missing == {"z": ("z_{<=t-2}",)}
+    assert found.repaired.text == "q(z_t | z_{<t}, x_{>=t})"
+    assert dvae.audit(SWITCHING[0], found.repaired, summed=("k",)).exact
+    single = dvae.faithful("p(k_t) p(z_t | z_{t-1}, k_t) p(x_t | z_t)", summed=("k",))
+    assert single.text == "q(z_t | z_{t-1}, x_{>=t})"
+    assert len(dvae.alternatives(SWITCHING[0], summed=("k",))) == 2
+    assert build((SWITCHING[0], "faithful"), {"k": 2}).inference.text == "q(z_t | z_{<t}, x_{>=t})"
+
+
+@pytest.mark.parametrize(
+    ("equations", "message"),
+    [
+        (("p(k_t | k_{<t}) p(x_t | k_t)", ""), r"that takes its 3\^T states at all T steps at once"),
+        (("p(k_t | k_{t-1}) p(x_t | k_{1:T})", ""), r"p\(x_t \| k_\{1:T\}\) reads k_\{1:T\}: k cannot be summed out"),
+        (("p(k_t | k_{t-9}) p(x_t | k_t)", ""), "at every step 59,049 states would be summed over, of 10 steps"),
+        (("p(k_t) p(x_t | k_t)", "q(k_t | x_t)"), "draws k, which is summed out: the guide knows nothing of it"),
+        (("p(k_t) p(z_t | k_t) p(x_t | z_t)", "q(z_t | x_t, k_t)"), "reads k, which is summed out"),
+        (("p(k_t) p(z_t | k_t) p(x_t | z_t)", None), "reads k, which is summed out"),
+    ],
+)
+def test_what_cannot_be_summed_is_refused(equations, message):
+    with pytest.raises(ValueError, match=message):
+        dvae.DynamicalVAE(*equations, {"k": Discrete(3), "x": 2} | ({"z": 1} if "z_t" in equations[0] else {}))
+
+
+def test_refusals_of_runs():
+    model = build(("p(k_t | k_{t-1}) p(x_t | k_t, x_{t-1})", ""), {"k": 3})
+    data = data_of(model)["x"]
+    seen = torch.rand_like(data) < 0.5
+    with pytest.raises(ValueError, match="where the model reads its own means, or noise, in place of x"):
+        dvae.importance_bound(model, {"x": data, "mask": seen}, 1)
+    with pytest.raises(ValueError, match="where the model reads its own means, or noise, in place of x"):
+        dvae.SequenceELBO().terms(model, data, self_feeding=dvae.InputNoise(0.5))
+    with pytest.raises(ValueError, match="k is summed out, exactly, and not followed by particles"):
+        dvae.particle_bound(model, data)
+    with pytest.raises(ValueError, match="at least two states"):
+        Discrete(1)
+    with pytest.raises(ValueError, match="is Normal; leave it to be that of categories"):
+        build(HMM, {"k": 2}, laws={"p(k)": dvae.laws.Normal()})
+    with pytest.raises(ValueError, match="nothing is summed out"):
+        build(("p(x_t | x_{<t})", ""), {}).states(data)
+    with pytest.raises(ValueError, match=r"sizes=\{'k': dvae.Discrete\(states\)\}"):
+        dvae.DynamicalVAE(*HMM, {"k": 2, "x": 2})
+
+
+def test_a_method_of_ones_own_has_states():
+    method = dvae.method("equations", generative=HMM[0], inference="", states={"k": 4})
+    assert method.build({"x": 3}).sums.sizes == {"k": 4}
+    with pytest.raises(ValueError, match="states"):
+        dvae.method("equations", generative=HMM[0], inference="", states={"k": 1}).check()
