@@ -195,7 +195,7 @@ def _emission(model: Any, draw_emission: bool | None) -> str:
 def _certain(model: Any, draw_emission: bool | None) -> bool:
     """Whether all forecasts of a window are one: means of a model in which nothing is latent."""
     means = _emission(model, draw_emission) == "mean"
-    return isinstance(model, DynamicalVAE) and means and not (model.latents or model.shared)
+    return isinstance(model, DynamicalVAE) and means and not (model.latents or model.summed or model.shared)
 
 
 def _reservations(measures: Sequence[Measure], samples: int, draw_emission: bool | None) -> Iterator[str]:

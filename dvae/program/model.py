@@ -252,7 +252,7 @@ class DynamicalVAE(nn.Module):
         They are of discrete data, of which the mean is no value (.3 of a bit), and of a model without latents, whose
         means would all be the same.
         """
-        return self.generator[name].discrete or not self.latents
+        return self.generator[name].discrete or not (self.latents or self.summed)
 
     # The Pyro program ----------------------------------------------------------------------------------------------
 

@@ -137,6 +137,14 @@ def test_every_bound_agrees():
     assert torch.equal(dvae.importance_bound(hmm, data, 3).bound, dvae.importance_bound(hmm, data, 3).bound)
 
 
+def test_annealing_brackets_what_is_summed():
+    pair = dvae.twin(SWITCHING[0], SWITCHING[1], {"k": Discrete(2), "z": 1, "x": 1}, STEPS).requires_grad_(False)
+    drawn, oracle = pair.sample(40, STEPS), dvae.Oracle(pair, STEPS)
+    for side, start in ((-1, None), (1, {"z": drawn["z"]})):
+        gap = dvae.annealed_bound(pair, drawn["x"], 6, 8, latents=start).bound - oracle.evidence(drawn["x"])
+        assert side * gap.mean() > -4 * gap.std() / math.sqrt(len(gap))
+
+
 def test_the_slope_of_the_sum_is_right():
     model = build(CASES[2][0], CASES[2][1])
     data = data_of(model)
