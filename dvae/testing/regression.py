@@ -206,6 +206,7 @@ class ElboRegression:
         name: str | None = None,
         particles: int = 100,
         alpha: float = 0.001,
+        bound: Callable[[Any, int], Tensor] | None = None,
     ) -> None:
         """Passes unless the mean bound of the data's sequences is significantly below the one on record.
 
@@ -220,6 +221,9 @@ class ElboRegression:
             name: of the record; the test's own if not given.
             particles: K, draws of every sequence. The error falls with its square root.
             alpha: probability of failing when the bound has not fallen.
+            bound: another one than the evidence lower bound of model and guide: a function of the data and of the seed
+                of a draw that gives (B,), such as
+                `lambda x, seed: dvae.annealed_bound(model, x, 10, seed=seed).bound`.
 
         Raises:
             AssertionError: the bound fell; old, new, difference, error and the worst sequences are printed.
@@ -236,7 +240,7 @@ class ElboRegression:
         path = self._claim(self.folder / f"{stem}.json")
         if self.strict and not self.update and not path.exists():
             raise AssertionError(f"there is no record {_shown(path)}; run without --elbo-strict, and commit it")
-        bounds = measure(model, guide, data, particles, seed=zlib.crc32(stem.encode()))
+        bounds = measure(model, guide, data, particles, zlib.crc32(stem.encode()), bound)
         new = Record.of(bounds, checksums(data, bounds.shape[1]))
         if not path.exists():
             _write(path, new.dumps())
@@ -283,11 +287,18 @@ class ElboRegression:
             self.note(f"better {rise}; run with --update-elbo to keep it: {_shown(path)}")
 
 
-def measure(model: Callable[..., Any], guide: Callable[..., Any], data: Any, particles: int, seed: int) -> Floats:
+def measure(
+    model: Callable[..., Any],
+    guide: Callable[..., Any],
+    data: Any,
+    particles: int,
+    seed: int,
+    bound: Callable[[Any, int], Tensor] | None = None,
+) -> Floats:
     """Bounds (K, B) of single draws, in evaluation mode; torch's random state is left as it was.
 
     Args:
-        model, guide, data: as of `ElboRegression.check`.
+        model, guide, data, bound: as of `ElboRegression.check`.
         particles: K.
         seed: of the draws; each has one of its own, whatever the others took.
 
@@ -302,16 +313,19 @@ def measure(model: Callable[..., Any], guide: Callable[..., Any], data: Any, par
         found = []
         for each in np.random.SeedSequence(seed).generate_state(particles).tolist():
             torch.manual_seed(each)
-            found.append(_bound(model, guide, data))
+            found.append(_one_each(bound(data, each) if bound else _bound(model, guide, data), data))
         bounds = np.stack(found)
     if bad := np.flatnonzero(~np.isfinite(bounds).all(0)).tolist():
         raise ValueError(f"the bound of sequence {_listed(bad)} is not finite")
     return bounds
 
 
-def _bound(model: Callable[..., Any], guide: Callable[..., Any], data: Any) -> Floats:
+def _bound(model: Callable[..., Any], guide: Callable[..., Any], data: Any) -> Any:
     terms = SequenceELBO().terms(model, data, guide)
-    bound = sum(terms.log_likelihood.values()) - sum(terms.kl.values())
+    return sum(terms.log_likelihood.values()) - sum(terms.kl.values())
+
+
+def _one_each(bound: Any, data: Any) -> Floats:
     sizes = {len(value) for _, value in _leaves(data) if value.ndim}
     if not isinstance(bound, Tensor) or bound.dim() != 1 or len(bound) not in sizes:
         shape = tuple(bound.shape) if isinstance(bound, Tensor) else "without an observed site"

@@ -15,6 +15,7 @@ import pytest
 import torch
 from scipy import stats
 
+import dvae
 from dvae import DynamicalVAE, Oracle, networks, twin
 from dvae.testing.regression import Change, ElboRegression, Record, measure
 
@@ -366,6 +367,29 @@ def test_the_exact_posterior_has_no_monte_carlo_error_and_its_loss_is_seen_at_on
     assert Record.loads((tmp_path / "test_it.json").read_text()).mean_error < 1e-12
 
 
+def test_another_bound_is_held_by_its_own_draws(tmp_path):
+    """With particles there is less to lose by a guide that is too wide than the ELBO loses, and it is found as well."""
+    model = twin(*PAIR, {"z": 1, "x": 1}, 3)
+    Oracle(model, 3).fit_guide()
+    x = model.sample(4, 3)["x"]
+
+    def weighted(data, seed):
+        return dvae.importance_bound(model, data, 4).bound
+
+    regression(tmp_path).check(model.model, model.guide, x, particles=20, bound=weighted)
+    record = (tmp_path / "test_it.json").read_text()
+    regression(tmp_path).check(model.model, model.guide, x, particles=20, bound=weighted)
+    with torch.no_grad():
+        for name, parameter in model.encoder.named_parameters():
+            parameter.add_(1.0 if "scale" in name else 0.0)
+    with pytest.raises(AssertionError, match="fell significantly"):
+        regression(tmp_path).check(model.model, model.guide, x, particles=20, bound=weighted)
+    elbo = measure(model.model, model.guide, x, 20, 1).mean()
+    assert elbo < measure(model.model, model.guide, x, 20, 1, weighted).mean() < Record.loads(record).mean
+    with pytest.raises(ValueError, match=r"the bound is \(3,\), expected one for each sequence"):
+        regression(tmp_path).check(model.model, model.guide, x, bound=lambda data, seed: torch.zeros(3))
+
+
 def test_bounds_are_one_for_each_sequence_and_finite(tmp_path):
     x = torch.linspace(-1, 2, 6)
     with pytest.raises(ValueError, match=r"the bound is \(3,\), expected one for each sequence; data have \[2\] rows"):
@@ -495,5 +519,5 @@ def test_the_documented_examples_run(pytester):
     pytester.makepyfile(test_documented="\n".join(blocks))
     # in a process of its own: training loads modules of torch that a process can load only once
     result = pytester.runpytest_subprocess("-p", "dvae.testing.plugin", "-W", "error")
-    result.assert_outcomes(passed=15)
-    assert len(list(pytester.path.glob("elbo_regression/test_documented/*.json"))) == 2
+    result.assert_outcomes(passed=16)
+    assert len(list(pytester.path.glob("elbo_regression/test_documented/*.json"))) == 3
