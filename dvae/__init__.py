@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from .inversion import faithful
     from .models.registry import method, methods
     from .notation import Factorization
-    from .oracle import Oracle, arrow_prices, price, twin
+    from .oracle import Oracle, arrow_prices, model_arrow_prices, model_price, price, twin
     from .program.model import DynamicalVAE
     from .program.rollout import InputNoise, SelfFeeding
     from .program.summed import Discrete
@@ -89,6 +89,8 @@ __all__ = [
     "load",
     "method",
     "methods",
+    "model_arrow_prices",
+    "model_price",
     "motion",
     "networks",
     "particle_bound",
@@ -127,7 +129,7 @@ _PLACES = {
         "models.registry": "method methods",
         "notation": "Factorization",
         "inversion": "faithful",
-        "oracle": "Oracle arrow_prices price twin",
+        "oracle": "Oracle arrow_prices model_arrow_prices model_price price twin",
         "program.model": "DynamicalVAE",
         "program.rollout": "InputNoise SelfFeeding",
         "program.summed": "Discrete",

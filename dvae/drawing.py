@@ -1,9 +1,9 @@
-"""Pictures of unrolled graphs: time from left to right, latents open, data shaded, context squares."""
+"""Pictures of graphs, unrolled or of one step: time from left to right, latents open, data shaded, context squares."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import networkx as nx
@@ -11,6 +11,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.patches import Patch
 
 Node = tuple[str, int | None]
 """A variable at a step, or a static one."""
@@ -21,6 +22,8 @@ ARROW: dict[str, Any] = {"shrinkA": 0, "shrinkB": 0, "arrowstyle": "-|>", "mutat
 EDGE: dict[str, Any] = {"color": "0.35", "linestyle": "-", "linewidth": 0.9}
 MISSING: dict[str, Any] = {"color": "#c0392b", "linestyle": "--", "linewidth": 1.3}
 REDUNDANT: dict[str, Any] = {"color": "0.6", "linestyle": ":", "linewidth": 1.2}
+LEAST = 1e-3
+"""Share of the highest price below which an arrow is drawn as one that costs nothing."""
 
 
 def draw_dag(
@@ -35,28 +38,75 @@ def draw_dag(
         redundant: arrows of the graph to show dotted grey.
     """
     import matplotlib.pyplot as plt
-    from matplotlib.patches import Circle, FancyArrowPatch, Patch, Rectangle
 
     place = _layout(dag)
     if ax is None:
         right, down = max(x for x, _ in place.values()), -min(y for _, y in place.values())
         _, ax = plt.subplots(figsize=(0.85 * right + 1.2, 0.85 * down + 1.4), layout="constrained")
-    patches: dict[Node, Patch] = {}
-    for node, (x, y) in place.items():
-        kind = dag.nodes[node].get("kind", "latent")
-        corner, side = (x - RADIUS, y - RADIUS), 2 * RADIUS
-        shape = Rectangle(corner, side, side) if kind == "context" else Circle((x, y), RADIUS)
-        shape.set(facecolor="0.85" if kind == "data" else "white", edgecolor="black", zorder=3)
-        patches[node] = ax.add_patch(shape)
-        name, t = node
-        symbol = name if len(name) == 1 else rf"\mathrm{{{name}}}".replace("_", r"\_")
-        ax.text(x, y, f"${symbol}_{{{t}}}$" if t else f"${symbol}$", ha="center", va="center", zorder=4)
+
+    def symbol(name: str, t: int | None) -> str:
+        word = name if len(name) == 1 else rf"\mathrm{{{name}}}".replace("_", r"\_")
+        return f"${word}_{{{t}}}$" if t else f"${word}$"
+
+    patches = {
+        node: _circled(ax, xy, symbol(*node), dag.nodes[node].get("kind", "latent")) for node, xy in place.items()
+    }
     dotted = set(redundant)
     arrows = [(edge, REDUNDANT if edge in dotted else EDGE) for edge in dag.edges]
     for (source, target), style in arrows + [(edge, MISSING) for edge in missing]:
-        ends: dict[str, Any] = {"patchA": patches[source], "patchB": patches[target]}
-        curve = f"arc3,rad={_bend(source, target, place)}"
-        ax.add_patch(FancyArrowPatch(place[source], place[target], connectionstyle=curve, **ends, **ARROW, **style))
+        _arrow(ax, source, target, place, patches, **style)
+    return _finished(ax)
+
+
+def draw_slice(graph: nx.DiGraph, prices: Mapping[tuple[Any, Any], float], ax: Axes, top: float = 0.0) -> Axes:
+    """Draws what one step reads, past to the left and future to the right, each arrow as thick as its price.
+
+    Args:
+        graph: as `Factorization.slice` makes it.
+        prices: of its edges, which are written beside them. One of 0 or less is dotted; an edge without is thin.
+        ax: matplotlib axes.
+        top: what the thickest arrow costs, by default the highest of these prices.
+    """
+    place = _slice_layout(graph)
+    patches = {
+        node: _circled(ax, xy, graph.nodes[node]["label"], graph.nodes[node]["kind"]) for node, xy in place.items()
+    }
+    top = max([top, *prices.values()])
+    for edge in graph.edges:
+        cost = prices.get(edge)
+        thick = {**EDGE, "linewidth": 0.9 + 5 * cost / top, "mutation_scale": 9 + 8 * cost / top} if cost else EDGE
+        bend = _arrow(ax, *edge, place, patches, **(REDUNDANT if cost is not None and cost < LEAST * top else thick))
+        if cost is not None:
+            start, end = np.array(place[edge[0]]), np.array(place[edge[1]])
+            middle = (start + end) / 2 + bend / 2 * np.array([(end - start)[1], (start - end)[0]])
+            box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+            ax.text(*middle, f"{cost:.3f}", ha="center", va="center", fontsize=8, bbox=box, zorder=5)
+    return _finished(ax)
+
+
+def _circled(ax: Axes, xy: tuple[float, float], symbol: str, kind: str) -> Patch:
+    """A node with what it is called."""
+    from matplotlib.patches import Circle, Rectangle
+
+    (x, y), side = xy, 2 * RADIUS
+    shape = Rectangle((x - RADIUS, y - RADIUS), side, side) if kind == "context" else Circle(xy, RADIUS)
+    shape.set(facecolor="0.85" if kind == "data" else "white", edgecolor="black", zorder=3)
+    ax.text(x, y, symbol, ha="center", va="center", zorder=4)
+    return ax.add_patch(shape)
+
+
+def _arrow(ax: Axes, source: Any, target: Any, place: Mapping[Any, Any], patches: Any, **style: Any) -> float:
+    """An arrow between two nodes; how it bends."""
+    from matplotlib.patches import FancyArrowPatch
+
+    bend = _bend(source, target, place)
+    ends: dict[str, Any] = {"patchA": patches[source], "patchB": patches[target]}
+    curve = f"arc3,rad={bend}"
+    ax.add_patch(FancyArrowPatch(place[source], place[target], connectionstyle=curve, **ends, **{**ARROW, **style}))
+    return bend
+
+
+def _finished(ax: Axes) -> Axes:
     ax.set_aspect("equal")
     ax.autoscale_view()
     ax.margins(0.05)
@@ -79,7 +129,23 @@ def _layout(dag: nx.DiGraph) -> dict[Node, tuple[float, float]]:
     return place
 
 
-def _bend(source: Node, target: Node, place: dict[Node, tuple[float, float]]) -> float:
+def _slice_layout(graph: nx.DiGraph) -> dict[Any, tuple[float, float]]:
+    """Static nodes on top, then a row per local variable, data last; what is further from now further out."""
+    local = {name: graph.nodes[name, sub]["kind"] == "data" for name, sub in graph if sub is not None}
+    rows = {name: row for row, name in enumerate(sorted(local, key=local.__getitem__), start=1)}
+    place, beside = {}, {}
+    static = [node for node in graph if node[1] is None]
+    for i, node in enumerate(static):
+        place[node] = (1.9 * (i - (len(static) - 1) / 2) + 0.6, 0.0)
+    for node in graph:
+        if node not in place:
+            side = graph.nodes[node]["side"]
+            out = beside[node[0], side] = beside.get((node[0], side), 0) + 1
+            place[node] = (2.2 * side * out + 0.3 * (rows[node[0]] % 3 - 1), -1.8 * rows[node[0]])
+    return place
+
+
+def _bend(source: Any, target: Any, place: Mapping[Any, tuple[float, float]]) -> float:
     """The least curvature with which an arrow passes no other node; outwards along the first and last row."""
     start, end = np.array(place[source]), np.array(place[target])
     others = np.array([xy for node, xy in place.items() if node not in (source, target)]).reshape(-1, 2)

@@ -300,6 +300,10 @@ class Factorization:
             for relation in sides(factor, parent.relation)
         )
 
+    def arrow(self, child: str, parent: Parent) -> str:
+        """One of its `arrows` in words, such as "x_{<t} to z_t"."""
+        return f"{parent} to {_plain(child, 't' if self.local(child) else None)}"
+
     def without(self, child: str, parent: Parent) -> Factorization:
         """The same less one of its `arrows`.
 
@@ -412,6 +416,30 @@ class Factorization:
         for factor in self.factors:
             dag.add_edges_from(factor.edges(T))
         return dag
+
+    def slice(self, observed: Iterable[str] = ("x",)) -> nx.DiGraph:
+        """The graph of one step: an edge for each of `arrows`, from what is read at its steps to the variable at t.
+
+        Returns:
+            networkx.DiGraph with nodes (name, subscript), such as ("x", "<t") and ("z", "t"), and (name, None) for
+            static variables, in the order of the arrows. Their attributes are `kind`, as in `dag`, `label` in LaTeX,
+            and `side`: -1 for the past and for all steps, 0 for t, 1 for the future.
+        """
+        graph, observed = nx.DiGraph(), tuple(observed)
+
+        def add(name: str, subscript: str | None, side: int) -> tuple[str, str | None]:
+            kind = "data" if name in observed else "latent" if name in self.variables else "context"
+            graph.add_node((name, subscript), kind=kind, side=side, label=f"${_latex(name, subscript)}$")
+            return name, subscript
+
+        for factor in self.factors:
+            add(factor.child, "t" if factor.local else None, 0)
+        for child, parent in self.arrows:
+            relation = parent.relation
+            side = 0 if relation in (None, NOW) else 1 if relation.intervals and relation & FUTURE == relation else -1
+            subscript = None if relation is None else relation.name[1:-1]
+            graph.add_edge(add(parent.name, subscript, side), (child, "t" if self.local(child) else None))
+        return graph
 
     # how it looks ------------------------------------------------------------------------------------------
 

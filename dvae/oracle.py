@@ -11,18 +11,20 @@ Where these can be counted, evidence and posterior moments are known still; boun
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
+from scipy import optimize
 from torch import Tensor, nn
 
 from .inversion import FAITHFUL, guide
 from .laws.families import FixedNormal, FixedNormalLaw, Gaussian
 from .laws.family import Family
 from .networks.linear import Linear, LinearNetwork
-from .notation import Factorization
+from .notation import Factor, Factorization
 from .program.model import DynamicalVAE
 from .program.summed import Discrete
 from .turns import alone
@@ -296,7 +298,7 @@ def price(
 
     Each seed is a linear-Gaussian model with random weights, and the best guide of this factorization for it. A guide
     that holds the posterior's dependencies costs nothing where latents have one dimension; with more, what is left is
-    the price of its diagonal covariance.
+    the price of its diagonal covariance. Over context, prices are averages: it is drawn from N(0, I).
 
     Args:
         generative, inference, sizes, observed: as of `DynamicalVAE`.
@@ -309,10 +311,103 @@ def price(
     """
     if min(steps, seeds) < 1:
         raise ValueError(f"a price is of at least 1 step and 1 model, not of {steps} and {seeds}")
-    gaps = [
-        Oracle(twin(generative, inference, sizes, steps, seed, observed), steps).fit_guide() for seed in range(seeds)
-    ]
+    model = Factorization.parse(generative)
+    read = guide(model, inference, observed)
+    context = _context(model, read)
+    model, data = _drawing(model, context), (*observed, *(factor.child for factor in context))
+    gaps = [Oracle(twin(model, read, sizes, steps, seed, data), steps).fit_guide() for seed in range(seeds)]
     return torch.tensor(gaps, dtype=torch.float64)
+
+
+def _context(model: Factorization, other: Factorization) -> tuple[Factor, ...]:
+    """Factors of what a model and its guide, or another model, are given."""
+    local = {name: part.local(name) for part in (model, other) for name in part.context if name not in model.variables}
+    return tuple(Factor("p", name, each) for name, each in local.items())
+
+
+def _drawing(model: Factorization, context: tuple[Factor, ...]) -> Factorization:
+    """A model that draws its context too."""
+    return replace(model, factors=(*context, *model.factors))
+
+
+@alone
+def model_price(
+    generative: str | Factorization,
+    reduced: str | Factorization,
+    sizes: Mapping[str, int],
+    steps: int = 5,
+    seeds: int = 5,
+    observed: tuple[str, ...] = ("x",),
+) -> Tensor:
+    """What a model of fewer arrows costs: the least expected evidence that it loses, in nats a sequence, (seeds,).
+
+    Each seed is a linear-Gaussian model p with random weights, the one that `price` has. The cost is the least of
+    KL(p(x) || r(x)) over linear-Gaussian models r of the reduced factorization: both are normals whose covariances are
+    known, and no guide is involved. The search begins at the weights of p less those of the missing arrows. Without
+    latents it is convex; with latents it could end in a local minimum, which is no less than the price.
+
+    Args:
+        generative, sizes, observed: as of `DynamicalVAE`; sizes are of context too, see `price`.
+        reduced: a model of the same variables.
+        steps: T.
+        seeds: number of random models.
+
+    Raises:
+        ValueError: other variables than those of the model; less than 1 step or model.
+
+    Example:
+        >>> dvae.model_price("p(x_t | x_{t-1})", "p(x_t)", {"x": 1}, steps=3, seeds=1) > 0
+        tensor([True])
+    """
+    if min(steps, seeds) < 1:
+        raise ValueError(f"a price is of at least 1 step and 1 model, not of {steps} and {seeds}")
+    whole, less = Factorization.parse(generative), Factorization.parse(reduced)
+    if {*whole.variables} != {*less.variables}:
+        names = ", ".join(whole.variables)
+        raise ValueError(f"a reduced model has the variables of the whole one, {names}, but it is {less.text!r}")
+    context = _context(whole, less)
+    whole, less, data = _drawing(whole, context), _drawing(less, context), (*observed, *(f.child for f in context))
+    lost = [_lost(Oracle(twin(whole, None, sizes, steps, seed, data), steps), less) for seed in range(seeds)]
+    return torch.tensor(lost, dtype=torch.float64)
+
+
+def _lost(oracle: Oracle, less: Factorization) -> float:
+    """The least KL of the data's normal under the model from that under a reduced one.
+
+    A model is R v = e, for its variables v less their means and standard normal e. Biases of the data give a reduced
+    one any mean of theirs, so that covariances C are all there is to compare. As latents may be rescaled, R has ones on
+    their diagonal; on that of the data it has the reciprocal scales of their noise. With J = (-P_xz P_zz^-1, I) for the
+    precision P = R'R, the data have the precision M = J P J', and the gradient of the divergence is R J'(C - M^-1) J.
+    """
+    model, names = oracle.model, (*oracle.model.latents, *oracle.model.observed)
+    n = sum(map(oracle._size, model.latents))
+    with torch.no_grad():
+        system = oracle._system(model.generator, names, ())
+    weights, scale = system.weights.numpy(), system.scale.numpy()
+    unit = np.where(np.arange(len(scale)) < n, scale, 1.0)
+    root = (np.eye(len(scale)) - weights) / scale[:, None] * unit
+    covariance = np.linalg.inv(root.T @ root)[n:, n:]
+    entropy = len(covariance) + np.linalg.slogdet(covariance)[1]
+
+    def reads(child: str, parent: str) -> np.ndarray:
+        return np.kron(less.mask(child, parent, oracle.steps), np.ones((model.sizes[child], model.sizes[parent])))
+
+    free = np.block([[reads(child, parent) for parent in names] for child in names]) > 0
+    noise = np.arange(n, len(scale))
+
+    def divergence(values: np.ndarray) -> tuple[float, np.ndarray]:
+        r, log_scale = np.eye(len(scale)), values[: len(noise)]
+        r[noise, noise], r[free] = np.exp(-log_scale), values[len(noise) :]
+        precision = r.T @ r
+        onto = np.hstack([-np.linalg.solve(precision[:n, :n], precision[:n, n:]).T, np.eye(len(noise))])
+        margin = onto @ precision @ onto.T
+        lost = 0.5 * ((margin * covariance).sum() - np.linalg.slogdet(margin)[1] - entropy)
+        slope = r @ onto.T @ (covariance - np.linalg.inv(margin)) @ onto
+        return lost, np.concatenate([-slope[noise, noise] * r[noise, noise], slope[free]])
+
+    start = np.concatenate([np.log(scale[n:]), root[free]])
+    options = {"maxiter": 20_000, "maxfun": 40_000, "maxcor": 50, "ftol": 1e-14, "gtol": 1e-9}
+    return float(optimize.minimize(divergence, start, jac=True, method="L-BFGS-B", options=options).fun)
 
 
 def arrow_prices(
@@ -340,10 +435,45 @@ def arrow_prices(
     """
     model = Factorization.parse(generative)
     written = guide(model, inference, observed)
-    known = sizes or dict.fromkeys((*model.variables, *model.context), 1)
+    known = sizes or ones(model, written)
     whole = price(model, written, known, steps, seeds, observed)
-    found = {}
-    for child, parent in written.arrows:
-        less = price(model, written.without(child, parent), known, steps, seeds, observed)
-        found[f"{parent} to {child}{'_t' if written.local(child) else ''}"] = less - whole
+    return _dearest_first(written, lambda less: price(model, less, known, steps, seeds, observed) - whole)
+
+
+def model_arrow_prices(
+    generative: str | Factorization,
+    sizes: Mapping[str, int] | None = None,
+    steps: int = 5,
+    seeds: int = 5,
+    observed: tuple[str, ...] = ("x",),
+) -> dict[str, Tensor]:
+    """What leaving out each arrow of a model costs by itself, in nats a sequence; see `model_price`.
+
+    Args:
+        generative, observed: as of `DynamicalVAE`.
+        sizes: of the variables; by default 2 of data and 1 of others, as what data of size 1 lose on one path can often
+            take another one.
+        steps, seeds: see `model_price`.
+
+    Returns:
+        {arrow: (seeds,), the evidence lost without it in each of the random models}, the dearest first.
+
+    Example:
+        >>> {arrow: bool((cost > 1e-6).all()) for arrow, cost in dvae.model_arrow_prices(
+        ...     "p(z_t | z_{t-1}) p(x_t | x_{<t}, z_t)", steps=3, seeds=2).items()}
+        {'x_{<t} to x_t': True, 'z_t to x_t': True, 'z_{t-1} to z_t': False}
+    """
+    model = Factorization.parse(generative)
+    known = sizes or {**ones(model), **dict.fromkeys(observed, 2)}
+    return _dearest_first(model, lambda less: model_price(model, less, known, steps, seeds, observed))
+
+
+def ones(*equations: Factorization) -> dict[str, int]:
+    """A size of 1 for each variable."""
+    return dict.fromkeys((name for part in equations for name in (*part.variables, *part.context)), 1)
+
+
+def _dearest_first(written: Factorization, cost: Callable[[Factorization], Tensor]) -> dict[str, Tensor]:
+    """What each arrow costs, by what it is called."""
+    found = {written.arrow(*arrow): cost(written.without(*arrow)) for arrow in written.arrows}
     return dict(sorted(found.items(), key=lambda item: -float(item[1].mean())))
