@@ -51,10 +51,12 @@ if TYPE_CHECKING:
     from .program.model import DynamicalVAE
     from .program.rollout import InputNoise, SelfFeeding
     from .program.summed import Discrete
+    from .runs.ablation import Ablation, ablate
     from .runs.directory import load
 
 __all__ = [
     "SVI",
+    "Ablation",
     "Alternatives",
     "ArrayWindows",
     "Audit",
@@ -75,6 +77,7 @@ __all__ = [
     "Stage",
     "Terms",
     "Training",
+    "ablate",
     "alternatives",
     "annealed_bound",
     "arrow_prices",
@@ -133,6 +136,7 @@ _PLACES = {
         "program.model": "DynamicalVAE",
         "program.rollout": "InputNoise SelfFeeding",
         "program.summed": "Discrete",
+        "runs.ablation": "Ablation ablate",
         "runs.directory": "load",
     }.items()
     for name in names.split()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import networkx as nx
@@ -54,11 +54,17 @@ def draw_dag(
     dotted = set(redundant)
     arrows = [(edge, REDUNDANT if edge in dotted else EDGE) for edge in dag.edges]
     for (source, target), style in arrows + [(edge, MISSING) for edge in missing]:
-        _arrow(ax, source, target, place, patches, **style)
+        _arrow(ax, (source, target), place, patches, style)
     return _finished(ax)
 
 
-def draw_slice(graph: nx.DiGraph, prices: Mapping[tuple[Any, Any], float], ax: Axes, top: float = 0.0) -> Axes:
+def draw_slice(
+    graph: nx.DiGraph,
+    prices: Mapping[tuple[Any, Any], float],
+    ax: Axes,
+    top: float = 0.0,
+    unsure: Collection[tuple[Any, Any]] = (),
+) -> Axes:
     """Draws what one step reads, past to the left and future to the right, each arrow as thick as its price.
 
     Args:
@@ -66,6 +72,7 @@ def draw_slice(graph: nx.DiGraph, prices: Mapping[tuple[Any, Any], float], ax: A
         prices: of its edges, which are written beside them. One of 0 or less is dotted; an edge without is thin.
         ax: matplotlib axes.
         top: what the thickest arrow costs, by default the highest of these prices.
+        unsure: edges to draw pale.
     """
     place = _slice_layout(graph)
     patches = {
@@ -74,13 +81,25 @@ def draw_slice(graph: nx.DiGraph, prices: Mapping[tuple[Any, Any], float], ax: A
     top = max([top, *prices.values()])
     for edge in graph.edges:
         cost = prices.get(edge)
-        thick = {**EDGE, "linewidth": 0.9 + 5 * cost / top, "mutation_scale": 9 + 8 * cost / top} if cost else EDGE
-        bend = _arrow(ax, *edge, place, patches, **(REDUNDANT if cost is not None and cost < LEAST * top else thick))
+        style = {**EDGE, "color": "0.7"} if edge in unsure else EDGE
         if cost is not None:
-            start, end = np.array(place[edge[0]]), np.array(place[edge[1]])
-            middle = (start + end) / 2 + bend / 2 * np.array([(end - start)[1], (start - end)[0]])
+            thick = {"linewidth": 0.9 + 5 * cost / top, "mutation_scale": 9 + 8 * cost / top} if cost > 0 else {}
+            style = REDUNDANT if cost <= LEAST * top else {**style, **thick}
+        bend = _arrow(ax, edge, place, patches, style)
+        if cost is not None:
+            (x, y), (to_x, to_y) = (place[node] for node in edge)
+            middle = (x + to_x + bend * (to_y - y)) / 2, (y + to_y - bend * (to_x - x)) / 2
             box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-            ax.text(*middle, f"{cost:.3f}", ha="center", va="center", fontsize=8, bbox=box, zorder=5)
+            ax.text(
+                middle[0],
+                middle[1],
+                f"{round(cost, 3) + 0.0:.3f}",
+                ha="center",
+                va="center",
+                fontsize=8,
+                bbox=box,
+                zorder=5,
+            )
     return _finished(ax)
 
 
@@ -95,10 +114,13 @@ def _circled(ax: Axes, xy: tuple[float, float], symbol: str, kind: str) -> Patch
     return ax.add_patch(shape)
 
 
-def _arrow(ax: Axes, source: Any, target: Any, place: Mapping[Any, Any], patches: Any, **style: Any) -> float:
+def _arrow(
+    ax: Axes, edge: tuple[Any, Any], place: Mapping[Any, Any], patches: Mapping[Any, Patch], style: dict[str, Any]
+) -> float:
     """An arrow between two nodes; how it bends."""
     from matplotlib.patches import FancyArrowPatch
 
+    source, target = edge
     bend = _bend(source, target, place)
     ends: dict[str, Any] = {"patchA": patches[source], "patchB": patches[target]}
     curve = f"arc3,rad={bend}"
@@ -133,7 +155,8 @@ def _slice_layout(graph: nx.DiGraph) -> dict[Any, tuple[float, float]]:
     """Static nodes on top, then a row per local variable, data last; what is further from now further out."""
     local = {name: graph.nodes[name, sub]["kind"] == "data" for name, sub in graph if sub is not None}
     rows = {name: row for row, name in enumerate(sorted(local, key=local.__getitem__), start=1)}
-    place, beside = {}, {}
+    place: dict[Any, tuple[float, float]] = {}
+    beside: dict[Any, int] = {}
     static = [node for node in graph if node[1] is None]
     for i, node in enumerate(static):
         place[node] = (1.9 * (i - (len(static) - 1) / 2) + 0.6, 0.0)

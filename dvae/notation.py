@@ -423,7 +423,7 @@ class Factorization:
         Returns:
             networkx.DiGraph with nodes (name, subscript), such as ("x", "<t") and ("z", "t"), and (name, None) for
             static variables, in the order of the arrows. Their attributes are `kind`, as in `dag`, `label` in LaTeX,
-            and `side`: -1 for the past and for all steps, 0 for t, 1 for the future.
+            and `side`: -1 for the past and for all steps, 0 for t, 1 for the future; of edges, `arrow`.
         """
         graph, observed = nx.DiGraph(), tuple(observed)
 
@@ -438,7 +438,8 @@ class Factorization:
             relation = parent.relation
             side = 0 if relation in (None, NOW) else 1 if relation.intervals and relation & FUTURE == relation else -1
             subscript = None if relation is None else relation.name[1:-1]
-            graph.add_edge(add(parent.name, subscript, side), (child, "t" if self.local(child) else None))
+            reads = add(parent.name, subscript, side), (child, "t" if self.local(child) else None)
+            graph.add_edge(*reads, arrow=(child, parent))
         return graph
 
     # how it looks ------------------------------------------------------------------------------------------
