@@ -37,7 +37,7 @@ from .console import ERROR, OUT, Missing, UsageError, arguments, at_least
 from .tables import is_table
 
 
-def _options(name: str, kind: type[Any], *aside: str) -> Any:
+def options_of(name: str, kind: type[Any], *aside: str) -> Any:
     """A dataclass of the options of another that can be written as words, but those that are left aside.
 
     Options are None where they are not given.
@@ -74,9 +74,9 @@ else:
     )
     ProtocolName = tyro.extras.literal_type_from_choices(motion.PROTOCOLS)
     SweptMethod = tyro.extras.literal_type_from_choices([name for name in methods() if name != "equations"])
-    MethodOptions = _options("MethodOptions", LatentMethod, "latent")
-    TrainingOptions = _options("TrainingOptions", Training, "self_feeding", "progress")
-    SweepOptions = _options("SweepOptions", Training, "self_feeding", "progress", "seed", "devices")
+    MethodOptions = options_of("MethodOptions", LatentMethod, "latent")
+    TrainingOptions = options_of("TrainingOptions", Training, "self_feeding", "progress")
+    SweepOptions = options_of("SweepOptions", Training, "self_feeding", "progress", "seed", "devices")
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ def fit(
         raise ValueError(f"{out} already holds a run; continue it with: dvae resume {out}, or choose another directory")
     with arguments():
         method.check()  # wrong equations and options are found before the data are read
-        how = _given(training)
+        how = given_options(training)
     opened = source.open(method)
     with _reported():
         _report(runs.fit_run(method, opened, out, how, trackers=[TensorBoard(out)] if tensorboard else []))
@@ -271,7 +271,7 @@ def sweep(
         raise UsageError(f"--out {out} is a file; name a directory for the runs")
     given = {name: value for name, value in vars(model).items() if value is not None}
     with arguments():
-        how = _given(training)
+        how = given_options(training)
         chosen: Any
         if grid is None:
             sizes: list[dict[str, int]] = [{"latent": size} for size in latent] or [{}]
@@ -297,7 +297,7 @@ def sweep(
     OUT.print(f"all {len(results)} runs have ended; {then}", soft_wrap=True)
 
 
-def _given(training: Any) -> dict[str, Any]:
+def given_options(training: Any) -> dict[str, Any]:
     """The options of training that are given, each of which may be."""
     given = {name: value for name, value in vars(training).items() if value is not None}
     Training(**given)

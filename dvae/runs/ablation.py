@@ -284,7 +284,7 @@ def ablate(
     sizes: Mapping[str, int] | None = None,
     steps: int = 5,
     twins: int = 5,
-    particles: int = 64,
+    bound_particles: int = 64,
     seed: int = 0,
     progress: bool = True,
 ) -> Ablation:
@@ -302,12 +302,12 @@ def ablate(
         data: with windows to train, validate and test on, such as `dvae.motion.MotionData` or `dvae.tables.PanelData`.
         out: where the run directories go.
         seeds: of the runs of each arrow.
-        training: options of the runs, or some of them beside the method's own.
+        training: options of the runs, or some of them beside those of `equations`.
         jobs: runs at a time.
         sizes: of the variables of the twins; by default 2 of data and 1 of others.
         steps: T of the twins.
         twins: random models on which arrows are priced.
-        particles: of the importance-weighted bound.
+        bound_particles: of the importance-weighted bound.
         seed: of the draws of that bound.
         progress: whether to show a progress bar.
 
@@ -362,8 +362,7 @@ def ablate(
         else:
             named[arrow.run] = reduced
     told = training if isinstance(training, Training) else {"progress": progress, **(training or {})}
-    own = whole if isinstance(method, tuple) else method
-    results = sweep(named, data, out, seeds, training_of(own, data, told), jobs)
+    results = sweep(named, data, out, seeds, training_of(whole, data, told), jobs)
     if failed := [str(result) for result in results if result.status not in ENDED]:
         raise RuntimeError(
             "\n".join([f"{len(failed)} of {len(results)} runs failed; the same again tries them anew", *failed])
@@ -371,7 +370,7 @@ def ablate(
     comparison = compare(
         {name: [load(Path(out) / f"{name}-seed{each}").model for each in seeds] for name in named},
         data.windows("test"),
-        particles=particles,
+        particles=bound_particles,
         contrasts=0,
         samples=0,
         seed=seed,
