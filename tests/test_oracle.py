@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pyro.infer import Trace_ELBO
 from torch.distributions.transforms import ReshapeTransform
 
-from dvae import DynamicalVAE, Oracle, SequenceELBO, audit, price, twin
+from dvae import DynamicalVAE, Oracle, SequenceELBO, audit, model_arrow_prices, model_price, price, twin
 from dvae.laws import FixedNormal, Mixture
 from dvae.networks import Linear
 from dvae.notation import Factorization
@@ -284,6 +284,80 @@ def test_the_price_of_a_dropped_arrow():
     assert full.shape == (2,)
     assert full.abs().max() < 1e-6
     assert dropped.min() > 1e-3
+
+
+def spread(generative, sizes, seed, steps):
+    """The covariance of the data under the model that prices of a seed have."""
+    oracle = Oracle(twin(generative, None, sizes, steps, seed), steps)
+    n = sum(map(oracle._size, oracle.model.latents))
+    return torch.linalg.inv(oracle._joint()[1].detach())[n:, n:]
+
+
+def dependence(covariance, size):
+    """How far blocks of so many normal coordinates are from independent, in nats: their total correlation."""
+    blocks = [covariance[k : k + size, k : k + size] for k in range(0, len(covariance), size)]
+    return float(sum(map(torch.logdet, blocks)) - torch.logdet(covariance)) / 2
+
+
+INDEPENDENT = {
+    "mutual information of two steps": ("p(x_t | x_{t-1})", "p(x_t)", {"x": 1}, 2, 1),
+    "of vectors, whose coordinates become independent too": ("p(x_t | x_{t-1})", "p(x_t)", {"x": 2}, 3, 1),
+    "no chain of latents": (DKF, "p(z_t) p(x_t | z_t)", {"z": 1, "x": 1}, T, 1),
+    "no latents": (DKF, "p(z_t | z_{t-1}) p(x_t)", {"z": 1, "x": 1}, T, 1),
+    "latents that still join the coordinates of a step": (DKF, "p(z_t) p(x_t | z_t)", {"z": 1, "x": 2}, T, 2),
+}
+
+
+@pytest.mark.parametrize("case", INDEPENDENT)
+def test_a_model_without_dependence_loses_all_of_it(case):
+    generative, reduced, sizes, steps, size = INDEPENDENT[case]
+    found = model_price(generative, reduced, sizes, steps, seeds=3)
+    expected = [dependence(spread(generative, sizes, seed, steps), size) for seed in range(3)]
+    assert min(expected) > 1e-6
+    assert found.tolist() == pytest.approx(expected, abs=1e-9)
+
+
+def test_what_another_arrow_can_carry_costs_nothing():
+    found = model_arrow_prices("p(z_t | z_{t-1}, x_{<t}) p(x_t | x_{<t}, z_t)", steps=3, seeds=2)
+    assert {arrow for arrow, cost in found.items() if cost.max() < 1e-8} == {"z_{t-1} to z_t", "x_{<t} to z_t"}
+    assert found["x_{<t} to x_t"].min() > 1e-3
+
+
+@settings(max_examples=15)
+@given(factorizations(), st.integers(0, 999), st.data())
+def test_two_arrows_cost_at_least_what_one_costs_which_is_no_less_than_nothing(pair, seed, chosen):
+    whole = Factorization.parse(pair[0])
+    order = chosen.draw(st.permutations(whole.arrows))[:2]
+    sizes = dict.fromkeys(whole.variables, 1) | {"x": 2}
+    costs, less = [0.0], whole
+    for arrow in order:
+        less = less.without(*arrow)
+        costs.append(float(model_price(whole, less, sizes, steps=3, seeds=1)[0]))
+    assert costs == pytest.approx(sorted(costs), abs=1e-8)
+
+
+def test_model_and_guide_are_priced_on_the_same_models():
+    alone, guided = (twin(DKF, guide, {"z": 1, "x": 2}, T, seed=3) for guide in (None, "q(z_t | z_{t-1}, x_{t:T})"))
+    pairs = zip(alone.generator.parameters(), guided.generator.parameters(), strict=True)
+    assert all(torch.equal(ours, theirs) for ours, theirs in pairs)
+
+
+def test_prices_of_models_with_context():
+    driven, sizes = "p(z_t | c_t) p(x_t | z_t)", {"z": 1, "x": 1, "c": 1}
+    assert price(driven, "q(z_t | x_t, c_t)", sizes, steps=3, seeds=2).max() < 1e-8
+    assert price(driven, "q(z_t | x_t)", sizes, steps=3, seeds=2).min() > 1e-4
+    model = twin("p(c_t) p(x_t | c_t)", None, {"x": 1, "c": 1}, 3, 0, ("x", "c"))
+    slopes = model.generator["x"].network.weight("c", 3).detach().squeeze().diagonal()
+    scales = model.generator["x"].law.log_scale.detach().exp().squeeze()
+    expected = float(torch.log1p((slopes / scales) ** 2).sum()) / 2
+    assert float(model_price("p(x_t | c_t)", "p(x_t)", {"x": 1, "c": 1}, 3, 1)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_prices_of_what_is_no_reduced_model():
+    with pytest.raises(ValueError, match="variables of the whole one, z, x, but it is 'p"):
+        model_price(DKF, "p(x_t)", {"z": 1, "x": 1})
+    with pytest.raises(ValueError, match="at least 1 step and 1 model, not of 0 and 5"):
+        model_price(DKF, DKF, {"z": 1, "x": 1}, steps=0)
 
 
 def test_fitting_the_guide_leaves_the_model_and_its_gradients_alone():

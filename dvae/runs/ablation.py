@@ -223,12 +223,16 @@ class Ablation(Result):
                 {run: str(note) for run, note in document["notes"].items()},
                 None if comparison is None else Comparison.from_json(json.dumps(comparison)),
             )
+            runs = {arrow.run for arrow in arrows_of(found.generative, found.inference)}
+            fitted = set() if found.comparison is None else found.comparison.rows.keys() - {WHOLE}
+            if prices.keys() != runs or not runs >= found.notes.keys() | fitted:
+                raise ValueError("its prices, notes and fits are not those of its arrows")
             counts = {len(costs) for costs in prices.values()}
             if len(counts) > 1 or max(counts, default=1) > MOST or not all(counts):
                 raise ValueError(f"every arrow has a price in each of the same 1 to {MOST} random models")
             if not all(map(math.isfinite, (cost for costs in prices.values() for cost in costs))):
                 raise ValueError("a price is finite")
-            found.table()  # of arrows, prices, differences and p-values, which belong together
+            found.table()  # of a comparison that has the whole and all that its table needs
             return found
         except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ValueError(f"this is not an ablation written by Ablation.to_json: {error!r}") from error

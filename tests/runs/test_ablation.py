@@ -1,0 +1,210 @@
+"""Ablations: prices are those of the oracle, every arrow has a run of its own, and a broken ablation is continued."""
+
+import json
+import re
+import shutil
+
+import matplotlib
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from matplotlib.patches import FancyArrowPatch
+
+import dvae
+from dvae.cli import main
+from dvae.notation import Factorization
+from dvae.runs.ablation import FAMILY, WHOLE, Ablation, arrows_of, as_equations
+from dvae.runs.grid import NAME
+from dvae.schema import Schema
+from dvae.testing.strategies import factorizations
+
+matplotlib.use("Agg")
+
+DKF, SMOOTHER = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"
+PAIR = "p(z_t | z_{t-1}) p(x_t | z_t, x_{t-1})", "q(z_t | x_t)"
+
+
+@pytest.fixture(scope="module")
+def priced():
+    return dvae.ablate((DKF, SMOOTHER), sizes={"z": 1, "x": 1}, steps=3, twins=2)
+
+
+def command(people, out, *more):
+    equations = ["--generative", PAIR[0], "--inference", PAIR[1], "--residual", ".5", "--latent", "2", "--width", "4"]
+    runs = ["--data", str(people), "--out", str(out), "--seeds", "0", "1", "--steps", "2", "--batch-size", "4"]
+    twins = ["--twins", "1", "--twin-steps", "2", "--bound-particles", "4", "--jobs", "1"]
+    return ["ablate", *equations, *runs, *twins, "--warm-up", "1", *more]
+
+
+@pytest.fixture(scope="module")
+def fitted(people, tmp_path_factory):
+    """An ablation by the command line: its directory."""
+    out = tmp_path_factory.mktemp("ablation") / "runs"
+    assert main(command(people, out, "--figure", str(out.with_name("arrows.png")))) == 0
+    return out
+
+
+def test_prices_are_those_of_the_guide_and_of_the_model(priced):
+    sizes = {"z": 1, "x": 1}
+    expected = {
+        "q": dvae.arrow_prices(DKF, SMOOTHER, sizes, steps=3, seeds=2),
+        "p": dvae.model_arrow_prices(DKF, sizes, steps=3, seeds=2),
+    }
+    assert len(priced.arrows) == sum(map(len, expected.values())) == 6
+    for arrow in priced.arrows:
+        assert priced.prices[arrow.run] == tuple(expected[arrow.kind][arrow.name].tolist())
+    assert {arrow.name for arrow in priced.arrows if max(priced.prices[arrow.run]) < 1e-6} == {"x_{<t} to z_t"}
+    assert priced.notes == {"model-without-z_t-to-x_t": "no data depend on z then"}
+
+
+@settings(max_examples=50)
+@given(factorizations())
+def test_every_arrow_has_a_run_and_an_edge_of_its_own(pair):
+    parts = [*map(Factorization.parse, pair)]
+    runs = [arrow.run for arrow in arrows_of(*parts)]
+    assert len({*runs, WHOLE}) == len(runs) + 1
+    assert all(re.fullmatch(NAME, run) for run in runs)
+    for part in parts:
+        edges = [arrow for *_, arrow in part.slice().edges.data("arrow")]
+        assert len(edges) == len(part.arrows)
+        assert all(arrow in part.arrows for arrow in edges)
+
+
+def test_the_thicker_an_arrow_the_higher_its_price(priced):
+    figure = priced.plot()
+    for axes, kind in zip(figure.axes, "pq", strict=True):
+        widths = {float(patch.get_linewidth()) for patch in axes.patches if isinstance(patch, FancyArrowPatch)}
+        costs = {round(np.mean(priced.prices[arrow.run]), 3) for arrow in priced.arrows if arrow.kind == kind}
+        written = sorted(float(text.get_text()) for text in axes.texts if "$" not in text.get_text())
+        assert {*written} == costs
+        assert len(widths) == len(costs)
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_a_method_of_the_family_becomes_its_equations(name):
+    method = dvae.method(name, width=4) if name not in ("vae",) else dvae.method(name)
+    found = as_equations(method)
+    assert found.equations() == method.equations()
+    ours, theirs = found.build({"x": 3}), method.build({"x": 3})
+    assert ours.sizes == theirs.sizes
+    assert found.warm_up == getattr(method, "warm_up", found.warm_up)
+
+
+def test_factors_read_the_covariates_of_data_as_those_of_the_method_do():
+    class Given(Schema):
+        covariates = ("c",), ("s",)
+
+    method, schema = dvae.method("dkf"), Given({"x": 2, "c": 1, "s": 1})
+    theirs = method.build(schema)
+    found = as_equations(method, schema).equations()
+    assert found == (theirs.generative, theirs.inference)
+    assert ("x", "c_t") in {(child, str(parent)) for child, parent in found[0].arrows}
+    priced = dvae.ablate(as_equations(method, schema), steps=2, twins=1)
+    assert min(priced.prices["model-without-c_t-to-x_t"]) > 1e-3
+
+
+def test_an_ablation_by_the_command_line(fitted):
+    found = dvae.Ablation.load(fitted / "ablation.json")
+    runs = {arrow.run for arrow in found.arrows}
+    left_out = {"model-without-x_t-1-to-x_t"}
+    assert found.notes.keys() >= left_out
+    assert "residual" in found.notes[left_out.copy().pop()]
+    assert found.differences.keys() == runs - left_out
+    assert {path.name for path in fitted.iterdir()} == {
+        "ablation.json",
+        *(f"{run}-seed{seed}" for run in runs - left_out | {WHOLE} for seed in (0, 1)),
+    }
+    bounds = {name: found.comparison[name]["importance bound"].mean for name in found.comparison.rows}
+    for run, estimate in found.differences.items():
+        assert estimate.mean == pytest.approx(bounds[WHOLE] - bounds[run], abs=1e-9)
+        assert estimate.p_value() <= found.p_values[run] <= 1
+    reduced = dvae.load(fitted / "guide-without-x_t-to-z_t-seed1")
+    assert (reduced.model.generative.text, reduced.model.inference.text) == (PAIR[0], "q(z_t)")
+    assert "not fitted" in str(found)
+    assert fitted.with_name("arrows.png").stat().st_size > 0
+
+
+def test_the_same_command_continues_it(fitted, people, tmp_path):
+    out = tmp_path / "runs"
+    shutil.copytree(fitted, out)
+    shutil.rmtree(out / "model-without-z_t-1-to-z_t-seed0")
+    before = {path: path.stat().st_mtime_ns for path in out.glob("*/*")}
+    assert main(command(people, out)) == 0
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    again, first = (json.loads((each / "ablation.json").read_text()) for each in (out, fitted))
+    assert again == first
+
+
+def test_it_comes_back_from_json(fitted, priced):
+    for found in (priced, Ablation.load(fitted / "ablation.json")):
+        again = Ablation.from_json(found.to_json())
+        assert (str(again), again.to_json()) == (str(found), found.to_json())
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"generative": "p(z_t | z_{t-99999999}) p(x_t | z_t)"},
+        {"generative": "p(x_t | " + "z_t, " * 10_000 + "z_t) p(z_t)"},
+        {"generative": "p(z_t) p(x_t | z_t)"},
+        {"generative": 3},
+        {"inference": "q(z_t | "},
+        {"prices": {}},
+        {"prices": []},
+        {"prices": {"model-without-z_t-to-x_t": [0.1]}},
+        {"steps": float("inf")},
+        {"sizes": {"x": "many"}},
+        {"notes": 1},
+        {"comparison": 1},
+        {"comparison": {"rows": {}}},
+    ],
+)
+def test_what_is_no_ablation_is_refused(priced, damage):
+    document = json.loads(priced.to_json()) | damage
+    with pytest.raises(ValueError, match="not an ablation written by"):
+        Ablation.from_json(json.dumps(document))
+
+
+def test_prices_that_do_not_belong_together_are_refused(priced):
+    document = json.loads(priced.to_json())
+    for costs in ([], [0.1], [None, 0.1], [float("inf"), 0.1], [0.1] * 2000):
+        damaged = {**document, "prices": {**document["prices"], "model-without-z_t-to-x_t": costs}}
+        with pytest.raises(ValueError, match="not an ablation written by"):
+            Ablation.from_json(json.dumps(damaged))
+    with pytest.raises(ValueError, match="not an ablation written by"):
+        Ablation.from_json("[" * 100)
+
+
+def test_a_comparison_of_other_models_is_refused(fitted):
+    document = json.loads((fitted / "ablation.json").read_text())
+    rows = document["comparison"]["rows"]
+    rows["another"] = rows.pop(WHOLE)
+    with pytest.raises(ValueError, match="not an ablation written by"):
+        Ablation.from_json(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "give the name of a method, or --generative"),
+        (["srnn", "--generative", DKF], "give the name of a method, or --generative"),
+        (["srnn", "--inference", SMOOTHER], "--inference is the guide of --generative; srnn has its own"),
+        (["hit-dvae"], "an ablation is of vae, dkf, storn"),
+        (["srnm"], "did you mean 'srnn'?"),
+        (["srnn", "--steps", "3"], "give --out DIR"),
+        (["srnn", "--data", "people.npz"], "give --out DIR"),
+        (["srnn", "--twins", "0"], "--twins is 0"),
+        (["srnn", "--network", "recurent"], "did you mean 'recurrent'?"),
+        (["--generative", "p(z_t"], "expected"),
+    ],
+)
+def test_wrong_arguments_are_told_before_any_work(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["ablate", *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert not [*tmp_path.iterdir()]
+
+
+def test_fits_need_data_and_a_directory(tmp_path):
+    with pytest.raises(ValueError, match="give both `data` and `out`"):
+        dvae.ablate((DKF, SMOOTHER), out=tmp_path)
