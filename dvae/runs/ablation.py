@@ -3,8 +3,11 @@
 Two prices, which answer two questions. On linear-Gaussian twins (`dvae.oracle`) it is computed: the evidence that a
 model loses without an arrow, and how much wider the gap of a guide becomes. It says which arrows can matter. On data it
 is measured: the whole and every reduced pair of equations are fitted with the same seeds (`sweep`) and compared on the
-test windows (`compare`): how much lower the importance-weighted bound is without the arrow, with its errors over clips
-and seeds, and a p-value for all arrows at once (Holm, 1979).
+test windows (`compare`), with errors over clips and seeds, and p-values for all arrows at once (Holm, 1979).
+
+Both prices are of the same: of a model's arrow the evidence, on data the importance-weighted bound, which is near it
+whatever the guide; of a guide's arrow the evidence lower bound, from which an importance-weighted one is made to hide
+how far the guide is from the posterior.
 
 All pairs are fitted with networks of one kind (the method `equations`), as those of a paper are made for its arrows:
 SRNN's three factors share the state of x_{<t}, and none of them could do without it alone.
@@ -46,6 +49,8 @@ from .sweep import ENDED, sweep
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+METRIC = {"p": "importance bound", "q": "ELBO"}
+"""By which arrows of a model, and of a guide, are priced on data."""
 WHOLE = "whole"
 """The run of all arrows."""
 FAMILY = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "autoregressive")
@@ -123,11 +128,11 @@ class Ablation(Result):
 
     @cached_property
     def differences(self) -> dict[str, Estimate]:
-        """By `Arrow.run`, what the bound of the whole is above that without the arrow, in nats a frame."""
+        """By `Arrow.run`, what the whole has above that without the arrow, by its `METRIC`, in nats a frame."""
         if self.comparison is None:
             return {}
-        fitted = [arrow.run for arrow in self.arrows if arrow.run in self.comparison.rows]
-        return {run: self.comparison.difference(WHOLE, run) for run in fitted}
+        fitted = [arrow for arrow in self.arrows if arrow.run in self.comparison.rows]
+        return {arrow.run: self.comparison.difference(WHOLE, arrow.run, METRIC[arrow.kind]) for arrow in fitted}
 
     @property
     def p_values(self) -> dict[str, float]:
@@ -145,8 +150,8 @@ class Ablation(Result):
         ]
         if self.comparison is not None:
             lines += [
-                f"fitted: bound (K = {self.comparison.particles}) of the whole minus that without the arrow, in nats a "
-                f"{self._frame},",
+                f"fitted: what the whole has more, of the model in the bound of K = {self.comparison.particles}, of "
+                f"the guide in the ELBO, in nats a {self._frame},",
                 "± standard errors over clips ± over seeds; 95 % from both; p: for all arrows at once (Holm)",
             ]
         table = Table(title=f"{self.generative.text}\n{self.inference.text}".strip(), caption="\n".join(lines))
@@ -167,15 +172,15 @@ class Ablation(Result):
     def plot(self) -> Figure:
         """Model and guide of one step, arrows as thick as their price: on twins and, where there are fits, on data."""
         parts = [part for part in (self.generative, self.inference) if part.factors]
-        rows = [("nats a sequence, on twins", {run: float(np.mean(costs)) for run, costs in self.prices.items()})]
-        unsure = {run for run, p in self.p_values.items() if not p < LEVEL}
+        on_twins = {run: float(np.mean(costs)) for run, costs in self.prices.items()}
+        rows: list[tuple[str, dict[str, float], set[str]]] = [("nats a sequence, on twins", on_twins, set())]
         if self.comparison is not None:
             fitted = {run: estimate.mean for run, estimate in self.differences.items()}
-            rows.append((f"nats a {self._frame}, on data\n(pale: p ≥ {LEVEL})", fitted))
+            unsure = {run for run, p in self.p_values.items() if not p < LEVEL}
+            rows.append((f"nats a {self._frame}, on data\n(pale: p ≥ {LEVEL})", fitted, unsure))
         figure = canvas(5 * len(parts), 3.6 * len(rows))
         panels = figure.subplots(len(rows), len(parts), squeeze=False)
-        for (unit, costs), row in zip(rows, panels, strict=True):
-            pale = unsure if costs is not rows[0][1] else set()
+        for (unit, costs, pale), row in zip(rows, panels, strict=True):
             top = max(costs.values(), default=0.0)
             for part, panel in zip(parts, row, strict=True):
                 graph = part.slice(self.observed)
