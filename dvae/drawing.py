@@ -90,16 +90,8 @@ def draw_slice(
             (x, y), (to_x, to_y) = (place[node] for node in edge)
             middle = (x + to_x + bend * (to_y - y)) / 2, (y + to_y - bend * (to_x - x)) / 2
             box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-            ax.text(
-                middle[0],
-                middle[1],
-                f"{round(cost, 3) + 0.0:.3f}",
-                ha="center",
-                va="center",
-                fontsize=8,
-                bbox=box,
-                zorder=5,
-            )
+            how: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "bbox": box, "zorder": 5}
+            ax.text(middle[0], middle[1], f"{round(cost, 3) + 0.0:.3f}", **how)
     return _finished(ax)
 
 

@@ -7,6 +7,7 @@ import torch
 import tyro
 
 import dvae
+from dvae.inference.estimates import number
 
 from .pages import DOCS, code, write
 
@@ -54,7 +55,8 @@ DERIVED = ("DKF", "SRNN", "DSAE", "HiT-DVAE", "two layers")
 
 def spread(price: torch.Tensor) -> str:
     """Mean, least and largest over random models."""
-    return f"{price.mean():.3f} ({price.min():.3f} to {price.max():.3f})"
+    mean, least, largest = (number(float(value)) for value in (price.mean(), price.min(), price.max()))
+    return f"{mean} ({least} to {largest})"
 
 
 def derived(names: Sequence[str]) -> str:

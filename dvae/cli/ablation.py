@@ -76,11 +76,9 @@ def ablate(
         raise UsageError("fits need a directory for their runs: give --out DIR")
     if out is not None and (out.is_file() or not seeds):
         raise UsageError(f"give at least one seed, and a directory for the runs: --out {out} --seeds {seeds}")
-    guide = FAITHFUL if inference is None else inference
     with arguments():
-        named = (
-            registry.method(method) if method is not None else Equations(generative=generative or "", inference=guide)
-        )
+        guide = FAITHFUL if inference is None else inference
+        named = registry.method(method) if method else Equations(generative=generative or "", inference=guide)
         given = {**vars(model), **vars(networks), "latent": latent}
         chosen = {name: value for name, value in given.items() if value is not None}
         replace(as_equations(named), **chosen).check()
