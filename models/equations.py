@@ -9,7 +9,9 @@ from typing import Annotated, Any
 
 from typing_extensions import override
 
+from ..inversion import guide
 from ..networks import Attention, Dense, Linear, NetworkSpec, Recurrent
+from ..notation import Factorization
 from ..options import Range, Size, nearest
 from ..program.model import DynamicalVAE
 from ..program.summed import LARGEST, Discrete
@@ -50,6 +52,12 @@ class Equations(LatentMethod):
                 raise ValueError(
                     f"{name} reads {lag[0][:20]} steps away; a lag is at most 999, or write {{<t}} for any"
                 )
+
+    @override
+    def equations(self) -> tuple[Factorization, Factorization]:
+        """The model and its guide, to which states are unknown."""
+        generative = Factorization.parse(self.generative)
+        return generative, guide(generative, self.inference, summed=self.states)
 
     @override
     def sizes(self) -> dict[str, int]:

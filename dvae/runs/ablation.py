@@ -267,6 +267,11 @@ def as_equations(method: Method | tuple[str, str], schema: Schema | None = None)
         generative, inference = method
         return Equations(generative=generative, inference=inference)
     if isinstance(method, Equations):
+        if method.states:
+            raise ValueError(
+                f"{', '.join(method.states)} is summed out, and twins with states have no price that is known; fit the "
+                "reduced equations by a sweep (--grid), and compare them"
+            )
         return method
     if method.name not in FAMILY:
         raise ValueError(

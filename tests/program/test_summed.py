@@ -287,5 +287,9 @@ def test_refusals_of_runs():
 def test_a_method_of_ones_own_has_states():
     method = dvae.method("equations", generative=HMM[0], inference="", states={"k": 4})
     assert method.build({"x": 3}).sums.sizes == {"k": 4}
+    method = dvae.method("equations", generative=SWITCHING[0], inference="faithful", states={"k": 2})
+    assert method.build({"x": 3}).inference.text == "q(z_t | z_{<t}, x_{>=t})"
+    with pytest.raises(ValueError, match="twins with states have no price"):
+        dvae.ablate(method)
     with pytest.raises(ValueError, match="states"):
         dvae.method("equations", generative=HMM[0], inference="", states={"k": 1}).check()
