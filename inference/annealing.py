@@ -35,6 +35,7 @@ from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import log_densities, require_data, require_likelihood, total
 from .held import reproducibly
+from .latents import joined, split
 from .result import progress_bar
 
 ACCEPTED = 0.8
@@ -167,9 +168,9 @@ class _Annealing:
         self.inverse = (1 - torch.cos(math.pi * torch.arange(temperatures + 1) / temperatures)).double() / 2
         self.levels = range(1, temperatures)
         draws = [model.guide(self.data) for _ in range(math.ceil(DRAWS / chains))]
-        self.shapes = {name: draws[0][name].shape[1:] for name in model.latents}
-        joined = torch.stack([self._joined(each) for each in draws]).unflatten(1, (chains, -1))
-        self.scale = joined.flatten(0, 1).std(0).clamp(min=1e-6).repeat(chains, 1)
+        self.like = {name: draws[0][name] for name in model.latents}
+        drawn = torch.stack([self._joined(each) for each in draws]).unflatten(1, (chains, -1))
+        self.scale = drawn.flatten(0, 1).std(0).clamp(min=1e-6).repeat(chains, 1)
 
     def lengths(self) -> dict[int, Tensor]:
         """Of steps at each temperature, (B,), by chains that count for nothing else."""
@@ -244,15 +245,11 @@ class _Annealing:
 
     def _densities(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """log p(x, z) and log q(z | x), (R,) each."""
-        values = self._split(points)
+        values = split(points, self.like)
         programs = (self.model.model, self.model.guide)
         traces = (poutine.trace(poutine.condition(each, data=values)).get_trace(self.data) for each in programs)
         joint, own = (total(log_densities(trace)) for trace in traces)
         return joint, own
 
     def _joined(self, values: Mapping[str, Tensor]) -> Tensor:
-        return torch.cat([values[name].flatten(1) for name in self.model.latents], 1)
-
-    def _split(self, points: Tensor) -> dict[str, Tensor]:
-        parts = points.split([math.prod(shape) for shape in self.shapes.values()], 1)
-        return {name: part.unflatten(1, shape) for (name, shape), part in zip(self.shapes.items(), parts, strict=True)}
+        return joined({name: values[name] for name in self.model.latents})

@@ -25,6 +25,7 @@ from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import require_likelihood
 from .held import on_device_of, reproducibly
+from .latents import quantities
 from .result import Result, Table, canvas, progress_bar
 
 if TYPE_CHECKING:
@@ -305,12 +306,7 @@ def calibrate(
             turn = torch.arange(start, min(start + at_once, simulations))
             given = on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
             ranks.append(_ranks(model, infer, given, len(turn), length, draws, torch.tensor(kept) - 1))
-    names = [
-        f"{name}{step}[{d}]"
-        for name in model.latents
-        for step in ([f"_{t}" for t in kept] if model.generative.local(name) else [""])
-        for d in range(model.sizes[name])
-    ]
+    names = quantities(model, kept)
     equations = {"generative": model.generative.text} | ({} if guide else {"inference": model.inference.text})
     return Calibration(torch.cat(ranks).numpy(), (*names, LOG_JOINT), draws, length, seed, equations)
 

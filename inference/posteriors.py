@@ -29,10 +29,10 @@ from ..options import Count, Delay, Positive, Size, check
 from ..program.batch import repeat, rows
 from ..turns import alone
 from .bounds import ImportanceBound, importance_mean
+from .latents import Values, joined, split
 from .result import progress_bar
 
 _Program = Callable[[Any], Any]
-Values = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True)
@@ -111,19 +111,19 @@ class Posterior:
     @property
     def deviation(self) -> dict[str, Tensor]:
         """Latent to standard deviations (B, ...)."""
-        return _split(self.factor.norm(dim=-1), self.mode)
+        return split(self.factor.norm(dim=-1), self.mode)
 
     def draw(self, n: int, seed: int = 0) -> dict[str, Tensor]:
         """Latent to draws (n, B, ...) from the normal."""
-        return _split(_joined(self.mode) + self._away(n, torch.Generator().manual_seed(seed)), self.mode)
+        return split(joined(self.mode) + self._away(n, torch.Generator().manual_seed(seed)), self.mode)
 
     def guide(self, batch: Any = None) -> dict[str, Tensor]:
         """The normal as a Pyro guide of the program, on the same batch."""
         with pyro.plate("sequences", len(self.factor)):
-            law = dist.MultivariateNormal(_joined(self.mode), scale_tril=self.factor)
+            law = dist.MultivariateNormal(joined(self.mode), scale_tril=self.factor)
             flat = pyro.sample("_latents", law, infer={"is_auxiliary": True})
-            split = _split(flat, self.mode).items()
-            return {name: pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 1)) for name, value in split}
+            values = split(flat, self.mode).items()
+            return {name: pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 1)) for name, value in values}
 
     @alone
     @torch.no_grad()
@@ -145,7 +145,7 @@ class Posterior:
 
         def log_weights(count: int) -> Tensor:
             away = self._away(count, generator)
-            drawn = _split((_joined(self.mode) + away).flatten(0, 1), self.mode)
+            drawn = split((joined(self.mode) + away).flatten(0, 1), self.mode)
             return -_energy(program, repeat(batch, count), drawn) - law.log_prob(away).flatten()
 
         return importance_mean(log_weights, len(self.factor), particles, chunk)
@@ -255,7 +255,7 @@ class _Search:
             self.went()
         left = -(gradient * step).sum(-1) / 2
         return Posterior(
-            _split(values, self.latents),
+            split(values, self.latents),
             self._measured(batch, values),
             energies.gather(0, order),
             course[:, best, each],
@@ -281,7 +281,7 @@ class _Search:
             )
         drawn = [self._drawn(self.program) for _ in range(self.descent.candidates)]
         guided = [self._drawn(self.program) | self._drawn(self.guide) for _ in drawn] if self.guide else []
-        every = torch.stack([torch.stack([_joined(each) for each in drawn]).mean(0), *map(_joined, drawn + guided)])
+        every = torch.stack([torch.stack([joined(each) for each in drawn]).mean(0), *map(joined, drawn + guided)])
         energies = torch.stack([self._measured(self.batch, each) for each in every]).nan_to_num(torch.inf)
         starts, each = self.descent.starts, torch.arange(self.size)
         return torch.stack([every[n::starts][energies[n::starts].argmin(0), each] for n in range(starts)])
@@ -311,11 +311,11 @@ class _Search:
         return values.detach().unflatten(0, starts.shape[:2]), torch.stack(course).unflatten(1, starts.shape[:2])
 
     def _energy(self, batch: Any, values: Tensor, sites: Collection[str] | None = None) -> Tensor:
-        return _energy(self.program, batch, _split(values, self.latents), sites)
+        return _energy(self.program, batch, split(values, self.latents), sites)
 
     def _renewed(self, batch: Any, values: Tensor) -> Any:
         with torch.no_grad():
-            return self.renew(batch, _split(values, self.latents))
+            return self.renew(batch, split(values, self.latents))
 
     def _measured(self, batch: Any, values: Tensor) -> Tensor:
         with torch.no_grad():
@@ -371,19 +371,6 @@ def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     upper = torch.linalg.qr((white.mT @ directions / values.clamp(min=1.0)[..., None, :].sqrt()).mT)[1]
     signs = upper.diagonal(dim1=-2, dim2=-1).sign()
     return (upper * signs[..., None]).mT.to(kind), bent
-
-
-def _joined(values: Values) -> Tensor:
-    """(..., B, P) of latents (..., B, ...), of which all but one dimension is of a sequence."""
-    return torch.cat([value.reshape(len(value), -1) for value in values.values()], -1)
-
-
-def _split(flat: Tensor, like: Values) -> dict[str, Tensor]:
-    """Latents (..., ...) of (..., P), in the shapes of these."""
-    shapes = {name: value.shape[1:] for name, value in like.items()}
-    parts = flat.split([shape.numel() for shape in shapes.values()], -1)
-    each = zip(shapes.items(), parts, strict=True)
-    return {name: part.reshape(*part.shape[:-1], *shape) for (name, shape), part in each}
 
 
 def _together(parts: Sequence[Posterior]) -> Posterior:
