@@ -41,9 +41,11 @@ if TYPE_CHECKING:
     from .inference.objectives import Evidence
     from .inference.particles import particle_bound
     from .inference.posteriors import Descent, Posterior, posterior
+    from .inference.stein import stein_discrepancy
     from .inference.svi import SVI
     from .inference.training import Stage, Training
     from .inference.traversal import traverse
+    from .inference.yardstick import reference_posterior
     from .inversion import faithful
     from .models.registry import method, methods
     from .notation import Factorization
@@ -100,7 +102,9 @@ __all__ = [
     "posterior",
     "predictive_checks",
     "price",
+    "reference_posterior",
     "schedules",
+    "stein_discrepancy",
     "tables",
     "traverse",
     "twin",
@@ -126,9 +130,11 @@ _PLACES = {
         "inference.objectives": "Evidence",
         "inference.particles": "particle_bound",
         "inference.posteriors": "Descent Posterior posterior",
+        "inference.stein": "stein_discrepancy",
         "inference.svi": "SVI",
         "inference.training": "Stage Training",
         "inference.traversal": "traverse",
+        "inference.yardstick": "reference_posterior",
         "models.registry": "method methods",
         "notation": "Factorization",
         "inversion": "faithful",

@@ -144,7 +144,8 @@ class Inferred:
         for some in u.split(CHUNK):
             with torch.enable_grad():
                 some = some.detach().requires_grad_()
-                parts.append(torch.autograd.grad(self.log_joint(some).sum(), some)[0])
+                (slope,) = torch.autograd.grad(self.log_joint(some).sum(), [some])
+                parts.append(slope)
         return torch.cat(parts)
 
     def whole(self, values: Tensor) -> Tensor:
@@ -157,4 +158,5 @@ class Inferred:
         sites = poutine.trace(self.guide).get_trace(repeat(self.data, n)).nodes
         if missing := [name for name in self.model.latents if name not in sites]:
             raise ValueError(f"the guide draws no {', '.join(missing)}; it needs one site for each latent")
-        return {name: sites[name]["value"].detach() for name in self.model.latents}
+        values: dict[str, Any] = {name: sites[name]["value"] for name in self.model.latents}
+        return {name: value.detach() for name, value in values.items()}

@@ -40,7 +40,7 @@ RHAT, EFFECTIVE = 1.01, 100
 """Largest R-hat, and least effective sample size for each chain, of chains that have converged (Vehtari et al., 2021,
 arXiv 1903.08008)."""
 
-_MOST = 2**24  # correlations
+_MOST = 2**22  # correlations, of which a file holds two times as many
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +171,10 @@ class ReferencePosterior(Result):
     def pairs(self) -> dict[str, np.ndarray]:
         """What pairs of numbers have in common, "z, between steps" or "w with z", to (Q, Q), each pair once."""
         latent, step, _ = self._places
-        there, same = np.isfinite(self.lack).any(0) & np.tri(len(latent), k=-1, dtype=bool).T, np.equal.outer(step, step)
+        there, same = (
+            np.isfinite(self.lack).any(0) & np.tri(len(latent), k=-1, dtype=bool).T,
+            np.equal.outer(step, step),
+        )
         found = {}
         for (one, name), (other, after) in combinations_with_replacement(enumerate(self.shapes), 2):
             both = there & np.logical_and.outer(latent == one, latent == other)
@@ -186,7 +189,11 @@ class ReferencePosterior(Result):
     @property
     def verdict(self) -> str:
         """One sentence on the reference."""
-        return "the reference is exact, as the model is linear-Gaussian" if self.sampling is None else self.sampling.verdict
+        return (
+            "the reference is exact, as the model is linear-Gaussian"
+            if self.sampling is None
+            else self.sampling.verdict
+        )
 
     def table(self) -> Group:
         """Of every latent, bias and ratio of deviations; of every kind of pair, correlations; and how NUTS fared."""
@@ -204,7 +211,9 @@ class ReferencePosterior(Result):
             moments.add_row(name, *numbers, self._called(*map(int, worst)), f"{mean} ({least} to {most})")
         correlations = Table(title="correlations", caption=self.verdict)
         for column in ("of", "pairs", "reference (rms)", "guide (rms)", "most lacking", "reference", "guide"):
-            correlations.add_column(column, justify="left" if column in ("of", "most lacking") else "right", no_wrap=True)
+            correlations.add_column(
+                column, justify="left" if column in ("of", "most lacking") else "right", no_wrap=True
+            )
         for kind, some in self.pairs.items():
             lack = np.where(some, abs(self.lack), np.nan)
             sequence, one, other = np.unravel_index(np.nanargmax(lack), lack.shape)
@@ -227,7 +236,11 @@ class ReferencePosterior(Result):
             table.add_column(column, justify="left" if column == "at" else "right", no_wrap=True)
         for place, sequence in enumerate(self.sequences):
             worst = int(np.nanargmax(sampling.rhat[place]))
-            numbers = f"{np.nanmin(sampling.effective[place]):.0f}", sampling.divergences[place], sampling.evaluations[place]
+            numbers = (
+                f"{np.nanmin(sampling.effective[place]):.0f}",
+                sampling.divergences[place],
+                sampling.evaluations[place],
+            )
             table.add_row(str(sequence), f"{sampling.rhat[place, worst]:.3f}", self.names[worst], *map(str, numbers))
         return table
 
@@ -245,34 +258,43 @@ class ReferencePosterior(Result):
         rows: dict[tuple[str, str], np.ndarray] = {}
         for place, (name, (steps, size)) in enumerate(self.shapes.items()):
             own = latent == place
-            rows |= {(name, f"{name}[{d}]"): own & (coordinate == d) for d in range(size)} if steps else {(name, name): own}
+            rows |= (
+                {(name, f"{name}[{d}]"): own & (coordinate == d) for d in range(size)} if steps else {(name, name): own}
+            )
         shown = sorted(rows.items(), key=lambda row: -float(np.nanmean(off[row[1]])))[:panels]
         figure = canvas(10.0, 6.2)
-        top, bottom = figure.subfigures(2, 1)
+        top, bottom = figure.subfigures(2, 1, squeeze=False)[:, 0]
         for panel, ((name, title), some) in zip(top.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
             local = self.shapes[name][0] > 0
             across = (step if local else coordinate)[some]
             for part, colour, called in ((self.reference, "0.35", "reference"), (self.guide, "C0", "guide")):
                 mean, deviation = part.mean[sequence, some], part.deviation[sequence, some]
                 if local:
-                    panel.fill_between(across, mean - 2 * deviation, mean + 2 * deviation, color=colour, alpha=0.25, lw=0)
+                    panel.fill_between(
+                        across, mean - 2 * deviation, mean + 2 * deviation, color=colour, alpha=0.25, lw=0
+                    )
                     panel.plot(across, mean, color=colour, label=called)
                 else:
-                    panel.errorbar(across + 0.2 * (called == "guide"), mean, 2 * deviation, fmt="o", color=colour, label=called)
+                    panel.errorbar(
+                        across + 0.2 * (called == "guide"), mean, 2 * deviation, fmt="o", color=colour, label=called
+                    )
             panel.set_title(title, fontsize=8, parse_math=False)
             panel.set_xlabel("step" if local else "coordinate", fontsize=8)
+            panel.set_xlim(across[0] - 0.5, across[-1] + 0.5)
+            panel.xaxis.get_major_locator().set_params(integer=True)
             panel.tick_params(labelsize=7)
         top.axes[0].legend(fontsize=7)
         scatter, *images = bottom.subplots(1, 3)
         for place, name in enumerate(self.shapes):
             own = latent == place
-            scatter.plot(self.reference.deviation[:, own].ravel(), self.guide.deviation[:, own].ravel(), ".", label=name)
+            scatter.plot(
+                self.reference.deviation[:, own].ravel(), self.guide.deviation[:, own].ravel(), ".", label=name
+            )
         ends = [f(part.deviation) for f, part in ((np.nanmin, self.reference), (np.nanmax, self.reference))]
         scatter.plot(ends, ends, color="0.4", linewidth=0.8)
-        scatter.set(xscale="log", yscale="log")
         scatter.set_xlabel("deviation, reference", fontsize=8)
         scatter.set_ylabel("deviation, guide", fontsize=8)
-        scatter.tick_params(labelsize=7, which="both")
+        scatter.tick_params(labelsize=7)
         scatter.legend(fontsize=7)
         for panel, part, called in zip(images, (self.reference, self.guide), ("reference", "guide"), strict=True):
             image = panel.imshow(part.correlation[sequence], cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
@@ -284,11 +306,11 @@ class ReferencePosterior(Result):
         return figure
 
     def document(self) -> dict[str, Any]:
-        """Everything, in JSON's types; correlations to four digits."""
+        """Everything, in JSON's types."""
         said: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         for name in ("guide", "reference"):
-            said[name] = plain(asdict(said[name]) | {"correlation": said[name].correlation.round(4)})
-        said["sampling"] = None if self.sampling is None else plain(asdict(self.sampling))
+            said[name] = asdict(said[name])
+        said["sampling"] = None if self.sampling is None else asdict(self.sampling)
         return {**plain(said), "verdict": self.verdict}
 
     def to_json(self) -> str:
@@ -315,7 +337,9 @@ class ReferencePosterior(Result):
             moments = {name: read(Moments, said.pop(name)) for name in ("guide", "reference")}
             sampling = said.pop("sampling")
             sampling = None if sampling is None else read(Sampling, sampling)
-            return cls(**moments, shapes=shapes, names=names, sequences=sequences, sampling=sampling, **said)
+            kinds = {"guide_draws": int, "seed": int, "equations": dict}
+            told = {name: kind(said.pop(name)) for name, kind in kinds.items()}
+            return cls(**moments, shapes=shapes, names=names, sequences=sequences, sampling=sampling, **told, **said)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ValueError(
                 f"this is not a reference posterior written by ReferencePosterior.to_json: {error!r}"
@@ -425,7 +449,8 @@ def reference_posterior(
             fared.append((*_diagnosed(inferred, drawn), divergences, evaluations))
     sampling = None
     if fared:
-        sampling = Sampling(*map(np.array, zip(*fared, strict=True)), chains, draws, warmup)  # type: ignore[call-arg]
+        rhat, effective, diverged, evaluated = map(np.array, zip(*fared, strict=True))
+        sampling = Sampling(rhat, effective, diverged, evaluated, chains, draws, warmup)
     steps = max(steps for steps, _ in inferred.shapes.values())
     return ReferencePosterior(
         _together(guides),
@@ -461,7 +486,9 @@ def _nuts(
     start = inferred.drawn(chains)
     start[1::2] = inferred.prior(chains)[1::2]
     start = inferred.whitened(start)
-    for kind, log_joint in zip(("guide", "prior"), (inferred.log_joint(start)[first::2] for first in (0, 1)), strict=True):
+    for kind, log_joint in zip(
+        ("guide", "prior"), (inferred.log_joint(start)[first::2] for first in (0, 1)), strict=True
+    ):
         if not log_joint.isfinite().all():
             raise FloatingPointError(
                 f"the log joint is not finite at a draw from the {kind}, from where NUTS would start; see whether the "
@@ -491,20 +518,25 @@ def _moments(inferred: Inferred, draws: Tensor) -> Moments:
     flat = values.flatten(0, 1)
     deviation = flat.std(0)
     unit = (flat - flat.mean(0)) / deviation.clamp(min=1e-12)
-    errors = [array_stats.mcse(values.numpy(), chain_axis=0, draw_axis=1, method=what) for what in ("mean", "sd")]
+    # of the deviation by the squares' own effective number: NUTS goes back and forth, so that means have more
+    squares = (values - flat.mean(0)).square() / (2 * deviation.clamp(min=1e-12))
+    with np.errstate(invalid="ignore"):  # chains that stood still have no error
+        errors = [array_stats.mcse(each.numpy(), chain_axis=0, draw_axis=1) for each in (values, squares)]
+    across = inferred.whole(inferred.whole(unit.T @ unit / (len(flat) - 1)).T)
     told = flat.mean(0), deviation, *map(torch.as_tensor, errors)
-    mean, deviation, mean_error, deviation_error = (inferred.whole(each).numpy() for each in told)
-    across = inferred.whole(unit.T @ unit / (len(flat) - 1))
-    return Moments(mean, deviation, inferred.whole(across.T).T.numpy(), mean_error, deviation_error)
+    mean, spread, *within = (inferred.whole(each).numpy() for each in told)
+    return Moments(mean, spread, across.numpy(), *within)
 
 
 def _diagnosed(inferred: Inferred, draws: Tensor) -> Iterator[np.ndarray]:
-    """R-hat and effective draws of the bulk (Q,) of draws (C, N, P)."""
+    """R-hat and effective draws of the bulk (Q,) of draws (C, N, P); of chains that stood still, 1000 and 0."""
     from arviz_stats.base import array_stats
 
     for measure in (array_stats.rhat, array_stats.ess):
-        found = measure(draws.double().cpu().numpy(), chain_axis=0, draw_axis=1)
-        yield inferred.whole(torch.as_tensor(found)).numpy()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = measure(draws.double().cpu().numpy(), chain_axis=0, draw_axis=1)
+        still = 1000.0 if measure is array_stats.rhat else 0.0
+        yield inferred.whole(torch.as_tensor(np.nan_to_num(found, nan=still, posinf=still))).numpy()
 
 
 def _together(parts: Sequence[Moments]) -> Moments:

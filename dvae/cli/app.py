@@ -30,6 +30,7 @@ COMMANDS = {
     "sweep": ("fitting:sweep", "Fit methods with several seeds and sizes, several runs at a time."),
     "evaluate": ("judging:evaluate", "Score runs on test windows."),
     "criticise": ("judging:criticise", "Is a run's guide calibrated, and do its motions look like real ones?"),
+    "reference": ("judging:reference", "Put what a run's guide says of latents beside their posterior."),
     "compare": (
         "judging:compare",
         "Compare runs on test windows: bounds, paired differences with their errors, use of latents.",

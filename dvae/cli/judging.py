@@ -1,4 +1,4 @@
-"""Commands that judge runs: evaluate, criticise, compare."""
+"""Commands that judge runs: evaluate, criticise, reference, compare."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ import numpy as np
 import tyro
 
 from .. import files, motion
+from ..data import each as of_each
 from ..inference.calibration import calibrate
 from ..inference.checkpoints import CheckpointError, Run
 from ..inference.checks import predictive_checks
 from ..inference.compare import compare as compare_models
 from ..inference.evaluate import evaluate as evaluate_models
+from ..inference.stein import stein_discrepancy
+from ..inference.yardstick import reference_posterior
 from ..models.trajectories import TrajectoryModel
 from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
@@ -273,6 +276,60 @@ def criticise(
         batch_size=batch_size,
     )
     _add(document, "predictive", checks, path, figure, "checks")
+
+
+def reference(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str | None = None,
+    missing: Missing = False,
+    windows: int = 3,
+    frames: int | None = None,
+    draws: int = 1000,
+    chains: int = 4,
+    warmup: int = 500,
+    stein_draws: int = 500,
+    seed: int = 0,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Put what a run's guide says of latents beside their posterior, on some test windows.
+
+    First the kernel Stein discrepancy, which takes moments, then means, deviations and correlations beside those by
+    NUTS, which take minutes for each window: begin with a few frames. Prints the tables, and writes them to
+    reference.json in the run, or to --out, each as soon as it is there.
+
+    Args:
+        run: the run directory.
+        data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
+        windows: test windows, evenly spread.
+        frames: of a window, from its first one, of which latents are inferred; all by default.
+        draws: of each chain of NUTS.
+        chains: of each window.
+        warmup: draws of each chain before.
+        stein_draws: from the guide for the kernel Stein discrepancy.
+        seed: of the draws.
+        out: file to write instead of reference.json in the run.
+        figure: save the figures, with -stein and -reference added to this name.
+    """
+    at_least(1, windows=windows, frames=frames, warmup=warmup)
+    at_least(2, chains=chains, stein_draws=stein_draws)
+    at_least(4, draws=draws)
+    check_files(out, figure, ".json")
+    kind = opening.kind_of([run], data)
+    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion")
+    opening.note_unfinished([loaded])
+    opened = opening.data_of(data, loaded, missing=missing)
+    batch = opened.windows("test").all()
+    some = np.unique(np.linspace(0, len(batch["x"]) - 1, windows).round().astype(int))
+    kept = of_each(batch, lambda value: value[some, :frames] if value.dim() == 3 else value[some])
+    if "lengths" in kept and frames is not None:
+        kept = {**kept, "lengths": kept["lengths"].clamp(max=frames)}
+    document: dict[str, Any] = {"windows": some.tolist(), "frames": frames}
+    path = out or run / f"{opening.record('reference', loaded, opened)}.json"
+    found = stein_discrepancy(loaded.model, kept, draws=stein_draws, seed=seed)
+    _add(document, "stein", found, path, figure, "stein")
+    beside = reference_posterior(loaded.model, kept, draws=draws, chains=chains, warmup=warmup, seed=seed)
+    _add(document, "reference", beside, path, figure, "reference")
 
 
 def _add(document: dict[str, Any], part: str, result: Any, path: Path, figure: Path | None, drawn: str) -> None:
