@@ -133,7 +133,7 @@ class Inferred:
         if self._repeated[0] != len(u):
             self._repeated = len(u), repeat(self.data, len(u))
         flat = self._elsewhere.repeat(len(u), 1)
-        flat[:, self.there] = self.center + self.scale * u
+        flat[:, self.there] = (self.center + self.scale * u).to(flat)  # of single precision NUTS makes double
         program = poutine.condition(self.model.model, data=split(flat, self._like))
         with torch.backends.cudnn.flags(enabled=False):  # which has no gradients of recurrent networks in evaluation
             return total(log_densities(poutine.trace(program).get_trace(self._repeated[1])))

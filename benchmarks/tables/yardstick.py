@@ -55,7 +55,7 @@ def twin(inference: str, steps: int, count: int) -> tuple[dvae.DynamicalVAE, tor
 
 
 def normal(oracle: dvae.Oracle, wrong: str) -> Callable[..., None]:
-    """The posterior as a guide of latents z: right, or without correlations, or z_T too narrow by a third given all else."""
+    """The posterior as a guide: right, or without correlations, or with z_T too narrow by a third given all else."""
 
     def guide(batch: Any) -> None:
         mean, covariance = oracle.posterior(batch)
@@ -87,7 +87,7 @@ def neural(inference: str, x: torch.Tensor, fitting: int) -> dvae.DynamicalVAE:
     """A small model that was fitted to sequences."""
     torch.manual_seed(0)
     model = dvae.DynamicalVAE(MODEL, inference, {"z": 2, "x": 4}, dvae.networks.Recurrent(16))
-    dvae.fit(model, dvae.ArrayWindows(x), steps=fitting, progress=False)
+    dvae.fit(model, dvae.ArrayWindows(x, observed=LENGTH - 1), steps=fitting, progress=False)
     return model
 
 

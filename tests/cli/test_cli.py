@@ -20,6 +20,8 @@ import torch
 import dvae
 from dvae import motion
 from dvae.cli import main
+from dvae.inference.stein import SteinDiscrepancy
+from dvae.inference.yardstick import ReferencePosterior
 from dvae.motion.dataset import MotionData
 from dvae.runs import directory as runs
 
@@ -505,6 +507,20 @@ def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monke
     found = dvae.Evaluation.load("run/evaluation-people.json")
     assert found.data["fingerprint"] == windows.fingerprint
     assert set(found.rows) == {"zero velocity", "run", "second"}  # the neighbours went with the training data
+
+
+def test_a_guide_is_put_beside_its_posterior(capsys, run, tmp_path):
+    """Of so few draws the reference says that it has not converged; of the frames alone latents are inferred."""
+    few = ["--windows", "2", "--frames", "2", "--draws", "4", "--chains", "2", "--warmup", "1", "--stein-draws", "9"]
+    assert main(["reference", str(run), *few, "--figure", str(tmp_path / "a.png")]) == 0
+    document = json.loads((run / "reference.json").read_text())
+    reference = ReferencePosterior.from_json(json.dumps(document["reference"]))
+    assert reference.shapes == {"z": (2, 3)}
+    assert reference.sequences == (0, 1)
+    assert len(document["windows"]) == 2
+    assert SteinDiscrepancy.from_json(json.dumps(document["stein"])).numbers.tolist() == [6, 6]
+    assert "did not converge" in capsys.readouterr().out
+    assert {path.name for path in tmp_path.glob("*.png")} == {"a-stein.png", "a-reference.png"}
 
 
 def test_a_run_of_format_1_is_used_on_other_data_while_its_own_are_there(capsys, run, people, tmp_path):
