@@ -44,7 +44,7 @@ _MOST = 2**22  # correlations, of which a file holds two times as many
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
+class LatentMoments:
     """Of the latents of S sequences, Q numbers each; NaN at padding.
 
     Args:
@@ -121,8 +121,8 @@ class ReferencePosterior(Result):
         equations: of model and guide; no guide's where it was a program of one's own.
     """
 
-    guide: Moments
-    reference: Moments
+    guide: LatentMoments
+    reference: LatentMoments
     shapes: Shapes
     names: tuple[str, ...]
     sequences: tuple[int, ...]
@@ -334,7 +334,7 @@ class ReferencePosterior(Result):
             if count != len(names) or min(count, len(sequences)) < 1 or any(min(each) < 0 for each in shapes.values()):
                 raise ValueError(f"{len(names)} names of {count} numbers of {len(sequences)} sequences")
             read = partial(_read, shape=(len(sequences), count))
-            moments = {name: read(Moments, said.pop(name)) for name in ("guide", "reference")}
+            moments = {name: read(LatentMoments, said.pop(name)) for name in ("guide", "reference")}
             sampling = said.pop("sampling")
             sampling = None if sampling is None else read(Sampling, sampling)
             kinds = {"guide_draws": int, "seed": int, "equations": dict}
@@ -465,7 +465,7 @@ def reference_posterior(
     )
 
 
-def _exact(model: DynamicalVAE, data: Mapping[str, Any], inferred: Inferred) -> Moments | None:
+def _exact(model: DynamicalVAE, data: Mapping[str, Any], inferred: Inferred) -> LatentMoments | None:
     """Of a linear-Gaussian model, all of whose data were observed."""
     if {"lengths", "mask"} & data.keys():  # of which the oracle knows nothing
         return None
@@ -476,7 +476,7 @@ def _exact(model: DynamicalVAE, data: Mapping[str, Any], inferred: Inferred) -> 
     deviation = covariance.diagonal().sqrt()
     correlation = covariance / torch.outer(deviation, deviation)
     told = (mean[0], deviation, correlation, torch.zeros_like(deviation), torch.zeros_like(deviation))
-    return Moments(*(each.detach().double().cpu().numpy() for each in told))
+    return LatentMoments(*(each.detach().double().cpu().numpy() for each in told))
 
 
 def _nuts(
@@ -510,7 +510,7 @@ def _nuts(
     return inferred.center + inferred.scale * u, len(run.diagnostics()["divergences"]["chain 0"]), evaluations
 
 
-def _moments(inferred: Inferred, draws: Tensor) -> Moments:
+def _moments(inferred: Inferred, draws: Tensor) -> LatentMoments:
     """Of draws (C, N, P), with errors by their effective number."""
     from arviz_stats.base import array_stats  # over a second to import
 
@@ -525,7 +525,7 @@ def _moments(inferred: Inferred, draws: Tensor) -> Moments:
     across = inferred.whole(inferred.whole(unit.T @ unit / (len(flat) - 1)).T)
     told = flat.mean(0), deviation, *map(torch.as_tensor, errors)
     mean, spread, *within = (inferred.whole(each).numpy() for each in told)
-    return Moments(mean, spread, across.numpy(), *within)
+    return LatentMoments(mean, spread, across.numpy(), *within)
 
 
 def _diagnosed(inferred: Inferred, draws: Tensor) -> Iterator[np.ndarray]:
@@ -539,5 +539,7 @@ def _diagnosed(inferred: Inferred, draws: Tensor) -> Iterator[np.ndarray]:
         yield inferred.whole(torch.as_tensor(np.nan_to_num(found, nan=still, posinf=still))).numpy()
 
 
-def _together(parts: Sequence[Moments]) -> Moments:
-    return Moments(**{field.name: np.stack([getattr(part, field.name) for part in parts]) for field in fields(Moments)})
+def _together(parts: Sequence[LatentMoments]) -> LatentMoments:
+    return LatentMoments(
+        **{field.name: np.stack([getattr(part, field.name) for part in parts]) for field in fields(LatentMoments)}
+    )

@@ -33,7 +33,9 @@ def said(model: dvae.DynamicalVAE, x: torch.Tensor, **nuts: int) -> list[str]:
     steps = found.pairs["z, between steps"]
     least, most = np.nanmin(found.ratio), np.nanmax(found.ratio)
     reference, guide = (root_mean_square(part.correlation[:, steps]) for part in (found.reference, found.guide))
+    fared = found.sampling
     return [
+        *([] if fared is None else [f"{np.nanmax(fared.rhat):.3f}, {np.nanmin(fared.effective):.0f}"]),
         f"{root_mean_square(found.bias):.2f} ± {root_mean_square(found.bias_error):.2f}",
         f"{np.exp(np.log(found.ratio).mean()):.2f} ({least:.2f} to {most:.2f})",
         f"{reference:.2f}",
@@ -97,7 +99,7 @@ def main(
     sequences: int = 10,
     powers: int = 40,
     fitting: int = 1000,
-    draws: int = 200,
+    draws: int = 400,
 ) -> None:
     """Write the tables.
 
@@ -128,7 +130,7 @@ def main(
         bound = dvae.SequenceELBO(num_particles=20).terms(model, x[320:]).bound
         told = f"{bound.mean():.2f} ± {bound.std() / len(bound) ** 0.5:.2f}"
         rows.append([f"{code(GUIDES[name])}, {name}", told, *cells, f"{spent:.0f} s"])
-    write(page, table(["fitted guide", "bound", *COLUMNS, "CPU"], rows), name="fitted")
+    write(page, table(["fitted guide", "bound", "R-hat, draws", *COLUMNS, "CPU"], rows), name="fitted")
 
 
 if __name__ == "__main__":
