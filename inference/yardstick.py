@@ -502,8 +502,8 @@ def _nuts(
         return -inferred.log_joint(values["u"].unflatten(0, start.shape)).double().sum()
 
     kernel = NUTS(potential_fn=energy)
-    hook = lambda *_: went()  # noqa: E731
-    run = MCMC(kernel, draws, warmup, {"u": start.flatten()}, hook_fn=hook, disable_progbar=True)
+    started = {"u": start.flatten()}
+    run = MCMC(kernel, draws, warmup, started, hook_fn=lambda *_: went(), disable_progbar=True)
     with torch.enable_grad():
         run.run()
     u = run.get_samples()["u"].unflatten(1, start.shape).transpose(0, 1)
