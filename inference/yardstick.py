@@ -473,6 +473,7 @@ def _exact(model: DynamicalVAE, data: Mapping[str, Any], inferred: Inferred) -> 
         mean, covariance = Oracle(model, max(steps for steps, _ in inferred.shapes.values())).posterior(data)
     except ValueError:  # the networks or laws are others, or there is context
         return None
+    covariance = covariance if covariance.dim() == 2 else covariance[0]  # each sequence's own, with states summed out
     deviation = covariance.diagonal().sqrt()
     correlation = covariance / torch.outer(deviation, deviation)
     told = (mean[0], deviation, correlation, torch.zeros_like(deviation), torch.zeros_like(deviation))

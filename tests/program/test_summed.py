@@ -137,6 +137,20 @@ def test_every_bound_agrees():
     assert torch.equal(dvae.importance_bound(hmm, data, 3).bound, dvae.importance_bound(hmm, data, 3).bound)
 
 
+def test_nuts_finds_the_moments_of_the_mixture():
+    """The yardstick of a guide is exact where courses are counted, and drawn where all entries have a mask."""
+    pair = dvae.twin(SWITCHING[0], SWITCHING[1], {"k": Discrete(2), "z": 1, "x": 1}, 2, scale=1.0).requires_grad_(False)
+    x = pair.sample(1, 2)["x"]
+    exact = dvae.reference_posterior(pair, x, guide_draws=100, progress=False)
+    assert exact.exact
+    mask = torch.ones_like(x, dtype=torch.bool)
+    drawn = dvae.reference_posterior(
+        pair, {"x": x, "mask": mask}, draws=100, warmup=50, guide_draws=100, progress=False
+    )
+    away = (drawn.reference.mean - exact.reference.mean) / drawn.reference.mean_error
+    assert (abs(away) < 4.5).all()
+
+
 def test_annealing_brackets_what_is_summed():
     pair = dvae.twin(SWITCHING[0], SWITCHING[1], {"k": Discrete(2), "z": 1, "x": 1}, STEPS).requires_grad_(False)
     drawn, oracle = pair.sample(40, STEPS), dvae.Oracle(pair, STEPS)
