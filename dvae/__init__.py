@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .inference.checks import predictive_checks
     from .inference.compare import compare
     from .inference.comparison import Comparison
+    from .inference.conformal import Tubes, conformal
     from .inference.evaluate import evaluate
     from .inference.evaluation import Evaluation
     from .inference.fit import Fit, fit
@@ -80,12 +81,14 @@ __all__ = [
     "Terms",
     "Training",
     "ablate",
+    "Tubes",
     "alternatives",
     "annealed_bound",
     "arrow_prices",
     "audit",
     "calibrate",
     "compare",
+    "conformal",
     "evaluate",
     "faithful",
     "fit",
@@ -123,6 +126,7 @@ _PLACES = {
         "inference.checks": "predictive_checks",
         "inference.compare": "compare",
         "inference.comparison": "Comparison",
+        "inference.conformal": "Tubes conformal",
         "inference.evaluate": "evaluate",
         "inference.evaluation": "Evaluation",
         "inference.fit": "Fit fit",

@@ -1,6 +1,7 @@
 """Simulation-based calibration of a guide (Talts et al., 2018, arXiv 1804.06788), with the exact simultaneous test and
-envelope for discrete ranks of Säilynoja et al. (2022, arXiv 2103.10522), and with the log joint as a quantity that
-depends on the data (Modrák et al., 2023, arXiv 2211.02383).
+envelope for discrete ranks of Säilynoja et al. (2022, arXiv 2103.10522), and with two quantities of all latents
+together that depend on the data: the log joint (Modrák et al., 2023, arXiv 2211.02383) and the distance from a point
+(TARP: Lemos et al., 2023, arXiv 2302.03026).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from scipy import fft, special
 from torch import Tensor
 from typing_extensions import override
 
-from ..program.batch import AnyBatch, repeat
+from ..program.batch import repeat
 from ..program.model import DynamicalVAE
 from ..turns import alone
 from .bounds import require_likelihood
@@ -31,7 +32,7 @@ from .result import Result, Table, canvas, progress_bar
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LOG_JOINT = "log joint"
+LOG_JOINT, TARP = "log joint", "TARP"
 
 _MOST = 2**24  # simulations times draws, or quantities, that are read from a file
 
@@ -42,11 +43,12 @@ class Calibration(Result):
 
     Uniform ranks of single coordinates are necessary, not sufficient: a guide that ignores the data and draws from the
     prior has them. The rank of the log joint, log p(x, latents), tells such a guide, and one that misses dependence
-    between coordinates.
+    between coordinates. So does that of the latents' distance from a point which the data suggest: whose latents those
+    of the simulation with the nearest data are, of as many further ones as there are draws.
 
     Attributes:
         ranks: (N, Q), how many of the L draws lie below the truth.
-        names: of the Q quantities: "w[0]", "z_3[1]" (step from 1, coordinate from 0), "log joint".
+        names: of the Q quantities: "w[0]", "z_3[1]" (step from 1, coordinate from 0), "TARP", "log joint".
         draws: L.
         length: T of the simulated sequences.
         seed: of simulations and draws.
@@ -300,15 +302,28 @@ def calibrate(
         raise ValueError(f"the model reads the context {', '.join(missing)}; pass context={{name: values}}")
     infer = guide or model.guide
     at_once = max(1, chunk // draws)
-    ranks = []
+    ranks, places = [], torch.tensor(kept) - 1
+
+    def given(turn: Tensor) -> dict[str, Any]:
+        return on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
+
+    with reproducibly(model, seed + 1):  # other simulations than those that are ranked
+        points = _Points.of(model, given(torch.arange(draws)), draws, length, places)
     with reproducibly(model, seed), progress_bar(progress) as bar:
         for start in bar.track(range(0, simulations, at_once), description="simulations"):
             turn = torch.arange(start, min(start + at_once, simulations))
             given = on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
             ranks.append(_ranks(model, infer, given, len(turn), length, draws, torch.tensor(kept) - 1))
     names = quantities(model, kept)
+            ranks.append(_ranks(model, infer, given(turn), len(turn), length, draws, places, points))
+    names = [
+        f"{name}{step}[{d}]"
+        for name in model.latents
+        for step in ([f"_{t}" for t in kept] if model.generative.local(name) else [""])
+        for d in range(model.sizes[name])
+    ]
     equations = {"generative": model.generative.text} | ({} if guide else {"inference": model.inference.text})
-    return Calibration(torch.cat(ranks).numpy(), (*names, LOG_JOINT), draws, length, seed, equations)
+    return Calibration(torch.cat(ranks).numpy(), (*names, TARP, LOG_JOINT), draws, length, seed, equations)
 
 
 def envelope(count: int, draws: int, alpha: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -332,6 +347,60 @@ def envelope(count: int, draws: int, alpha: float = 0.05) -> tuple[np.ndarray, n
     return points, within.argmax(1) / count, 1 - within[:, ::-1].argmax(1) / count
 
 
+@dataclass(frozen=True)
+class _Points:
+    """Simulations, to give TARP a point for any data: the latents of those with the nearest data.
+
+    Args:
+        data: (M, F).
+        latents: (M, Q).
+    """
+
+    data: Tensor
+    latents: Tensor
+
+    @classmethod
+    def of(cls, model: DynamicalVAE, given: Mapping[str, Tensor], count: int, length: int, steps: Tensor) -> Self:
+        """So many new ones."""
+        drawn = _simulated(model, given, count, length)
+        return cls(_data(model, drawn), _coordinates(model, drawn, steps))
+
+    def distances(self, model: DynamicalVAE, batch: Mapping[str, Any], latents: Tensor) -> Tensor:
+        """(B,), of latents (B, Q), in standard deviations of each of them in the simulations."""
+        nearest = torch.cdist(_data(model, batch) / _scale(self.data), self.data / _scale(self.data)).argmin(1)
+        return ((latents - self.latents[nearest]) / _scale(self.latents)).norm(dim=1)
+
+
+def _scale(values: Tensor) -> Tensor:
+    """Standard deviations of columns; 1 of those that do not vary."""
+    scale = values.std(0, correction=0)
+    return torch.where(scale > 0, scale, 1.0)
+
+
+def _data(model: DynamicalVAE, batch: Mapping[str, Any]) -> Tensor:
+    """(B, F)."""
+    return torch.cat([batch[name].flatten(1) for name in model.observed], 1)
+
+
+def _coordinates(model: DynamicalVAE, latents: Mapping[str, Tensor], steps: Tensor) -> Tensor:
+    """(B, Q), of all latents at these steps."""
+    local = model.generative.local
+    return torch.cat(
+        [(latents[name][:, steps] if local(name) else latents[name]).flatten(1) for name in model.latents], 1
+    )
+
+
+def _simulated(model: DynamicalVAE, given: Mapping[str, Tensor], count: int, length: int) -> Mapping[str, Tensor]:
+    """Latents and data of so many sequences."""
+    truth = model.sample(count, length, given or None)
+    if wrong := [name for name in (*model.latents, *model.observed) if not truth[name].isfinite().all()]:
+        raise FloatingPointError(
+            f"a free run of {length} steps gave {', '.join(wrong)} that are not finite; simulate fewer steps, "
+            "or see whether the model has been fitted"
+        )
+    return truth
+
+
 def _ranks(
     model: DynamicalVAE,
     infer: Callable[..., Any],
@@ -340,22 +409,17 @@ def _ranks(
     length: int,
     draws: int,
     steps: Tensor,
+    points: _Points,
 ) -> Tensor:
     """Ranks (B, Q) of B simulations, latents and data, among the guide's draws of their latents."""
 
-    def quantities(batch: AnyBatch, latents: Mapping[str, Tensor]) -> Tensor:
+    def quantities(batch: Mapping[str, Any], latents: Mapping[str, Tensor]) -> Tensor:
         """(B, Q)."""
-        local = model.generative.local
-        ranked = [latents[name][:, steps] if local(name) else latents[name] for name in model.latents]
+        ranked = _coordinates(model, latents, steps)
         joint = torch.stack(list(model.log_joint(batch, latents).values())).sum(0)
-        return torch.cat([*(value.flatten(1) for value in ranked), joint[:, None]], 1)
+        return torch.cat([ranked, points.distances(model, batch, ranked)[:, None], joint[:, None]], 1)
 
-    truth = model.sample(count, length, given or None)
-    if wrong := [name for name in (*model.latents, *model.observed) if not truth[name].isfinite().all()]:
-        raise FloatingPointError(
-            f"a free run of {length} steps gave {', '.join(wrong)} that are not finite; simulate fewer steps, "
-            "or see whether the model has been fitted"
-        )
+    truth = _simulated(model, given, count, length)
     batch = {**given, **{name: truth[name] for name in model.observed}}
     repeated = repeat(batch, draws)
     sites = poutine.trace(infer).get_trace(repeated).nodes
@@ -458,6 +522,8 @@ def _reading(name: str, counts: np.ndarray, draws: int) -> str:
     spread = 2 * (likelihood - _likeliest_normal(counts, draws, log_spread=0.0)[1]) > 9
     if name == LOG_JOINT:  # of draws that are all near the mode, the truth is the least probable
         return ("draws improbable latents" if bias > 0 else "is too concentrated") if biased else "has another shape"
+    if name == TARP:  # the nearer draws are to each other, the nearer to a point among them
+        return ("is too concentrated" if bias > 0 else "is too dispersed") if biased else "has another shape"
     parts = ["is too narrow" if log_spread > 0 else "is too wide"] * spread
     parts += ["draws too low" if bias > 0 else "draws too high"] * biased
     return ", ".join(parts) or "has another shape"

@@ -120,7 +120,7 @@ def evaluate(
             rows[name] = Row(count, means, histograms=histograms)
         for name, each in models.items():
             with reproducibly(each, seed):
-                forecaster = _forecaster(each, held, samples, {"draw_emission": draw_emission, **(options or {})})
+                forecaster = forecaster_of(each, held, samples, {"draw_emission": draw_emission, **(options or {})})
                 means, histograms = judge.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
             if each.likelihood:
                 with reproducibly(each, seed):
@@ -224,13 +224,8 @@ class _Judge:
         held, found = self.held, []
         index = torch.arange(len(held.keys))
         for part in parts:
-            truth = held.futures[part]
-            forecasts = forecaster(part).cpu()
-            expected = (samples, *truth.shape)
-            if forecasts.shape != expected:
-                raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
-            refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
-            scored = forecasts.movedim(0, 1), truth, held.past(part), index[part]
+            forecasts = forecasts_of(name, forecaster, samples, held, part)
+            scored = forecasts, held.futures[part], held.past(part), index[part]
             found.append({measure.name: measure.function(*scored) for measure in measures})
         values = _concatenate(found)
         pooled = {measure.name: measure.pool(values[measure.name], held.places) for measure in measures}
@@ -295,9 +290,24 @@ def _references(
     return truths | {name: known[name] for name in asked}
 
 
-def _forecaster(model: Any, held: Held, samples: int, options: Mapping[str, Any]) -> Forecaster:
+def forecaster_of(model: Any, held: Held, samples: int, options: Mapping[str, Any]) -> Forecaster:
+    """Which windows to a model's K futures of each, with these options of its `forecast`."""
     horizon = held.futures.shape[1]
     return lambda part: model.forecast(on_device_of(model, held.past(part)), horizon, samples, **options)["x"]
+
+
+def forecasts_of(name: str, forecaster: Forecaster, samples: int, held: Held, part: slice) -> Tensor:
+    """Futures `(B, K, H, D)` of some windows, on the CPU.
+
+    Raises:
+        ValueError, FloatingPointError: forecasts of another shape, or that are not finite.
+    """
+    forecasts = forecaster(part).cpu()
+    expected = (samples, *held.futures[part].shape)
+    if forecasts.shape != expected:
+        raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
+    refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
+    return forecasts.movedim(0, 1)
 
 
 def _concatenate(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:

@@ -213,7 +213,8 @@ class Evaluation(Result):
         below, deviations = linearised(shares, np.array(list(self.clips.values())))
         if len(self.clips) == 1:
             return points, below - points, points * np.nan, points * np.nan
-        numbers = self.data["windows"] * (self.data["frames"] - self.protocol["observed"]) * self.data["coordinates"]
+        whole = (self.data["frames"] - self.protocol["observed"]) * self.data["coordinates"]
+        numbers = self.data["windows"] * self.basis.get(histogram, {}).get("numbers", whole)
         worth = effective_number(points, deviations, min(numbers, _MOST_RANKS))
         _, low, high = envelope(worth, len(points), alpha)
         return points, below - points, low - points, high - points

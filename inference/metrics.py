@@ -286,6 +286,33 @@ def pit_histogram(samples: Array, truth: Array, bins: int = 20) -> Tensor:
     return torch.stack([*inner, whole], -1).diff(dim=-1, prepend=whole[..., None] * 0)
 
 
+def tarp_histogram(samples: Array, truth: Array, reference: Array, bins: int = 20) -> Tensor:
+    """TARP (Lemos et al. 2023, arXiv 2302.03026): the PIT of the truth's distance from a point, as shares in bins.
+
+    The share of the samples in the ball around the point with the truth on its surface: uniform where they are of the
+    truth's law, wherever the point is, for every K and with ties, as in `pit_histogram`. Unlike the PIT of each number
+    it is of all of them together. Where it is uniform for all points that depend on what a forecast is told, the law of
+    the samples is that of the truth; points that do not depend on it pass samples that ignore it.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truth: `(..., T, D)`; what was not observed counts in no distance.
+        reference: `(..., T, D)`, the point; distances are Euclidean, over all numbers, in their units.
+        bins: their number.
+
+    Returns:
+        `(..., bins)`, in double precision, which add up to 1.
+    """
+    samples, truth = _paired(samples, truth)
+    reference, missing = torch.as_tensor(reference).to(truth), truth.isnan()
+
+    def distance(values: Tensor, point: Tensor, gaps: Tensor) -> Tensor:
+        return torch.where(gaps, 0.0, values - point).flatten(-2).norm(dim=-1)[..., None, None]
+
+    there = distance(truth, reference, missing).masked_fill(missing.all(-1, True).all(-2, True), torch.nan)
+    return pit_histogram(distance(samples, reference.unsqueeze(-3), missing.unsqueeze(-3)), there, bins)
+
+
 def coverage(samples: Array, truth: Array, level: float) -> Tensor:
     """Share of the numbers of the truth that lie in the central interval of K samples: `level` if calibrated.
 

@@ -6,9 +6,10 @@ a function of the windows that are evaluated on:
     speed = Measure("speed error", lambda forecasts, truth, past, index: ..., unit="m/s")
     dvae.evaluate(model, windows, scores=lambda windows: [*proper(windows), speed])
 
-`proper` are proper scoring rules, and `calibrated` adds coverage, sharpness and PIT: what there is to know of forecasts
-of any data. `by_column` has a score of every column alone, in its own unit. What a model explains (bound, importance
-bound, k-hat, KL, log score) needs the model and no forecasts; `dvae.evaluate` has options for it.
+`proper` are proper scoring rules, and `calibrated` adds coverage, sharpness, PIT and TARP: what there is to know of
+forecasts of any data. `by_column` has a score of every column alone, in its own unit, `by_frame` one of some frames,
+and `over_horizon` calibration at these. What a model explains (bound, importance bound, k-hat, KL, log score) needs the
+model and no forecasts; `dvae.evaluate` has options for it.
 """
 
 import math
@@ -21,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..data import Batch, HeldOutWindows, columns_of, mask_of, scales_of
+from ..data import Batch, HeldOutWindows, bridged, called, columns_of, gapped, mask_of, scales_of
 from . import metrics
 
 
@@ -213,11 +214,36 @@ PIT_VARIANCE = Measure("PIT variance", paired(metrics.pit_variance), "1/12", **_
 def calibrated(windows: HeldOutWindows) -> list[Measure]:
     """Proper scores, and whether forecasts are calibrated and how sharp they are, for any data.
 
-    Coverage at 50, 80, 90 and 95 %, width of the intervals of 90 %, mean and variance of the PIT, and its histogram,
-    for `Evaluation.plot_calibration`. Coverage at 95 % needs 39 forecasts of a window.
+    Coverage at 50, 80, 90 and 95 %, width of the intervals of 90 %, mean and variance of the PIT, and the histograms of
+    PIT and TARP, for `Evaluation.plot_calibration`. Coverage at 95 % needs 39 forecasts of a window.
     """
     width = _of_all(width_at(0.9), windows)
-    return [*proper(windows), *map(coverage_at, LEVELS), width, PIT_MEAN, PIT_VARIANCE, PIT]
+    return [*proper(windows), *map(coverage_at, LEVELS), width, PIT_MEAN, PIT_VARIANCE, PIT, tarp(windows)]
+
+
+def tarp(windows: HeldOutWindows, seed: int = 0) -> Measure:
+    """TARP of whole futures (`metrics.tarp_histogram`), one number of a window, as a histogram.
+
+    The point of a window is its last observed frame (or where each number was last seen), repeated, with a normal step
+    away from it at every frame and number, drawn from `seed`: it depends on the past and on no forecast, so that
+    forecasts which do not heed the past are told too. Steps and distances are in standard deviations of each column's
+    observed frames.
+    """
+    batch, observed = windows.all(), windows.protocol.observed
+    past = gapped(batch)[:, :observed].double()
+    scale = torch.from_numpy(np.nanstd(past.numpy(), (0, 1)))
+    scale = torch.where(scale > 0, scale, 1.0)
+    last = bridged(past, ~past.isnan())[:, -1:]
+    steps = torch.randn(
+        len(last), batch["x"].shape[1] - observed, len(scale), generator=torch.Generator().manual_seed(seed)
+    )
+    points = last / scale + steps
+
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        return metrics.tarp_histogram(forecasts / scale, truth / scale, points[index], BINS)
+
+    told = {"TARP": {"numbers": 1, "seed": seed}}  # of a window
+    return Measure("TARP", function, "share", **_CALIBRATED, bins=BINS, least=BINS - 1, basis=told)
 
 
 def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
@@ -237,7 +263,7 @@ def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
         ['CRPS, speed', 'CRPS, load']
     """
 
-    def of(place: int) -> Callable[[Tensor, Tensor, Batch, Tensor], Tensor]:
+    def of(place: int) -> Measure:
         column = slice(place, place + 1)
 
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
@@ -245,17 +271,69 @@ def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
                 raise ValueError(f"{len(columns)} columns ({', '.join(columns)}) are not the {truth.shape[-1]} of x")
             mask = mask_of(past)
             seen = {"x": past["x"][..., column]} | ({} if mask is None else {"mask": mask[..., column]})
-            found = measure.function(forecasts[..., column], truth[..., column], {**past, **seen}, index)
-            nothing = truth[..., place].isnan().all(-1)
-            return found.masked_fill(nothing.reshape(-1, *[1] * (found.ndim - 1)), torch.nan)
+            return measure.function(forecasts[..., column], truth[..., column], {**past, **seen}, index)
 
-        return function
+        return _part(measure, function, lambda truth: truth[..., column])
 
-    pool = means_of_those_that_count if measure.pool is clip_means else measure.pool
     return [
-        replace(measure, name=f"{measure.name}, {name}", function=of(place), unit=measure.unit or unit, pool=pool)
+        replace(of(place), name=f"{measure.name}, {name}", unit=measure.unit or unit)
         for place, (name, unit) in enumerate(columns.items())
     ]
+
+
+def by_frame(measure: Measure, frames: Sequence[int], frame: str = "frame") -> list[Measure]:
+    """A score at some frames of the future alone, named "PIT, frame 30"; `Evaluation.plot_horizon` draws them.
+
+    Args:
+        measure: of forecasts of any number of frames.
+        frames: which, the first of the future being 1.
+        frame: what one is called.
+
+    Raises:
+        ValueError: a frame beyond the future.
+
+    Example:
+        >>> [each.name for each in by_frame(CRPS, (1, 30))]
+        ['CRPS, frame 1', 'CRPS, frame 30']
+    """
+
+    def of(place: int) -> Measure:
+        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+            if not 1 <= place <= truth.shape[-2]:
+                raise ValueError(f"{frame} {place} is none of the {truth.shape[-2]} of the future, counted from 1")
+            return measure.function(forecasts[..., place - 1 : place, :], truth[..., place - 1 : place, :], past, index)
+
+        return _part(measure, function, lambda truth: truth[..., place - 1 : place, :])
+
+    return [replace(of(place), name=f"{measure.name}, {frame} {place}") for place in frames]
+
+
+def _part(
+    measure: Measure, function: Callable[[Tensor, Tensor, Batch, Tensor], Tensor], part: Callable[[Tensor], Tensor]
+) -> Measure:
+    """A score of a part of the future, of those windows of which something of it was observed."""
+
+    def known(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        found = function(forecasts, truth, past, index)
+        nothing = part(truth).isnan().all(-1).all(-1)
+        return found.masked_fill(nothing.reshape(-1, *[1] * (found.ndim - 1)), torch.nan)
+
+    pool = means_of_those_that_count if measure.pool is clip_means else measure.pool
+    return replace(measure, function=known, pool=pool)
+
+
+def over_horizon(windows: HeldOutWindows, frames: Sequence[int] | None = None) -> list[Measure]:
+    """Whether forecasts are calibrated, as a whole and at some frames of the future alone; see `calibrated`.
+
+    Args:
+        windows: that are evaluated on.
+        frames: which frames of the future, from 1; by default six, evenly spread from the first to the last.
+    """
+    horizon = windows.all()["x"].shape[1] - windows.protocol.observed
+    frames = frames or sorted({round(place) for place in np.linspace(1, horizon, 6)})
+    _, frame = called(windows.description)
+    alone = [*map(coverage_at, (0.5, 0.8, 0.9)), PIT]
+    return [*calibrated(windows), *(each for measure in alone for each in by_frame(measure, frames, frame))]
 
 
 Scores = Callable[[HeldOutWindows], Sequence[Measure]]
