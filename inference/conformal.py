@@ -228,7 +228,7 @@ class Tubes(Result):
 
     def _spread(self, forecasts: Tensor) -> Tensor:
         """Of forecasts (B, K, H, D): (B, H, D), or the one (H, D) of all."""
-        return forecasts.std(1) if self.spread is None else torch.as_tensor(self.spread).to(forecasts)
+        return _deviations(forecasts) if self.spread is None else torch.as_tensor(self.spread).to(forecasts)
 
     def _factor(self, region: str, like: Tensor) -> Tensor:
         return torch.as_tensor(self.factors[region]).to(like)
@@ -316,7 +316,7 @@ def conformal(
         found, count = [], 0
         for forecasts, truth in futures(held, "calibration"):
             count = forecasts.shape[1]
-            found.append(distances(forecasts, truth, forecasts.std(1) if spread is None else spread))
+            found.append(distances(forecasts, truth, _deviations(forecasts) if spread is None else spread))
     far = torch.cat(found)
     factors = {region: quantile(worst(far, region), places, level) for region in REGIONS}
     if not all(factor.isfinite().all() for factor in factors.values()):
@@ -345,6 +345,11 @@ def clips_alike(values: Tensor, clips: Tensor) -> list[float]:
     means, windows = np.array(clip_means(values, clips)), np.bincount(clips.numpy())
     found: list[float] = (means.mean() + (means - means.mean()) * windows.mean() / windows).tolist()
     return found
+
+
+def _deviations(forecasts: Tensor) -> Tensor:
+    """Standard deviations (B, H, D) of forecasts (B, K, H, D); of a single one 0."""
+    return forecasts.std(1, correction=min(1, forecasts.shape[1] - 1))
 
 
 def distances(forecasts: Tensor, truth: Tensor, spread: Tensor) -> Tensor:

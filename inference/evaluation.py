@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
@@ -23,6 +24,7 @@ from .scores import Metric
 from .uncertainty import clustered_variance, decimals, effective_number, linearised, student_interval
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
@@ -234,15 +236,7 @@ class Evaluation(Result):
         figure = canvas(0.8 + 2.4 * len(methods), 3.7)
         panels = figure.subplots(2, len(methods), squeeze=False, sharex=True, sharey="row")
         for (top, bottom), method in zip(panels.T, methods, strict=True):
-            clip_shares = np.array(self.rows[method].histograms[histogram]).T
-            bins = len(clip_shares)
-            shares, deviations = linearised(clip_shares, np.array(list(self.clips.values())))
-            errors = np.array([math.sqrt(clustered_variance(each)) for each in deviations])
-            edges = np.linspace(0, 1, bins + 1)
-            low, high = (bins * (shares + reach * errors) for reach in (-2, 2))
-            top.stairs(high, edges, baseline=low, fill=True, color="0.88")
-            top.stairs(bins * shares, edges, color="C0")
-            top.axhline(1, color="0.4", linewidth=0.8)
+            self._draw(top, method, histogram)
             top.set_title(f"{method}, K = {self.rows[method].samples}", fontsize=8, parse_math=False)
             points, departs, low, high = self.departure(method, histogram)
             bottom.fill_between(points, low, high, color="0.88", step="mid", linewidth=0)
@@ -254,8 +248,66 @@ class Evaluation(Result):
         panels[0, 0].set_ylabel(f"{histogram}\nover uniform", fontsize=8, parse_math=False)
         panels[1, 0].set_ylabel("ECDF\nless uniform", fontsize=8)
         figure.suptitle(self._title(), fontsize=9, parse_math=False)
-        figure.supxlabel("PIT of the true future among the forecasts", fontsize=8)
+        figure.supxlabel(f"{histogram} of the true future among the forecasts", fontsize=8, parse_math=False)
         return figure
+
+    def plot_horizon(self) -> Figure:
+        """For each method, histograms of the PIT at some frames of the future, and coverage over them.
+
+        Bands are two standard errors, clustered by clip; see `scores.over_horizon`.
+
+        Raises:
+            KeyError: no method has a histogram of a frame.
+        """
+        _, frame = called(self.data)
+
+        def at(score: str, names: Iterable[str]) -> dict[int, str]:
+            """Names of a score by frame."""
+            found = (re.fullmatch(rf"{re.escape(score)}, {re.escape(frame)} (\d+)", name) for name in names)
+            return {int(each[1]): each[0] for each in found if each}
+
+        shown = {name: found for name, row in self.rows.items() if (found := at("PIT", row.histograms))}
+        if not shown:
+            raise KeyError("no method has a histogram of a frame; evaluate with scores=over_horizon")
+        columns = max(map(len, shown.values())) + 1
+        figure = canvas(1 + 1.5 * columns, 0.9 + 1.7 * len(shown))
+        panels = figure.subplots(len(shown), columns, squeeze=False)
+        for (*alone, last), (method, histograms) in zip(panels, shown.items(), strict=True):
+            for panel, (place, name) in zip(alone, histograms.items(), strict=True):
+                self._draw(panel, method, name)
+                panel.sharey(alone[0])
+                panel.set_title(f"{frame} {place}", fontsize=8)
+            alone[0].set_ylim(bottom=0)
+            alone[0].set_ylabel(f"{method}\nPIT over uniform", fontsize=8, parse_math=False)
+            scores = self[method]
+            for order, level in enumerate((50, 80, 90)):
+                covered = {place: scores[name] for place, name in at(f"coverage {level} %", scores).items()}
+                means, errors = (
+                    np.array([getattr(each, of) for each in covered.values()]) for of in ("mean", "standard_error")
+                )
+                last.fill_between(
+                    [*covered], means - 2 * errors, means + 2 * errors, color=f"C{order}", alpha=0.2, linewidth=0
+                )
+                last.plot([*covered], means, color=f"C{order}", linewidth=1.2)
+                last.axhline(level / 100, color=f"C{order}", linewidth=0.8, linestyle=":")
+            last.set_ylim(0, 1)
+            last.set_title(f"coverage by {frame}", fontsize=8, parse_math=False)
+        for panel in panels.flat:
+            panel.tick_params(labelsize=7)
+        figure.suptitle(self._title(), fontsize=9, parse_math=False)
+        return figure
+
+    def _draw(self, panel: Axes, method: str, histogram: str) -> None:
+        """A histogram over uniform, with two standard errors of each bin."""
+        clip_shares = np.array(self.rows[method].histograms[histogram]).T
+        bins = len(clip_shares)
+        shares, deviations = linearised(clip_shares, np.array(list(self.clips.values())))
+        errors = np.array([math.sqrt(clustered_variance(each)) for each in deviations])
+        edges = np.linspace(0, 1, bins + 1)
+        low, high = (bins * (shares + reach * errors) for reach in (-2, 2))
+        panel.stairs(high, edges, baseline=low, fill=True, color="0.88")
+        panel.stairs(bins * shares, edges, color="C0")
+        panel.axhline(1, color="0.4", linewidth=0.8)
 
     def to_json(self) -> str:
         """Everything, with means and standard errors written out; numbers that are not finite become null."""
