@@ -31,6 +31,7 @@ COMMANDS = {
     "evaluate": ("judging:evaluate", "Score runs on test windows."),
     "criticise": ("judging:criticise", "Is a run's guide calibrated, and do its motions look like real ones?"),
     "reference": ("judging:reference", "Put what a run's guide says of latents beside their posterior."),
+    "tubes": ("judging:tubes", "Widen a run's forecasts to tubes that hold the future as often as they say."),
     "compare": (
         "judging:compare",
         "Compare runs on test windows: bounds, paired differences with their errors, use of latents.",

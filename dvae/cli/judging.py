@@ -1,4 +1,5 @@
 """Commands that judge runs: evaluate, criticise, reference, compare."""
+"""Commands that judge runs: evaluate, criticise, tubes, compare."""
 
 from __future__ import annotations
 
@@ -18,6 +19,7 @@ from ..inference.calibration import calibrate
 from ..inference.checkpoints import CheckpointError, Run
 from ..inference.checks import predictive_checks
 from ..inference.compare import compare as compare_models
+from ..inference.conformal import conformal
 from ..inference.evaluate import evaluate as evaluate_models
 from ..inference.stein import stein_discrepancy
 from ..inference.yardstick import reference_posterior
@@ -339,6 +341,74 @@ def _add(document: dict[str, Any], part: str, result: Any, path: Path, figure: P
     with files.written(path) as file:
         file.write((json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
     ERROR.print(f"wrote {path}: {part}")
+
+
+def tubes(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str | None = None,
+    missing: Missing = False,
+    level: float = 0.9,
+    label: str | None = None,
+    values: tuple[str, ...] = (),
+    samples: int = 50,
+    seed: int = 0,
+    batch_size: int = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Widen a run's forecasts to tubes that hold the future as often as they say, and judge them on other windows.
+
+    Calibrated on the run's validation windows, which are of what it was fitted on, and judged on its test windows; or,
+    by --label style --values feminine, on the test clips of some styles, and judged on the others. Prints the factors
+    and how often futures are held before and after, and writes tubes.json in the run, or --out: `dvae.Tubes.load` reads
+    it, and its `tube` goes around forecasts.
+
+    Args:
+        run: the run directory.
+        data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
+        level: share of futures to be held.
+        label: of test clips, by whose values they are for calibration.
+        values: of the label, of the clips that calibrate.
+        samples: forecasts of each window.
+        seed: of the draws.
+        batch_size: windows forecast at once.
+        out: file to write instead of tubes.json in the run.
+        figure: save the factors over the horizon.
+    """
+    at_least(1, samples=samples, batch_size=batch_size)
+    check_files(out, figure, ".json")
+    if bool(values) != (label is not None):
+        raise UsageError("--label and --values tell together which test clips calibrate")
+    kind = opening.kind_of([run], data)
+    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion")
+    opening.note_unfinished([loaded])
+    opened = opening.data_of(data, loaded, missing=missing)
+    kept, judged = _kept_and_judged(kind, loaded, opened, label, values)
+    found = conformal(loaded.model, kept, level, samples=samples, seed=seed, batch_size=batch_size)
+    _keep(found, [out or run / f"{opening.record('tubes', loaded, opened)}.json"], figure)
+    OUT.print(found.coverage({loaded.method.name: loaded.model}, judged).table())
+
+
+def _kept_and_judged(kind: str, loaded: runs.Loaded, opened: Any, label: str | None, values: Sequence[str]) -> Any:
+    """Windows to calibrate on, and to judge on."""
+    if kind == "panel":
+        if label is not None:
+            raise UsageError(f"--label is of clips of motion, and {loaded.path} is of a table")
+        return [tables.windows(loaded, opened, split) for split in ("validation", "test")]
+    if label is None:
+        return [opened.windows(split) for split in ("validation", "test")]
+    clips, whole = opened.windows("test").clips, opened.motion
+    found = {clip.labels.get(label, "") for clip in clips}
+    if unknown := sorted({*values} - found):
+        raise UsageError(f"no test clip has {label} {', '.join(unknown)}; there are {', '.join(sorted(found))}")
+    test = motion.MotionSet(clips, whole.skeleton, opened.path, missing=whole.missing)
+    others = tuple(sorted(found - {*values}))
+    if not others:
+        raise UsageError(f"all test clips would calibrate, of {label} {', '.join(values)}; leave some to judge on")
+    return [
+        motion.windows(test, replace(opened.protocol, split_by=label, train=(), test=part), "test")
+        for part in (tuple(values), others)
+    ]
 
 
 def compare(

@@ -645,3 +645,28 @@ def test_motion_is_the_same_in_every_format_and_to_models_of_everything(people, 
     page = tmp_path / "page.html"
     assert main(["report", runs[npz, "positions"], runs[npz, "6d"], "--windows", "1", "--out", str(page)]) == 0
     assert page.read_text(encoding="utf-8").count("<canvas") == 2
+
+
+def test_forecasts_become_tubes_on_validation_windows_or_on_clips_of_a_label(capsys, tmp_path):
+    clips = motion.simulate(clips=30, frames=90, seed=1)
+    styled = [replace(clip, labels={"style": "ab"[place % 2]}) for place, clip in enumerate(clips)]
+    motion.save(tmp_path / "people.npz", motion.MotionSet(styled, clips.skeleton, clips.name))
+    run = tmp_path / "run"
+    assert main(["fit", "vae", "--data", str(tmp_path / "people.npz"), "--out", str(run), "--steps", "5", *SMALL]) == 0
+    assert main(["tubes", str(run), "--samples", "4", "--level", ".5"]) == 0
+    opened = dvae.load(run).data
+    assert dvae.Tubes.load(run / "tubes.json").clips == len(opened.windows("validation").clips)
+    told = ["--label", "style", "--values", "a", "--out", str(tmp_path / "a.json"), "--figure", str(tmp_path / "a.png")]
+    assert main(["tubes", str(run), "--samples", "4", "--level", ".5", *told]) == 0
+    assert "held 50 %, future" in capsys.readouterr().out
+    test = opened.windows("test").clips
+    assert dvae.Tubes.load(tmp_path / "a.json").clips == sum(clip.labels["style"] == "a" for clip in test)
+    assert (tmp_path / "a.png").stat().st_size
+    for wrong, said in (
+        (["--label", "style"], "tell together"),
+        (["--label", "style", "--values", "c"], "no test clip has style c; there are a, b"),
+        (["--label", "style", "--values", "a", "b"], "all test clips would calibrate"),
+        (["--level", ".9"], "90 % need 9 clips"),
+    ):
+        assert main(["tubes", str(run), "--samples", "4", *wrong])
+        assert said in " ".join(capsys.readouterr().err.split())
