@@ -59,6 +59,7 @@ class Tubes(Result):
         spread: (H, D), in the unit of the data, where it is not the standard deviation of a window's forecasts.
         samples: K, the forecasts of a window.
         seed: of their draws.
+        options: further arguments of the model's `forecast`.
         clips: C, what is exchangeable, of the calibration windows.
         data: of these windows.
 
@@ -76,6 +77,7 @@ class Tubes(Result):
     spread: np.ndarray | None
     samples: int
     seed: int
+    options: Mapping[str, Any]
     clips: int
     data: Mapping[str, Any]
 
@@ -116,7 +118,7 @@ class Tubes(Result):
         def judged(forecasts: Tensor, truth: Tensor) -> dict[tuple[str, str], tuple[Tensor, Tensor]]:
             gaps = truth.isnan()
             spread = self._spread(forecasts)
-            away, own = distances(forecasts, truth, spread), None
+            away, own = standardised(forecasts, truth, spread), None
             if forecasts.shape[1] >= least["said"]:
                 own = _own_distances(forecasts, None if self.spread is None else spread).masked_fill(
                     gaps[:, None], torch.nan
@@ -142,6 +144,7 @@ class Tubes(Result):
                 pool=clips_alike,
                 least=least[how],
                 of_draws=True,
+                note="said: tubes as wide as forecasts say; held: recalibrated. Of a window of a clip drawn at random",
             )
 
         return [measure(how, region, place) for place in (0, 1) for region in REGIONS for how in least]
@@ -174,11 +177,12 @@ class Tubes(Result):
             seed=self.seed,
             references=references,
             training_windows=training_windows,
+            options=self.options,
             progress=progress,
         )
 
     def table(self) -> Table:
-        """Factors, beside those of independent normal numbers."""
+        """Factors: their mean over frames and coordinates, the least and the largest."""
         clip, frame = called(self.data)
         title = f"tubes of {100 * self.level:g} % · {self.data['windows']} windows of {self.clips} {clip}s"
         table = Table(title=title, caption=f"half the width of a tube over the forecasts’ spread, K = {self.samples}")
@@ -252,7 +256,7 @@ def conformal(
     """Tubes around forecasts, calibrated on windows that the model has not been fitted to.
 
     They hold the future of new windows as often as the level says if the clips of these are exchangeable with those of
-    calibration: of the same people, styles and recordings, or of groups that are as many as to be told.
+    calibration: of the same people and styles. Of one person's or style's clips they say nothing of another's.
 
     Args:
         model: a model (`Forecasting`), or the name of a reference row, see `References`.
@@ -298,16 +302,15 @@ def conformal(
         def futures(of: Held, label: str) -> Iterator[tuple[Tensor, Tensor]]:
             """Forecasts (B, K, H, D) and true futures, batch by batch."""
             if isinstance(model, str):
+                name = model
                 drawn, forecaster = References(of, samples, seed, training_windows)[model]
             else:
-                drawn, forecaster = (
-                    samples,
-                    forecaster_of(model, of, samples, {"draw_emission": True, **(options or {})}),
-                )
+                name, drawn = type(model).__name__, samples
+                forecaster = forecaster_of(model, of, samples, {"draw_emission": True, **(options or {})})
             with nullcontext() if isinstance(model, str) else reproducibly(model, seed):
                 for start in bar.track(range(0, len(of.keys), batch_size), description=label):
                     part = slice(start, start + batch_size)
-                    yield forecasts_of(str(model), forecaster, drawn, of, part), of.futures[part]
+                    yield forecasts_of(name, forecaster, drawn, of, part), of.futures[part]
 
         spread = None
         if residuals is not None:
@@ -316,7 +319,7 @@ def conformal(
         found, count = [], 0
         for forecasts, truth in futures(held, "calibration"):
             count = forecasts.shape[1]
-            found.append(distances(forecasts, truth, _deviations(forecasts) if spread is None else spread))
+            found.append(standardised(forecasts, truth, _deviations(forecasts) if spread is None else spread))
     far = torch.cat(found)
     factors = {region: quantile(worst(far, region), places, level) for region in REGIONS}
     if not all(factor.isfinite().all() for factor in factors.values()):
@@ -330,6 +333,7 @@ def conformal(
         spread=None if spread is None else spread.numpy(),
         samples=count,
         seed=seed,
+        options=dict(options or {}),
         clips=clips,
         data=held.description(),
     )
@@ -352,7 +356,7 @@ def _deviations(forecasts: Tensor) -> Tensor:
     return forecasts.std(1, correction=min(1, forecasts.shape[1] - 1))
 
 
-def distances(forecasts: Tensor, truth: Tensor, spread: Tensor) -> Tensor:
+def standardised(forecasts: Tensor, truth: Tensor, spread: Tensor) -> Tensor:
     """How far a future (B, H, D) is from the mean of forecasts (B, K, H, D), in units of their spread.
 
     NaN where it was not observed, and infinite where it is missed by forecasts without a spread.

@@ -18,11 +18,11 @@ import tyro
 
 import dvae
 from dvae import Training, motion
-from dvae.inference.conformal import REGIONS, clips_alike, distances, quantile, worst
+from dvae.inference.conformal import REGIONS, quantile, standardised, worst
 from dvae.inference.evaluate import forecaster_of, forecasts_of
 from dvae.inference.held import Held, clip_places, hold, reproducibly
 from dvae.inference.references import References
-from dvae.inference.scores import over_horizon
+from dvae.inference.scores import clip_means, over_horizon
 from dvae.motion.dataset import MotionData
 from dvae.runs.directory import fit_run
 
@@ -53,22 +53,18 @@ class Scored:
     @classmethod
     def of(cls, windows: motion.Windows, parts: Iterator[tuple[torch.Tensor, torch.Tensor]], spread: Any) -> Scored:
         """From forecasts (B, K, H, D) and true futures."""
-        apart = torch.cat([distances(drawn, true, drawn.std(1) if spread is None else spread) for drawn, true in parts])
-        far = {region: worst(apart, region) for region in REGIONS}
+        apart = torch.cat(
+            [standardised(drawn, true, drawn.std(1) if spread is None else spread) for drawn, true in parts]
+        )
+        far = {region: worst(torch.cat(apart), region) for region in REGIONS}
         return cls(far, clip_places(windows.keys), np.array(windows.labels("style")))
 
     def held(self, region: str, kept: np.ndarray, judged: np.ndarray) -> float:
         """The share of windows of a judged clip that is in tubes calibrated on others."""
-        factor = quantile(self.far[region][kept], clip_places_of(self.places[kept]), LEVEL)
+        ours, theirs = (self.places[windows].unique(return_inverse=True)[1] for windows in (kept, judged))
+        factor = quantile(self.far[region][kept], ours, LEVEL)
         inside = (self.far[region][judged] <= factor).double().mean((1, 2))
-        shares = clips_alike(inside, clip_places_of(self.places[judged]))
-        windows = np.bincount(clip_places_of(self.places[judged]))
-        return float(np.average(shares, weights=windows))
-
-
-def clip_places_of(places: torch.Tensor) -> torch.Tensor:
-    """The same clips, numbered from 0 without gaps."""
-    return places.unique(return_inverse=True)[1]
+        return float(np.mean(clip_means(inside, theirs)))
 
 
 def across(scored: Scored) -> Iterator[tuple[np.ndarray, np.ndarray]]:

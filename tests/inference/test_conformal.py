@@ -10,7 +10,7 @@ import torch
 
 import dvae
 from dvae import ArrayWindows
-from dvae.inference.conformal import Tubes, clips_alike, conformal, distances, quantile, worst
+from dvae.inference.conformal import Tubes, clips_alike, conformal, quantile, standardised, worst
 from dvae.inference.evaluate import evaluate
 from dvae.inference.metrics import pit_histogram, tarp_histogram
 from dvae.inference.scores import PIT, by_frame, calibrated, over_horizon, tarp
@@ -86,14 +86,14 @@ def test_clips_alike_have_the_mean_over_clips_and_its_error():
 def test_distances_are_of_what_is_known_and_the_worst_of_each_region():
     forecasts, truth = draw(3, 9, 4, 2), draw(3, 4, 2, seed=1)
     truth[0, 1, 0], truth[1, 2] = torch.nan, torch.nan
-    far = distances(forecasts, truth, forecasts.std(1))
+    far = standardised(forecasts, truth, forecasts.std(1))
     expected = ((truth - forecasts.mean(1)).abs() / forecasts.std(1)).numpy()
     np.testing.assert_allclose(far, expected)
     np.testing.assert_allclose(worst(far, "future")[:, 0, 0], np.nanmax(expected, (1, 2)))
     assert worst(far, "frame").shape == (3, 4, 1)
     assert worst(far, "frame")[1, 2].isnan().all()
     point = draw(1, 1, 2, 1)
-    zero = distances(point, point[:, 0] + torch.tensor([[0.0], [1.0]]), torch.zeros(1, 2, 1).double())
+    zero = standardised(point, point[:, 0] + torch.tensor([[0.0], [1.0]]), torch.zeros(1, 2, 1).double())
     assert zero.flatten().tolist() == [0, math.inf]
 
 
