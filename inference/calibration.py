@@ -312,16 +312,8 @@ def calibrate(
     with reproducibly(model, seed), progress_bar(progress) as bar:
         for start in bar.track(range(0, simulations, at_once), description="simulations"):
             turn = torch.arange(start, min(start + at_once, simulations))
-            given = on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
-            ranks.append(_ranks(model, infer, given, len(turn), length, draws, torch.tensor(kept) - 1))
-    names = quantities(model, kept)
             ranks.append(_ranks(model, infer, given(turn), len(turn), length, draws, places, points))
-    names = [
-        f"{name}{step}[{d}]"
-        for name in model.latents
-        for step in ([f"_{t}" for t in kept] if model.generative.local(name) else [""])
-        for d in range(model.sizes[name])
-    ]
+    names = quantities(model, kept)
     equations = {"generative": model.generative.text} | ({} if guide else {"inference": model.inference.text})
     return Calibration(torch.cat(ranks).numpy(), (*names, TARP, LOG_JOINT), draws, length, seed, equations)
 

@@ -1,5 +1,4 @@
-"""Commands that judge runs: evaluate, criticise, reference, compare."""
-"""Commands that judge runs: evaluate, criticise, tubes, compare."""
+"""Commands that judge runs: evaluate, criticise, reference, tubes, compare."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -26,9 +26,6 @@ from torch.nn.functional import one_hot
 
 from ..notation import Factor, Factorization
 from .conditional import like
-
-if TYPE_CHECKING:
-    from .rollout import Rollout
 
 LARGEST = 4096
 """States of a window, with those of static latents, that are summed over at once."""
@@ -228,13 +225,13 @@ class Summation:
 
     Args:
         sums: how they are summed out.
-        rollout: the run, with values of all that they and their readers read.
+        rollout: the run (`Rollout`), with values of all that they and their readers read.
 
     Raises:
         ValueError: a model that reads its own means, or noise, in place of data, which depend on the states.
     """
 
-    def __init__(self, sums: Sums, rollout: Rollout):
+    def __init__(self, sums: Sums, rollout: Any):
         self.sums, self.rollout, self.values = sums, rollout, dict(rollout.values)
         read = {parent.name for factor in sums.generative.factors for parent in factor.parents}
         if fed := sorted((rollout.hidden.keys() | rollout.noisy) & read):

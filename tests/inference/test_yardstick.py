@@ -65,7 +65,7 @@ def test_of_a_linear_gaussian_model_the_reference_is_the_oracles(beside):
     mean, covariance = oracle.posterior(x)
     deviation = covariance.diagonal().sqrt()
     assert known.exact
-    np.testing.assert_array_equal(known.reference.mean, mean.numpy())
+    np.testing.assert_allclose(known.reference.mean, mean.numpy(), rtol=1e-12)
     for sequence in range(2):
         scaled = known.reference.correlation[sequence] * np.outer(*[known.reference.deviation[sequence]] * 2)
         np.testing.assert_allclose(scaled, covariance.numpy(), rtol=1e-12, atol=1e-15)
