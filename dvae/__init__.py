@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .inference import schedules
     from .inference.annealing import annealed_bound
     from .inference.bounds import SequenceELBO, Terms, importance_bound
+    from .inference.bracket import Bracket, bracket
     from .inference.calibration import calibrate
     from .inference.checks import predictive_checks
     from .inference.compare import compare
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from .inference.fit import Fit, fit
     from .inference.gradnorm import GradNorm
     from .inference.objectives import Evidence
+    from .inference.local import local_guide
     from .inference.particles import particle_bound
     from .inference.posteriors import Descent, Posterior, posterior
     from .inference.stein import stein_discrepancy
@@ -63,6 +65,7 @@ __all__ = [
     "Alternatives",
     "ArrayWindows",
     "Audit",
+    "Bracket",
     "Comparison",
     "Descent",
     "Discrete",
@@ -86,6 +89,7 @@ __all__ = [
     "annealed_bound",
     "arrow_prices",
     "audit",
+    "bracket",
     "calibrate",
     "compare",
     "conformal",
@@ -95,6 +99,7 @@ __all__ = [
     "importance_bound",
     "laws",
     "load",
+    "local_guide",
     "method",
     "methods",
     "model_arrow_prices",
@@ -122,6 +127,7 @@ _PLACES = {
         "inference": "schedules",
         "inference.annealing": "annealed_bound",
         "inference.bounds": "SequenceELBO Terms importance_bound",
+        "inference.bracket": "Bracket bracket",
         "inference.calibration": "calibrate",
         "inference.checks": "predictive_checks",
         "inference.compare": "compare",
@@ -132,6 +138,7 @@ _PLACES = {
         "inference.fit": "Fit fit",
         "inference.gradnorm": "GradNorm",
         "inference.objectives": "Evidence",
+        "inference.local": "local_guide",
         "inference.particles": "particle_bound",
         "inference.posteriors": "Descent Posterior posterior",
         "inference.stein": "stein_discrepancy",

@@ -24,7 +24,6 @@ from operator import itemgetter
 from typing import Any
 
 import torch
-from pyro import poutine
 from torch import Tensor
 
 from ..data import each
@@ -33,7 +32,7 @@ from ..program.conditional import like
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from ..turns import alone
-from .bounds import log_densities, require_data, require_likelihood, total
+from .bounds import joint_and_guide, require_data, require_likelihood
 from .held import reproducibly
 from .latents import joined, split
 from .result import progress_bar
@@ -245,11 +244,7 @@ class _Annealing:
 
     def _densities(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """log p(x, z) and log q(z | x), (R,) each."""
-        values = split(points, self.like)
-        programs = (self.model.model, self.model.guide)
-        traces = (poutine.trace(poutine.condition(each, data=values)).get_trace(self.data) for each in programs)
-        joint, own = (total(log_densities(trace)) for trace in traces)
-        return joint, own
+        return joint_and_guide(self.model, self.data, split(points, self.like))
 
     def _joined(self, values: Mapping[str, Tensor]) -> Tensor:
         return joined({name: values[name] for name in self.model.latents})

@@ -207,6 +207,13 @@ def total(logs: Mapping[str, Tensor]) -> Tensor:
     return sum(log.sum(-1) if log.dim() == 2 else log for log in logs.values())  # type: ignore[return-value]
 
 
+def joint_and_guide(model: DynamicalVAE, batch: AnyBatch, latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    """log p(x, z) and log q(z | x) at these latents, (B,) each."""
+    traces = (poutine.trace(poutine.condition(each, data=dict(latents))).get_trace(batch) for each in (model.model, model.guide))
+    joint, own = (total(log_densities(trace)) for trace in traces)
+    return joint, own
+
+
 def _closed_forms(model_sites: Mapping[str, Any], guide_sites: Mapping[str, Any]) -> set[str]:
     """The latents whose KL term may be analytic; none for programs whose factorizations are not known."""
     # In a replayed model the latents' sites carry the guide's notes; those of the data carry its own.

@@ -379,12 +379,9 @@ class Comparison(Result):
             known = [known for known in (*row.bounds, *row.free_running) if known != "k-hat"]
             raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, known)}; it has {', '.join(known)}")
         places = clip_places(self.keys).numpy()
-        weights = np.bincount(places, weights=self.frames)
         if metric in row.free_running:
-            means = row.free_running[metric]
-        else:
-            means = np.stack([np.bincount(places, weights=seed) for seed in row.bounds[metric]]) / weights
-        return Crossed.of(means, weights)
+            return Crossed.of(row.free_running[metric], np.bincount(places, weights=self.frames))
+        return Crossed.by_clip(row.bounds[metric], self.frames, places)
 
     # Tables
 

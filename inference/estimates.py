@@ -116,6 +116,15 @@ class Crossed:
         rest = sum(clustered_variance(own) for own in deviations - common) / (count * (count - 1))
         return cls(float(by_seed.mean()), common, float(by_seed.var(ddof=1)) / count, rest, count)
 
+    @classmethod
+    def by_clip(cls, values: np.ndarray, weights: np.ndarray, places: np.ndarray) -> Crossed:
+        """From values by seed and sequence (S, N), their weights (N,) and the clip (N,) that each sequence is of.
+
+        A value is of its whole sequence: the mean is the sum of values over that of weights.
+        """
+        whole = np.bincount(places, weights=weights)
+        return cls.of(np.stack([np.bincount(places, weights=seed) for seed in values]) / whole, whole)
+
     def estimate(self, other: Crossed | None = None) -> Estimate:
         """The mean, or its paired difference to that of another model, with the errors of the module's docstring."""
         mean, deviations, between, rest = self.mean, self.deviations, self.seeds, self.rest

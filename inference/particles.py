@@ -99,8 +99,8 @@ def particle_bound(
     size = require_data(model, data)
     at_once = max(1, chunk // particles)
     with model._evaluating():
-        run = model._rollout(model.generative, model.generator, data, None, 1)  # refuses what cannot be read
-        _check_order(model, run)
+        if refused := obstacle(model, data):
+            raise ValueError(refused)
         parts = []
         for first in range(0, size, at_once):
             some = each(data, itemgetter(slice(first, first + at_once)))
@@ -347,38 +347,44 @@ def _waits(factor: Factor, names: set[str]) -> bool:
     return factor.child in names or any(parent.name in names for parent in factor.parents)
 
 
-def _check_order(model: DynamicalVAE, run: Rollout) -> None:
-    """Refuses what cannot be drawn and weighed forward, step by step."""
+def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
+    """Why a model cannot be drawn and weighed forward, step by step, in a sentence; "" where it can.
+
+    Raises:
+        ValueError: a batch that cannot be read.
+    """
+    run = model._rollout(model.generative, model.generator, batch, None, 1)
     instead = "use importance_bound"
     if run.groups is not None:
-        raise ValueError(
+        return (
             f"particles are of one sequence each, but groups share {', '.join(model.grouped)}; {instead}, or leave "
             f"{GROUP!r} out of the batch, where every sequence is a group"
         )
     for block in model.inference.blocks:
         if block.direction < 0:
-            raise ValueError(
+            return (
                 f"particles move forward in time, but the guide draws {', '.join(block.names)} backward "
                 f"({model.inference.factor(block.names[0])}); {instead}"
             )
     hidden, late = _hidden(run), _late(model)
     if static := [name for name in hidden if not model.generative.local(name)]:
-        raise ValueError(f"a static variable has no missing entries in a particle bound, but {', '.join(static)} has")
+        return f"a static variable has no missing entries in a particle bound, but {', '.join(static)} has"
     latents = [name for name in model.latents if model.generative.local(name)]
     for equations, drawn in ((model.inference, latents), (model.generative, [*latents, *hidden])):
         for factor in equations.factors:
             for parent in factor.parents if factor.local else ():
                 if parent.name in late:
-                    raise ValueError(
+                    return (
                         f"{factor} reads {parent}, which {model.inference.factor(parent.name)} draws after all steps, "
                         f"so that particles cannot be weighed on the way; {instead}"
                     )
                 if parent.name in drawn and _reads_ahead(parent, run.length):
                     missing = " where entries are missing" if parent.name in hidden else ""
-                    raise ValueError(
+                    return (
                         f"{factor} reads {parent}, and {parent.name} after t is not drawn yet{missing} when the "
                         f"particles are at t; {instead}"
                     )
+    return ""
 
 
 def _reads_ahead(parent: Parent, length: int) -> bool:
