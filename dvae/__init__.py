@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from .inference.evaluation import Evaluation
     from .inference.fit import Fit, fit
     from .inference.gradnorm import GradNorm
-    from .inference.objectives import Evidence
     from .inference.local import local_guide
+    from .inference.objectives import Evidence
     from .inference.particles import particle_bound
     from .inference.posteriors import Descent, Posterior, posterior
     from .inference.stein import stein_discrepancy

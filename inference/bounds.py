@@ -209,7 +209,10 @@ def total(logs: Mapping[str, Tensor]) -> Tensor:
 
 def joint_and_guide(model: DynamicalVAE, batch: AnyBatch, latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
     """log p(x, z) and log q(z | x) at these latents, (B,) each."""
-    traces = (poutine.trace(poutine.condition(each, data=dict(latents))).get_trace(batch) for each in (model.model, model.guide))
+    traces = (
+        poutine.trace(poutine.condition(each, data=dict(latents))).get_trace(batch)
+        for each in (model.model, model.guide)
+    )
     joint, own = (total(log_densities(trace)) for trace in traces)
     return joint, own
 

@@ -1,9 +1,9 @@
 """Comparison of models on held-out sequences, as a statistician would make it.
 
 Every model is scored on the same sequences, teacher-forced: evidence lower bound, importance-weighted bound with the
-Pareto diagnosis of its weights, KL of every latent, and what the guide's latents tell of the data. Free-running scores
-come from `evaluate`. Models are ranked by the importance-weighted bound per frame. What their differences are sure of
-stands in `comparison`.
+Pareto diagnosis of its weights, the particle filter's bound where it is asked for, KL of every latent, and what the
+guide's latents tell of the data. Free-running scores come from `evaluate`. Models are ranked by the importance-weighted
+bound per frame. What their differences are sure of stands in `comparison`.
 """
 
 import dataclasses
@@ -23,10 +23,11 @@ from ..turns import alone
 from .bounds import require_likelihood
 from .comparison import Comparison, Contender
 from .evaluate import evaluate
-from .held import plain, reproducibly
+from .held import on_device_of, plain, reproducibly
+from .particles import obstacle
 from .result import progress_bar
 from .scores import Measure, Scores, proper
-from .teacher_forced import bounds, information, length_of, variances
+from .teacher_forced import bounds, filtered, information, length_of, variances
 
 _PAIRS = 4096  # sequences times contrasts to hold at once
 
@@ -39,6 +40,7 @@ def compare(
     scores: Scores = proper,
     particles: int = 64,
     estimates: int = 1,
+    filter_particles: int = 0,
     contrasts: int = 128,
     samples: int = 50,
     draw_emission: bool | None = None,
@@ -80,6 +82,8 @@ def compare(
         particles: K of the importance-weighted bound. k-hat needs 25, and 100 or more to be read sequence by sequence.
         estimates: independent importance-weighted estimates of every sequence, of K particles each. The bound is
             their mean. `Comparison.to_arviz` needs 25 or more.
+        filter_particles: K of the particle filter's bound too (FIVO, see `particle_bound`); 0 leaves it out. Models of
+            which it cannot be had, as where the guide goes backward, are left without it, and say why.
         contrasts: M, the sequences, drawn at random, among which information is measured; all if there are no more,
             0 leaves it out.
         samples: forecasts per window of the free-running scores; 0 leaves these out, which take longest. Data that are
@@ -105,10 +109,10 @@ def compare(
         >>> found.ranking
         ['twin']
     """
-    if particles < 1 or estimates < 1 or batch_size < 1 or contrasts < 0 or samples < 0:
+    if min(particles, estimates, batch_size) < 1 or min(filter_particles, contrasts, samples) < 0:
         raise ValueError(
-            "particles, estimates and batch_size are at least 1, contrasts and samples at least 0, not "
-            f"{particles}, {estimates}, {batch_size}, {contrasts} and {samples}"
+            "particles, estimates and batch_size are at least 1, filter_particles, contrasts and samples at least 0, "
+            f"not {particles}, {estimates}, {batch_size}, {filter_particles}, {contrasts} and {samples}"
         )
     windows = data if isinstance(data, HeldOutWindows) else None
     whole = windows is not None and windows.protocol.observed is None
@@ -138,7 +142,7 @@ def compare(
         emission = made.emission
         free = {label: {m.name: np.array(made.rows[label].clip_means[m.name]) for m in measures} for label in labelled}
     measured = {
-        label: _measured(label, model, batch, keys, chosen, particles, estimates, **shared)
+        label: _measured(label, model, batch, keys, chosen, particles, estimates, filter_particles, **shared)
         | {"free_running": free[label]}
         for label, model in labelled.items()
     }
@@ -160,6 +164,7 @@ def compare(
         },
         protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
         particles=particles,
+        filter_particles=filter_particles,
         contrasts=len(chosen),
         samples=samples,
         emission=emission,
@@ -180,6 +185,7 @@ def _measured(
     chosen: Tensor,
     particles: int,
     estimates: int,
+    filter_particles: int,
     *,
     seed: int,
     batch_size: int,
@@ -194,6 +200,13 @@ def _measured(
 
         with reproducibly(model, seed):
             found = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
+        found["notes"] = []
+        if filter_particles and (refused := obstacle(model, model.read(on_device_of(model, batch)))):
+            found["notes"].append(f"no particle bound: {refused}")
+        elif filter_particles:
+            with reproducibly(model, seed):
+                pieces = parts("particle bound", len(keys), batch_size)
+                found["bounds"] |= filtered(label, model, batch, keys, filter_particles, pieces)
         with reproducibly(model, seed):
             found["variances"] = variances(model, batch, parts("active units", len(keys), batch_size))
         with reproducibly(model, seed):
@@ -204,10 +217,10 @@ def _measured(
 
 def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: dict[str, Any]) -> Contender:
     """A row from what was measured of the models of its seeds, of which one is given."""
-    scores = _stack(seeds)
-    del scores["frames"]
+    said = {"frames", "notes"}
+    scores = _stack([{key: value for key, value in seed.items() if key not in said} for seed in seeds])
     equations = {"generative": model.generative.text, "inference": model.inference.text}
-    return Contender(equations, config, **{**scores, "estimates": scores["estimates"].mean(0)})
+    return Contender(equations, config, **{**scores, "estimates": scores["estimates"].mean(0)}, notes=seeds[0]["notes"])
 
 
 def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:

@@ -51,12 +51,14 @@ class Contender:
     Args:
         equations: "generative" and "inference".
         config: what the caller said of it.
-        bounds: "ELBO", "importance bound", "k-hat" and "KL z" for every latent z: (S, N), bounds in nats a sequence.
+        bounds: "ELBO", "importance bound", "k-hat" and "KL z" for every latent z, and "particle bound" where there is
+            one: (S, N), bounds in nats a sequence.
         kl_steps: local latent to (S, T), its mean KL over sequences by step, in nats.
         variances: latent to (S, D), variance over the data of each coordinate's posterior mean.
         information: latent to (S, T), or (S, 1) of a static one: nats a step, or a sequence.
         estimates: (E, N) independent importance-weighted bounds in nats a sequence, each the mean over seeds.
         free_running: metric to (S, C), the means of each clip's windows.
+        notes: what was asked for and is not there, and why.
     """
 
     equations: dict[str, str]
@@ -67,6 +69,7 @@ class Contender:
     information: dict[str, np.ndarray]
     estimates: np.ndarray
     free_running: dict[str, np.ndarray]
+    notes: list[str] = field(default_factory=list)
 
     @property
     def seeds(self) -> int:
@@ -113,6 +116,7 @@ class Comparison(Result):
         shown: free-running score to its unit, those of the table.
         notes: lines below that table on how scores are to be read, or why there are none.
         better: by score of that table, "lower", "higher" or "".
+        filter_particles: K of the particle bound; 0 where there is none.
 
     Example:
         >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
@@ -135,6 +139,7 @@ class Comparison(Result):
     shown: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     better: dict[str, str] = field(default_factory=dict)
+    filter_particles: int = 0
 
     def __getitem__(self, name: str) -> dict[str, Estimate]:
         row = self._row(name)
@@ -242,7 +247,12 @@ class Comparison(Result):
             each, _, frame = self._words
             panel.set_xlabel(f"nats a {frame} (95 %, thick: over {each}s, thin: over seeds too)", fontsize=9)
             panel.grid(axis="x", alpha=0.3)
-        panels[0].set_title(f"importance-weighted bound ↑ (K = {self.particles})")
+        for place, name in enumerate(ranking):
+            if "particle bound" in self.rows[name].bounds:
+                mean = self[name]["particle bound"].mean
+                panels[0].plot(mean, place, "D", markersize=6, color="black", fillstyle="none")
+        title = f"importance-weighted bound ↑ (K = {self.particles})"
+        panels[0].set_title(title + (f", ◇ FIVO (K = {self.filter_particles})" if self.filter_particles else ""))
         panels[1].set_title(f"difference to {ranking[0]}", parse_math=False)
         panels[1].axvline(0, color="grey", linewidth=0.8)
         panels[1].set_yticklabels([])
@@ -356,6 +366,8 @@ class Comparison(Result):
             del document["ranking"]
             rows = {name: _contender(row, document["particles"]) for name, row in document.pop("rows").items()}
             keys = [(split, clip, start) for split, clip, start in document.pop("keys")]
+            if not isinstance(document.get("filter_particles", 0), int):
+                raise ValueError("filter_particles is no whole number")
             return cls(rows=rows, keys=keys, frames=np.array(document.pop("frames"), dtype=float), **document)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"this is not a comparison written by Comparison.to_json: {error!r}") from error
@@ -404,6 +416,7 @@ class Comparison(Result):
     def _bound_table(self) -> Table:
         each, clip, frame = self._words
         bounds = (f"importance bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
+        filters = [f"particle bound ↑\nK = {self.filter_particles}"] if self.filter_particles else []
         table = _table(
             f"{self._title()}\nteacher-forced, nats a {frame}",
             "\n".join(
@@ -411,9 +424,10 @@ class Comparison(Result):
                     f"mean ± standard error over {each}s (clustered by {clip}) ± over seeds",
                     "95 %: from both, by Student's t, in brackets its degrees of freedom",
                     *([] if self.samples else self.notes),
+                    *(f"{name}: {note}" for name, row in self.rows.items() for note in row.notes),
                 ]
             ),
-            ("seeds", *bounds, f"k-hat\n> {KHAT}"),
+            ("seeds", *bounds, *filters, f"k-hat\n> {KHAT}"),
         )
         ranking = self.ranking
         for name in ranking:
@@ -422,7 +436,8 @@ class Comparison(Result):
             behind = ["–", "–"] if name == ranking[0] else [str(difference), _interval(difference)]
             share = "–" if math.isnan(row.unreliable) else f"{100 * row.unreliable:.1f} %"
             means = (str(scores["importance bound"]), *behind, str(scores["ELBO"]))
-            table.add_row(name, str(row.seeds), *means, share)
+            filtered = [str(scores.get("particle bound", "–")) for _ in filters]
+            table.add_row(name, str(row.seeds), *means, *filtered, share)
         return table
 
     def _latent_table(self) -> Table:
@@ -500,8 +515,11 @@ def _contender(document: dict[str, Any], particles: int) -> Contender:
             return {key: arrays(item) for key, item in value.items()}
         return np.array(value, dtype=float)
 
+    said = {"equations", "config", "notes"}
+    document = {"notes": [], **document}  # of which older files have none
+    if not isinstance(document["notes"], list) or not all(isinstance(note, str) for note in document["notes"]):
+        raise ValueError("notes are no list of texts")
     names = [field.name for field in dataclasses.fields(Contender)]
-    said = {"equations", "config"}
     row = Contender(**{name: document[name] if name in said else arrays(document[name]) for name in names})
     if particles >= KHAT_PARTICLES and "k-hat" in row.bounds:
         row.bounds["k-hat"][np.isnan(row.bounds["k-hat"])] = math.inf

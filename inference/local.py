@@ -3,11 +3,13 @@
     q_n(v | parents) = N(m + s_0 (b_n + sum_u W_nu (u - c_u) / d_u),  s exp(a_n))
 
 m and s are what the guide's own conditional says, given the data and the latents that it reads. b_n, a_n and W_nu are
-free for every sequence n, every step of v and every step u of the latents before it that the arrows allow: they begin at
-0, where q_n is the guide, and are moved up the evidence lower bound of that sequence. s_0, c_u and d_u are units, from
-draws of the guide: deviations given what is read, means and deviations. What the guide's network makes of the data is
-in b_n and a_n without limit, of the latents in m and s, and as far as it is linear in W_nu. A guide that reads no
-latents becomes the best product of normals for the sequence, as in Cremer, Li and Duvenaud (2018, arXiv 1801.03558).
+free for every sequence n, every step of v and every step u of the latents that v may read. They begin at 0, where q_n
+is the guide, and go up the evidence lower bound of their sequence. s_0, c_u and d_u are units, from draws of the guide:
+mean deviations given what is read, means and deviations of what is read.
+
+So whatever a network could make of the data is within reach, and no sequence is worse off than with the guide. What the
+network makes of latents stays, up to a linear function of them. A guide that reads none becomes the best product of
+normals for the sequence, as in Cremer, Li and Duvenaud (2018, arXiv 1801.03558); a linear one, the best linear one.
 
 Gradients are those of the path alone (Roeder, Wu and Duvenaud, 2017, arXiv 1703.09194): they have no noise where the
 guide is the posterior.
@@ -16,10 +18,8 @@ guide is the posterior.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,13 +46,13 @@ UNITS = 32
 
 @dataclass(frozen=True)
 class Link:
-    """How the location of a latent moves with another one, for B sequences.
+    """How the location of a latent at S steps moves with another one, for B sequences.
 
     Args:
         parent: the latent that is read.
-        to, of: (P,) steps of the child, in order, and of the parent; 0 of a static one.
-        weight: (B, P, E, D), in units, times the square root of how many numbers a step of the child reads.
-        centre, deviation: (B, S, E) of the parent.
+        to, of: (P,) places among the S steps, in order, and steps of the parent, 0 of a static one.
+        weight: (B, P, E, D), in units.
+        centre, deviation: (B, P, E) of what is read.
     """
 
     parent: str
@@ -62,31 +62,34 @@ class Link:
     centre: Tensor
     deviation: Tensor
 
-    def moves(self, values: Sequence[Tensor], first: int, count: int) -> Tensor:
-        """(k, B, S, D) in units, at steps from `first` on, from values (k B, E) of the parent by step."""
-        begin, end = np.searchsorted(self.to, (first, first + count)).tolist()
-        shape = (-1, len(self.weight), count, self.weight.shape[-1])
-        if begin == end:
-            return self.weight.new_zeros(1, *shape[1:])
-        of = self.of[begin:end].tolist()
-        read = torch.stack([values[s] for s in of], 1).unflatten(0, (-1, len(self.weight)))
-        read = (read - self.centre[:, of]) / self.deviation[:, of]
-        weight = self.weight[:, begin:end]
-        if count == 1:
-            return (read.flatten(2).transpose(0, 1) @ weight.flatten(1, 2)).transpose(0, 1).unsqueeze(2)
-        each = torch.einsum("kbpe,bped->kbpd", read, weight)
-        to = torch.as_tensor(self.to[begin:end] - first, device=each.device)
-        return each.new_zeros(len(each), *shape[1:]).index_add(2, to, each)
+    def moves(self, values: Sequence[Tensor], steps: int) -> Tensor:
+        """(k, B, S, D) in units, from values (k B, E) of the parent by step."""
+        read = torch.stack([values[s] for s in self.of.tolist()], 1).unflatten(0, (-1, len(self.weight)))
+        read = (read - self.centre) / self.deviation
+        if steps == 1:
+            return (read.flatten(2).transpose(0, 1) @ self.weight.flatten(1, 2)).transpose(0, 1).unsqueeze(2)
+        each = torch.einsum("kbpe,bped->kbpd", read, self.weight)
+        to = torch.as_tensor(self.to, device=each.device)
+        return each.new_zeros(*each.shape[:2], steps, each.shape[3]).index_add(2, to, each)
+
+    def by_step(self, steps: int) -> list[Link | None]:
+        """The same for each of the steps alone, None where nothing is read."""
+        counts = np.bincount(self.to, minlength=steps)
+        places = np.split(self.of, counts.cumsum()[:-1])
+        # not a slice for each: that would have a gradient as large as the whole
+        tensors = (each.split(counts.tolist(), 1) for each in (self.weight, self.centre, self.deviation))
+        parts = zip(places, *tensors, strict=True)
+        return [Link(self.parent, of * 0, of, *rest) if len(of) else None for of, *rest in parts]
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What is added to a conditional of the guide, for B sequences; T is 1 of a static latent.
+    """What is added to a conditional of the guide at S steps, 1 of a static latent, for B sequences.
 
     Args:
-        unit: (B, T, D), deviations.
-        shift: (B, T, D) of the location, in units.
-        stretch: (B, T, D) of the logarithm of the scale.
+        unit: (B, S, D), deviations.
+        shift: (B, S, D) of the location, in units.
+        stretch: (B, S, D) of the logarithm of the scale.
         links: to latents that are read.
     """
 
@@ -95,15 +98,22 @@ class Correction:
     stretch: Tensor
     links: tuple[Link, ...]
 
-    def __call__(self, parameters: Parameters, values: Mapping[str, Sequence[Tensor]], first: int = 0) -> Parameters:
-        """Location and scale (k B, S, D) at steps from `first` on, from the guide's own and latents by step."""
+    def __call__(self, parameters: Parameters, values: Mapping[str, Sequence[Tensor]]) -> Parameters:
+        """Location and scale (k B, S, D) from the guide's own, and from latents by step."""
         loc, scale = (each.unflatten(0, (-1, len(self.unit))) for each in parameters)
-        steps = slice(first, first + loc.shape[2])
-        moved = self.shift[:, steps]
+        moved = self.shift
         for link in self.links:
-            moved = moved + link.moves(values[link.parent], first, loc.shape[2])
-        loc, scale = loc + self.unit[:, steps] * moved, scale * self.stretch[:, steps].exp()
+            moved = moved + link.moves(values[link.parent], loc.shape[2])
+        loc, scale = loc + self.unit * moved, scale * self.stretch.exp()
         return loc.flatten(0, 1), scale.flatten(0, 1)
+
+    def by_step(self) -> list[Correction]:
+        """The same for each of its steps alone."""
+        steps = self.unit.shape[1]
+        links = zip(*(link.by_step(steps) for link in self.links), strict=True) if self.links else [()] * steps
+        tensors = (each.split(1, 1) for each in (self.unit, self.shift, self.stretch))
+        parts = zip(*tensors, links, strict=True)
+        return [Correction(unit, shift, stretch, tuple(filter(None, own))) for unit, shift, stretch, own in parts]
 
     @property
     def free(self) -> list[tuple[Tensor, int]]:
@@ -146,18 +156,19 @@ class Local(nn.Module):
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """The state of the guide's own loop, or its parameters by step where it reads nothing of what is drawn."""
         known = {link.parent: _by_step(given[link.parent]) for link in self.correction.links if link.parent in given}
+        steps = self.correction.by_step()
         if all(name in given for name in self.own.parents):
-            return tuple(p.unbind(1) for p in self.own(given, batch, length, lengths)), None, known
-        return None, self.own.start(given, batch, length, lengths), known
+            return tuple(p.unbind(1) for p in self.own(given, batch, length, lengths)), None, known, steps
+        return None, self.own.start(given, batch, length, lengths), known, steps
 
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Parameters, Any]:
         """See `Conditional`."""
-        fixed, inner, known = state
+        fixed, inner, known, steps = state
         if fixed is None:
             own, inner = self.own.step(inner, t, drawn)
         else:
             own = tuple(p[t] for p in fixed)
-        return _alone(self.correction(_with_step(own), {**drawn, **known}, t)), (fixed, inner, known)
+        return _alone(steps[t](_with_step(own), {**drawn, **known})), (fixed, inner, known, steps)
 
     def chain(self, *_: Any) -> None:
         """There is no fused loop of it."""
@@ -182,7 +193,7 @@ def local_guide(
     *,
     missing: bool = False,
     steps: int = 300,
-    rate: float = 0.2,
+    rate: float = 0.05,
     draws: int = 4,
     reach: int | None = None,
     seed: int = 0,
@@ -210,7 +221,7 @@ def local_guide(
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
         >>> x, oracle = model.sample(3, 4)["x"], dvae.Oracle(model, 4)
-        >>> local = dvae.local_guide(model, x, missing=True)
+        >>> local = dvae.local_guide(model, x, missing=True, rate=0.2)
         >>> (oracle.evidence(x) - dvae.SequenceELBO(50).terms(local, x).bound).abs().max() < 0.05
         tensor(True)
     """
@@ -254,8 +265,8 @@ def require_local(model: DynamicalVAE) -> None:
     for name in model.latents:
         if not isinstance(model.encoder[name].law, Gaussian):
             raise ValueError(
-                f"local guides are normals, of a location and a scale, but the law of {model.inference.factor(name)} is "
-                f"a {type(model.encoder[name].law).__name__}"
+                f"local guides are normals, of a location and a scale, but the law of {model.inference.factor(name)} "
+                f"is a {type(model.encoder[name].law).__name__}"
             )
 
 
@@ -286,9 +297,9 @@ def _joined(parents: Sequence[Parent], added: Sequence[Parent]) -> tuple[Parent,
     """Parents with further ones, those of one name as one."""
     found = {parent.name: parent for parent in parents}
     for parent in added:
-        own = found.get(parent.name)
-        joined = None if own is None or own.relation is None or parent.relation is None else own.relation | parent.relation
-        found[parent.name] = replace(parent, relation=joined) if joined else parent
+        own = found.get(parent.name, parent).relation
+        relation = parent.relation if own is None or parent.relation is None else own | parent.relation
+        found[parent.name] = replace(parent, relation=relation)
     return tuple(found.values())
 
 
@@ -326,7 +337,7 @@ class _Drawn:
 
     def links(self, factor: Factor, reach: int | None) -> tuple[Link, ...]:
         """Of nothing yet, to the latents among the parents."""
-        _, size, length, width = self.values[factor.child].shape
+        _, size, _, width = self.values[factor.child].shape
         length = max(value.shape[2] for value in self.values.values())
         found = []
         for parent in factor.parents:
@@ -338,7 +349,7 @@ class _Drawn:
                 mask = mask & (abs(steps[:, None] - steps) <= reach)
             to, of = np.nonzero(mask)
             if len(to):
-                values = self.values[parent.name]
+                values = self.values[parent.name][:, :, of]
                 weight = values.new_zeros(size, len(to), values.shape[-1], width)
                 deviation = values.std(0)
                 deviation = torch.where(deviation > 0, deviation, 1.0)  # of padding

@@ -21,6 +21,7 @@ from ..program.model import DynamicalVAE
 from ..program.rollout import Sequence as SequenceLaw
 from .bounds import SequenceELBO, importance_bound, site_log_prob, sites_of
 from .held import on_device_of, refuse_non_finite
+from .particles import particle_bound
 
 _GUIDE_DRAWS = 8  # over which posterior means are averaged; the noise that this leaves is taken out
 
@@ -61,6 +62,23 @@ def bounds(
         "estimates": weighted.numpy(),
         "frames": length.numpy(),
     }
+
+
+def filtered(
+    name: str,
+    model: DynamicalVAE,
+    batch: Batch,
+    keys: Sequence[tuple[str, str, int]],
+    particles: int,
+    parts: Iterable[slice],
+) -> dict[str, np.ndarray]:
+    """The particle bound in nats a sequence (N,)."""
+    found = []
+    for part in parts:
+        bound = particle_bound(model, on_device_of(model, each(batch, itemgetter(part))), particles).bound
+        refuse_non_finite(name, "particle bound", bound.isfinite(), keys[part])
+        found.append(bound.double().cpu())
+    return {"particle bound": torch.cat(found).numpy()}
 
 
 def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:

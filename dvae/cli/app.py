@@ -37,6 +37,7 @@ COMMANDS = {
         "Compare runs on test windows: bounds, paired differences with their errors, use of latents.",
     ),
     "ablate": ("ablation:ablate", "What every arrow of a model and its guide is worth: on twins, and fitted to data."),
+    "bracket": ("judging:bracket", "A run's evidence between two bounds, and where its ELBO falls short of it."),
     "forecast": ("futures:forecast", "Forecast the test windows, or those of one clip, many times each."),
     "complete": ("futures:complete", "Complete motion along paths of some joints, from a clip or from a file."),
     "interpolate": ("segments:interpolate", "Go from one segment of motion to another in a run's latent space."),

@@ -1,4 +1,4 @@
-"""Commands that judge runs: evaluate, criticise, reference, tubes, compare."""
+"""Commands that judge runs: evaluate, criticise, reference, tubes, compare, bracket."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import tyro
 
 from .. import files, motion
 from ..data import each as of_each
+from ..inference.bracket import bracket as bracketed
 from ..inference.calibration import calibrate
 from ..inference.checkpoints import CheckpointError, Run
 from ..inference.checks import predictive_checks
@@ -416,6 +417,7 @@ def compare(
     missing: Missing = False,
     particles: int = 64,
     estimates: int = 1,
+    filter_particles: int = 0,
     contrasts: int = 128,
     samples: int = 50,
     forecasts: bool = True,
@@ -435,6 +437,7 @@ def compare(
         data: where the data lie now, if the path in the runs no longer leads there; or other data of the same joints.
         particles: of the importance-weighted bound, K.
         estimates: independent estimates of that bound; 25 or more for arviz, 1 otherwise.
+        filter_particles: of the particle filter's bound (FIVO) beside that one; 0 leaves it out.
         contrasts: windows among which the information of latents is measured; 0 leaves it out.
         samples: forecasts of each window.
         forecasts: score forecasts too, which takes longest.
@@ -446,7 +449,7 @@ def compare(
         figure: save bounds, differences, k-hat, and KL over time.
     """
     at_least(1, particles=particles, estimates=estimates, samples=samples, batch_size=batch_size, stride=stride)
-    at_least(0, contrasts=contrasts)
+    at_least(0, contrasts=contrasts, filter_particles=filter_particles)
     check_files(out, figure, ".json")
     kind = opening.kind_of(run, data)
     loaded = opening.alike(run, data, kind if kind == "panel" else "motion")
@@ -461,6 +464,7 @@ def compare(
         scores=judged,
         particles=particles,
         estimates=estimates,
+        filter_particles=filter_particles,
         contrasts=contrasts,
         samples=samples if forecasts else 0,
         draw_emission=True if draw_emission is None and kind == "panel" else draw_emission,
@@ -469,6 +473,63 @@ def compare(
         configs={name: opening.config_without_seed(row[0]) for name, row in shown.items()},
     )
     _keep(result, [] if out is None else [out], figure)
+
+
+def bracket(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str | None = None,
+    missing: Missing = False,
+    count: int = 32,
+    particles: int = 64,
+    temperatures: int = 50,
+    chains: int = 8,
+    fitting: int = 300,
+    reach: int | None = None,
+    seed: int = 0,
+    batch_size: int = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """A run's evidence between two bounds, and where its ELBO loses what it lacks: amortisation, arrows, family.
+
+    Prints bounds of some test windows and of as many that are simulated from the model, and the parts of the gap, and
+    writes them to bracket.json in the run, or to --out.
+
+    Args:
+        run: the run directory.
+        data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
+        count: test windows, drawn at random; time grows with them.
+        particles: of IWAE and FIVO, and draws over which ELBOs are averaged.
+        temperatures: of annealed importance sampling, L: the more, the narrower the bracket.
+        chains: of each window.
+        fitting: steps of the guides of single windows; 0 leaves the parts of the gap out.
+        reach: steps between latents up to which these guides read them linearly; by default all that arrows allow.
+        seed: of the draws.
+        batch_size: windows at once.
+        out: file to write instead of bracket.json in the run.
+        figure: save all bounds on one axis.
+    """
+    at_least(1, count=count, particles=particles, temperatures=temperatures, chains=chains, batch_size=batch_size)
+    at_least(0, fitting=fitting, reach=reach)
+    check_files(out, figure, ".json")
+    kind = opening.kind_of([run], data)
+    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion")
+    opening.note_unfinished([loaded])
+    opened = opening.data_of(data, loaded, missing=missing)
+    windows, _ = _compared(loaded, opened, None)
+    result = bracketed(
+        loaded.model,
+        windows,
+        count=count,
+        particles=particles,
+        temperatures=temperatures,
+        chains=chains,
+        fitting=fitting,
+        reach=reach,
+        seed=seed,
+        batch_size=batch_size,
+    )
+    _keep(result, [out or run / f"{opening.record('bracket', loaded, opened)}.json"], figure)
 
 
 def _compared(first: runs.Loaded, opened: Any, stride: int | None) -> tuple[Any, Any]:

@@ -495,7 +495,7 @@ def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monke
     for command in (
         "forecast run --out f.npz --samples 2",
         "evaluate run second --samples 2",
-        "compare run second --samples 2 --particles 4 --contrasts 0",
+        "compare run second --samples 2 --particles 4 --contrasts 0 --filter-particles 2",
         "criticise run --simulations 20 --draws 9 --samples 19",
         "animate run --out f.html",
     ):

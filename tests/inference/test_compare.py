@@ -118,6 +118,45 @@ def test_independent_estimates_average_to_the_bound():
     np.testing.assert_allclose(row.estimates.mean(0), row.bounds["importance bound"][0])
 
 
+def test_the_particle_bound_is_that_of_the_filter_and_models_without_one_say_why(tmp_path):
+    """Below the evidence on average, the same as without the others, and nothing else depends on it."""
+    models = {
+        "filters": build(MEAN_FIELD, fitted=False),
+        "backward": build((DKF[0], "q(z_t | z_{>t}, x_{1:T})")),
+        "nothing latent": twin("p(x_t | x_{t-1})", "", {"x": 2}, T),
+    }
+    x = draws(models["filters"], 60)
+    result, without = run(models, x, filter_particles=16), run(models, x)
+    own, evidence = result.rows["filters"].bounds["particle bound"][0], Oracle(models["filters"], T).evidence(x)
+    above = own - evidence.detach().numpy()
+    assert -2 < above.mean() < 4 * above.std() / math.sqrt(60)
+    none = result.rows["nothing latent"].bounds
+    np.testing.assert_allclose(none["particle bound"], none["importance bound"])
+    assert "particle bound" not in result.rows["backward"].bounds
+    assert ["backward" in note for note in result.rows["backward"].notes] == [True]
+    assert "particle bound" not in str(without)
+    for name in models:
+        assert scores(without, name).items() <= scores(result, name).items()
+        assert scores(run({name: models[name]}, x, filter_particles=16), name) == scores(result, name)
+    assert "particle bound ↑" in str(result)
+    assert "backward: no particle bound: particles move forward" in str(result)
+    with pytest.raises(KeyError, match="'backward' has no score 'particle bound'"):
+        result.pairs("particle bound")
+    result.save(tmp_path / "c.json")
+    again = Comparison.load(tmp_path / "c.json")
+    assert str(again) == str(result)
+    assert again.difference("filters", "nothing latent", "particle bound").sequences > 0
+    assert len(result.plot().axes[0].lines) > len(without.plot().axes[0].lines)
+    document = json.loads(without.to_json())
+    for former in (document, *document["rows"].values()):  # as files were before
+        former.pop("filter_particles", None)
+        former.pop("notes" if "scores" in former else "", None)
+    assert str(Comparison.from_json(json.dumps(document))) == str(without)
+    for change in ({"filter_particles": "16"}, {"rows": {"a": {**document["rows"]["backward"], "notes": "text"}}}):
+        with pytest.raises(ValueError, match="not a comparison"):
+            Comparison.from_json(json.dumps({**document, **change}))
+
+
 def test_comparison_leaves_mode_and_random_state_alone():
     model = build().train()
     state = torch.get_rng_state()
