@@ -8,7 +8,8 @@ A local guide is the model's own with parameters that are free for every sequenc
 network fails to read off the data, or may not read, is amortisation. With all arrows it reads the latents too that the
 posterior depends on and the guide's equations leave out. What then is left is the price of normals whose locations move
 linearly with what was added. After Cremer, Li and Duvenaud (2018, arXiv 1801.03558), whose approximation gap is the sum
-of the last two. Each part is at least 0, but for noise and a search that has not ended.
+of the last two. Each part is at least 0, but for noise and what a search has not found, which is counted further down.
+Both local guides have the same number of steps from the model's own.
 
 The evidence is bracketed: from below by annealed importance sampling, which starts at the local guide with all arrows,
 and from above by the same run backward, for sequences simulated from the model (`annealed_bound`).
@@ -405,7 +406,7 @@ class _Work:
         for name, missing in ((OWN, False), (ALL, True)) if self.fitting else ():
             if not missing or self.lacking:  # else there is nothing to add
                 how: Any = {"missing": missing, "steps": self.fitting, "reach": self.reach, "seed": seed}
-                model = local_guide(model, data, **how, progress=advance)
+                model = local_guide(self.model, data, **how, progress=advance)
             with reproducibly(model, seed):
                 found[name] = self._weights(model, data).mean(0)
         how = {"temperatures": self.temperatures, "chains": self.chains, "seed": seed}

@@ -42,6 +42,9 @@ from .held import reproducibly
 
 UNITS = 32
 """Draws from the guide of which units are taken."""
+NAT = 1.0
+"""Slopes much below it, in nats a deviation, are followed in proportion, as by gradient ascent; above it, by their sign.
+Were all followed by their sign, so would be the noise of those that are 0, of which arrows have many."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +196,7 @@ def local_guide(
     *,
     missing: bool = False,
     steps: int = 300,
-    rate: float = 0.05,
+    rate: float = 0.2,
     draws: int = 4,
     reach: int | None = None,
     seed: int = 0,
@@ -207,8 +210,8 @@ def local_guide(
             (`importance_bound` and `annealed_bound` with a `chunk` of all of them), and nothing else.
         missing: the guide reads the latents too that the posterior depends on and it does not, in its order of drawing
             (`audit`).
-        steps: of Adam, on a rate that falls to 0.
-        rate: of the first of them, in deviations of the guide.
+        steps: of Adam, with a rate that falls to 0.
+        rate: of the first of them, in deviations of the guide; what is read of other latents has together as much.
         draws: of every sequence in each step.
         reach: between local latents that are read linearly; None for all that the arrows allow.
         seed: of the draws.
@@ -221,7 +224,7 @@ def local_guide(
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
         >>> x, oracle = model.sample(3, 4)["x"], dvae.Oracle(model, 4)
-        >>> local = dvae.local_guide(model, x, missing=True, rate=0.2)
+        >>> local = dvae.local_guide(model, x, missing=True, rate=0.5)
         >>> (oracle.evidence(x) - dvae.SequenceELBO(50).terms(local, x).bound).abs().max() < 0.05
         tensor(True)
     """
@@ -239,7 +242,7 @@ def local_guide(
         found, corrections = _start(model, data, missing, reach)
         rows, free = repeat(data, draws), [each for c in corrections.values() for each in c.free]
         frozen = _with(found, {name: each.freed(Tensor.detach) for name, each in corrections.items()})
-        optimiser = torch.optim.Adam([{"params": [each], "lr": rate / width**0.5} for each, width in free])
+        optimiser = torch.optim.Adam([{"params": [each], "lr": rate / width} for each, width in free], eps=NAT)
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
         for _ in range(steps):
             with torch.enable_grad(), torch.backends.cudnn.flags(enabled=False), computing_once():

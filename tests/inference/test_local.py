@@ -60,13 +60,13 @@ def test_the_best_guide_of_a_factorization_has_nothing_to_gain_but_its_missing_a
     best = evidence - oracle.bound(x)
     moved(model)
     assert (evidence - oracle.bound(x) - best).min() > 0.02
-    own = local_guide(model, x, steps=100, rate=0.1)
+    own = local_guide(model, x, steps=100, rate=0.5)
     bound, error = elbo(own, x)
     # a sequence may have better than the guide that is the best for all, where that may not read all of the data
     assert ((evidence - bound) < best + 4 * error + 0.01).all()
     if pair != "backward":
         torch.testing.assert_close((evidence - bound).mean(), best.mean(), rtol=0, atol=float(4 * error.max()) + 0.01)
-    everything = local_guide(own, x, missing=True, steps=100, rate=0.1)
+    everything = local_guide(own, x, missing=True, steps=100, rate=0.5)
     bound, error = elbo(everything, x)
     assert ((evidence - bound).abs() < 4 * error + 0.01).all()
 
@@ -78,7 +78,7 @@ def test_data_that_a_guide_may_not_read_are_amortisation():
     assert oracle.fit_guide(300) > 0.5
     model.requires_grad_(False)
     x = model.sample(3, T)["x"]
-    bound, error = elbo(local_guide(model, x, steps=100, rate=0.1), x)
+    bound, error = elbo(local_guide(model, x, steps=100, rate=0.5), x)
     assert ((oracle.evidence(x) - bound).abs() < 4 * error + 0.01).all()
 
 
@@ -182,5 +182,5 @@ def test_other_likelihoods_than_normals():
         logs = model.log_joint({"x": x.expand(len(grid), -1, -1)}, {"w": grid})
     evidence = sum(log.sum(-1) if log.dim() == 2 else log for log in logs.values()).logsumexp(0) + math.log(16 / 4000)
     before, _ = elbo(model, x)
-    bound, error = elbo(local_guide(model, x, steps=100, rate=0.1), x)
+    bound, error = elbo(local_guide(model, x, steps=100, rate=0.5), x)
     assert before + 0.1 < bound < evidence + 4 * error
