@@ -43,8 +43,8 @@ from .held import reproducibly
 UNITS = 32
 """Draws from the guide of which units are taken."""
 NAT = 1.0
-"""Slopes much below it, in nats a deviation, are followed in proportion, as by gradient ascent; above it, by their sign.
-Were all followed by their sign, so would be the noise of those that are 0, of which arrows have many."""
+"""Slopes well below it, in nats a deviation, are followed in proportion, as by gradient ascent, those above by sign.
+By sign alone, as Adam has it, the noise of those that are 0 would be followed too, and many arrows have such."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from benchmarks.tables import (
     audits,
     bones,
     bounds,
+    bracket,
     completion,
     control,
     demo,
@@ -124,6 +125,25 @@ def test_bounds(page, monkeypatch):
     assert len(gaps) == len(bounds.GUIDES)
     assert gaps[0] == max(gaps)
     assert min(gaps) >= 0
+
+
+def test_bracket(folder, page, tmp_path, monkeypatch):
+    monkeypatch.setattr(bracket, "SETTINGS", {"particles": 2, "temperatures": 2, "chains": 2})
+    monkeypatch.setattr(bracket, "GUIDES", {name: bounds.GUIDES[name] for name in ("mean-field", "exact")})
+    marks = "".join(f"<!-- {name} -->\n<!-- end of {name} -->\n" for name in ("parts", "bracket"))
+    page.write_text(page.read_text().replace("| old |\n", marks))
+    run = fitted(folder, "bracketed", "dkf", "--warm-up", 1, "--latent", 1)
+    bracket.main((run,), tmp_path / "kept", page, count=2, fitting=1, steps=2)
+    parts, (head, line) = tables(page)
+    mean_field, exact = (float(row[1]) for row in parts[1:])
+    assert mean_field > exact > -1e-6
+    assert line[0].startswith("bracketed, ")
+    assert len(head) == len(line)
+    assert not {"–", ""} & {*line}
+    (kept,) = (tmp_path / "kept").iterdir()
+    kept.write_text(kept.read_text().replace('"seed"', '"other"'))
+    with pytest.raises(ValueError, match="not a bracket"):
+        bracket.main((run,), tmp_path / "kept", page, count=2, fitting=1, steps=2)
 
 
 def test_family(folder, page):
