@@ -43,6 +43,7 @@ from .held import clip_places, on_device_of, plain, refuse_non_finite, reproduci
 from .local import local_guide, missing_latents, require_local
 from .particles import obstacle, particle_bound
 from .result import Result, Table, canvas, progress_bar
+from .teacher_forced import length_of
 from .uncertainty import decimals
 
 if TYPE_CHECKING:
@@ -312,7 +313,7 @@ def bracket(
     if GROUP in whole and model.grouped:
         raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")
     windows = data if isinstance(data, HeldOutWindows) else None
-    size = len(whole[(model.view.parts and "x") or model.observed[0]])
+    size = length_of(whole)
     keys = [("data", str(n), 0) for n in range(size)] if windows is None else clusters(windows)
     chosen = torch.randperm(size, generator=torch.Generator().manual_seed(seed))[:count]
     batch, keys = each(whole, itemgetter(chosen)), [keys[n] for n in chosen.tolist()]

@@ -70,14 +70,14 @@ def main(
         kept: directory of brackets.
         page: where.
         count: windows of each run, and sequences of the known model.
-        fitting: steps of local guides; of the known model twice as many.
+        fitting: steps of local guides.
         reach: steps between latents of runs that local guides read linearly, at most.
         steps: of a sequence of the known model.
     """
     torch.set_num_threads(1)
     kept.mkdir(parents=True, exist_ok=True)
     parts = ["amortisation", "missing arrows", "family"]
-    rows = [known(name, inference, steps, count, 2 * fitting) for name, inference in GUIDES.items()]
+    rows = [known(name, inference, steps, count, fitting) for name, inference in GUIDES.items()]
     write(page, table(["", "evidence - ELBO", *parts, "AIS - evidence", "upper - AIS"], rows), name="parts")
     rows = [row(run.name, bracketed(run, kept, count, fitting, reach)) for run in runs]
     columns = ["", "IWAE", "FIVO", "AIS", *parts, "upper - AIS, simulated"]
