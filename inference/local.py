@@ -275,7 +275,7 @@ def require_local(model: DynamicalVAE) -> None:
 
 def missing_latents(model: DynamicalVAE) -> dict[str, tuple[Parent, ...]]:
     """By latent, the latents that its guide does not read and the posterior depends on, in the guide's order."""
-    found = audit(model.generative, model.inference, observed=model.observed).missing_parents
+    found = audit(model.generative, model.inference, observed=model.observed, summed=model.summed).missing_parents
     lacking = {name: tuple(p for p in parents if p.name in model.latents) for name, parents in found.items()}
     return {name: parents for name, parents in lacking.items() if parents}
 

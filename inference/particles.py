@@ -91,10 +91,6 @@ def particle_bound(
     if not 0 <= resample_below <= 1:
         raise ValueError(f"resample_below is a share of the particles, between 0 and 1, got {resample_below}")
     require_likelihood(model)
-    if model.summed:
-        raise ValueError(
-            f"{', '.join(model.summed)} is summed out, exactly, and not followed by particles; use importance_bound"
-        )
     data = model.read(batch)
     size = require_data(model, data)
     at_once = max(1, chunk // particles)
@@ -355,6 +351,8 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
     """
     run = model._rollout(model.generative, model.generator, batch, None, 1)
     instead = "use importance_bound"
+    if model.summed:
+        return f"{', '.join(model.summed)} is summed out, exactly, and not followed by particles; {instead}"
     if run.groups is not None:
         return (
             f"particles are of one sequence each, but groups share {', '.join(model.grouped)}; {instead}, or leave "

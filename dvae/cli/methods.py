@@ -39,6 +39,7 @@ def show(
     generative: str | None = None,
     inference: str | None = None,
     steps: int = 4,
+    summed: tuple[str, ...] = (),
     out: Path | None = None,
 ) -> None:
     """Show two equations: the joint distributions, the audit of the guide, and the graph; and how a method is fitted.
@@ -49,11 +50,12 @@ def show(
         inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; "faithful" for one that misses nothing, "" of a model
             without latents.
         steps: time steps in the figure.
+        summed: discrete latents of the model, which are summed out and have no factor in the guide.
         out: save the unrolled graphs of model and guide to this file (png, pdf, svg).
     """
     at_least(1, steps=steps)
     check_figure(out, "out")
-    if method is not None and (generative or inference):
+    if method is not None and (generative or inference or summed):
         raise UsageError("give the name of a method or two equations, not both")
     if method is not None:
         with arguments():
@@ -64,26 +66,28 @@ def show(
         observed = [name for name in pair[0].variables if name not in pair[1].variables]
     elif generative and inference is None:
         with arguments():
-            choice = alternatives(generative)
+            choice = alternatives(generative, summed=summed)
         OUT.print(str(choice.generative), highlight=False, markup=False, soft_wrap=True)
         OUT.print(choice.table())
         return
     elif generative:
         with arguments():
             model = Factorization.parse(generative)
-            pair = model, guide(model, inference)
+            pair = model, guide(model, inference, summed=summed)
         observed = ["x"]
     else:
         raise UsageError("give the name of a method, or --generative, with --inference for the audit of a guide")
     with arguments():
-        found = audit(*pair, observed=observed)
+        found = audit(*pair, observed=observed, summed=summed)
     OUT.print(str(found.generative), highlight=False, markup=False, soft_wrap=True)
     if found.inference.factors:
         OUT.print(str(found.inference), highlight=False, markup=False, soft_wrap=True)
         OUT.print(found.table())
         OUT.print(found.verdict)
     else:
-        OUT.print("nothing is latent: there is no guide, and the bound is the log evidence")
+        OUT.print(
+            f"{'all that is' if summed else 'nothing is'} latent{' is summed out' if summed else ''}: there is no guide, and the bound is the log evidence"
+        )
     if method is not None:
         OUT.print("\n".join(_fitted(kind.trainings)), highlight=False, soft_wrap=True)
     if out is not None:

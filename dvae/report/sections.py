@@ -147,8 +147,9 @@ def graphs(runs: Runs) -> Section:
         model = run.model
         generative = _drawn(model.generative.draw(STEPS, observed=model.observed), "model")
         if not model.inference.factors:
-            return generative + paragraph("Nothing is latent: there is no guide, and the bound is the log evidence.")
-        found = audit(model.generative, model.inference, observed=model.observed)
+            why = "All that is latent is summed out" if model.summed else "Nothing is latent"
+            return generative + paragraph(f"{why}: there is no guide, and the bound is the log evidence.")
+        found = audit(model.generative, model.inference, observed=model.observed, summed=model.summed)
         return (
             beside(generative, _drawn(found.draw(STEPS), "guide")) + paragraph(found.verdict) + tabulated(found.table())
         )
