@@ -384,6 +384,7 @@ def alternatives(
             raise ValueError(f"nothing is latent in {generative.text!r}: there is no guide to derive")
         looped = tuple(name for block in inference.blocks if block.direction for name in block.names)
         closed = analytic_kl(generative, inference)
+        closed |= {f.child: False for f in generative.factors if f.child in closed and any(map(f.parent, summed))}
         derived = Derived(
             order,
             inference,

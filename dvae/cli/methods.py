@@ -85,9 +85,8 @@ def show(
         OUT.print(found.table())
         OUT.print(found.verdict)
     else:
-        OUT.print(
-            f"{'all that is' if summed else 'nothing is'} latent{' is summed out' if summed else ''}: there is no guide, and the bound is the log evidence"
-        )
+        why = "all that is latent is summed out" if summed else "nothing is latent"
+        OUT.print(f"{why}: there is no guide, and the bound is the log evidence")
     if method is not None:
         OUT.print("\n".join(_fitted(kind.trainings)), highlight=False, soft_wrap=True)
     if out is not None:
