@@ -360,8 +360,8 @@ def tubes(
 
     Calibrated on the run's validation windows, which are of what it was fitted on, and judged on its test windows; or,
     by --label style --values feminine, on the test clips of some styles, and judged on the others. Prints the factors
-    and how often futures are held before and after, and writes tubes.json in the run, or --out: `dvae.Tubes.load` reads
-    it, and its `tube` goes around forecasts.
+    and how often futures are held before and after, and writes tubes.json and tubes-coverage.json in the run, or beside
+    --out: `dvae.Tubes.load` reads the first, and its `tube` goes around forecasts.
 
     Args:
         run: the run directory.
@@ -385,8 +385,9 @@ def tubes(
     opened = opening.data_of(data, loaded, missing=missing)
     kept, judged = _kept_and_judged(kind, loaded, opened, label, values)
     found = conformal(loaded.model, kept, level, samples=samples, seed=seed, batch_size=batch_size)
-    _keep(found, [out or run / f"{opening.record('tubes', loaded, opened)}.json"], figure)
-    OUT.print(found.coverage({loaded.method.name: loaded.model}, judged).table())
+    path = out or run / f"{opening.record('tubes', loaded, opened)}.json"
+    _keep(found, [path], figure)
+    _keep(found.coverage({loaded.method.name: loaded.model}, judged), [path.with_stem(f"{path.stem}-coverage")], None)
 
 
 def _kept_and_judged(kind: str, loaded: runs.Loaded, opened: Any, label: str | None, values: Sequence[str]) -> Any:

@@ -17,9 +17,10 @@ from ..motion.plot import staged
 from ..report import Section, document, lacking, sections
 from ..report.page import beside, picture
 from ..runs import directory as runs
+from ..runs.ablation import Ablation
 from ..tables.windows import PanelWindows
 from . import opening
-from .console import ERROR, Missing, at_least, check_files
+from .console import ERROR, Missing, UsageError, at_least, check_files
 from .futures import draw_futures
 from .judging import Control
 from .judging import evaluate as evaluate_runs
@@ -31,6 +32,9 @@ OF_DIRECTORIES = (
     sections.curves,
     sections.evaluated,
     sections.calibration,
+    sections.bracketed,
+    sections.yardsticks,
+    sections.tubes,
 )
 """What needs no data."""
 QUANTILES = 100
@@ -48,6 +52,7 @@ def report(
     bound_windows: int = 64,
     particles: int = 64,
     seed: int = 0,
+    ablation: Path | None = None,
     data: str | None = None,
     missing: Missing = False,
 ) -> None:
@@ -65,11 +70,13 @@ def report(
         bound_windows: test windows, evenly spread, of which bounds, KL and latents are shown.
         particles: of the importance-weighted bound.
         seed: of the draws.
+        ablation: the file of `dvae ablate`, whose table and drawing are shown too.
         data: where the data lie now, if the path in the runs no longer leads there; or other data of the same joints.
     """
     at_least(0, windows=windows)
     at_least(1, samples=samples, bound_windows=bound_windows, particles=particles)
     check_files(out, None, ".html", ".htm")
+    ablated = None if ablation is None else _ablation(ablation)
     kind = opening.kind_of(run, data)
     loaded = opening.alike(run, data, kind if kind == "panel" else "motion")
     if evaluate:
@@ -79,6 +86,7 @@ def report(
 
     with progress_bar(True) as bar:
         shown = [make(named) for make in bar.track(OF_DIRECTORIES, description="run directories")]
+    shown += [] if ablated is None else [sections.arrows(ablated)]
     try:
         opened = opening.data_of(data, *loaded, missing=missing)
         test: Any = opened.windows("test")
@@ -94,6 +102,13 @@ def report(
     with files.written(out) as file:
         file.write(text.encode(errors="replace"))
     ERROR.print(f"wrote {out}: {', '.join(named)}, {len(text) / 1e6:.1f} MB")
+
+
+def _ablation(path: Path) -> Ablation:
+    try:
+        return Ablation.from_json(files.read(path, sections.LARGEST, links=True).decode())
+    except ValueError as error:
+        raise UsageError(f"--ablation {path}: {reason(error)}") from error
 
 
 def _fans(named: Mapping[str, Any], windows: PanelWindows, count: int, samples: int, seed: int) -> Section:

@@ -24,18 +24,23 @@ from torch import Tensor
 from .. import files
 from ..data import Batch, HeldOutWindows, each
 from ..graph import audit
+from ..inference.bracket import Bracket
 from ..inference.calibration import Calibration
 from ..inference.checkpoints import CheckpointError, Run
 from ..inference.compare import compare
 from ..inference.comparison import KHAT, Comparison
+from ..inference.conformal import Tubes
 from ..inference.evaluation import ARROWS, Evaluation
 from ..inference.fit import Fit
 from ..inference.held import on_device_of, plain, reproducibly
 from ..inference.result import Table, as_they_are, canvas, progress_bar, reason
+from ..inference.stein import SteinDiscrepancy
 from ..inference.trackers import JSONLines
+from ..inference.yardstick import ReferencePosterior
 from ..options import flat
 from ..program.batch import repeat
 from ..program.protocols import Program
+from ..runs.ablation import Ablation
 from ..runs.directory import Loaded
 from .page import Section, beside, command, lacking, paragraph, picture, tabulated
 
@@ -213,6 +218,59 @@ def calibration(runs: Runs) -> Section:
 
     about = "Is the guide the model's posterior on the model's own data, and do replicated windows look like real ones?"
     return Section("Calibration and predictive checks", cells(runs, cell), about)
+
+
+def bracketed(runs: Runs) -> Section:
+    """The evidence between two bounds, and where the ELBO loses what it lacks."""
+
+    def cell(run: Loaded) -> Markup:
+        if (text := _record(run, "bracket.json")) is None:
+            return _missing(run, "bracket.json", "bounds from both sides", "bracket")
+        found = Bracket.from_json(text)
+        return picture(found.plot(), "bounds of the evidence from both sides") + tabulated(found.table())
+
+    about = (
+        "How far the evidence lies above the bound that was trained, and how much of that a better guide would have."
+    )
+    return Section("Evidence from both sides", cells(runs, cell), about)
+
+
+def yardsticks(runs: Runs) -> Section:
+    """The guide beside reference posteriors of some windows."""
+
+    def cell(run: Loaded) -> Markup:
+        if (text := _record(run, "reference.json")) is None:
+            return _missing(run, "reference.json", "reference posteriors", "reference")
+        document, parts = json.loads(text), Markup()
+        kinds: dict[str, type[SteinDiscrepancy | ReferencePosterior]]
+        kinds = {"stein": SteinDiscrepancy, "reference": ReferencePosterior}
+        for name in [name for name in kinds if name in document]:
+            found = kinds[name].from_json(json.dumps(document[name]))
+            parts += picture(found.plot(), found.verdict) + tabulated(found.table())
+        return parts
+
+    about = "What the guide says of the latents of some test windows, beside what their posterior is."
+    return Section("Guide beside the posterior", cells(runs, cell), about)
+
+
+def tubes(runs: Runs) -> Section:
+    """How forecasts are widened to hold the future as often as they say, and how often they do."""
+
+    def cell(run: Loaded) -> Markup:
+        if (text := _record(run, "tubes.json")) is None:
+            return _missing(run, "tubes.json", "tubes around forecasts", "tubes")
+        found, held = Tubes.from_json(text), _record(run, "tubes-coverage.json")
+        shown = picture(found.plot(), "factors over the horizon") + tabulated(found.table())
+        return shown + (tabulated(Evaluation.from_json(held).table()) if held is not None else "")
+
+    about = "Forecasts hold the future as often as they say once they are this much wider; judged on windows apart."
+    return Section("Tubes around forecasts", cells(runs, cell), about)
+
+
+def arrows(found: Ablation) -> Section:
+    """What every arrow of a model and its guide is worth."""
+    shown = picture(found.plot(), "model and guide of one step, arrows as thick as their price")
+    return Section("What every arrow is worth", before=shown + tabulated(found.table()))
 
 
 # ---------------------------------------------------------------------------------------- what windows are needed for

@@ -156,6 +156,11 @@ def scored(fitted, tmp_path_factory):
     run = shutil.copytree(fitted, tmp_path_factory.mktemp("scored") / "run")
     assert main(["evaluate", str(run), "--samples", "2"]) == 0
     assert main(["criticise", str(run), "--simulations", "20", "--draws", "9", "--ranked-steps", "1"]) == 0
+    few = ["--temperatures", "2", "--chains", "2", "--particles", "2", "--fitting", "2"]
+    assert main(["bracket", str(run), "--count", "2", *few]) == 0
+    assert main(["tubes", str(run), "--samples", "4", "--level", "0.4"]) == 0
+    few = ["--draws", "8", "--chains", "2", "--warmup", "2", "--stein-draws", "9"]
+    assert main(["reference", str(run), "--windows", "1", "--frames", "2", *few]) == 0
     return run
 
 
@@ -172,6 +177,24 @@ def test_records_beside_a_run_are_shown(scored):
     assert json.loads((scored / "criticism.json").read_text())["calibration"]["verdict"] in criticism
     assert "bone stretch (%)" in criticism
     assert "changed" not in scores
+
+
+def test_what_the_bench_left_beside_a_run_is_shown(scored, tmp_path):
+    run = {"a": dvae.load(scored)}
+    made = (sections.bracketed, sections.yardsticks, sections.tubes)
+    bracket, beside, tubes = (Tags(document("a", [make(run)])) for make in made)
+    assert "AIS, L = 2, K = 2" in bracket.text
+    assert "amortisation" in bracket.text
+    assert json.loads((scored / "reference.json").read_text())["stein"]["verdict"] in beside.text
+    assert "beside the posterior of 1 sequences" in beside.text
+    assert "held 40 %" in tubes.text
+    pair = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})")
+    dvae.ablate(pair, steps=2, twins=1).save(tmp_path / "ablation.json")
+    arrows = document("a", [sections.arrows(dvae.Ablation.load(tmp_path / "ablation.json"))])
+    assert "z_{t-1} to z_t" in Tags(arrows).text
+    assert "<img" in arrows
+    (tmp_path / "none.json").write_text("{}")
+    assert main(["report", str(scored), "--out", "a.html", "--ablation", str(tmp_path / "none.json")]) == 2
 
 
 def test_scores_of_another_state_of_the_run_are_told_apart(scored, tmp_path):
