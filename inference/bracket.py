@@ -173,8 +173,8 @@ class Bracket(Result):
 
     def plot(self) -> Figure:
         """All bounds above the ELBO, real and simulated data apart, the parts of the gap, and the bracket shaded."""
-        figure = canvas(9, 5.5)
-        panels = figure.subplots(2, 1, sharex=True)
+        figure = canvas(9, 6)
+        panels = figure.subplots(2, 1)  # each with its own axis: a guide may be far worse on data it was not fitted to
         unknown = self.estimate("upper", "AIS", "simulated").mean
         for panel, data in zip(panels, DATA, strict=True):
             names = list(self.bounds[data])
@@ -194,8 +194,7 @@ class Bracket(Result):
             panel.set_title(f"{data} data", loc="left", fontsize=10)
             panel.grid(axis="x", alpha=0.3)
         panels[1].set_xlabel("nats a sequence above the ELBO (95 % over sequences)")
-        if panels[1].get_legend_handles_labels()[1]:
-            panels[1].legend(fontsize=8)
+        figure.legend(*panels[1].get_legend_handles_labels(), loc="outside lower center", ncols=len(PARTS), fontsize=8)
         figure.suptitle(f"{self.equations['generative']}\n{self.equations['inference']}", fontsize=9, parse_math=False)
         return figure
 

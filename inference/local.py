@@ -7,8 +7,8 @@ free for every sequence n, every step of v and every step u of the latents that 
 is the guide, and go up the evidence lower bound of their sequence. s_0, c_u and d_u are units, from draws of the guide:
 mean deviations given what is read, means and deviations of what is read.
 
-So whatever a network could make of the data is within reach, and no sequence is worse off than with the guide. What the
-network makes of latents stays, up to a linear function of them. A guide that reads none becomes the best product of
+So whatever a network could make of the data is within reach, and the guide itself too. What it makes of latents stays,
+up to a linear function of them. A guide that reads none becomes the best product of
 normals for the sequence, as in Cremer, Li and Duvenaud (2018, arXiv 1801.03558); a linear one, the best linear one.
 
 Gradients are those of the path alone (Roeder, Wu and Duvenaud, 2017, arXiv 1703.09194): they have no noise where the
