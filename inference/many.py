@@ -27,7 +27,7 @@ import numpy as np
 from scipy import special, stats
 
 from .estimates import Crossed, Estimate, number
-from .result import Table
+from .result import Shown, Table
 
 
 def holm(p_values: Sequence[float]) -> np.ndarray:
@@ -50,8 +50,8 @@ def holm(p_values: Sequence[float]) -> np.ndarray:
     return found
 
 
-@dataclass(frozen=True)
-class Pairs:
+@dataclass(frozen=True, repr=False)
+class Pairs(Shown):
     """All paired differences of some models, first minus second.
 
     Attributes:
@@ -93,8 +93,8 @@ def pairs(contenders: Mapping[str, Crossed]) -> Pairs:
     return Pairs(found, dict(zip(found, map(float, adjusted), strict=True)))
 
 
-@dataclass(frozen=True)
-class ConfidenceSet:
+@dataclass(frozen=True, repr=False)
+class ConfidenceSet(Shown):
     """Models that may be the best.
 
     Attributes:
@@ -207,8 +207,8 @@ def _check(rows: Mapping[str, Crossed]) -> int:
     return next(iter(counts.values()))
 
 
-@dataclass(frozen=True)
-class Requirement:
+@dataclass(frozen=True, repr=False)
+class Requirement(Shown):
     """What it takes to tell two models apart.
 
     Attributes:

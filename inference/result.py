@@ -78,12 +78,35 @@ def as_they_are(texts: "Iterable[matplotlib.text.Text]") -> None:
         text.set_parse_math(False)
 
 
-class Result:
-    """A result with a `table` and a `to_json`; it shows itself as the one and is kept as the other."""
+class Shown:
+    """What has a `table` shows itself as that, in a terminal and in a notebook."""
 
     def table(self) -> RenderableType:
         """Everything that matters, with its uncertainty."""
         raise NotImplementedError
+
+    def __rich__(self) -> RenderableType:
+        return self.table()
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=400, force_jupyter=False)
+        console.print(self.table())
+        return console.file.getvalue().rstrip()  # type: ignore[attr-defined]
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        console = Console(file=io.StringIO(), width=400, force_jupyter=False, record=True)
+        console.print(self.table())
+        lines = "\n".join(
+            line.rstrip() for line in console.export_html(inline_styles=True, code_format="{code}").split("\n")
+        )
+        return f'<pre style="line-height:normal; font-family:monospace">{lines}</pre>'
+
+
+class Result(Shown):
+    """A result with a `table` and a `to_json`; it shows itself as the one and is kept as the other."""
 
     def to_json(self) -> str:
         """Everything, as text."""
@@ -115,25 +138,6 @@ class Result:
             OSError, ValueError: there is no such file, or it is no plain one, or no result of this kind.
         """
         return cls.from_json(files.read(path, LARGEST, links=True).decode())
-
-    def __rich__(self) -> RenderableType:
-        return self.table()
-
-    def __str__(self) -> str:
-        console = Console(file=io.StringIO(), width=400, force_jupyter=False)
-        console.print(self.table())
-        return console.file.getvalue().rstrip()  # type: ignore[attr-defined]
-
-    def __repr__(self) -> str:
-        return str(self)
-
-    def _repr_html_(self) -> str:
-        console = Console(file=io.StringIO(), width=400, force_jupyter=False, record=True)
-        console.print(self.table())
-        lines = "\n".join(
-            line.rstrip() for line in console.export_html(inline_styles=True, code_format="{code}").split("\n")
-        )
-        return f'<pre style="line-height:normal; font-family:monospace">{lines}</pre>'
 
 
 def progress_bar(shown: bool) -> Progress:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ..inference.checkpoints import Run
+from ..models.equations import Equations
 from ..models.registry import judges
 from ..options import flat
 from ..runs import directory as runs
@@ -119,9 +121,19 @@ def rows(loaded: Sequence[runs.Loaded]) -> dict[str, list[runs.Loaded]]:
     names = [first.method.name for first in firsts]
     for name in [name for name, count in Counter(names).items() if count > 1]:
         places = [place for place, other in enumerate(names) if other == name]
+        grid = [_of_grid(list(rows.values())[place]) for place in places]
+        if name == Equations.name and all(grid) and len({*grid}) == len(grid):  # shorter than what they differ in
+            names = [grid[places.index(place)] if place in places else other for place, other in enumerate(names)]
+            continue
         for place, said in zip(places, _apart([firsts[place] for place in places]), strict=True):
             names[place] = f"{name} ({said})"
     return dict(zip(names, rows.values(), strict=True))
+
+
+def _of_grid(row: Sequence[runs.Loaded]) -> str:
+    """What directories of a row are called but for the seed, as a sweep names them; "" where that is not one name."""
+    stems = {re.sub(r"-seed\d+$", "", run.path.absolute().name) for run in row}
+    return stems.pop() if len(stems) == 1 and len(row) > 1 else ""
 
 
 def _apart(loaded: Sequence[runs.Loaded]) -> list[str]:

@@ -1,5 +1,7 @@
 """Grids: what a file says is what a sweep fits, under the file's names, and the same command continues it."""
 
+from pathlib import Path
+
 import pytest
 
 import dvae
@@ -46,6 +48,17 @@ def test_a_grid_is_what_its_file_says(study):
     study.write_text(STUDY + "\n[more]\nmethod = 'srnn'\neach.latent = [1, 2]\neach.width = [3, 4]\n")
     more = [name for name in Grid.read(study).methods if name.startswith("more")]
     assert more == [f"more-latent={latent}-width={width}" for latent in (1, 2) for width in (3, 4)]
+
+
+def test_the_study_of_the_docs_is_a_grid(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "study.md").read_text(encoding="utf-8")
+    (tmp_path / "study.toml").write_text(page.split("```toml\n")[1].split("```")[0])
+    grid = Grid.read(tmp_path / "study.toml")
+    assert list(grid.methods) == ["filter", "chain", "person", "switching"]
+    assert grid.methods["switching"].sizes()["k"] == 3
+    assert grid.seeds == (0, 1, 2)
+    for method in grid.methods.values():
+        method.build({"x": 3})
 
 
 def test_options_of_all_give_way_to_those_of_the_file(study):
