@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Self
@@ -314,7 +314,8 @@ def bracket(
     windows = data if isinstance(data, HeldOutWindows) else None
     size = length_of(whole)
     keys = [("data", str(n), 0) for n in range(size)] if windows is None else clusters(windows)
-    chosen = torch.randperm(size, generator=torch.Generator().manual_seed(seed))[:count]
+    chance = torch.Generator().manual_seed(seed)
+    chosen = torch.randperm(size, generator=chance)[:count]
     batch, keys = each(whole, itemgetter(chosen)), [keys[n] for n in chosen.tolist()]
     parts = [slice(first, first + batch_size) for first in range(0, len(keys), batch_size)]
     read = [model.read(on_device_of(model, each(batch, itemgetter(part)))) for part in parts]
@@ -327,7 +328,7 @@ def bracket(
     refused = next(filter(None, (obstacle(model, part) for part in read)), "")
     if refused:
         notes.append(f"no FIVO: {refused}")
-    with reproducibly(model, seed):
+    with reproducibly(model, _seeds(chance, 1)[0]):
         drawn = [_simulated(model, part) for part in read]
     added = missing_latents(model) if fitting else {}
     work = _Work(model, particles, temperatures, chains, fitting, reach, bool(refused), bool(added))
@@ -336,7 +337,7 @@ def bracket(
         task = bar.add_task("bracket", total=len(parts) * 2 * ((1 + bool(added)) * fitting + 1))
         for place, (real, (simulated, latents)) in enumerate(zip(read, drawn, strict=True)):
             for name, some, start in (("real", real, None), ("simulated", simulated, latents)):
-                bounds = work.bounds(some, start, seed + place, lambda: bar.advance(task))
+                bounds = work.bounds(some, start, _seeds(chance, 3), lambda: bar.advance(task))
                 for bound, values in bounds.items():
                     refuse_non_finite(bound, f"bound of {name} data", values.isfinite(), keys[parts[place]])
                 found[name].append(bounds)
@@ -358,6 +359,11 @@ def bracket(
         seed=seed,
         notes=notes,
     )
+
+
+def _seeds(chance: torch.Generator, count: int) -> list[int]:
+    """Of draws that have nothing to do with each other: what a guide was fitted by is not what it is judged by."""
+    return torch.randint(2**31, (count,), generator=chance).tolist()  # type: ignore[no-any-return]
 
 
 def _called(windows: HeldOutWindows) -> dict[str, Any]:
@@ -394,22 +400,26 @@ class _Work:
     lacking: bool
 
     def bounds(
-        self, data: Mapping[str, Any], latents: Mapping[str, Tensor] | None, seed: int, advance: Any
+        self, data: Mapping[str, Any], latents: Mapping[str, Tensor] | None, seeds: Sequence[int], advance: Any
     ) -> dict[str, Tensor]:
-        """Bound to (B,); an upper one too, where there are latents that the data were drawn with."""
+        """Bound to (B,); an upper one too, where there are latents that the data were drawn with.
+
+        The draws of all ELBOs have one seed, so that their differences have less noise.
+        """
         model, found = self.model, {}
-        with reproducibly(model, seed):
+        judging, fitting, annealing = seeds
+        with reproducibly(model, judging):
             weights = self._weights(model, data)
             found["ELBO"], found["IWAE"] = weights.mean(0), weights.logsumexp(0) - math.log(self.particles)
             if not self.blocked:
                 found["FIVO"] = particle_bound(model, data, self.particles, chunk=CHUNK).bound
         for name, missing in ((OWN, False), (ALL, True)) if self.fitting else ():
             if not missing or self.lacking:  # else there is nothing to add
-                how: Any = {"missing": missing, "steps": self.fitting, "reach": self.reach, "seed": seed}
+                how: Any = {"missing": missing, "steps": self.fitting, "reach": self.reach, "seed": fitting}
                 model = local_guide(self.model, data, **how, progress=advance)
-            with reproducibly(model, seed):
+            with reproducibly(model, judging):
                 found[name] = self._weights(model, data).mean(0)
-        how = {"temperatures": self.temperatures, "chains": self.chains, "seed": seed}
+        how = {"temperatures": self.temperatures, "chains": self.chains, "seed": annealing}
         how["chunk"] = self.chains * len(found["ELBO"])  # a local guide is for all of them
         found["AIS"] = annealed_bound(model, data, **how).bound
         if latents is not None:
