@@ -252,10 +252,12 @@ def audit(
     given = {node for name in (*data, *context) for node in view.nodes(name)}
     model.add_nodes_from(given)
     read.add_nodes_from(given)
+    inner = {node for name in latents for node in view.inner(name)}
     needs, uses = {}, {}
     for node in view.drawn(inference.blocks):
-        needs[node] = markov_boundary(model, node, given)
-        uses[node] = markov_boundary(model, node, set(read.predecessors(node)))
+        if node in inner:
+            needs[node] = markov_boundary(model, node, given)
+            uses[node] = markov_boundary(model, node, set(read.predecessors(node)))
         given.add(node)
     lacks = {node: boundary - set(read.predecessors(node)) for node, boundary in needs.items()}
 

@@ -39,13 +39,12 @@ def markov_boundary(dag: nx.DiGraph, node: Node, given: AbstractSet[Node]) -> se
         node: a node that is not in given.
         given: nodes whose values are known.
     """
-    kept: set[Node] = set()
+    kept = {node, *given}
     frontier = [node, *given]
     while frontier:
-        current = frontier.pop()
-        if current not in kept:
-            kept.add(current)
-            frontier.extend(dag.predecessors(current))
+        above = [parent for parent in dag.pred[frontier.pop()] if parent not in kept]
+        kept.update(above)
+        frontier.extend(above)
     # In the moral graph of these a child and its parents, a family, are neighbours; given nodes stop a path.
     boundary: set[Node] = set()
     walked, families = {node}, set()
@@ -85,6 +84,10 @@ class Unrolled:
         """Of a variable."""
         return unrolled(name, self.local[name], self.length)
 
+    def inner(self, name: str) -> list[Node]:
+        """Of a variable, those that count; that of a static one does."""
+        return self.nodes(name)[self.margin : self.margin + self.width] or self.nodes(name)
+
     def drawn(self, order: Sequence[Block]) -> Iterator[Node]:
         """Latents one after the other; those of a block that is drawn at all steps at once, forward in time."""
         for block in order:
@@ -96,9 +99,7 @@ class Unrolled:
 
         (1,), whether there is any at all, where one of the two is static.
         """
-        rows, columns = (
-            self.nodes(name)[self.margin : self.margin + self.width] or self.nodes(name) for name in (child, parent)
-        )
+        rows, columns = map(self.inner, (child, parent))
         arrows = np.array([[column in edges[row] for column in columns] for row in rows])
         if not self.in_time(child, parent):
             return np.array([arrows.any()])
@@ -166,9 +167,11 @@ def faithful(
     view = Unrolled({name: generative.local(name) for name in names}, width=4 * reach + 3, margin=2 * reach + 2)
     dag = generative.dag(view.length)
     given = {node for name in (*data, *generative.context) for node in view.nodes(name)}
+    inner = {node for name in latents for node in view.inner(name)}
     needs = {}
     for node in view.drawn(order):
-        needs[node] = markov_boundary(dag, node, given)
+        if node in inner:
+            needs[node] = markov_boundary(dag, node, given)
         given.add(node)
 
     def factor(child: str) -> Factor:

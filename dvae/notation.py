@@ -101,11 +101,11 @@ class Factor:
 
     def edges(self, T: int) -> list[tuple[Node, Node]]:
         """The arrows (parent, child) of the graph unrolled over T steps; see `Factorization.dag`."""
-        return [
-            (unrolled(parent.name, parent.local, T)[s], unrolled(self.child, self.local, T)[t])
-            for parent in self.parents
-            for t, s in np.argwhere(self.mask(parent.name, T)).tolist()
-        ]
+        found, children = [], unrolled(self.child, self.local, T)
+        for parent in self.parents:
+            parents = unrolled(parent.name, parent.local, T)
+            found += [(parents[s], children[t]) for t, s in np.argwhere(self.mask(parent.name, T)).tolist()]
+        return found
 
     def render(self, variable: Callable[[str, str | None], str], bar: str = " | ") -> str:
         """The factor as text, each variable written by `variable(name, subscript)`."""

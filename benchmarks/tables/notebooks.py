@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 PLOTLY = "application/vnd.plotly.v1+json"
 # sequences have fewer steps than training
 SHARED = re.compile(
-    r"(\b(?:steps|particles|samples|warm_up)=|\b(?:Stage|draw)\(|\"warm_up\": )(\d{3,}|(?<=samples=)\d\d)"
+    r"(\b(?:steps|particles|samples|fitting|warm_up)=|\b(?:Stage|draw)\(|\"warm_up\": )(\d{3,}|(?<=samples=)\d\d)"
 )
 CLIPS, FEWEST = re.compile(r"(\bclips=)(\d{2,})"), 0.5  # a share of them, so that every split has some
 LIGHT = np.array([-0.5, -0.6, 0.63])  # towards it, from the left, above and in front

@@ -294,7 +294,7 @@ def test_all_scores_are_public():
     of_features = {frechet_distance, frechet_pseudo_values, gaussian_frechet_distance}
     of_motion = {average_pairwise_distance_error, cumulative_motion_distance, motion_pseudo_values}
     of_ranks = {metrics.coverage, metrics.interval_width, metrics.probability_integral_transform}
-    of_ranks |= {metrics.pit_histogram, metrics.pit_mean, metrics.pit_variance}
+    of_ranks |= {metrics.pit_histogram, metrics.pit_mean, metrics.pit_variance, metrics.tarp_histogram}
     at_once = {average_pairwise_distance, metrics.multimodal_errors}
     public = {*at_once, *of_features, *of_motion, *of_ranks, *PAIRED, *MULTIMODAL}
     functions = inspect.getmembers(metrics, inspect.isfunction)

@@ -70,6 +70,7 @@ class TestSwitching(FactorizationContract):
     """A chain of states that chooses the dynamics of a continuous latent."""
 
     missing: ClassVar = {"z": ("z_{<=t-2}",)}
+    training_steps = 20
 
     def build(self, size):
         sizes = {"k": Discrete(max(size, 2)), "z": size, "x": size}
@@ -78,6 +79,8 @@ class TestSwitching(FactorizationContract):
 
 class TestMixture(FactorizationContract):
     """A state of the sequence, of which a static latent and the data are told."""
+
+    training_steps = 20
 
     def build(self, size):
         equations = "p(m) p(w | m) p(x_t | m, w)", "q(w | x_{1:T})"
@@ -144,9 +147,7 @@ def test_nuts_finds_the_moments_of_the_mixture():
     exact = dvae.reference_posterior(pair, x, guide_draws=100, progress=False)
     assert exact.exact
     mask = torch.ones_like(x, dtype=torch.bool)
-    drawn = dvae.reference_posterior(
-        pair, {"x": x, "mask": mask}, draws=100, warmup=50, guide_draws=100, progress=False
-    )
+    drawn = dvae.reference_posterior(pair, {"x": x, "mask": mask}, draws=80, warmup=40, guide_draws=100, progress=False)
     away = (drawn.reference.mean - exact.reference.mean) / drawn.reference.mean_error
     assert (abs(away) < 4.5).all()
 
@@ -208,11 +209,11 @@ def test_missing_entries_leave_the_sum():
     found = dvae.importance_bound(model, {"x": data, "mask": seen}, 1).bound
     assert torch.equal(found, dvae.importance_bound(model, {"x": torch.where(seen, data, 9.0), "mask": seen}, 1).bound)
     every = []
-    for value in torch.linspace(-30, 30, 1201, dtype=torch.float64):  # the integral over one unseen coordinate
+    for value in torch.linspace(-30, 30, 601, dtype=torch.float64):  # the integral over one unseen coordinate
         filled = data.clone()
         filled[:, 1, 0] = value
         every.append(dvae.importance_bound(model, {"x": filled, "mask": _but(seen, data)}, 1).bound)
-    total = torch.stack(every).logsumexp(0) + math.log(60 / 1200)
+    total = torch.stack(every).logsumexp(0) + math.log(60 / 600)
     torch.testing.assert_close(total, found, rtol=0, atol=1e-3)
     assert model.impute({"x": data, "mask": seen}, 3)["x"].shape == (3, *data.shape)
 
@@ -233,10 +234,10 @@ def test_the_oracle_counts_all_courses():
     torch.testing.assert_close(oracle.bound(x), oracle.evidence(x))
     pair = dvae.twin(SWITCHING[0], "faithful", {"k": Discrete(3), "z": 1, "x": 1}, 1, scale=1.5)
     oracle, x = dvae.Oracle(pair, 1), pair.sample(4, 1)["x"]
-    grid = torch.linspace(-15, 15, 3001, dtype=torch.float64)
+    grid = torch.linspace(-15, 15, 601, dtype=torch.float64)
     joint = [sum(pair.log_joint(x, {"z": z.expand(4, 1, 1)}).values()) for z in grid]
     weights = torch.stack(joint).softmax(0)
-    torch.testing.assert_close(oracle.evidence(x), torch.stack(joint).logsumexp(0) + math.log(0.01), rtol=0, atol=1e-8)
+    torch.testing.assert_close(oracle.evidence(x), torch.stack(joint).logsumexp(0) + math.log(0.05), rtol=0, atol=1e-8)
     mean, covariance = oracle.posterior(x)
     torch.testing.assert_close(mean[:, 0], (weights * grid[:, None]).sum(0), rtol=0, atol=1e-8)
     square = (weights * grid[:, None] ** 2).sum(0)
