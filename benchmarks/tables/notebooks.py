@@ -15,6 +15,7 @@ from typing import Any
 import nbformat
 import numpy as np
 import tyro
+from jupyter_client.manager import KernelManager
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -27,18 +28,32 @@ PLOTLY = "application/vnd.plotly.v1+json"
 SHARED = re.compile(
     r"(\b(?:steps|particles|samples|fitting|warm_up)=|\b(?:Stage|draw)\(|\"warm_up\": )(\d{3,}|(?<=samples=)\d\d)"
 )
-CLIPS, FEWEST = re.compile(r"(\bclips=)(\d{2,})"), 0.5  # a share of them, so that every split has some
+CLIPS, FEWEST = re.compile(r"(\bclips=)(\d{2,})"), 0.35  # a share of them, so that every split has some
 LIGHT = np.array([-0.5, -0.6, 0.63])  # towards it, from the left, above and in front
 TEXTS = ("text/plain", "text/html", "text/latex")
 
 
-def execute(path: Path, share: float = 1.0) -> nbformat.NotebookNode:
-    """A notebook run from top to bottom in a kernel of its own, without what varies.
+CLEAR = "%reset -f\nimport matplotlib.pyplot, pyro\nmatplotlib.pyplot.close('all')\npyro.clear_param_store()"
+"""What a kernel is told before another notebook."""
+
+
+def kernel() -> KernelManager:
+    """A kernel that has not begun, for one notebook after the other."""
+    found = KernelManager(kernel_name="python3")
+    own = {"PYTHONPATH": str(ROOT), "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    env = {**os.environ, **own, "PYTHONWARNINGS": "ignore:IProgress not found"}  # tqdm misses ipywidgets
+    found.start_kernel(env=env, cwd=str(ROOT))
+    return found
+
+
+def execute(path: Path, share: float = 1.0, on: KernelManager | None = None) -> nbformat.NotebookNode:
+    """A notebook run from top to bottom, without what varies.
 
     Args:
         path: the notebook.
-        share: of the steps of training, of particles and of samples, and of simulated clips half at least; fewer change
-            no more than numbers and pictures.
+        share: of the steps of training, of particles and of samples, and of simulated clips a third at least; fewer
+            change no more than numbers and pictures.
+        on: a kernel, which is cleared before; one of its own without.
     """
     notebook = nbformat.read(path, as_version=4)
     sources = [cell.source for cell in notebook.cells]
@@ -47,10 +62,22 @@ def execute(path: Path, share: float = 1.0) -> nbformat.NotebookNode:
             cell.source = pattern.sub(
                 lambda found, part=part: f"{found[1]}{max(int(part * int(found[2])), 2)}", cell.source
             )
-    options = {"timeout": 1200, "kernel_name": "python3", "record_timing": False}
-    client = NotebookClient(notebook, resources={"metadata": {"path": str(ROOT)}}, **options)
-    own = {"PYTHONPATH": str(ROOT), "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
-    client.execute(env={**os.environ, **own, "PYTHONWARNINGS": "ignore:IProgress not found"})  # tqdm misses ipywidgets
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(CLEAR))
+    manager = on or kernel()
+    client = NotebookClient(notebook, km=manager, timeout=1200, record_timing=False)
+    try:
+        client.execute()
+    finally:
+        client.kc.stop_channels()
+        if on is None:
+            manager.shutdown_kernel(now=True)
+    del notebook.cells[0]
+    code = (cell for cell in notebook.cells if cell.cell_type == "code")
+    for count, cell in enumerate(code, 1):
+        cell.execution_count = count
+        for output in cell.outputs:
+            if "execution_count" in output:
+                output.execution_count = count
     notebook.metadata.language_info = {"name": "python"}
     for cell, source in zip(notebook.cells, sources, strict=True):
         cell.source = source

@@ -50,7 +50,7 @@ class FactorizationContract:
     tolerance = 1e-8
     still: frozenset[str] = frozenset()
     missing: Mapping[str, tuple[str, ...]] | None = None
-    training_steps = 100
+    training_steps = 30
 
     def build(self, size: int) -> DynamicalVAE:
         """The model under test, small.

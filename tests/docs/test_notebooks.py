@@ -26,13 +26,20 @@ def shown(notebook):
     return [notebooks.shown(cell) for cell in notebook.cells if cell.cell_type == "code"]
 
 
+@pytest.fixture(scope="module")
+def one_kernel():
+    manager = notebooks.kernel()
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
 @each_notebook
 # The kernel's transport warns of its own affairs.
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.timeout(1200)
 @pytest.mark.slow
-def test_a_run_shows_what_is_stored(path):
-    stored, run = nbformat.read(path, as_version=4), notebooks.execute(path, share=0.02)
+def test_a_run_shows_what_is_stored(path, one_kernel):
+    stored, run = nbformat.read(path, as_version=4), notebooks.execute(path, share=0.02, on=one_kernel)
     for cell, before, now in zip(
         (cell for cell in run.cells if cell.cell_type == "code"), shown(stored), shown(run), strict=True
     ):

@@ -1,6 +1,6 @@
 """Fuzzing by the clock: hypothesis draws examples until a test's share of the time is over.
 
-All tests of this directory together take DVAE_FUZZ_SECONDS (60 where it is not set), each in proportion to the share
+All tests of this directory together take DVAE_FUZZ_SECONDS (15 where it is not set), each in proportion to the share
 that it names. DVAE_FUZZ_SEED (0) decides which examples are tried, in which order; time decides how far one gets.
 
     def test_sums_are_symmetric():
@@ -31,7 +31,7 @@ from hypothesis.strategies import SearchStrategy
 
 Example = TypeVar("Example")
 
-SECONDS = float(os.environ.get("DVAE_FUZZ_SECONDS", "30"))
+SECONDS = float(os.environ.get("DVAE_FUZZ_SECONDS", "15"))
 """Of all tests together."""
 
 SEED = int(os.environ.get("DVAE_FUZZ_SEED", "0"))
@@ -47,7 +47,7 @@ _SHRINKING = 20.0
 
 
 def scaled(seconds: float) -> float:
-    """A share of the default minute, in this run's time."""
+    """A share of a minute, in this run's time."""
     return seconds * SECONDS / 60
 
 

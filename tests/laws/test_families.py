@@ -39,7 +39,6 @@ class Contract(dvae.testing.FactorizationContract):
 
     missing = None
     law = None
-    training_steps = 20
 
     def build(self, size):
         return built(self.law, size)
@@ -111,7 +110,6 @@ class TestSeveralVariables(dvae.testing.FactorizationContract):
     """Data variables of a family each, which read each other."""
 
     missing = None
-    training_steps = 20
 
     def build(self, size):
         return dvae.DynamicalVAE(
@@ -431,8 +429,6 @@ for block in re.findall(r"```python\n(.*?)```", PAGE.partition("## A family of o
 
 class TestOfOnesOwn(SHOWN["TestBursts"]):
     """In the lines that the page shows."""
-
-    training_steps = 20
 
 
 def test_a_family_of_ones_own_is_short():

@@ -55,8 +55,6 @@ def walk(windows):
 
 
 class TestMotionInfilling(FactorizationContract):
-    training_steps = 30
-
     def build(self, size):
         return small().build({"x": size})
 

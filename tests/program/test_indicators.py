@@ -22,7 +22,6 @@ def model(network=None, guide=PAIR[1], indicators=("x",), **options):
 
 
 class TestModel(FactorizationContract):
-    training_steps = 10
     test_its_linear_gaussian_twin_is_bounded_by_the_evidence_and_tight_where_the_audit_says_so = None  # of equations
 
     def build(self, size):

@@ -70,7 +70,6 @@ class TestSwitching(FactorizationContract):
     """A chain of states that chooses the dynamics of a continuous latent."""
 
     missing: ClassVar = {"z": ("z_{<=t-2}",)}
-    training_steps = 20
 
     def build(self, size):
         sizes = {"k": Discrete(max(size, 2)), "z": size, "x": size}
@@ -79,8 +78,6 @@ class TestSwitching(FactorizationContract):
 
 class TestMixture(FactorizationContract):
     """A state of the sequence, of which a static latent and the data are told."""
-
-    training_steps = 20
 
     def build(self, size):
         equations = "p(m) p(w | m) p(x_t | m, w)", "q(w | x_{1:T})"
