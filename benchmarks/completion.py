@@ -1,4 +1,4 @@
-"""Speed of completion by a latent of the paper's size: `python benchmarks/completion.py`, or `make bench`.
+"""Speed of completion by a latent of the paper's size: `python -m benchmarks.bench completion`.
 
     whole      100 segments from one start each, of which 16 markers are seen in 5 frames: one by one over in one batch
     starts     the same from four starts each, the default
@@ -15,8 +15,6 @@ from __future__ import annotations
 import time
 from itertools import cycle, islice
 
-from speed import report, start
-
 import dvae
 from dvae import motion
 from dvae.models.motion_latent import MotionLatent
@@ -28,8 +26,7 @@ MANY, STEPS = 100, 101
 TARGETS = {"whole": ("at least", 20.0), "descent": ("at least", 20.0)}
 
 
-def main() -> None:
-    start(__doc__)
+def rows() -> dict[str, float]:
     people = bodies.fitted(motion.simulate(clips=4, frames=90, seed=1), bodies.human())
     segments = Segments(motion.gait_cycles(people))
     model, batch = MotionLatent().build(segments).eval(), segments.all()
@@ -55,8 +52,4 @@ def main() -> None:
         "descent": MANY * steps[1] / steps[MANY],
         "curvature": MANY * least[1, 1] / least[1, MANY],
     }
-    report(found, TARGETS)
-
-
-if __name__ == "__main__":
-    main()
+    return found

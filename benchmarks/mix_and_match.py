@@ -1,4 +1,4 @@
-"""Speed of Mix-and-Match at the preset for small sets and 15 + 60 frames: `python benchmarks/mix_and_match.py`.
+"""Speed of Mix-and-Match at the preset for small sets and 15 + 60 frames: `python -m benchmarks.bench mix_and_match`.
 
     feeding    a training step (32 windows of quaternions; forward, backward, Adam) in which the decoder reads its own
                poses, against one in which it reads the true ones, whose loop is torch's
@@ -12,16 +12,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from speed import report, seconds, start, training_step
 
 import dvae
 from dvae import motion
 
+from .speed import seconds, training_step
+
 TARGETS = {"feeding": ("at most", 1.75)}
 
 
-def main() -> None:
-    start(__doc__)
+def rows() -> dict[str, float]:
     protocol = replace(motion.PROTOCOLS["simulated"], representation="quaternion")
     windows = motion.windows(motion.simulate(), protocol, "train")
     method = dvae.method("mix-and-match").suited(windows)
@@ -35,8 +35,4 @@ def main() -> None:
         ),
         repeat=5,
     )
-    report({"feeding": own / true, "step": own}, TARGETS)
-
-
-if __name__ == "__main__":
-    main()
+    return {"feeding": own / true, "step": own}

@@ -1,11 +1,11 @@
-"""Speed of TrajeVAE at its size for Human3.6M: `python benchmarks/trajevae.py`, or `make bench`.
+"""Speed of TrajeVAE at its size for Human3.6M: `python -m benchmarks.bench trajevae`.
 
-    step      a training step (32 windows of 1 + 100 frames; forward, backward, Adam), in units of one
-              2048 x 2048 x 2048 float32 product timed beside it. The public implementation takes 48.
-    sampling  50 motions of one pose and its paths, in the same unit; the public implementation 11
+    step      a training step (32 windows of 1 + 100 frames; forward, backward, Adam), over its
+              matrix products alone
+    sampling  50 motions of one pose and its paths, over their matrix products alone
     bend      5 motions of 100 frames bent to the path of a wrist, in seconds, once
 
-Motion is simulated, on the same tree of joints. The first two are the least of several times, in turns with products.
+Motion is simulated, on the same tree of joints. Times are the least of several, in turns with the products.
 """
 
 from __future__ import annotations
@@ -15,30 +15,29 @@ import warnings
 from dataclasses import replace
 
 import torch
-from speed import report, seconds, start, training_step
 
 import dvae
 from dvae import motion
 
-TARGETS = {"step": ("at most", 48.0), "sampling": ("at most", 5.0)}
+from .speed import products, seconds, training_step
+
+TARGETS: dict[str, tuple[str, float]] = {}
 
 
-def main() -> None:
-    start(__doc__)
-
+def rows() -> dict[str, float]:
     protocol = replace(motion.PROTOCOLS["simulated-trajectories"], predicted=100)
     windows = motion.windows(motion.simulate(), protocol, "train")
     method = dvae.method("trajevae")
     method = method.filled(method.preset(motion.HUMAN36M))
     model = method.build(windows).train()
     source, generator = method.train(windows).batches, torch.Generator().manual_seed(0)
-    elbo, objective, square = dvae.SequenceELBO(), method.train(windows).objective, torch.randn(2048, 2048)
+    elbo, objective = dvae.SequenceELBO(), method.train(windows).objective
     step = training_step(model, lambda: objective(elbo.terms(model, source.sample(32, generator)), 0))
     batch = {name: value[:1] for name, value in windows.given(["RFoot", "LFoot"]).all().items()}
     past = {"x": batch["x"][:, :1], "y": batch["y"]}
     sampling = lambda: model.forecast(past, 100, 50)  # noqa: E731
-    product, *times = seconds(lambda: square @ square, step, sampling, repeat=3)
-    found = dict(zip(("step", "sampling"), (each / product for each in times), strict=True))
+    times = seconds(step, products(step), sampling, products(sampling), repeat=3)
+    found = {"step": times[0] / times[1], "sampling": times[2] / times[3]}
 
     positions = windows.positions(batch["x"])[0].numpy()
     path = {"LWrist": positions[1:, windows.skeleton.find("LWrist")]}
@@ -47,8 +46,4 @@ def main() -> None:
         warnings.simplefilter("ignore")  # the model is not fitted, and stretches bones
         model.complete(positions[0], path, samples=5, exact=True)
     found["bend"] = time.perf_counter() - begun
-    report(found, TARGETS)
-
-
-if __name__ == "__main__":
-    main()
+    return found
