@@ -32,7 +32,7 @@ from ..program.conditional import like
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from ..turns import alone
-from .bounds import joint_and_guide, require_data, require_likelihood
+from .bounds import joint_and_guide, require_data, require_latents, require_likelihood
 from .held import reproducibly
 from .latents import joined, split
 from .result import progress_bar
@@ -53,7 +53,8 @@ class AnnealedBound:
 
     Args:
         bound: (B,) log of the estimated evidence, in nats; below it on average, or above it where chains ran backward.
-        error: (B,) standard error of that, by the spread of the weights; of few effective chains it is too small. NaN
+        error: (B,) standard error of that, by the spread of the weights, with K - 1 degrees of freedom for an interval
+            by Student's t; of few effective chains it is too small. NaN
             of chains that ran backward: those of a sequence start at one draw, whose own chance their spread does not
             tell. The error of a mean over sequences is by the spread of their bounds.
         effective: (B,) effective number of chains, between 1 and K, or NaN, likewise.
@@ -117,8 +118,7 @@ def annealed_bound(
         )
     require_likelihood(model)
     data = model.read(batch)
-    if not model.latents:
-        raise ValueError(f"nothing is latent in {model.generative}: its bound is the log evidence itself")
+    require_latents(model)
     if model.grouped and GROUP in data:
         raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")
     size = require_data(model, data)

@@ -290,6 +290,17 @@ def require_likelihood(model: DynamicalVAE) -> None:
         )
 
 
+def require_latents(model: DynamicalVAE) -> None:
+    """Refuse a model in which nothing is drawn.
+
+    Raises:
+        ValueError: it has no latents but those that are summed out.
+    """
+    if not model.latents:
+        summed = f" but {', '.join(model.summed)}, which is summed out" if model.summed else ""
+        raise ValueError(f"nothing is latent in {model.generative}{summed}: its bound is the log evidence itself")
+
+
 def require_data(model: DynamicalVAE, data: AnyBatch) -> int:
     """The number of sequences of a batch that holds all that a bound needs.
 

@@ -37,7 +37,7 @@ from ..program.model import DynamicalVAE
 from ..turns import alone
 from ..views import LOG_DET
 from .annealing import annealed_bound
-from .bounds import joint_and_guide, require_likelihood
+from .bounds import joint_and_guide, require_latents, require_likelihood
 from .estimates import Crossed, Estimate, number
 from .held import clip_places, on_device_of, plain, refuse_non_finite, reproducibly
 from .local import local_guide, missing_latents, require_local
@@ -306,8 +306,7 @@ def bracket(
             f"{count}, {particles}, {temperatures}, {chains}, {batch_size} and {fitting}"
         )
     require_likelihood(model)
-    if not model.latents:
-        raise ValueError(f"nothing is latent in {model.generative}: its bound is the log evidence itself")
+    require_latents(model)
     whole, notes = sequences(data).batch, []
     if GROUP in whole and model.grouped:
         raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")

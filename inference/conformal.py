@@ -292,10 +292,10 @@ def conformal(
     places, needed = clip_places(keys), _fewest(_checked(level))
     clips = int(places.max()) + 1
     if clips < needed:
-        what = f"{clip}s" if groups is None else "groups"
+        what, most = f"{clip}s" if groups is None else "groups", math.floor(100 * clips / (clips + 1))
         raise ValueError(
             f"tubes of {100 * level:g} % need {needed} {what} of calibration windows, given are {clips}: of fewer, the "
-            "next one lies beyond all of them too often; take a lower level or more of them"
+            f"next one lies beyond all of them too often; take more, or {most} % at most"
         )
     with progress_bar(progress) as bar:
 

@@ -14,7 +14,7 @@ from ..networks.base import valid_steps
 from ..program.batch import AnyBatch, repeat, rows
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
-from .bounds import log_densities, require_data, require_likelihood, total
+from .bounds import log_densities, require_data, require_latents, require_likelihood, total
 
 Values = Mapping[str, Tensor]
 Shapes = Mapping[str, tuple[int, int]]
@@ -61,8 +61,7 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
             sequences share some; data that are missing; sequences that are not in the batch.
     """
     require_likelihood(model)
-    if not model.latents:
-        raise ValueError(f"nothing is latent in {model.generative}, so that there is no posterior")
+    require_latents(model)
     for name in model.latents:
         conditional = model.generator[name]
         if conditional.support is not None or conditional.law.deterministic:

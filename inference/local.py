@@ -37,7 +37,7 @@ from ..program.conditional import Conditional
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from ..turns import alone
-from .bounds import joint_and_guide, require_data, require_likelihood, sites_of
+from .bounds import joint_and_guide, require_data, require_latents, require_likelihood, sites_of
 from .held import reproducibly
 
 UNITS = 32
@@ -103,6 +103,11 @@ class Correction:
 
     def __call__(self, parameters: Parameters, values: Mapping[str, Sequence[Tensor]]) -> Parameters:
         """Location and scale (k B, S, D) from the guide's own, and from latents by step."""
+        if len(parameters[0]) % len(self.unit):
+            raise ValueError(
+                f"this guide is of {len(self.unit)} sequences of its own, and the batch has {len(parameters[0])} rows; "
+                "give it the sequences that it was fitted to, in their order"
+            )
         loc, scale = (each.unflatten(0, (-1, len(self.unit))) for each in parameters)
         moved = self.shift
         for link in self.links:
@@ -263,8 +268,7 @@ def require_local(model: DynamicalVAE) -> None:
         ValueError: it has no latents or no likelihood, or laws of latents are no normals.
     """
     require_likelihood(model)
-    if not model.latents:
-        raise ValueError(f"nothing is latent in {model.generative}: its bound is the log evidence itself")
+    require_latents(model)
     for name in model.latents:
         if not isinstance(model.encoder[name].law, Gaussian):
             raise ValueError(

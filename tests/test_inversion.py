@@ -59,11 +59,11 @@ def test_a_derived_guide_is_exact_and_no_smaller_one_is(pair, data):
     found = faithful(generative, order=order)
     audit = dvae.audit(generative, found)
     assert audit.exact
-    # A lag of 2 alone makes patterns periodic in time, of which relations have no end.
-    if "{t-2}" not in generative:
-        assert not audit.redundant
+    # A lag of 2 alone may make patterns periodic in time, of which relations have no end.
+    assert not audit.redundant or "{t-2}" in generative
+    if not audit.redundant:
         smaller = list(fewer(found, width=4))
-        for less in data.draw(st.permutations(smaller))[:1]:
+        for less in data.draw(st.permutations(smaller))[:3]:
             assert not dvae.audit(generative, less).exact, less.text
 
 

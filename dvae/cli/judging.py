@@ -358,10 +358,11 @@ def tubes(
 ) -> None:
     """Widen a run's forecasts to tubes that hold the future as often as they say, and judge them on other windows.
 
-    Calibrated on the run's validation windows, which are of what it was fitted on, and judged on its test windows; or,
-    by --label style --values feminine, on the test clips of some styles, and judged on the others. Prints the factors
-    and how often futures are held before and after, and writes tubes.json and tubes-coverage.json in the run, or beside
-    --out: `dvae.Tubes.load` reads the first, and its `tube` goes around forecasts.
+    Calibrated on the run's validation windows, which are of what it was fitted on and chose the weights that were
+    kept, and judged on its test windows; or, by --label style --values feminine, on the test clips of some styles, and
+    judged on the others. Prints the factors and how often futures are held before and after, and writes tubes.json and
+    tubes-coverage.json in the run, or beside --out: `dvae.Tubes.load` reads the first, and its `tube` goes around
+    forecasts.
 
     Args:
         run: the run directory.

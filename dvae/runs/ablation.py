@@ -39,7 +39,7 @@ from ..inference.result import Result, Table, canvas, progress_bar
 from ..inference.training import Training
 from ..models.equations import Equations
 from ..models.method import Method
-from ..notation import Factorization, Parent
+from ..notation import Factorization, Parent, check_pair
 from ..oracle import model_price, ones, price
 from ..schema import Schema
 from .directory import load, training_of
@@ -295,6 +295,7 @@ def ablate(
     training: Training | Mapping[str, Any] | None = None,
     jobs: int = 2,
     *,
+    observed: Sequence[str] = ("x",),
     sizes: Mapping[str, int] | None = None,
     steps: int = 5,
     twins: int = 5,
@@ -318,6 +319,7 @@ def ablate(
         seeds: of the runs of each arrow.
         training: options of the runs, or some of them beside those of `equations`.
         jobs: runs at a time.
+        observed: names of the observed variables where there are no data, which else name them.
         sizes: of the variables of the twins; by default 2 of data and 1 of others.
         steps: T of the twins.
         twins: random models on which arrows are priced.
@@ -326,7 +328,8 @@ def ablate(
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: a method that is more than its equations; data without `out`; as `sweep`, `price` and `compare`.
+        ValueError: a method that is more than its equations; data without `out`; a latent that the guide
+            does not draw; as `sweep`, `price` and `compare`.
         RuntimeError: a run has failed; the same call tries it again.
         SweepInterrupted: after Ctrl-C or SIGTERM.
 
@@ -339,6 +342,8 @@ def ablate(
         raise ValueError("fits need data, and a directory for their runs: give both `data` and `out`, or none of them")
     whole = as_equations(method, None if data is None else data.schema)
     model, read = whole.equations()
+    if data is None:
+        check_pair(model, read, observed)
     observed = tuple(name for name in model.variables if name not in read.variables)
     known = dict(sizes or {**ones(model, read), **dict.fromkeys(observed, 2)})
     arrows = arrows_of(model, read)

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from scipy import stats
 
 import dvae
 from dvae import Oracle, annealed_bound, importance_bound, twin
@@ -63,6 +64,15 @@ def test_weights_are_unbiased_for_the_evidence_and_their_inverses_for_its_invers
     back = annealed_bound(model, many, temperatures, chains=1, chunk=250, latents={"z": exact.unflatten(1, (T, 1))})
     weights = (evidence - back.bound).exp()
     assert abs(weights.mean() - 1) < 4 * weights.std() / math.sqrt(len(weights))
+
+
+def test_intervals_by_its_error_hold_the_evidence_as_often_as_they_say():
+    model, x, _ = simulated("dkf, mean-field", 300)
+    found = annealed_bound(model, x, 30, chains=16)
+    away = (found.bound - Oracle(model, T).evidence(x)) / found.error
+    for level in (0.5, 0.95):
+        held = (away.abs() < stats.t.ppf((1 + level) / 2, df=15)).double().mean()
+        assert held == pytest.approx(level, abs=4 * math.sqrt(level * (1 - level) / 300))
 
 
 def test_more_temperatures_come_nearer():

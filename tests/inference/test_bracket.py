@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from dvae.views import View
 
 T, N = 3, 12
 DKF = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})")
+HMM = {"k": dvae.Discrete(2), "x": 1}
 FEW = {"particles": 8, "temperatures": 3, "chains": 2, "fitting": 2, "progress": False}
 
 
@@ -83,6 +85,19 @@ def test_errors_are_clustered_by_clip_on_real_data_alone(known):
     assert frame.mean == pytest.approx(whole.mean / T)
     with pytest.raises(KeyError, match="no 'upper' of real data"):
         found.estimate("upper")
+
+
+def test_intervals_hold_the_mean_as_often_as_they_say(known):
+    """Of bounds that clips have in common, in sets that were drawn a thousand times."""
+    *_, found = known
+    random, held = np.random.default_rng(0), []
+    keys = [("test", f"clip {n // 2}", n) for n in range(N)]
+    for _ in range(1000):
+        values = 3 + random.normal(size=N // 2).repeat(2) + 0.5 * random.normal(size=N)
+        drawn = replace(found, keys=keys, bounds={"real": {"ELBO": np.zeros(N), "AIS": values}})
+        below, above = drawn.estimate("AIS", "ELBO").interval(error="sequences")
+        held.append(below < 3 < above)
+    assert np.mean(held) == pytest.approx(0.95, abs=4 * math.sqrt(0.95 * 0.05 / 1000))
 
 
 def test_it_is_shown_and_kept(known):
@@ -192,6 +207,7 @@ def test_sequences_are_drawn_and_scores_depend_on_the_seed():
         ({"fitting": -1}, "fitting at least 0"),
         ({"count": 0}, "at least 1"),
         ({"model": dvae.DynamicalVAE("p(x_t | x_{t-1})", "", {"x": 1})}, "nothing is latent"),
+        ({"model": dvae.DynamicalVAE("p(k_t | k_{t-1}) p(x_t | k_t)", "", HMM)}, "but k, which is summed out"),
     ],
 )
 def test_what_has_no_bracket_is_refused(change, told):

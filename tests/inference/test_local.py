@@ -171,6 +171,12 @@ def test_what_has_no_local_guide_is_refused(change, told):
         local_guide(**{**given, **change})
 
 
+def test_a_local_guide_is_of_its_own_sequences():
+    guide = local_guide(twin(*PAIRS["mean-field"], {"z": 1, "x": 1}, T), torch.zeros(2, T, 1), steps=1)
+    with pytest.raises(ValueError, match="of 2 sequences of its own, and the batch has 3 rows"):
+        dvae.importance_bound(guide, torch.zeros(3, T, 1), 1)
+
+
 def test_other_likelihoods_than_normals():
     """A Poisson given one normal: the best normal is below the evidence, an integral over a line, and near it."""
     model = dvae.DynamicalVAE(

@@ -209,3 +209,5 @@ def test_wrong_arguments_are_told_before_any_work(arguments, message, tmp_path, 
 def test_fits_need_data_and_a_directory(tmp_path):
     with pytest.raises(ValueError, match="give both `data` and `out`"):
         dvae.ablate((DKF, SMOOTHER), out=tmp_path)
+    with pytest.raises(ValueError, match="the latent k has no factor in the guide"):
+        dvae.ablate(("p(k_t | k_{t-1}) p(x_t | k_t)", ""), twins=1, progress=False)
