@@ -1,0 +1,195 @@
+"""A GPU that is only said to be one: what a program puts there, brings there and waits for, told without one.
+
+Torch's own fakes (`FakeTensorMode`) have no values, so that a program that looks at one goes no further, and a build
+without CUDA has no gradients of them. Here a tensor of the device is one of the processor under another name: its
+operations run and give what they do there, one that mixes the two is refused as CUDA refuses it, and each copy between
+the two is listed, with each value that a program waits for.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, ClassVar
+from unittest import mock
+
+import torch
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map_only
+from typing_extensions import Self, override
+
+aten: Any = torch.ops.aten
+READS = {  # CUDA waits for their values, for the shapes that these have, or for the errors that they tell
+    aten._local_scalar_dense,
+    aten.is_nonzero,
+    aten.equal,
+    aten.nonzero,
+    aten.masked_select,
+    aten._unique2,
+    aten.unique_dim,
+    aten.unique_consecutive,
+    aten.repeat_interleave,
+    aten.bincount,
+    aten._linalg_check_errors,
+}
+INDEXED = {aten.index, aten.index_put, aten.index_put_, aten._index_put_impl_}
+
+
+class OnDevice(Tensor):
+    """A tensor of the processor that says that it is on the device."""
+
+    device: ClassVar[torch.device] = torch.device("cuda", 0)  # type: ignore[misc]
+    own: Tensor
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    @staticmethod
+    def __new__(cls, own: Tensor, requires_grad: bool = False) -> Self:
+        layout = {"strides": own.stride(), "storage_offset": own.storage_offset(), "dtype": own.dtype}
+        made: Self = Tensor._make_wrapper_subclass(cls, own.shape, requires_grad=requires_grad, **layout)  # type: ignore[attr-defined]
+        made.own = own
+        return made
+
+    @override
+    def __repr__(self) -> str:  # type: ignore[override]
+        return f"OnDevice({self.own!r})"
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        raise RuntimeError(f"{func} of a tensor on {cls.device}, which is there only within on_device()")
+
+
+class Traffic(TorchDispatchMode):
+    """What goes between processor and device, as "file:line operation" of where it comes from.
+
+    Attributes:
+        reads: what is brought to the processor, or waited for: values, and shapes and errors that depend on them.
+        uploads: what is brought to the device.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reads: list[str] = []
+        self.uploads: list[str] = []
+
+    @override
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
+        there = {id(value.own): value for value in tensors if isinstance(value, OnDevice)}
+        here = [value for value in tensors if not isinstance(value, OnDevice) and value.dim()]
+        device, packet = kwargs.get("device"), func.overloadpacket
+        asked = device is not None and device.type == "cuda"
+        if asked:
+            kwargs["device"] = torch.device("cpu")
+            if tensors and not there:
+                self.uploads.append(_place(packet))
+                here = []
+        elif there and packet is aten.copy_:
+            target, source = (isinstance(value, OnDevice) for value in args[:2])
+            if target != source:
+                (self.uploads if target else self.reads).append(_place(packet))
+            here = []
+        elif there and packet in INDEXED:
+            places = [place for place in args[1] if place is not None]
+            fill = len(args) > 2 and args[2].numel() == 1  # under a mask, which needs no places
+            if any(place.dtype == torch.bool for place in places) and not fill:
+                self.reads.append(_place(packet))
+            if brought := [place for place in places if not isinstance(place, OnDevice)]:
+                self.uploads.append(_place(packet))
+                here = [value for value in here if all(value is not place for place in brought)]
+        elif there and packet in READS:
+            self.reads.append(_place(packet))
+        # torch fills in gradients on the processor, where it takes those of the device to be
+        backward = not tensors and device is not None and torch._C._current_autograd_node() is not None
+        if not (there or asked or backward):
+            return func(*args, **kwargs)
+        if here:
+            shapes = ", ".join(str(tuple(value.shape)) for value in here)
+            raise RuntimeError(f"{packet} of tensors on {OnDevice.device} and others on the processor, {shapes}")
+        args, kwargs = tree_map_only(OnDevice, lambda value: value.own, (args, kwargs))
+        found = func(*args, **kwargs)
+        return tree_map_only(Tensor, lambda value: there[id(value)] if id(value) in there else OnDevice(value), found)
+
+
+class _Moves(TorchFunctionMode):
+    """Moves that torch leaves out where both ends are on the processor."""
+
+    def __init__(self, traffic: Traffic) -> None:
+        super().__init__()
+        self.traffic = traffic
+
+    @override
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if func in (Tensor.to, Tensor.cpu, Tensor.cuda, Tensor.type_as):
+            return self._moved(func, args[0], [*args[1:], *kwargs.values()])
+        if func in (Tensor.numpy, Tensor.__array__, Tensor.tolist) and isinstance(args[0], OnDevice):
+            if func is not Tensor.tolist:
+                raise TypeError(f"a tensor on {OnDevice.device} has no array; bring it to the processor first")
+            self.traffic.reads.append(_place("tolist"))
+            return args[0].own.tolist()
+        return func(*args, **kwargs)
+
+    def _moved(self, func: Any, value: Tensor, given: list[Any]) -> Tensor:
+        given = given + [each for v in given if isinstance(v, Tensor) for each in (v.device, v.dtype)]
+        ends = {Tensor.cpu: "cpu", Tensor.cuda: "cuda"}
+        device = next((each for each in given if isinstance(each, str | torch.device)), ends.get(func, value.device))
+        cast = Tensor.to(value, next((each for each in given if isinstance(each, torch.dtype)), value.dtype))
+        there = torch.device(device).type == "cuda"
+        if there == isinstance(value, OnDevice):
+            return cast
+        if there:
+            self.traffic.uploads.append(_place("to"))
+            return OnDevice(cast.detach(), value.requires_grad)
+        self.traffic.reads.append(_place("to"))
+        return cast.own  # type: ignore[attr-defined, no-any-return]
+
+
+def _place(what: Any) -> str:
+    """Where an operation of a program comes from: the last line that is neither torch's nor of this file."""
+    calls = [call for call in traceback.extract_stack() if "site-packages" not in call.filename]
+    last = next((call for call in reversed(calls) if call.filename != __file__), calls[-1])
+    return f"{'/'.join(last.filename.split('/')[-2:])}:{last.lineno} {what}"
+
+
+@contextmanager
+def on_device() -> Iterator[Traffic]:
+    """Within it, "cuda" is a device, and what goes there and back is listed.
+
+    Example:
+        >>> import torch
+        >>> from dvae.testing.device import on_device
+        >>> with on_device() as traffic:
+        ...     there = torch.ones(3).to("cuda")
+        ...     total = float(there.sum())
+        >>> total, len(traffic.uploads), len(traffic.reads)
+        (3.0, 1, 1)
+    """
+    lifting = torch._C._only_lift_cpu_tensors()
+    with ExitStack() as stack:
+        for name in ("_lazy_init", "set_rng_state"):
+            stack.enter_context(mock.patch.object(torch.cuda, name, lambda *_: None))
+        stack.enter_context(mock.patch.object(torch.cuda, "get_rng_state", lambda *_: torch.get_rng_state()))
+        torch._C._set_only_lift_cpu_tensors(True)  # so that torch.tensor(..., device=...) brings them there by `to`
+        stack.callback(torch._C._set_only_lift_cpu_tensors, lifting)
+        traffic = stack.enter_context(Traffic())
+        stack.enter_context(_Moves(traffic))
+        yield traffic
+
+
+def move(module: nn.Module) -> nn.Module:
+    """Moves the parameters and buffers of a module to the device, as `to` does, and nothing else."""
+    moved: dict[int, Any] = {}
+    for part in module.modules():
+        for name, value in part._parameters.items():
+            if value is not None:
+                there = moved.setdefault(id(value), nn.Parameter(OnDevice(value.detach()), value.requires_grad))
+                setattr(part, name, there)
+        for name, buffer in part._buffers.items():
+            if buffer is not None:
+                part._buffers[name] = moved.setdefault(id(buffer), OnDevice(buffer))
+    return module
