@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from .constants import indices
 from .data import Batch
 from .networks.base import valid_steps
 from .notation import Factorization
@@ -229,19 +230,20 @@ class Parts(View):
         size = sum(map(len, self.parts.values()))
         if whole.dim() < 2 or whole.shape[-1] != size:
             raise ValueError(f"{WHOLE} has shape {tuple(whole.shape)}, expected (B, T, {size})")
-        for name, places in self.parts.items():
-            seen.setdefault(name, whole[..., list(places)])
+        for name, part in self.parts.items():
+            own = indices(part, whole)
+            seen.setdefault(name, whole.index_select(-1, own))
             if mask is not None:
-                masks[name] = mask[..., list(places)]
+                masks[name] = mask.index_select(-1, own)
         return {**seen, "mask": masks} if mask is not None else seen
 
     @override
     def inverse(self, seen: Batch) -> dict[str, Any]:
         if not self.parts.keys() <= seen.keys():
             return dict(seen)
-        places = torch.tensor([place for part in self.parts.values() for place in part])
+        order = [place for part in self.parts.values() for place in part]
         whole = torch.cat([seen[name] for name in self.parts], dim=-1)
-        return {**seen, WHOLE: whole[..., places.argsort().to(whole.device)]}
+        return {**seen, WHOLE: whole.index_select(-1, indices(map(order.index, range(len(order))), whole))}
 
 
 @dataclass(frozen=True)

@@ -155,8 +155,8 @@ class Balance:
         Raises:
             ValueError: losses without a training rate.
         """
-        losses = mean(self._losses).double().cpu()
-        norms = torch.linalg.vector_norm(mean(self._gradients), dim=1, dtype=torch.float64).cpu()
+        norms = torch.linalg.vector_norm(mean(self._gradients), dim=1, dtype=torch.float64)
+        losses, norms = torch.stack([mean(self._losses).double(), norms]).cpu()  # at once, as it is waited for
         first, asymmetry = self.first if self.first.any() else losses, self.objective.asymmetry
         for task, start, now in zip(self.objective.tasks, first.tolist(), losses.tolist(), strict=True):
             if asymmetry and (start <= 0 or now < 0):

@@ -179,14 +179,16 @@ class SVI:
                 parameter.grad = None  # which the optimiser leaves out, with its state
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
-        self._numbers = torch.stack([loss.detach(), norm])
-        if not torch.isfinite(self.total(self._numbers)).all():
+        numbers = torch.stack([loss.detach(), norm])
+        # the one place where a step waits for the device, on which all is queued up to the optimiser's step
+        *self._numbers, of_all = torch.cat([numbers, self.total(numbers).sum()[None]]).tolist()
+        if not math.isfinite(of_all):
             impossible = any((value == -math.inf).any() for value in terms.log_likelihood.values())
             advice = "a lower learning rate, a smaller gradient_clip or a longer warm-up"
             if impossible and not state.step:
                 advice = "a law that can have these values; where it ends may depend on its parameters"
             raise NonFiniteError(f"{where}: {_culprit(self.model, terms, loss)}; no step was taken. Try {advice}")
-        if training.gradient_clip is not None and norm > training.gradient_clip:
+        if training.gradient_clip is not None and self._numbers[1] > training.gradient_clip:
             for gradient in gradients:
                 gradient.mul_(training.gradient_clip / norm)
         self._weights = dict[str, float]()
@@ -202,7 +204,7 @@ class SVI:
         """Return the numbers of the last step, in nats per frame (see `trackers`)."""
         if self.state.terms is None:
             raise RuntimeError("no step has been taken since init(), so there are no numbers of one")
-        loss, norm = self._numbers.tolist()
+        loss, norm = self._numbers
         rates = self.rates(self.state.step - 1)
         return {"loss": loss, "gradient_norm": norm, **rates, **self._weights, **_per_frame(_sums(self.state.terms))}
 
@@ -368,7 +370,8 @@ def _sums(terms: Terms) -> dict[str, Tensor]:
 
 
 def _per_frame(sums: Mapping[str, Tensor]) -> dict[str, float]:
-    return {name: float(value / sums["frames"]) for name, value in sums.items() if name != "frames"}
+    rates = (torch.stack(list(sums.values())) / sums["frames"]).tolist()
+    return {name: rate for name, rate in zip(sums, rates, strict=True) if name != "frames"}
 
 
 def _culprit(model: nn.Module, terms: Terms, loss: Tensor) -> str:

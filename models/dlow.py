@@ -25,6 +25,7 @@ from typing import Any
 from torch import Tensor
 from typing_extensions import override
 
+from ..constants import indices
 from ..inference.objectives import Evidence, Objective
 from ..motion import Skeleton, energies
 from ..motion.parts import places_of
@@ -127,9 +128,10 @@ class DLowModel(ModesModel):
         variance = scale.square()
         found["kl"] = (variance + location.square() - 1 - variance.log()).sum(2).mean(1) / 2
         made = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (self.modes, -1))
-        found["diversity"] = energies.gaussian_diversity(made[..., self.free], self.method.diversity_scale or 1.0)
+        free = made.index_select(-1, indices(self.free, made))
+        found["diversity"] = energies.gaussian_diversity(free, self.method.diversity_scale or 1.0)
         if self.held:
-            held = made[..., self.held]
+            held = made.index_select(-1, indices(self.held, made))
             apart = (held - held[:1]).square().sum((2, 3))
             found["held"] = apart.sum(0) / max(self.modes - 1, 1)
         return found

@@ -122,6 +122,7 @@ class EnergyModel(DynamicalVAE):
         super().__init__(view=Views(*(view for view in (heading, bones) if view), *views), **options)
         self.method, self.skeleton, self.frames, self.heading, self.bones = method, skeleton, observed, heading, bones
         self.limits: tuple[str, ...] | None = None
+        self.angles: AngleLimits | None = None
         if method.angles:
             self.limits = angle_names(skeleton)
             self.register_buffer("angle_low", torch.full((len(self.limits),), -1.0))
@@ -162,8 +163,9 @@ class EnergyModel(DynamicalVAE):
             found["limb"] = energies.limb_length(samples, reference, self.skeleton)
         judged = samples[:, :, frames]
         if self.limits is not None:
-            limits = AngleLimits(self.limits, self.angle_low, self.angle_high)
-            found["angles"] = energies.joint_angles(judged, limits, self.skeleton)
+            if self.angles is None or self.angles.low is not self.angle_low:  # checked once, which is waited for
+                self.angles = AngleLimits(self.limits, self.angle_low, self.angle_high)
+            found["angles"] = energies.joint_angles(judged, self.angles, self.skeleton)
         if self.pose_prior is not None:
             offset = int(torch.randint(min(3, judged.shape[2]), ()))  # every third frame, another third at every step
             found["pose_prior"] = energies.pose_prior_energy(judged[:, :, offset::3], self.pose_prior, self.skeleton)

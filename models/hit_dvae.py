@@ -42,6 +42,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from torch import Tensor, nn
 from typing_extensions import override
 
+from ..constants import indices
 from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
 from ..inference.schedules import Ramp, Schedule
@@ -328,6 +329,6 @@ class HiTModel(EnergyModel):
         method = self.method
         for part, weight, scale in zip(PARTS, method.diversity, method.diversity_scale, strict=True):
             if weight:
-                held = motions[..., self.coordinates[part]]
+                held = motions.index_select(-1, indices(self.coordinates[part], motions))
                 means[f"diversity_{part}"] = energies.pairwise_diversity(held, scale)
         return self.best(motions, truth, data, everything) | {n: rollout.length * e for n, e in means.items()}

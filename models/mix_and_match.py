@@ -28,6 +28,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
+from ..constants import constant
 from ..inference.objectives import Evidence
 from ..inference.recipe import Recipe
 from ..inference.schedules import Logistic, Ramp
@@ -208,7 +209,7 @@ class MixAndMatchModel(DynamicalVAE):
         view = self.turns
         place = view.turning.index(view.skeleton.root)
         start = 3 * view.root
-        unturned = quaternions.new_tensor([1.0, 0, 0, 0]).expand(*quaternions.shape[:-1], 4)
+        unturned = constant((1.0, 0.0, 0.0, 0.0), quaternions).expand(*quaternions.shape[:-1], 4)
         first = torch.zeros_like(quaternions[..., :start])
         turns = quaternions[..., start:].unflatten(-1, (-1, 4))
         turns = torch.cat([turns[..., :place, :], unturned[..., None, :], turns[..., place + 1 :, :]], -2)

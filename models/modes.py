@@ -24,7 +24,6 @@ from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import one_hot
 from typing_extensions import override
 
 from ..inference.checkpoints import CONFIG, CheckpointError, Run, at_most, load_weights
@@ -210,15 +209,20 @@ class ModesModel(FutureModel):
             Likewise, M B rows.
         """
         size = len(data[HISTORY])
-        places = one_hot(modes, self.modes).repeat_interleave(size, 0).to(data[HISTORY])
+        places = self._coded(modes.repeat_interleave(size), data[HISTORY])
         group = torch.arange(size, device=places.device).repeat(len(modes))
         return {**repeat(data, len(modes)), MODE: places, GROUP: group}
+
+    def _coded(self, modes: Tensor, like: Tensor) -> Tensor:
+        """(B, K), 1 at the mode of each row."""
+        return torch.eye(self.modes, dtype=like.dtype, device=like.device).index_select(0, modes.to(like.device))
 
     def in_sets(self, batch: AnyBatch | None) -> dict[str, Any]:
         """A batch of B windows in all modes, as `in_modes` has it, whose futures are to be compared."""
 
         def compute() -> dict[str, Any]:
-            data = self.in_modes(self.read(batch), torch.arange(self.modes))
+            read = self.read(batch)
+            data = self.in_modes(read, torch.arange(self.modes, device=read[HISTORY].device))
             return {**data, WHOLE_SETS: torch.ones_like(data[GROUP], dtype=torch.bool)}
 
         return once(self.generator, [batch], compute)
@@ -240,7 +244,7 @@ class ModesModel(FutureModel):
         if MODE in factorization.context and MODE not in data and HISTORY in data:
             history = data[HISTORY]
             drawn = torch.randint(self.modes, history.shape[:1], device=history.device)
-            data = {**data, MODE: one_hot(drawn, self.modes).to(history)}
+            data = {**data, MODE: self._coded(drawn, history)}
         rollout = super()._rollout(factorization, conditionals, data, length, size)
         return replace(rollout, draws=self.modes) if WHOLE_SETS in data else rollout
 

@@ -40,7 +40,7 @@ from ..inference.training import Stage, Training
 from ..laws import Family, LawSpec
 from ..motion import Windows
 from ..networks import Input, NetworkSpec
-from ..networks.base import AtOnce
+from ..networks.base import AtOnce, once
 from ..options import Share, Size
 from ..program.batch import AnyBatch
 from ..units import Units
@@ -194,8 +194,13 @@ class InfillingModel(TrajectoryModel):
     def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0) -> dict[str, Any]:
         """Without the trajectories that are hidden when the curriculum has come so far."""
         if isinstance(batch, Mapping) and HIDDEN in batch:
-            given = torch.where(batch[HIDDEN] <= curriculum, 0.0, batch[GIVEN])
-            batch = {name: value for name, value in batch.items() if name != HIDDEN} | {GIVEN: given}
+            whole = batch
+
+            def shown() -> Batch:
+                given = torch.where(whole[HIDDEN] <= curriculum, 0.0, whole[GIVEN])
+                return {name: value for name, value in whole.items() if name != HIDDEN} | {GIVEN: given}
+
+            batch = once(self, [whole, curriculum], shown)  # by guide and model both
         return super().read(batch, size=size, curriculum=curriculum)
 
 

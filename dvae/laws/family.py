@@ -40,6 +40,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, biject_to, transform_to
 from typing_extensions import override
 
+from ..constants import constant
 from ..options import nearest
 from .base import Law, LawSpec, Parameters, Shape
 from .families import FixedNormal, Normal, StudentT
@@ -197,7 +198,11 @@ class FamilyLaw(Law):
             name: value.unflatten(-1, shape) if len(shape) > 1 else value if shape else value[..., 0]
             for (name, (_, _, shape)), value in zip(self.forms.items(), parameters, strict=True)
         }
-        return self.kind(**shaped, **self.given)  # type: ignore[no-any-return]
+        given = self.given
+        if parameters:  # numbers, which torch would bring to the device each time
+            numbers = {name: value for name, value in given.items() if isinstance(value, float)}
+            given = given | {name: constant(value, parameters[0]) for name, value in numbers.items()}
+        return self.kind(**shaped, **given)  # type: ignore[no-any-return]
 
     @override
     def mean(self, parameters: Parameters) -> Tensor:

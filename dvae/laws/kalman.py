@@ -112,7 +112,7 @@ class LinearGaussianChain:
 def update(mean: Tensor, covariance: Tensor, information: Tensor, potential: Tensor) -> Moments:
     """Moments of N(mean, covariance) times exp(g' z - z' G z / 2); shapes (..., N) and (..., N, N)."""
     identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
-    after = _symmetric(torch.linalg.solve(identity + covariance @ information, covariance))
+    after = _symmetric(torch.linalg.solve_ex(identity + covariance @ information, covariance)[0])
     return Moments(mean + _times(after, potential - _times(information, mean)), after)
 
 

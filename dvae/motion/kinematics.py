@@ -13,6 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from ..constants import indices
 from .rotations import across, procrustes
 from .skeleton import Skeleton, inverse_lengths, rotate_about_up
 
@@ -35,19 +36,20 @@ def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Te
     generations = [[list(parents).index(-1)]]
     while below := [joint for joint, parent in enumerate(parents) if parent in generations[-1]]:
         generations.append(below)
-    order = torch.tensor([joint for joints in generations for joint in joints], device=rotations.device)
+    order = [joint for joints in generations for joint in joints]
+    first_to_last = indices(order, rotations)
     many = [len(joints) for joints in generations]
     # by index_select, whose gradient costs less than that of a list of indices
-    first, *turns = rotations.index_select(-3, order).split(many, -3)
-    _, *bones = offsets.index_select(-2, order)[..., None].split(many, -3)
+    first, *turns = rotations.index_select(-3, first_to_last).split(many, -3)
+    _, *bones = offsets.index_select(-2, first_to_last)[..., None].split(many, -3)
     turned, placed = [first], [root[..., None, :]]
     for (before, joints), local, bone in zip(pairwise(generations), turns, bones, strict=True):
-        above = order.new_tensor([before.index(parents[joint]) for joint in joints])
+        above = indices([before.index(parents[joint]) for joint in joints], rotations)
         turn = turned[-1].index_select(-3, above)
         placed.append(placed[-1].index_select(-2, above) + (turn @ bone).squeeze(-1))
         turned.append(turn @ local)
-    places = order.argsort()
-    return torch.cat(placed, -2).index_select(-2, places), torch.cat(turned, -3).index_select(-3, places)
+    back = indices([order.index(joint) for joint in range(len(order))], rotations)
+    return torch.cat(placed, -2).index_select(-2, back), torch.cat(turned, -3).index_select(-3, back)
 
 
 def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:

@@ -22,6 +22,8 @@ import re
 import torch
 from torch import Tensor
 
+from ..constants import constant
+
 SIZES = {"matrix": 9, "quaternion": 4, "vector": 3, "6d": 6}
 _EULER = re.compile(r"euler-[xyz]+")
 _WHOLE = re.compile(r"euler-([xyz])(?!\1)([xyz])(?!\2)([xyz])")
@@ -66,7 +68,7 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
         first, second = values.unflatten(-1, (2, 3)).unbind(-2)
         # asked first, for gradients of what is not chosen cost as much as those of what is
         if (short := first.norm(dim=-1, keepdim=True) < shortest).any():
-            first = torch.where(short, values.new_tensor([1.0, 0, 0]), first)
+            first = torch.where(short, constant((1.0, 0.0, 0.0), values), first)
         with torch.no_grad():
             axis = torch.nn.functional.normalize(first, dim=-1)
             apart = (second - (axis * second).sum(-1, keepdim=True) * axis).norm(dim=-1, keepdim=True)
@@ -104,7 +106,7 @@ def from_matrix(rotations: Tensor, form: str) -> Tensor:
 def normalised(quaternions: Tensor) -> Tensor:
     """(..., 4) of unit length; unturned where they are shorter than rounding."""
     none = quaternions.norm(dim=-1, keepdim=True) < torch.finfo(quaternions.dtype).eps
-    quaternions = torch.where(none, quaternions.new_tensor([1.0, 0, 0, 0]), quaternions)
+    quaternions = torch.where(none, constant((1.0, 0.0, 0.0, 0.0), quaternions), quaternions)
     return torch.nn.functional.normalize(quaternions, dim=-1)
 
 

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from .. import files
+from ..constants import indices
 from .naming import readings
 
 MOST_JOINTS = 1000
@@ -253,8 +254,12 @@ class Skeleton:
                 f"positions have shape {tuple(positions.shape)}, expected (..., {self.joints}, 3) for "
                 f"skeleton {self.name!r}"
             )
-        parents, children = (list(ends) for ends in zip(*self.edges, strict=True))
-        return ((positions[..., children, :] - positions[..., parents, :]) ** 2).sum(-1) ** 0.5
+        parents, children = zip(*self.edges, strict=True)
+        if isinstance(positions, Tensor):
+            ends = [positions.index_select(-2, indices(joints, positions)) for joints in (children, parents)]
+        else:
+            ends = [positions[..., list(joints), :] for joints in (children, parents)]
+        return ((ends[0] - ends[1]) ** 2).sum(-1) ** 0.5
 
     def limbs(self, poses: Tensor) -> Tensor:
         """Vectors from parent to child in metres: poses (..., D) -> (..., J - 1, 3), as in `edges`.
@@ -324,7 +329,8 @@ class Skeleton:
             ValueError: the skeleton does not say what is left and right.
         """
         plane = [(self.vertical + 1) % 3, (self.vertical + 2) % 3]
-        left, right = (self._side(positions[..., side, :][..., plane]) for side in self.sides)
+        level = positions.index_select(-1, indices(plane, positions))
+        left, right = (self._side(level.index_select(-2, indices(side, level))) for side in self.sides)
         across = left - right
         towards_x = 0.0 if plane[0] == 0 else pi / 2
         return torch.atan2(across[..., 1], across[..., 0]) - towards_x
@@ -345,7 +351,7 @@ class Skeleton:
         positions = positions[..., : frame + 1, :, :]
         time = torch.arange(positions.shape[-3], device=positions.device)
         level = positions[..., self.vertical - 1].isfinite()
-        left, right = (level[..., side].sum(-1) for side in self.sides)
+        left, right = (level.index_select(-1, indices(side, level)).sum(-1) for side in self.sides)
         chosen = torch.where((left > 0) & (right > 0), time + len(time) * (left + right), -1).argmax(-1)
         pose = positions.take_along_dim(chosen[..., None, None, None], -3).squeeze(-3)
         return self.heading(pose).nan_to_num(0.0)

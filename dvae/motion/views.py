@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from ..constants import constant, indices
 from ..data import BESIDE, Batch
 from ..networks.base import valid_steps
 from ..views import WHOLE, View
@@ -258,11 +259,12 @@ class Rotations(View):
     form: str = "6d"
     root: bool = False
     names = (LENGTHS,)
-    _offsets: Tensor = field(init=False, repr=False, compare=False)
+    _offsets: tuple[tuple[float, ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         size(self.form)
-        object.__setattr__(self, "_offsets", self.skeleton.offsets)  # which says what to do where there are none
+        offsets = self.skeleton.offsets  # which says what to do where there are none
+        object.__setattr__(self, "_offsets", tuple(map(tuple, offsets.tolist())))
 
     @property
     def measured(self) -> str:  # type: ignore[override]
@@ -298,11 +300,11 @@ class Rotations(View):
         positions = skeleton.with_root(x.unflatten(-1, (-1, 3)))
         turns = data.get(BESIDE, {}).get(TURNS)
         if turns is None:
-            matrices = kinematics.inverse(skeleton, positions, self._offsets.to(x))[..., self.turning, :, :]
+            matrices = kinematics.inverse(skeleton, positions, constant(self._offsets, x))[..., self.turning, :, :]
             found = in_time(matrices, self.form)
         else:
             turns = turns[:, : x.shape[1]].unflatten(-1, (-1, 4))  # of a past, no more than that
-            found = in_time(turns[..., self.turning, :].to(x), self.form, "quaternion")
+            found = in_time(turns.index_select(-2, indices(self.turning, turns)).to(x), self.form, "quaternion")
         place = [positions[..., skeleton.root, :]] if self.root else []
         seen[WHOLE] = torch.cat([*place, found.flatten(-2)], -1)
         seen[LENGTHS] = (beside or {}).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
@@ -315,16 +317,15 @@ class Rotations(View):
         if WHOLE not in seen:
             return data
         x, skeleton = seen[WHOLE], self.skeleton
-        offsets = self._offsets.to(x)
+        offsets = constant(self._offsets, x)
         if bones is not None:
             children = [child for _, child in skeleton.edges]
             lengths = bones.new_zeros(*bones.shape[:-1], skeleton.joints)
-            lengths[..., children] = bones
+            lengths = lengths.index_copy(-1, indices(children, bones), bones)
             offsets = lengths[..., None, :, None] * torch.nn.functional.normalize(offsets, dim=-1)  # (B, 1, J, 3)
         place = x[..., :3] if self.root else torch.zeros_like(x[..., :3])
-        turns = torch.eye(3).to(x).repeat(*x.shape[:-1], skeleton.joints, 1, 1)
-        turns[..., self.turning, :, :] = to_matrix(
-            x[..., 3 * self.root :].unflatten(-1, (len(self.turning), -1)), self.form
-        )
+        turns = torch.eye(3, dtype=x.dtype, device=x.device).repeat(*x.shape[:-1], skeleton.joints, 1, 1)
+        told = to_matrix(x[..., 3 * self.root :].unflatten(-1, (len(self.turning), -1)), self.form)
+        turns = turns.index_copy(-3, indices(self.turning, turns), told)
         positions, _ = kinematics.forward(skeleton.parents, turns, offsets, place)
         return {**data, WHOLE: (positions if self.root else skeleton.without_root(positions)).flatten(-2)}

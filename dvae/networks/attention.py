@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
+from ..constants import visible
 from ..relations import Relation
 from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, at, part, valid_steps
 from .extract import Extract, Extractors
@@ -157,7 +158,7 @@ class AttentionNetwork(Network):
     def bias(self, parent: Input, length: int) -> Tensor:
         """(heads, T, T) or (1, 1, T) for a static child: minus slope times distance where visible, else -inf."""
         assert parent.relation is not None
-        mask = torch.as_tensor(parent.relation.mask(length), device=self.slopes.device)
+        mask = visible(parent.relation, length, self.slopes.device)
         if not self.local:
             return self.slopes.new_zeros(1, 1, length).masked_fill(~mask[:1], -math.inf)
         steps = torch.arange(length, device=self.slopes.device, dtype=self.slopes.dtype)
@@ -323,7 +324,7 @@ class SelfAttentionNetwork(Network):
         """(1, heads, T, T): minus slope times distance where visible, else -inf."""
         relation = self.encoded[0].relation
         assert relation is not None
-        mask = torch.as_tensor(relation.mask(length), device=self.slopes.device)
+        mask = visible(relation, length, self.slopes.device)
         steps = torch.arange(length, device=self.slopes.device, dtype=self.slopes.dtype)
         ahead = steps[None, :] - steps[:, None]
         looks_ahead = torch.arange(len(self.slopes), device=self.slopes.device)[:, None, None] % 2 == 1

@@ -68,15 +68,15 @@ def computing_once() -> Iterator[None]:
         _ONCE.reset(token)
 
 
-def once(module: nn.Module, inputs: Sequence[Any], compute: Callable[[], Computed]) -> Computed:
-    """compute(), or its result for the same module and the very same inputs within `computing_once`.
+def once(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed]) -> Computed:
+    """compute(), or its result for the same owner, such as a module, and the very same inputs within `computing_once`.
 
     Factors that share a module (SRNN's h_t) then evaluate it once, without knowing of each other.
     """
     kept = _ONCE.get()
     if kept is None:
         return compute()
-    key = _key(module, inputs)
+    key = _key(owner, inputs)
     if key not in kept:
         kept[key] = (inputs, compute())  # the inputs are held, so that their ids stay theirs
     result: Computed = kept[key][1]
@@ -90,8 +90,8 @@ def keep(module: nn.Module, inputs: Sequence[Tensor | None], result: Tensor) -> 
         kept[_key(module, inputs)] = (inputs, result)
 
 
-def _key(module: nn.Module, inputs: Sequence[Any]) -> tuple[Any, ...]:
-    return id(module), torch.is_grad_enabled(), *map(id, inputs)
+def _key(owner: object, inputs: Sequence[Any]) -> tuple[Any, ...]:
+    return id(owner), torch.is_grad_enabled(), *map(id, inputs)
 
 
 class Network(nn.Module):

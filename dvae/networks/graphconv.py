@@ -23,6 +23,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
+from ..constants import indices
 from .base import AtOnce, Input
 from .dct import cosine_basis
 
@@ -118,7 +119,7 @@ class GraphConvNetwork(AtOnce):
         hidden = self.first(joined)
         for block in self.rest:
             hidden = hidden + block(hidden)
-        made: Tensor = (self.last(hidden) + joined)[:, self.own, : self.inner]  # (B, own nodes, coordinates * C)
+        made: Tensor = (self.last(hidden) + joined)[..., : self.inner].index_select(1, indices(self.own, hidden))
         made = made.unflatten(-1, (self.coordinates, -1)).flatten(1, 2).to(known.dtype)
         with torch.autocast(made.device.type, enabled=False):
             return (made @ self._transform(length, made)).transpose(1, 2)
@@ -127,13 +128,10 @@ class GraphConvNetwork(AtOnce):
         """(B, nodes, coordinates * C): coefficients of the first coordinate, then of the second, and so on."""
         known: Tensor | None = None
         for name, nodes, seen in self.trajectories:
-            values = parents[name][:, :seen]
+            values, own = parents[name][:, :seen], indices(nodes, self.last.weight)
             found = (self._transform(seen, values) @ values).transpose(1, 2)  # (B, nodes * coordinates, C)
             found = found.unflatten(1, (-1, self.coordinates)).flatten(2)
-            if known is None:
-                known = found[:, torch.tensor(nodes).argsort()]
-            else:
-                known = known.index_copy(1, torch.tensor(nodes, device=known.device), found)
+            known = found.index_select(1, own.argsort()) if known is None else known.index_copy(1, own, found)
         assert known is not None
         return known
 

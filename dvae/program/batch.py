@@ -133,29 +133,26 @@ class Reader:
             ValueError: a batch that cannot be read.
         """
         lengths, masks = values.get("lengths"), values.get("mask", {})
-        groups = Groups.of(values[GROUP]) if self.grouped and GROUP in values else None
+        index = values[GROUP] if self.grouped and GROUP in values else None
+        groups = None if index is None else once(self, [index], lambda: Groups.of(index))
         values = {name: value for name, value in values.items() if name in self.sizes}
         for name, value in values.items():
             self.check(name, value)
         size, length = _extent(values, length, size)
+        given = list(values.values())
         self._extend_history(factorization, values, length)
         local = {name: v for name, v in values.items() if v.dim() == 3}
         prefix = {name: v for name, v in local.items() if v.shape[1] < length}
         if max((v.shape[1] for v in local.values()), default=0) > length or not set(prefix) <= set(self.observed):
             raise ValueError(f"expected {length} steps (fewer of data to continue), the batch holds {shapes(local)}")
         if lengths is not None:
-            if lengths.is_floating_point() or lengths.shape != (size,) or lengths.min() < 1 or lengths.max() > length:
-                raise ValueError(f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}")
+            if lengths.is_floating_point() or lengths.shape != (size,):
+                raise ValueError(_no_lengths(lengths, length))
             valid = valid_steps(lengths, length)[..., None]
             values |= {name: v.masked_fill(~valid, 0) for name, v in values.items() if v.dim() == 3}
-        for name, value in values.items():
-            if not torch.isfinite(value.sum()):  # one pass; a NaN or infinity survives the sum
-                raise ValueError(
-                    f"{name} holds values that are not finite; where entries are missing, set 'mask' False in the batch"
-                )
         self._check_context(factorization, values)
-        for name in values.keys() & self.laws.keys():
-            self._check_support(name, values[name], masks.get(name), lengths)
+        checked = [length, lengths, *given, *masks.values()]  # by guide and model both
+        once(self, checked, lambda: self._check_values(values, masks, lengths, length))
         return Rollout(
             factorization=factorization,
             conditionals=conditionals,
@@ -189,23 +186,48 @@ class Reader:
                     f"{shapes(values) or 'nothing'}"
                 )
 
-    def _check_support(self, name: str, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> None:
+    def _check_values(
+        self, values: Mapping[str, Tensor], masks: Mapping[str, Tensor], lengths: Tensor | None, length: int
+    ) -> None:
+        """Refuses what no law has a density for, or lengths that are none, by one verdict: a GPU is waited for once."""
+        wrong = {name: ~torch.isfinite(value.sum()) for name, value in values.items()}  # a NaN survives the sum
+        outside = {
+            name: found
+            for name in values.keys() & self.laws.keys()
+            if (found := self._outside(name, values[name], masks.get(name), lengths)) is not None
+        }
+        verdict = [*wrong.values(), *(found.any() for found in outside.values())]
+        verdict += [] if lengths is None else [((lengths < 1) | (lengths > length)).any()]
+        if not verdict or not torch.stack(verdict).any():
+            return
+        if lengths is not None and (lengths.min() < 1 or lengths.max() > length):
+            raise ValueError(_no_lengths(lengths, length))
+        for name, bad in wrong.items():
+            if bad:
+                raise ValueError(
+                    f"{name} holds values that are not finite; where entries are missing, set 'mask' False in the batch"
+                )
+        for name, found in outside.items():
+            if found.any():
+                law, place = self.laws[name], found.nonzero()[0].tolist()
+                raise ValueError(
+                    f"{name} holds {values[name][tuple(place)].item():g} (sequence {place[0]}, coordinate {place[-1]}),"
+                    f" and by {law.factor}, {law.family}, values are {_meaning(law.support)}; give {name} another law,"
+                    " or hide such entries by the 'mask' of the batch"
+                )
+
+    def _outside(self, name: str, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> Tensor | None:
+        """Which observed entries are where the law has no density, as the value; None where none can be."""
         law = self.laws[name]
         if (support := law.support) is None:
-            return
-        wrong = ~once(law, [value], lambda: support.check(value))
+            return None
+        wrong = ~support.check(value)
         wrong = wrong[..., None].expand_as(value) if law.whole else wrong
         if mask is not None:
             wrong = wrong & mask
         if lengths is not None and value.dim() == 3:
             wrong = wrong & valid_steps(lengths, value.shape[1])[..., None]
-        if wrong.any():
-            place = wrong.nonzero()[0].tolist()
-            raise ValueError(
-                f"{name} holds {value[tuple(place)].item():g} (sequence {place[0]}, coordinate {place[-1]}), and by "
-                f"{law.factor}, {law.family}, values are {_meaning(support)}; give {name} another law, or hide "
-                "such entries by the 'mask' of the batch"
-            )
+        return wrong
 
     def check(self, name: str, value: Tensor) -> None:
         """Refuses a value (B, T, D), or (B, D), of another shape.
@@ -219,6 +241,10 @@ class Reader:
             raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {expected}")
         if value.dim() == 3 and value.shape[1] == 0:
             raise ValueError(f"{name} has no steps: shape {tuple(value.shape)}")
+
+
+def _no_lengths(lengths: Tensor, length: int) -> str:
+    return f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}"
 
 
 def _tensors(value: Any, dtype: torch.dtype, names: Collection[str]) -> Any:

@@ -323,7 +323,8 @@ class DynamicalVAE(nn.Module):
             factors[LOG_DET] = volume(data)
         with pyro.plate("windows", rollout.batch // rollout.draws, dim=-1) if factors else nullcontext():
             for name, value in factors.items():
-                pyro.factor(name, value)
+                unit = dist.Unit(value, validate_args=False)  # a loss that is not finite is told by the step
+                pyro.sample(name, unit, obs=value.new_empty((*value.shape, 0)), infer={"is_auxiliary": True})
         return rollout.states | rollout.values
 
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> Mapping[str, Tensor]:
@@ -344,7 +345,8 @@ class DynamicalVAE(nn.Module):
         if self.generator[name].law.deterministic:  # a deterministic site in Pyro's sense, with no density to score
             value = rollout.draw(name) if data is None else data
             infer: Any = {**_note(self.generative, rollout), "_deterministic": True}
-            return pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 1).mask(False), obs=value, infer=infer)
+            law = dist.Delta(value, event_dim=value.dim() - 1, validate_args=False).mask(False)
+            return pyro.sample(name, law, obs=value, infer=infer)
         return pyro.sample(name, rollout.law(name), obs=data, infer=_note(self.generative, rollout))
 
     def guide(
@@ -558,8 +560,11 @@ class DynamicalVAE(nn.Module):
             if name not in data:
                 law = spec.distribution(self.sizes[name], curriculum)
                 value = one[name] if name in one else pyro.sample(name, law, infer=SHARED)
-                data[name] = value.to(like(self)).expand(size, -1)
+                data[name] = once(self, [value, size], partial(self._of_each, value, size))  # by guide and model both
         return data
+
+    def _of_each(self, value: Tensor, size: int) -> Tensor:
+        return value.to(like(self)).expand(size, -1)
 
     def shown(self, values: Mapping[str, Tensor], data: Mapping[str, Any] | None = None) -> dict[str, Tensor]:
         """Values that the model made, with those of the data as the data are: back through the view.

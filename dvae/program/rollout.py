@@ -73,6 +73,13 @@ class SelfFeeding:
             fed &= (place >= kept)[:, None]
         return fed
 
+    def told(self, length: int) -> list[bool] | None:
+        """Which of T frames stay as they are, where chance has no part in it."""
+        if self.probability < 1:
+            return None
+        kept, own = self.blocks or (0, 1)
+        return [t < self.start or (t - self.start) % (kept + own) < kept for t in range(length)]
+
 
 @dataclass(frozen=True)
 class InputNoise:
@@ -106,10 +113,13 @@ class Hidden:
     Args:
         entries: (B, T, 1 or D), or (B, D) of a static variable.
         detached: those of them whose mean is fed without a gradient, or None.
+        told: at which steps there are none in any sequence, where that is known without a look at them, which a GPU
+            would be waited for.
     """
 
     entries: Tensor
     detached: Tensor | None = None
+    told: list[bool] | None = None
 
     def fill(self, value: Tensor, mean: Tensor, steps: int | slice = slice(None)) -> Tensor:
         """The value (B, T, D) with the mean at these entries; at one step, (B, D) both."""
@@ -365,7 +375,7 @@ class Rollout:
                 absent = missing.get(name)
                 entries = fed if absent is None else fed | absent
                 detached = None if self.feeding.gradient else fed if absent is None else fed & ~absent
-                hidden[name] = Hidden(entries, detached)
+                hidden[name] = Hidden(entries, detached, self.feeding.told(self.length) if absent is None else None)
         return hidden
 
     def _feed(self, block: Block) -> dict[str, Tensor]:
@@ -479,14 +489,16 @@ class Rollout:
         """At which steps all that a loop would make is known, of every sequence."""
         if any(name not in told for name in live):
             return [False] * self.length
-        whole = torch.ones(self.length, dtype=torch.bool, device=told[live[0]].device)
+        end = min(told[name].shape[1] for name in live)
+        known, seen = [True] * end, []
         for name in live:
-            seen = self.observed.get(name) if hidden is None else ~hidden[name].entries
-            end = told[name].shape[1]
-            whole[end:] = False
-            if seen is not None:
-                whole[:end] &= seen[:, :end].all(-1).all(0)
-        return whole.tolist()  # type: ignore[no-any-return]
+            if hidden is not None and (told_at := hidden[name].told) is not None:
+                known = [before and now for before, now in zip(known, told_at, strict=False)]
+            elif (mask := self.observed.get(name) if hidden is None else ~hidden[name].entries) is not None:
+                seen.append(mask[:, :end].all(-1).all(0))
+        if seen:
+            known = [before and now for before, now in zip(known, torch.stack(seen).all(0).tolist(), strict=True)]
+        return known + [False] * (self.length - end)
 
     def _continue(self, name: str, steps: int | slice, value: Tensor) -> Tensor:
         """The known first values of a variable; `value` at entries that are missing there."""

@@ -11,15 +11,16 @@ from __future__ import annotations
 import traceback
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 from unittest import mock
 
 import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
+from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
-from typing_extensions import Self, override
+from typing_extensions import override
 
 aten: Any = torch.ops.aten
 READS = {  # CUDA waits for their values, for the shapes that these have, or for the errors that they tell
@@ -41,24 +42,27 @@ INDEXED = {aten.index, aten.index_put, aten.index_put_, aten._index_put_impl_}
 class OnDevice(Tensor):
     """A tensor of the processor that says that it is on the device."""
 
-    device: ClassVar[torch.device] = torch.device("cuda", 0)  # type: ignore[misc]
+    # of a number that no machine has, so that nothing is mistaken for what a real one keeps
+    device: ClassVar[torch.device] = torch.device("cuda", 127)  # type: ignore[misc]
     own: Tensor
 
-    __torch_function__ = torch._C._disabled_torch_function_impl
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     @staticmethod
-    def __new__(cls, own: Tensor, requires_grad: bool = False) -> Self:
-        layout = {"strides": own.stride(), "storage_offset": own.storage_offset(), "dtype": own.dtype}
-        made: Self = Tensor._make_wrapper_subclass(cls, own.shape, requires_grad=requires_grad, **layout)  # type: ignore[attr-defined]
+    def __new__(cls, own: Tensor, requires_grad: bool = False) -> Self:  # noqa: D102
+        made: Any = Tensor._make_wrapper_subclass(
+            cls, own.shape, own.stride(), own.storage_offset(), dtype=own.dtype, requires_grad=requires_grad
+        )
         made.own = own
-        return made
+        return made  # type: ignore[no-any-return]
 
     @override
     def __repr__(self) -> str:  # type: ignore[override]
         return f"OnDevice({self.own!r})"
 
     @classmethod
-    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    @override
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
         raise RuntimeError(f"{func} of a tensor on {cls.device}, which is there only within on_device()")
 
 
@@ -74,6 +78,7 @@ class Traffic(TorchDispatchMode):
         super().__init__()
         self.reads: list[str] = []
         self.uploads: list[str] = []
+        self.within = False
 
     @override
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -103,15 +108,18 @@ class Traffic(TorchDispatchMode):
                 here = [value for value in here if all(value is not place for place in brought)]
         elif there and packet in READS:
             self.reads.append(_place(packet))
-        # torch fills in gradients on the processor, where it takes those of the device to be
-        backward = not tensors and device is not None and torch._C._current_autograd_node() is not None
-        if not (there or asked or backward):
+        # what torch makes within a function of the device's tensors is there too
+        within = self.within and not tensors and device is not None
+        if not (there or asked or within):
             return func(*args, **kwargs)
         if here:
             shapes = ", ".join(str(tuple(value.shape)) for value in here)
             raise RuntimeError(f"{packet} of tensors on {OnDevice.device} and others on the processor, {shapes}")
-        args, kwargs = tree_map_only(OnDevice, lambda value: value.own, (args, kwargs))
-        found = func(*args, **kwargs)
+        own, options = tree_map_only(OnDevice, lambda value: value.own, (args, kwargs))
+        found = func(*own, **options)
+        if torch.Tag.inplace_view in func.tags:  # the name has a shape of its own
+            with no_dispatch():
+                func(*args, **kwargs)
         return tree_map_only(Tensor, lambda value: there[id(value)] if id(value) in there else OnDevice(value), found)
 
 
@@ -132,7 +140,15 @@ class _Moves(TorchFunctionMode):
                 raise TypeError(f"a tensor on {OnDevice.device} has no array; bring it to the processor first")
             self.traffic.reads.append(_place("tolist"))
             return args[0].own.tolist()
-        return func(*args, **kwargs)
+        before, self.traffic.within = self.traffic.within, any(isinstance(v, OnDevice) for v in tree_leaves(args))
+        try:
+            made = func(*args, **kwargs)
+        finally:
+            self.traffic.within = before
+        if func is Tensor.new_tensor and isinstance(args[0], OnDevice) and not isinstance(made, OnDevice):
+            self.traffic.uploads.append(_place("new_tensor"))
+            return OnDevice(made.detach(), made.requires_grad)
+        return made
 
     def _moved(self, func: Any, value: Tensor, given: list[Any]) -> Tensor:
         given = given + [each for v in given if isinstance(v, Tensor) for each in (v.device, v.dtype)]
@@ -171,9 +187,8 @@ def on_device() -> Iterator[Traffic]:
     """
     lifting = torch._C._only_lift_cpu_tensors()
     with ExitStack() as stack:
-        for name in ("_lazy_init", "set_rng_state"):
-            stack.enter_context(mock.patch.object(torch.cuda, name, lambda *_: None))
-        stack.enter_context(mock.patch.object(torch.cuda, "get_rng_state", lambda *_: torch.get_rng_state()))
+        for name in ("_lazy_init", "get_rng_state", "set_rng_state"):  # all draws are those of the processor
+            stack.enter_context(mock.patch.object(torch.cuda, name, return_value=torch.empty(0)))
         torch._C._set_only_lift_cpu_tensors(True)  # so that torch.tensor(..., device=...) brings them there by `to`
         stack.callback(torch._C._set_only_lift_cpu_tensors, lifting)
         traffic = stack.enter_context(Traffic())

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from ...constants import indices
 from ..kinematics import forward
 
 UNTOLD = 1e-5
@@ -204,7 +205,7 @@ class Body(nn.Module):
             )
         pivots = self._pivots(shape)[..., None, :, :]
         root = self.parents.index(-1)
-        offsets = pivots - pivots[..., [max(parent, 0) for parent in self.parents], :]
+        offsets = pivots - pivots.index_select(-2, indices([max(parent, 0) for parent in self.parents], pivots))
         joints, turns = forward(self.parents, rotations, offsets, pivots[..., root, :].expand_as(translation))
         moved = joints - (turns @ pivots[..., None]).squeeze(-1)
         return torch.cat([turns, moved[..., None]], -1), joints

@@ -27,6 +27,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 from torch.nn.functional import pad
 
+from ...constants import constant, indices
 from ...data import Batch
 from ...options import Positive, Size, check
 from ...views import WHOLE
@@ -237,9 +238,9 @@ class TimedFrames:
         """What any frames (..., D) say of poses, with gradients: rotations (..., J, 3, 3) and places (..., 3)."""
         turning = self.turning
         ends = [joint for joint in range(self.skeleton.joints) if joint not in turning]
-        unturned = torch.eye(3).to(x).expand(*x.shape[:-1], len(ends), 3, 3)
-        places = torch.tensor([*turning, *ends], device=x.device).argsort()
-        rotations = torch.cat([to_matrix(self._turns(x), "6d"), unturned], -3).index_select(-3, places)
+        unturned = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], len(ends), 3, 3)
+        back = indices([[*turning, *ends].index(joint) for joint in range(self.skeleton.joints)], x)
+        rotations = torch.cat([to_matrix(self._turns(x), "6d"), unturned], -3).index_select(-3, back)
         return rotations, x[..., -4:-1] * self.metres
 
     def times(self, x: Tensor) -> Tensor:
@@ -325,7 +326,7 @@ class TimedFrames:
 
     def _scaling(self, like: Tensor) -> tuple[Tensor, Tensor]:
         unturned = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0) * len(self.turning)
-        return like.new_tensor(self.mean or unturned), like.new_tensor(self.deviation or [1.0] * len(unturned))
+        return constant(self.mean or unturned, like), constant(self.deviation or (1.0,) * len(unturned), like)
 
 
 def resting_offsets(motion: MotionSet) -> Tensor:
