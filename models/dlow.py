@@ -30,6 +30,7 @@ from ..inference.objectives import Evidence, Objective
 from ..motion import Skeleton, energies
 from ..motion.parts import places_of
 from ..options import Amount, Positive
+from ..program.conditional import like
 from ..program.rollout import Rollout
 from ..schema import SchemaError
 from ..views import WHOLE
@@ -124,7 +125,8 @@ class DLowModel(ModesModel):
         if WHOLE_SETS not in data:
             return super().penalties(rollout, data, draws)
         found = super().penalties(rollout, data, {MODE: self.modes})
-        scale, location = self.sampler(rollout.values[HISTORY]).chunk(2, -1)
+        shapes = self.sampler(rollout.values[HISTORY]).to(like(self).dtype)  # of autocast in half precision
+        scale, location = shapes.chunk(2, -1)
         variance = scale.square()
         found["kl"] = (variance + location.square() - 1 - variance.log()).sum(2).mean(1) / 2
         made = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (self.modes, -1))

@@ -247,6 +247,9 @@ class Conditional(nn.Module):
         return self.units.get(self.factor.child) if self.law.location_scale else None
 
     def _in_units(self, parameters: Parameters) -> Parameters:
+        if parameters and torch.is_autocast_enabled(parameters[0].device.type):
+            # networks may compute in half precision, but not densities, divergences and draws
+            parameters = tuple(parameter.to(like(self).dtype) for parameter in parameters)
         units = self._made_in
         return parameters if units is None else self.law.in_units(parameters, units.mean, units.scale)
 

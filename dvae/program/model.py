@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
+from functools import partial
 from itertools import accumulate
 from operator import mul
 from typing import Any, ClassVar
@@ -318,7 +319,8 @@ class DynamicalVAE(nn.Module):
                 rollout = rollout.fork((draws or {}).get(name, 1))
                 with rollout.plate:
                     rollout.know(name, self._site(name, rollout))
-        factors = {name: -energy for name, energy in self.penalties(rollout, data, draws or {}).items()}
+        precision = like(self).dtype  # whatever autocast computes in
+        factors = {name: -e.to(precision) for name, e in self.penalties(rollout, data, draws or {}).items()}
         if LOG_DET in data and self.likelihood:
             factors[LOG_DET] = volume(data)
         with pyro.plate("windows", rollout.batch // rollout.draws, dim=-1) if factors else nullcontext():
