@@ -31,6 +31,7 @@ from ..program.batch import AnyBatch, repeat
 from ..program.conditional import Conditional
 from ..program.model import DynamicalVAE
 from ..program.reference import reference
+from .device import move, on_device
 
 
 class FactorizationContract:
@@ -43,6 +44,7 @@ class FactorizationContract:
         still: parameters that need not learn from every batch, by name.
         missing: what the guide should read and does not, as it is published, {} for nothing; not checked if None.
         training_steps: of the optimiser, for the test that trains.
+        waits: how often a bound and its gradient wait for a GPU: once, for what is wrong with a batch.
     """
 
     batch = 3
@@ -51,6 +53,7 @@ class FactorizationContract:
     still: frozenset[str] = frozenset()
     missing: Mapping[str, tuple[str, ...]] | None = None
     training_steps = 30
+    waits = 1
 
     def build(self, size: int) -> DynamicalVAE:
         """The model under test, small.
@@ -219,6 +222,26 @@ class FactorizationContract:
             expected = run(model)
             torch.manual_seed(1)
             assert all(torch.equal(value, expected[name]) for name, value in run(other).items())
+
+    def test_a_bound_stays_on_its_device(self) -> None:
+        """On a GPU that is only said to be one it is the processor's, with no copies from there and few waits."""
+        model = self._model()
+        data = self._data(model)
+        torch.manual_seed(1)
+        expected = SequenceELBO().terms(model, data).bound
+        with on_device() as traffic:
+            move(model)
+            there = {name: value.to("cuda") for name, value in data.items()}
+            for _ in range(2):  # what does not change is brought there in the first
+                traffic.clear()
+                torch.manual_seed(1)
+                bound = SequenceELBO().terms(model, there).bound
+                bound.sum().backward()
+            assert not traffic.uploads, f"a bound brings tensors to the device: {', '.join(traffic.uploads)}"
+            assert len(traffic.reads) <= self.waits, f"a bound waits for the device: {', '.join(traffic.reads)}"
+            past = {name: v[:, :-1] if name in model.observed and v.dim() == 3 else v for name, v in there.items()}
+            model.forecast(past, 1)
+            self._close({"bound": bound.detach().cpu()}, {"bound": expected})
 
     def test_the_audit_says_what_is_published(self) -> None:
         """The guide misses `missing` of the exact posterior's dependencies, and nothing else."""

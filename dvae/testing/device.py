@@ -8,9 +8,10 @@ the two is listed, with each value that a program waits for.
 
 from __future__ import annotations
 
-import traceback
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any, ClassVar, Self
 from unittest import mock
 
@@ -19,7 +20,6 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map_only
 from typing_extensions import override
 
 aten: Any = torch.ops.aten
@@ -63,7 +63,7 @@ class OnDevice(Tensor):
     @classmethod
     @override
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
-        raise RuntimeError(f"{func} of a tensor on {cls.device}, which is there only within on_device()")
+        raise RuntimeError(f"{func} of a tensor on {cls.device}, a device only within on_device()")
 
 
 class Traffic(TorchDispatchMode):
@@ -80,10 +80,15 @@ class Traffic(TorchDispatchMode):
         self.uploads: list[str] = []
         self.within = False
 
+    def clear(self) -> None:
+        """Forgets what it has listed."""
+        self.reads.clear()
+        self.uploads.clear()
+
     @override
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
-        tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
+        tensors = list(_tensors((*args, *kwargs.values())))
         there = {id(value.own): value for value in tensors if isinstance(value, OnDevice)}
         here = [value for value in tensors if not isinstance(value, OnDevice) and value.dim()]
         device, packet = kwargs.get("device"), func.overloadpacket
@@ -115,12 +120,12 @@ class Traffic(TorchDispatchMode):
         if here:
             shapes = ", ".join(str(tuple(value.shape)) for value in here)
             raise RuntimeError(f"{packet} of tensors on {OnDevice.device} and others on the processor, {shapes}")
-        own, options = tree_map_only(OnDevice, lambda value: value.own, (args, kwargs))
-        found = func(*own, **options)
+        own = [_mapped(value, OnDevice, lambda v: v.own) for value in (*args, *kwargs.values())]
+        found = func(*own[: len(args)], **dict(zip(kwargs, own[len(args) :], strict=True)))
         if torch.Tag.inplace_view in func.tags:  # the name has a shape of its own
             with no_dispatch():
                 func(*args, **kwargs)
-        return tree_map_only(Tensor, lambda value: there[id(value)] if id(value) in there else OnDevice(value), found)
+        return _mapped(found, Tensor, lambda value: there[id(value)] if id(value) in there else OnDevice(value))
 
 
 class _Moves(TorchFunctionMode):
@@ -140,7 +145,7 @@ class _Moves(TorchFunctionMode):
                 raise TypeError(f"a tensor on {OnDevice.device} has no array; bring it to the processor first")
             self.traffic.reads.append(_place("tolist"))
             return args[0].own.tolist()
-        before, self.traffic.within = self.traffic.within, any(isinstance(v, OnDevice) for v in tree_leaves(args))
+        before, self.traffic.within = self.traffic.within, any(isinstance(value, OnDevice) for value in _tensors(args))
         try:
             made = func(*args, **kwargs)
         finally:
@@ -165,11 +170,27 @@ class _Moves(TorchFunctionMode):
         return cast.own  # type: ignore[attr-defined, no-any-return]
 
 
+def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
+    for value in values:
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, list | tuple):
+            yield from _tensors(value)
+
+
+def _mapped(value: Any, kind: type[Tensor], to: Callable[[Any], Tensor]) -> Any:
+    """The value with tensors of a kind replaced in it; torch's own, for trees of any kind, takes most of a step."""
+    if isinstance(value, kind):
+        return to(value)
+    return type(value)([_mapped(each, kind, to) for each in value]) if isinstance(value, list | tuple) else value
+
+
 def _place(what: Any) -> str:
     """Where an operation of a program comes from: the last line that is neither torch's nor of this file."""
-    calls = [call for call in traceback.extract_stack() if "site-packages" not in call.filename]
-    last = next((call for call in reversed(calls) if call.filename != __file__), calls[-1])
-    return f"{'/'.join(last.filename.split('/')[-2:])}:{last.lineno} {what}"
+    frame: Any = sys._getframe(1)
+    while frame.f_back and ("site-packages" in (file := frame.f_code.co_filename) or file == __file__):
+        frame = frame.f_back
+    return f"{'/'.join(Path(frame.f_code.co_filename).parts[-2:])}:{frame.f_lineno} {what}"
 
 
 @contextmanager

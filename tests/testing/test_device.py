@@ -1,0 +1,221 @@
+"""Readiness for a GPU without one: steps and evaluations of every method on a device that is only said to be one."""
+
+from dataclasses import replace
+from typing import ClassVar
+
+import pytest
+import torch
+from lightning_fabric.accelerators import CPUAccelerator
+from lightning_fabric.strategies import SingleDeviceStrategy
+from torch.utils._pytree import tree_leaves
+
+import dvae
+from dvae import motion
+from dvae.models.motion_latent import MotionLatent
+from dvae.models.registry import METHODS
+from dvae.models.trajectories import TrajectoryMethod
+from dvae.motion import bodies
+from dvae.motion.segments.embodied import Segments
+from dvae.testing.device import OnDevice, move, on_device
+
+DENSE = {"latent": 4, "width": 8, "hidden": (8,)}
+SMALL = {
+    "hit-dvae": {"samples": 2, "width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "pose_prior": 0.0},
+    "gsps": {"width": 8, "blocks": 1, "draws": (2, 2), "coefficients": 4, "pose_prior": 0.0},
+    "trajevae": {"width": 8, "feedforward": 8, "components": 4, "layers": 1},
+    "erd": {"width": 4, "encoder": (5,), "decoder": (6,)},
+    "aclstm": {"width": 4},
+    "autoregressive": {"width": 4},
+    "moglow": {"width": 4, "flow_steps": 1},
+    "cvae-rnn": {"latent": 4, "summary": 4, "width": 8, "hidden": (8,)},
+    "motion-infilling": {"maps": (4, 6)},
+    "mt-vae": {"latent": 4, "width": 8},
+    "bom-parts": {"width": 8, "blocks": 1, "coefficients": 4},
+    "mix-and-match": {"width": 8},
+    "motion-latent": {"latent": 4, "widths": (8, 8)},
+    "equations": {"latent": 4, "warm_up": 1, "width": 8},
+    **dict.fromkeys(("cvae", "bom", "pose-knows", "rhp"), DENSE),
+    **dict.fromkeys(("dlow", "dsf"), {**DENSE, "modes": 3, "sampler_width": 8, "sampler_hidden": (8,)}),
+}
+STEP = {
+    "program/batch.py": 1,  # one verdict on the whole batch: finite, in the laws' supports, of lengths that there are
+    "inference/svi.py": 1,  # loss and norm of the gradient, by which a step is taken, clipped or refused
+}
+"""For what any step waits, and how often."""
+BESIDE = {
+    "moglow": {"laws/conditional_flow.py": 2},  # zuko looks up both halves of a coupling, once for each of them
+    "hit-dvae": {"motion/energies.py": 1},  # how many futures are admissible is a shape
+    "gsps": {"motion/energies.py": 1},
+    "dlow": {"program/groups.py": 1, "models/modes.py": 1},  # how many windows there are, and that histories recur
+    "dsf": {"models/modes.py": 1},
+    "mix-and-match": {"program/rollout.py": 1},  # which frames chance has fed, so that a loop passes over the others
+    "motion-latent": {"inference/gradnorm.py": 1},  # losses and gradients' norms, by which the weights adapt
+}
+BROUGHT = {"mix-and-match": 1}
+"""Tensors brought to the device in a step, beside the batch: the indices that all sequences share."""
+
+
+@pytest.fixture(scope="module")
+def people():
+    return motion.simulate(clips=6, frames=60, seed=1)
+
+
+@pytest.fixture(scope="module")
+def segments():
+    return Segments(motion.gait_cycles(bodies.fitted(motion.simulate(clips=4, frames=90, seed=1), bodies.human())))
+
+
+@pytest.fixture
+def trained(request, people):
+    """By the name of a method: a small model of it, its recipe, and its windows for training and for testing."""
+
+    def make(name):
+        torch.manual_seed(0)
+        if name == "motion-latent":
+            method, train = MotionLatent(**SMALL[name]), request.getfixturevalue("segments")
+            return method.build(train), method.train(train, None, 4), train, None
+        of_paths = issubclass(dvae.methods()[name], TrajectoryMethod)
+        protocol = motion.PROTOCOLS["simulated-trajectories" if of_paths else "simulated"]
+        cut = {"predicted": 8, "observed": min(protocol.observed, 6), "train_stride": 15, "test_stride": 25}
+        cut |= {"representation": "quaternion"} if name == "mix-and-match" else {}
+        data = motion.MotionData("simulated", people, replace(protocol, **cut))
+        train = data.windows("train")
+        method = dvae.method(name, **SMALL.get(name, {"latent": 4, "warm_up": 1})).suited(train)
+        model, recipe = method.build(data.schema), method.train(train, None, 4)
+        recipe.prepare(model)
+        return model, recipe, train, data.windows("test")
+
+    return make
+
+
+def two_steps(model, recipe, before_the_second=lambda: None):
+    """The terms of two steps of the recipe, the number of tensors of the batch, and what took them."""
+    options = {"steps": 4, "self_feeding": recipe.feeding, "accelerator": "cpu", "progress": False}
+    svi = dvae.SVI(model, stages=recipe.stages, **options)
+    svi.init()
+    batch = recipe.batches.sample(3, torch.Generator().manual_seed(1))
+    first = svi.step(batch)
+    before_the_second()
+    return (first, svi.step(batch)), len(tree_leaves(batch)), svi
+
+
+def numbers(terms):
+    tables = ((kind, getattr(terms, kind)) for kind in ("log_likelihood", "kl", "energies", "steps"))
+    return {(kind, name): value for kind, table in tables for name, value in table.items()}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_stays_on_its_device_and_a_step_waits_for_it_as_often_as_is_said(name, trained, monkeypatch):
+    """What it does there is what it does on the processor: training, validation, forecasts and their scores."""
+    model, recipe, _, _ = trained(name)
+    expected, _, _ = two_steps(model.double(), recipe)
+    model, recipe, train, test = trained(name)
+    monkeypatch.setattr(SingleDeviceStrategy, "root_device", OnDevice.device)
+    monkeypatch.setattr(CPUAccelerator, "setup_device", lambda *_: None)
+    with on_device() as traffic:
+        found, tensors, svi = two_steps(move(model.double()), recipe, traffic.clear)
+        places = [read.partition(":")[0] for read in traffic.reads]
+        assert {place: places.count(place) for place in places} == STEP | BESIDE.get(name, {}), traffic.reads
+        assert len(traffic.uploads) == tensors + BROUGHT.get(name, 0), traffic.uploads
+        svi.evaluate(train.sample(3, torch.Generator()))
+        if test is not None:
+            options = {"scores": motion.displacements, "samples": 2, "references": False, "progress": False}
+            dvae.evaluate(model, test, batch_size=500, bound_particles=2 * model.likelihood, **options)
+        for there, here in zip(found, expected, strict=True):
+            got = {key: value.cpu() for key, value in numbers(there).items()}
+            torch.testing.assert_close(got, numbers(here), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_terms_have_the_precision_of_the_model_under_autocast(name, trained):
+    """A bound in mixed precision is off by no more than weights would have it be that have bfloat16's digits."""
+    model, recipe, _, _ = trained(name)
+    model.train(name == "gsps").requires_grad_(False)  # which normalises over a batch
+    batch = recipe.batches.sample(3, torch.Generator().manual_seed(1))
+    drawing = {"draws": recipe.objective.draws} if getattr(recipe.objective, "draws", None) else {}
+
+    def terms():
+        torch.manual_seed(3)
+        return dvae.SequenceELBO().terms(model, batch, **drawing)
+
+    def value(found):
+        return float((found.bound - sum(found.energies.values())).double().sum())
+
+    exact = value(terms())
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = terms()
+    assert {part.dtype for part in (mixed.bound, mixed.frames, *numbers(mixed).values())} == {torch.float32}
+    weights, squares = [parameter.clone() for parameter in model.parameters()], []
+    for seed in range(4):
+        torch.manual_seed(seed)
+        for parameter, weight in zip(model.parameters(), weights, strict=True):
+            parameter.copy_(weight * (1 + 2**-8 * torch.randn_like(weight)))
+        squares.append((value(terms()) - exact) ** 2)
+    assert abs(value(mixed) - exact) <= 4 * (sum(squares) / len(squares)) ** 0.5
+
+
+# ------------------------------------------------------------------------------------------------ the device itself
+
+
+class TestOnDevice:
+    here: ClassVar = torch.arange(6.0).view(2, 3)
+
+    @pytest.mark.parametrize(
+        ("run", "reads", "uploads"),
+        [
+            (lambda x: x.sum().item(), 1, 0),
+            (lambda x: bool((x > 0).all()), 1, 0),
+            (lambda x: x.tolist(), 1, 0),
+            (lambda x: x.cpu(), 1, 0),
+            (lambda x: torch.zeros(2, 3).copy_(x), 1, 0),
+            (lambda x: x.nonzero(), 1, 0),
+            (lambda x: x[x > 2], 1, 0),
+            (lambda x: torch.equal(x, x), 1, 0),
+            (lambda x: torch.linalg.inv(x @ x.T), 1, 0),
+            (lambda x: torch.linalg.inv_ex(x @ x.T), 0, 0),
+            (lambda x: x.masked_fill(x > 2, 0.0), 0, 0),
+            (lambda x: x[:, [0, 2]], 0, 1),
+            (lambda x: x + torch.ones(2, 3).to(x), 0, 1),
+            (lambda x: x + torch.ones(2, 3).to(x.device, torch.float64), 0, 1),
+            (lambda x: torch.tensor([1.0, 2, 3], device=x.device) * x, 0, 1),
+            (lambda x: x.new_tensor([1.0, 2, 3]) * x, 0, 1),
+            (lambda x: torch.arange(3, device=x.device) * x, 0, 0),
+            (lambda x: x * torch.tensor(2.0), 0, 0),
+            (lambda x: x.double().to(x.device), 0, 0),
+        ],
+    )
+    def test_it_lists_what_is_brought_and_waited_for(self, run, reads, uploads):
+        expected = run(self.here)
+        with on_device() as traffic:
+            x = self.here.to("cuda")
+            traffic.clear()
+            found = run(x)
+            assert (len(traffic.reads), len(traffic.uploads)) == (reads, uploads)
+            assert all(place.startswith("testing/test_device.py:") for place in (*traffic.reads, *traffic.uploads))
+            as_here = [value.cpu() if isinstance(value, torch.Tensor) else value for value in tree_leaves(found)]
+        torch.testing.assert_close(as_here, tree_leaves(expected))
+
+    @pytest.mark.parametrize(
+        "run",
+        [lambda x: x + torch.ones(3), lambda x: torch.cat([x, torch.zeros(2, 3)]), lambda x: x.add_(torch.ones(2, 3))],
+    )
+    def test_it_refuses_what_is_on_both_sides(self, run):
+        with on_device(), pytest.raises(RuntimeError, match=r"on cuda:127 and others on the processor, \("):
+            run(self.here.to("cuda"))
+
+    def test_gradients_are_those_of_the_processor(self):
+        lstm = torch.nn.LSTM(3, 4, batch_first=True)
+        x = torch.randn(2, 5, 3)
+        expected = torch.autograd.grad(lstm(x)[0].square().sum(), list(lstm.parameters()))
+        with on_device() as traffic:
+            move(lstm)(x.to("cuda"))[0].square().sum().backward()
+            assert not traffic.reads
+            torch.testing.assert_close([p.grad.cpu() for p in lstm.parameters()], list(expected))
+
+    def test_it_is_there_within_alone(self):
+        with on_device():
+            x = self.here.to("cuda")
+        with pytest.raises(RuntimeError, match="a device only within on_device"):
+            x + 1
+        with on_device(), pytest.raises(TypeError, match="has no array; bring it to the processor first"):
+            x.numpy()
