@@ -78,8 +78,9 @@ class MixtureLaw(Prior):
 
     @override
     def prior(self) -> Any:
-        parts = dist.Normal(self.loc, self.log_scale.exp()).to_event(1)
-        return dist.MixtureSameFamily(dist.Categorical(logits=self.logits), parts)
+        parts = dist.Normal(self.loc, self.log_scale.exp(), validate_args=False).to_event(1)
+        weights = dist.Categorical(logits=self.logits, validate_args=False)
+        return dist.MixtureSameFamily(weights, parts, validate_args=False)
 
 
 @dataclass(frozen=True)
@@ -142,8 +143,9 @@ class VampLaw(Prior):
     @override
     def prior(self) -> Any:
         posteriors = self.guide.law.joint(self.guide(dict(self.pseudo.items()), self.components, self.steps))
-        weights = dist.Categorical(logits=next(self.pseudo.parameters()).new_zeros(self.components))
-        return dist.MixtureSameFamily(weights, posteriors)
+        same = next(self.pseudo.parameters()).new_zeros(self.components)
+        weights = dist.Categorical(logits=same, validate_args=False)
+        return dist.MixtureSameFamily(weights, posteriors, validate_args=False)
 
 
 @dataclass(frozen=True)
@@ -204,4 +206,5 @@ class FlowLaw(Prior):
         reverse = transforms.Permute(torch.arange(len(loc) - 1, -1, -1, device=loc.device), cache_size=0)
         moves = [part for layer in self.layers for part in (*map(copy.copy, layer), reverse)]
         moves.append(transforms.AffineTransform(loc, self.log_scale.exp(), event_dim=1, cache_size=1))
-        return dist.TransformedDistribution(dist.Normal(torch.zeros_like(loc), 1.0).to_event(1), moves)
+        noise = dist.Normal(torch.zeros_like(loc), torch.ones_like(loc), validate_args=False).to_event(1)
+        return dist.TransformedDistribution(noise, moves, validate_args=False)

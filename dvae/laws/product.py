@@ -14,6 +14,7 @@ from torch.distributions import constraints
 from torch.nn import functional
 from typing_extensions import override
 
+from ..constants import indices
 from .base import Law, LawSpec, Parameters, Shape
 
 
@@ -76,7 +77,9 @@ class ProductLaw(Law):
 
     def _part(self, n: int, features: Tensor, previous: Tensor | None, t: int | None) -> Parameters:
         law: Any = self.parts[n]
-        own = previous[..., self.places[n]] if law.residual and previous is not None else None
+        own = None
+        if law.residual and previous is not None:
+            own = previous.index_select(-1, indices(self.places[n], previous))
         return law(features, own, t)  # type: ignore[no-any-return]
 
     @override
@@ -134,20 +137,20 @@ class ProductDistribution(TorchDistribution):
 
     def __init__(self, parts: Sequence[tuple[list[int], Any]]):
         self.parts = parts
-        self.order = _order(places for places, _ in parts)
+        self.order = _order(places for places, _ in parts).tolist()
         first = parts[0][1]
         batch = first.batch_shape if first.event_shape else first.batch_shape[:-1]
         self.has_rsample = all(law.has_rsample for _, law in parts)
         super().__init__(torch.Size([*batch, len(self.order)]), torch.Size(), validate_args=False)
 
     def _whole(self, parts: list[Tensor]) -> Tensor:
-        return torch.cat(parts, -1)[..., self.order.to(parts[0].device)]
+        return torch.cat(parts, -1).index_select(-1, indices(self.order, parts[0]))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """(..., D); of an event at its first coordinate, 0 at its others."""
         found = []
         for places, law in self.parts:
-            own = law.log_prob(value[..., places])
+            own = law.log_prob(value.index_select(-1, indices(places, value)))
             found.append(functional.pad(own[..., None], (0, len(places) - 1)) if law.event_shape else own)
         return self._whole(found)
 
@@ -187,6 +190,7 @@ class ProductSupport(constraints.Constraint):
         """Whether each coordinate is where it may be."""
         found = []
         for places, own in self.parts:
-            right = own.check(value[..., places])
+            right = own.check(value.index_select(-1, indices(places, value)))
             found.append(right[..., None].expand(*right.shape, len(places)) if own.event_dim else right)
-        return torch.cat(found, -1)[..., _order(places for places, _ in self.parts).to(value.device)]
+        order = _order(places for places, _ in self.parts).tolist()
+        return torch.cat(found, -1).index_select(-1, indices(order, value))

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from ..constants import visible
+from ..constants import indices, visible
 from ..relations import Relation
 from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, at, part, valid_steps
 from .extract import Extract, Extractors
@@ -442,4 +442,4 @@ class Attending:
         if self.in_order:
             return row[..., : self.given + len(self.seen)]
         columns = [*range(self.given), *(self.given + token for token in self.seen)]
-        return row.index_select(-1, torch.tensor(columns, device=row.device))
+        return row.index_select(-1, indices(columns, row))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
+from ..constants import visible
 from .base import Input, Network, at
 from .rows import select
 
@@ -58,7 +59,10 @@ class LinearNetwork(Network):
         if length > self.steps:
             raise ValueError(f"Linear(steps={self.steps}) was given {length} steps; build it with steps={length}")
         weight: Tensor = self.weights[name][:length, :length]
-        return weight * self.mask(name, length)[:, :, None, None].to(weight.device)
+        relation = next(parent.relation for parent in self.inputs if parent.name == name)
+        if relation is None:
+            return weight
+        return weight * visible(relation, length, weight.device)[: len(weight), :, None, None]
 
     def known(self, given: Mapping[str, Tensor], length: int) -> Tensor:
         """The share of given parents in the features (B, T, H), or (T, H) without any."""
@@ -88,8 +92,8 @@ class LinearNetwork(Network):
         base, live = state
         features = base[t]
         for name, (weight, mask) in live.items():
-            for s, visible in enumerate(mask[t]):
-                if visible:
+            for s, seen in enumerate(mask[t]):
+                if seen:
                     features = features + at(drawn[name], s, features, weight.shape[-1]) @ weight[t, s].t()
         return features, state
 

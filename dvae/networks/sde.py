@@ -195,7 +195,12 @@ class Equation(nn.Module):
             decay, covariance = transition(self.drift, self.noise, distinct.to(self.log_rate.dtype))
             # the last is that from the stationary law, which forgets all
             decay = torch.cat([decay, torch.zeros_like(self.turning)[None]])
-            whitening = torch.cat([InverseCholesky.apply(covariance), torch.eye(len(self.turning)).to(decay)[None]])
+            whitening = torch.cat(
+                [
+                    InverseCholesky.apply(covariance),
+                    torch.eye(len(self.turning), dtype=decay.dtype, device=decay.device)[None],
+                ]
+            )
         which = torch.full(gaps.shape, len(distinct), device=gaps.device)
         which[there] = place
         return decay[which], whitening[which]

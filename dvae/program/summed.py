@@ -219,6 +219,19 @@ class Sums:
             place = place * self.sizes[own] + digits[own, 0 if window.factor.local else None]
         return torch.from_numpy(place)
 
+    @torch.inference_mode(False)
+    def placed(self, window: Window, length: int, device: torch.device) -> tuple[dict[str, Tensor], Tensor]:
+        """Patterns and places on a device, where they are brought once."""
+        key = window.factor.child, length, device
+        if key not in self._placed:
+            told = {name: value.to(device) for name, value in self.patterns(window, length).items()}
+            self._placed[key] = told, self.places(window, length).to(device)
+        return self._placed[key]
+
+    @cached_property
+    def _placed(self) -> dict[Any, tuple[dict[str, Tensor], Tensor]]:
+        return {}
+
 
 class Summation:
     """The sum over discrete latents in one run, all else being known.
@@ -252,7 +265,7 @@ class Summation:
         """Log densities or probabilities in all joint states: (B or 1, T, M, K^L, K); (B or 1, M) of a static one."""
         sums, run, local = self.sums, self.rollout, window.factor.local
         conditional, own = run.conditionals[name], name in sums.sizes
-        told = sums.patterns(window, run.length)
+        told, places = sums.placed(window, run.length, like(conditional).device)
         count = len(next(iter(told.values()))) if told else 1
         values = {n: one_hot(v, sums.sizes[n]).to(like(conditional)) for n, v in told.items()}
         if values.keys() == {*conditional.parents}:  # the same for all sequences
@@ -269,7 +282,6 @@ class Summation:
             logs = law.log_prob(conditional.scored(run.values[name], mask))
             logs = logs if mask is None else torch.where(mask, logs, 0.0)
             logs = logs if conditional.whole else logs.sum(-1)
-        places = sums.places(window, run.length).to(logs.device)
         logs = logs.reshape(count, -1, len(places), self.sums.sizes.get(name, 1)).permute(1, 2, 0, 3).flatten(2)
         logs = logs.gather(2, places.expand(len(logs), -1, -1))
         shape = (sums.kept, sums.width**sums.lag, sums.width)

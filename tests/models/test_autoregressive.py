@@ -13,6 +13,7 @@ X = torch.randn(6, 7, 2)
 
 
 class TestAutoregressive(FactorizationContract):
+    waits = 1
     missing = {}  # noqa: RUF012
 
     def build(self, size):

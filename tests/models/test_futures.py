@@ -23,6 +23,7 @@ def small(name, **options):
 
 class Contract(FactorizationContract):
     name = ""
+    waits = 1
     missing: ClassVar = {}
     options: ClassVar = {}
 

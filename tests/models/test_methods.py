@@ -45,6 +45,7 @@ def small(name, size=2, **options):
 
 class Contract(FactorizationContract):
     name = ""
+    waits = 1
     options: ClassVar = {}
 
     def build(self, size):
@@ -176,6 +177,7 @@ class TestDSAEWithMixture(Contract):
 
 class TestEquationsWithFlow(Contract):
     name = "equations"
+    waits = 21  # Pyro's splines look up by a mask what lies within their bounds
     options: ClassVar = {
         "generative": "p(w) p(x_t | x_{t-1}, w)",
         "inference": "q(w | x_{1:T})",

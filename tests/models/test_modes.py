@@ -34,6 +34,7 @@ class Contract(FactorizationContract):
     """That of the factorization, of which all is trained."""
 
     name = ""
+    waits = 2  # for whether the rows are some histories over and over
     missing: ClassVar = {}
 
     def build(self, size):

@@ -35,7 +35,7 @@ SMALL = {
     "motion-latent": {"latent": 4, "widths": (8, 8)},
     "equations": {"latent": 4, "warm_up": 1, "width": 8},
     **dict.fromkeys(("cvae", "bom", "pose-knows", "rhp"), DENSE),
-    **dict.fromkeys(("dlow", "dsf"), {**DENSE, "modes": 3, "sampler_width": 8, "sampler_hidden": (8,)}),
+    **{n: {**DENSE, "modes": 3, "sampler_width": 8, "sampler_hidden": (8,)} for n in ("dlow", "dsf")},
 }
 STEP = {
     "program/batch.py": 1,  # one verdict on the whole batch: finite, in the laws' supports, of lengths that there are
