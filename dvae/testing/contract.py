@@ -241,8 +241,6 @@ class FactorizationContract:
             assert not traffic.uploads, f"a bound brings tensors to the device: {', '.join(traffic.uploads)}"
             waited = f"a bound waits {len(traffic.reads)} times for the device: {', '.join(traffic.reads)}"
             assert self.waits is None or len(traffic.reads) <= self.waits, waited
-                f"a bound waits {len(traffic.reads)} times for the device: {', '.join(traffic.reads)}"
-            )
             past = {name: v[:, :-1] if name in model.observed and v.dim() == 3 else v for name, v in there.items()}
             model.forecast(past, 1)
             self._close({"bound": bound.detach().cpu()}, {"bound": expected})
