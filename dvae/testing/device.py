@@ -37,6 +37,7 @@ READS = {  # CUDA waits for their values, for the shapes that these have, or for
     aten._linalg_check_errors,
 }
 INDEXED = {aten.index, aten.index_put, aten.index_put_, aten._index_put_impl_}
+BENEATH = {"torch", "pyro", "zuko", "roma"}
 
 
 class OnDevice(Tensor):
@@ -186,9 +187,11 @@ def _mapped(value: Any, kind: type[Tensor], to: Callable[[Any], Tensor]) -> Any:
 
 
 def _place(what: Any) -> str:
-    """Where an operation of a program comes from: the last line that is neither torch's nor of this file."""
+    """Where an operation of a program comes from: the last line that is none of these libraries' or of this file."""
     frame: Any = sys._getframe(1)
-    while frame.f_back and ("site-packages" in (file := frame.f_code.co_filename) or file == __file__):
+    while frame.f_back and (
+        (name := frame.f_globals.get("__name__", "")) == __name__ or name.partition(".")[0] in BENEATH
+    ):
         frame = frame.f_back
     return f"{'/'.join(Path(frame.f_code.co_filename).parts[-2:])}:{frame.f_lineno} {what}"
 
