@@ -1,14 +1,17 @@
 """What makes the tables of the pages, each on little: tables stand between the marks, and all else stays."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import networkx as nx
 import numpy as np
 import pytest
 import torch
 
+from benchmarks import bench, speed
 from benchmarks.tables import (
     audits,
     bones,
@@ -606,6 +609,49 @@ def test_halves_keep_times_between_frames_and_no_frame_twice():
 def test_gaps_are_as_long_as_they_are():
     mask = torch.tensor([1, 0, 0, 1, 1, 0, 0, 0, 1, 0]).bool()
     assert occlusion.bursts(mask[None, :, None])[0, :, 0].tolist() == [0, 2, 2, 0, 0, 3, 3, 3, 0, 1]
+
+
+def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(bench, "HISTORY", tmp_path / "history.json")
+    history = tmp_path / "speed.md"
+    history.write_text("<!-- history -->\n<!-- end of history -->\n")
+    monkeypatch.setattr(bench, "page", partial(bench.page, path=history))
+    targets = {"speed: step": ("at most", 2.0), "speed: gain": ("at least", 3.0)}
+    runs = []
+
+    def run(*found, keep=False):
+        left = [dict(zip((*targets, "speed: seen"), rows, strict=True)) for rows in found]
+        monkeypatch.setattr(bench, "measured", lambda name: (dict(left.pop(0)), targets))
+        runs.append(bench.main(("speed",), threads=torch.get_num_threads(), out=tmp_path / "out.json", keep=keep))
+        assert not left
+        return capsys.readouterr().out.splitlines()[-1]
+
+    run((1.0, 4.0, 7.0), keep=True)
+    run((1.09, 3.7, 70.0))  # within a tenth, and rows without a target are free
+    run((1.3, 4.0, 7.0), (1.05, 4.0, 7.0))  # the better of two
+    assert run((1.3, 4.0, 7.0), (1.2, 4.0, 7.0)) == "speed: step: 1.20 was 1.00 at the last release"
+    assert run((1.0, 2.0, 7.0), (1.0, 2.9, 7.0)) == (
+        "speed: gain: 2.90 is to be at least 3, was 4.00 at the last release"
+    )
+    assert runs == [0, 0, 0, 1, 1]
+    assert "| speed: step | at most 2 | **1.00** | – |" in history.read_text()
+    monkeypatch.setattr(bench.dvae, "__version__", "9.0")
+    run((1.05, 5.0, 7.0), keep=True)
+    assert "| speed: gain | at least 3 | **5.00** | 4.00 | 1.25 |" in history.read_text()
+    assert len(json.loads((tmp_path / "history.json").read_text())) == 2
+
+
+def test_products_alone_are_those_of_the_work():
+    x, y = torch.randn(3, 4, requires_grad=True), torch.randn(4, 2)
+    with speed.Products() as noted:
+        (x @ y).sum().backward()
+        torch.baddbmm(torch.zeros(5, 3, 2), torch.randn(5, 3, 4), torch.randn(5, 4, 2))
+    assert [[tuple(v.shape) for v in args if isinstance(v, torch.Tensor)] for _, args in noted.calls] == [
+        [(3, 4), (4, 2)],
+        [(3, 2), (2, 4)],
+        [(5, 3, 2), (5, 3, 4), (5, 4, 2)],
+    ]
+    noted.run()
 
 
 def test_demo(tmp_path):
