@@ -24,6 +24,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from .scan import Covariances, Recursion, States, backward, riccati, symmetric, turned
+
 
 class Moments(NamedTuple):
     """Means (T, B, N) and covariances (T, B, N, N) of every z_t."""
@@ -79,16 +81,22 @@ class LinearGaussianChain:
         return torch.linalg.solve(self.predicted.covariance[1:], self.transition @ self.filtered.covariance[:-1]).mT
 
     @cached_property
+    def _backward(self) -> tuple[Tensor, Moments]:
+        """Of z_t given z_{t+1} and what came up to t, from the last t back: the gain, and moments at z_{t+1} = 0."""
+        gain = self._gain
+        rest = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain @ self.transition
+        # a sum of squares (Joseph's form), which stays positive where the difference would not
+        spread = rest @ self.filtered.covariance[:-1] @ rest.mT + gain @ self.noise @ gain.mT
+        mean = self.filtered.mean[:-1] - _times(gain, self.predicted.mean[1:])
+        return gain.flip(0), Moments(mean.flip(0), symmetric(spread).flip(0))
+
+    @cached_property
     def smoothed(self) -> Moments:
         """Of z_t given everything."""
-        mean, covariance = ([last[-1]] for last in self.filtered)
-        for t in range(len(self.transition) - 1, -1, -1):
-            gain = self._gain[t]
-            change = mean[-1] - self.predicted.mean[t + 1]
-            mean.append(self.filtered.mean[t] + _times(gain, change))
-            change = covariance[-1] - self.predicted.covariance[t + 1]
-            covariance.append(_symmetric(self.filtered.covariance[t] + gain @ change @ gain.mT))
-        return Moments(torch.stack(mean[::-1]), torch.stack(covariance[::-1]))
+        gain, (mean, covariance) = self._backward
+        means = States.apply(gain, mean, self.filtered.mean[-1])
+        covariances = Covariances.apply(gain, covariance, self.filtered.covariance[-1])
+        return Moments(means.flip(0), covariances.flip(0))
 
     @property
     def lag_one(self) -> Tensor:
@@ -97,22 +105,16 @@ class LinearGaussianChain:
 
     def draw(self, noise: Tensor) -> Tensor:
         """Reparameterised draws (T, B, N) of z_{1:T} given everything, from standard normal noise of that shape."""
-        gain, last = self._gain, self.filtered.covariance[-1:]
-        rest = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain @ self.transition
-        # of z_t given z_{t+1}; a sum of squares (Joseph's form), which stays positive where the difference would not
-        spread = rest @ self.filtered.covariance[:-1] @ rest.mT + gain @ self.noise @ gain.mT
-        roots = torch.linalg.cholesky(torch.cat([_symmetric(spread), last]))
-        independent = self.filtered.mean + _times(roots, noise)
-        values = [independent[-1]]
-        for t in range(len(gain) - 1, -1, -1):
-            values.append(independent[t] + _times(gain[t], values[-1] - self.predicted.mean[t + 1]))
-        return torch.stack(values[::-1])
+        gain, (mean, covariance) = self._backward
+        roots = torch.linalg.cholesky(torch.cat([self.filtered.covariance[-1:], covariance]))
+        values = torch.cat([self.filtered.mean[-1:], mean]) + _times(roots, noise.flip(0))
+        return States.apply(gain, values[1:], values[0]).flip(0)
 
 
 def update(mean: Tensor, covariance: Tensor, information: Tensor, potential: Tensor) -> Moments:
     """Moments of N(mean, covariance) times exp(g' z - z' G z / 2); shapes (..., N) and (..., N, N)."""
     identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
-    after = _symmetric(torch.linalg.solve_ex(identity + covariance @ information, covariance)[0])
+    after = symmetric(torch.linalg.solve_ex(identity + covariance @ information, covariance)[0])
     return Moments(mean + _times(after, potential - _times(information, mean)), after)
 
 
@@ -131,31 +133,11 @@ class Predict(torch.autograd.Function):
         potential: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Run the filter."""
-        steps, batch, size = potential.shape
-        identity = torch.eye(size, dtype=mean.dtype, device=mean.device).expand(batch, size, size)
-        covariances = torch.empty_like(information)
-        covariances[0] = covariance
-        shrink = torch.empty_like(transition).mT  # W; transposed, since the inverse is computed by columns
-        carry = torch.empty_like(transition)  # F
-        inside, right = (mean.new_empty(batch, size, size) for _ in range(2))
-        info = torch.empty(batch, dtype=torch.int32, device=mean.device)
-        sequences = (tensor.unbind(0) for tensor in (transition, noise, information, shrink, carry, covariances[1:]))
-        last = covariances[0]
-        for a, q, g, w, f, new in zip(*sequences, strict=False):
-            torch.baddbmm(identity, last, g, out=inside)
-            torch.linalg.inv_ex(inside, out=(w, info))
-            torch.bmm(a, w, out=f)
-            torch.bmm(last, a.mT, out=right)
-            last = torch.baddbmm(q, f, right, out=new)
-        covariances = _symmetric(covariances)
+        covariances, shrink, carry = riccati(transition, noise, information[:-1], covariance)
+        covariances = symmetric(covariances)
         filtered = shrink @ covariances[:-1]
         gathered = (transition @ _column(filtered, potential[:-1])).add_(offset[..., None])
-        means = mean.new_empty(steps, batch, size, 1)
-        means[0] = mean[..., None]
-        states = means.unbind(0)
-        for t, (f, c) in enumerate(zip(carry.unbind(0), gathered.unbind(0), strict=True)):
-            torch.baddbmm(c, f, states[t], out=states[t + 1])
-        means = means[..., 0]
+        means = Recursion(carry).states(gathered, mean[..., None])[..., 0]
         ctx.save_for_backward(transition, information, potential, means, filtered, shrink, carry)
         return means, covariances
 
@@ -167,19 +149,13 @@ class Predict(torch.autograd.Function):
         That of G is not symmetric; its symmetric part is the gradient, since G is symmetric.
         """
         transition, information, potential, means, filtered, shrink, carry = ctx.saved_tensors
-        back = carry.mT
-        total = to_mean[..., None].clone(memory_format=torch.contiguous_format)
-        steps = total.unbind(0)
-        for t in range(len(carry) - 1, -1, -1):
-            steps[t].baddbmm_(back[t], steps[t + 1])
+        back = backward(carry)
+        total = back.states(*turned(to_mean[..., None])).flip(0)
         later = total[1:]
         missed = potential[:-1, ..., None] - information[:-1] @ means[:-1, ..., None]
         totals = to_covariance.clone()
-        totals[:-1] += (back @ later) @ (shrink.mT @ missed).mT
-        totals = _symmetric(totals)
-        steps, carries, backs = totals.unbind(0), carry.unbind(0), back.unbind(0)
-        for t in range(len(carry) - 1, -1, -1):
-            steps[t].baddbmm_(backs[t], torch.bmm(steps[t + 1], carries[t]))
+        totals[:-1] += (carry.mT @ later) @ (shrink.mT @ missed).mT
+        totals = back.covariances(*turned(symmetric(totals))).flip(0)
         laters = totals[1:]
         to_filtered = transition.mT @ later  # gradient of the filtered mean
         moved = filtered @ to_filtered
@@ -206,7 +182,3 @@ def _column(matrix: Tensor, vector: Tensor) -> Tensor:
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return _column(matrix, vector)[..., 0]
-
-
-def _symmetric(matrix: Tensor) -> Tensor:
-    return 0.5 * (matrix + matrix.mT)
