@@ -5,6 +5,7 @@
     cache     generation with caches against recomputing the prefix at every step, Attention
     linear    seconds of a training step over T, Recurrent: the exponent of a power law
     segments  segments seen as time-stamped frames against forward kinematics of as many poses, on one core
+    filter    a Kalman chain of 10,000 steps in blocks against one step after the other; filter-step: with its gradients
     the family, by name: a whole training step (forward, backward, Adam) at the layer sizes of the public
               implementation over the LSTM layers that are in it, forward and backward, alone
 
@@ -20,6 +21,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+from unittest import mock
 
 import torch
 from torch import Tensor, nn
@@ -28,7 +30,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import dvae
 from dvae import motion
+from dvae.laws import scan
 from dvae.laws.chain import gaussian_chain
+from dvae.laws.kalman import LinearGaussianChain
 from dvae.networks.base import shift
 
 BATCH, STEPS, SIZE = 32, 125, 48
@@ -38,6 +42,8 @@ TARGETS = {
     "cache": ("at least", 8.0),
     "linear": ("at most", 1.1),  # 1 is linear; what is timed is exact to a few percent
     "segments": ("at most", 3.0),
+    "filter": ("at most", 0.1),
+    "filter-step": ("at most", 0.1),
     "srnn": ("at most", 1.6),
     "dsae": ("at most", 1.35),
     "storn": ("at most", 1.35),
@@ -225,6 +231,34 @@ def segments() -> float:
     return a / b
 
 
+def filters(steps: int = 10_000, batch: int = 1, size: int = 4) -> tuple[float, float]:
+    """Time of a Kalman chain in blocks over that of one step after the other: forward, and with its gradients."""
+    options = {"dtype": torch.float32, "requires_grad": True}
+    emission = 0.3 * torch.randn(steps, batch, 2 * size, size)
+    chain = LinearGaussianChain(
+        transition=torch.normal(0.95 * torch.eye(size).expand(steps - 1, batch, size, size), 0.05).requires_grad_(),
+        offset=torch.randn(steps - 1, batch, size, **options),
+        noise=0.08 * torch.eye(size),
+        mean=torch.zeros(batch, size),
+        covariance=20 * torch.eye(size).expand(batch, size, size),
+        information=(emission.mT @ emission / 0.03).requires_grad_(),
+        potential=torch.randn(steps, batch, size, **options),
+    )
+
+    @torch.no_grad()
+    def forward(widest: int) -> None:
+        with mock.patch.object(scan, "WIDE", widest):
+            _ = replace(chain).predicted
+
+    def backward(widest: int) -> None:
+        with mock.patch.object(scan, "WIDE", widest):
+            mean, covariance = replace(chain).predicted
+            (mean.sum() + covariance.sum()).backward()
+
+    each = [seconds(lambda f=f: f(scan.WIDE), lambda f=f: f(0), repeat=5) for f in (forward, backward)]
+    return each[0][0] / each[0][1], each[1][0] / each[1][1]
+
+
 def member(name: str, x: Tensor) -> float:
     """Training step of a member of the family over its LSTM layers."""
     model = dvae.method(name, **FAMILY[name]).build({"x": SIZE})
@@ -236,4 +270,5 @@ def member(name: str, x: Tensor) -> float:
 def rows() -> dict[str, float]:
     x = torch.randn(BATCH, STEPS, SIZE)
     found = {"program": program(x), "chain": chain(x), "cache": cache(), "linear": linear(), "segments": segments()}
+    found["filter"], found["filter-step"] = filters()
     return found | {name: member(name, x) for name in FAMILY}
