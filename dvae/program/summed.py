@@ -24,11 +24,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
+from ..laws.scan import BLOCK
 from ..notation import Factor, Factorization
 from .conditional import like
 
 LARGEST = 4096
 """States of a window, with those of static latents, that are summed over at once."""
+WIDE = 2**11
+"""Most numbers of a step from every state, of all sequences, for blocks; beyond them these cost more than they save."""
 COURSES = 2**17
 """Of states over a whole sequence, that are counted one by one, where that is asked for."""
 
@@ -306,11 +309,7 @@ class Summation:
         steps = steps - steps.detach().amax((2, 3, 4), keepdim=True)  # as they add up, digits are lost
         if not self.sums.lag:  # no step looks back
             return torch.cat([alpha[:, None], alpha[:, None] + steps.logsumexp(-1).cumsum(1)], 1)
-        alphas = [alpha]
-        for step in steps.unbind(1):
-            joint = alphas[-1][..., None] + step
-            alphas.append(joint.flatten(2).unflatten(2, (self.sums.width, -1)).logsumexp(2))
-        return torch.stack(alphas, 1)
+        return forward(alpha, steps)
 
     @torch.no_grad()
     def draw(self) -> dict[str, Tensor]:
@@ -346,6 +345,29 @@ class Summation:
                 others = [first + other for other in range(len(names)) if other != place]
                 found[name] = apart.sum(others) if others else apart
         return found
+
+
+def forward(start: Tensor, steps: Tensor) -> Tensor:
+    """The forward algorithm: (..., B, T + 1, M, W) from (..., B, M, W) and logs (B, T, M, W, K) of steps from W states.
+
+    Long series run in blocks (see `laws.scan`) from each of the W states: a block is a step from W states to W.
+    """
+    batch, length, kept, window, width = steps.shape
+    if length >= 4 * BLOCK and batch * kept * window**2 * width <= WIDE:
+        padded = torch.cat([steps, steps.new_zeros(batch, -length % BLOCK, kept, window, width)], 1)
+        blocks = padded.unflatten(1, (-1, BLOCK)).flatten(0, 1)
+        never = torch.finfo(steps.dtype).min / 1000  # at infinity there is no gradient
+        each = torch.full_like(steps[0, 0, 0, :, :1].expand(-1, window), never).fill_diagonal_(0.0)
+        own = forward(each[:, None, None].expand(-1, len(blocks), kept, -1), blocks)[:, :, 1:]
+        own = own.unflatten(1, (batch, -1))  # (W, B, blocks, BLOCK, M, W)
+        starts = forward(start, own[:, :, :, -1].movedim(0, 3))[:, :-1]
+        joint = starts.movedim(3, 0)[:, :, :, None, :, None] + own
+        return torch.cat([start[:, None], joint.logsumexp(0).flatten(1, 2)[:, :length]], 1)
+    alphas = [start]
+    for step in steps.unbind(1):
+        joint = alphas[-1][..., None] + step
+        alphas.append(joint.flatten(-2).unflatten(-1, (width, -1)).logsumexp(-2))
+    return torch.stack(alphas, -3)
 
 
 def _drawn(logits: Tensor) -> Tensor:

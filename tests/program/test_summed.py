@@ -2,6 +2,7 @@
 
 import math
 from typing import ClassVar
+from unittest import mock
 
 import pyro
 import pytest
@@ -13,6 +14,7 @@ import dvae
 from benchmarks.tables.switching import filtered, switching
 from dvae import Discrete
 from dvae.networks import Dense, Recurrent
+from dvae.program import summed
 from dvae.program.reference import reference
 from dvae.testing import FactorizationContract
 
@@ -318,3 +320,24 @@ def test_a_method_of_ones_own_has_states():
         dvae.ablate(method)
     with pytest.raises(ValueError, match="states"):
         dvae.method("equations", generative=HMM[0], inference="", states={"k": 1}).check()
+
+
+@pytest.mark.parametrize(
+    ("steps", "kept", "states", "lag"), [(63, 1, 2, 1), (64, 2, 3, 1), (99, 1, 2, 3), (1100, 1, 2, 1)]
+)
+def test_blocks_of_a_long_chain_change_neither_its_sums_nor_their_slopes(steps, kept, states, lag, monkeypatch):
+    """Some transitions never happen; 1,100 steps take two levels. Values are of the size of the sum, as rounding is."""
+    logs = torch.randn(2, steps, kept, states**lag, states, dtype=torch.float64).log_softmax(-1) - 0.5
+    logs[..., 0, -1] = -math.inf
+    start = torch.randn(2, kept, states**lag, dtype=torch.float64)
+    found, whole = [], summed.forward
+    for widest in (summed.WIDE, 0):
+        again = mock.Mock(wraps=whole)
+        monkeypatch.setattr(summed, "forward", again)
+        monkeypatch.setattr(summed, "WIDE", widest)
+        leaves = [v.clone().requires_grad_() for v in (start, logs)]
+        values = whole(*leaves)
+        assert again.called == (steps >= 64 and widest > 0)
+        found.append([values, *torch.autograd.grad(values[:, -1].flatten(1).logsumexp(1).sum(), leaves)])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12 * steps)
