@@ -11,7 +11,8 @@ The prediction is one autograd function. With W_t = (I + P_t G_t)^-1 and F_t = A
     P_{t+1} = Q_{t+1} + F_t P_t A_{t+1}'        m_{t+1} = F_t m_t + A_{t+1} W_t P_t g_t + b_{t+1}
 
 of which only the first is not linear; its derivative is F_t dP F_t'. So both recursions of the backward pass are linear
-with known matrices: three products a step, all else at all steps at once.
+with known matrices: three products a step, all else at all steps at once. So are smoother and draws, from the last step
+back. Long series run in blocks (`scan.py`).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .scan import Covariances, Recursion, States, backward, riccati, symmetric, turned
+from .scan import Covariances, Recursion, States, backward, from_last, riccati, symmetric
 
 
 class Moments(NamedTuple):
@@ -150,12 +151,12 @@ class Predict(torch.autograd.Function):
         """
         transition, information, potential, means, filtered, shrink, carry = ctx.saved_tensors
         back = backward(carry)
-        total = back.states(*turned(to_mean[..., None])).flip(0)
+        total = back.states(*from_last(to_mean[..., None])).flip(0)
         later = total[1:]
         missed = potential[:-1, ..., None] - information[:-1] @ means[:-1, ..., None]
         totals = to_covariance.clone()
         totals[:-1] += (carry.mT @ later) @ (shrink.mT @ missed).mT
-        totals = back.covariances(*turned(symmetric(totals))).flip(0)
+        totals = back.covariances(*from_last(symmetric(totals))).flip(0)
         laters = totals[1:]
         to_filtered = transition.mT @ later  # gradient of the filtered mean
         moved = filtered @ to_filtered

@@ -10,8 +10,8 @@ for with C, W and D those of the solution from P_1 = 0 it is, from any P_1,
 
     P_{t+1} = C_{t+1} + D_t (I + P_1 J_t)^-1 P_1 D_t'        J_t = D_0' G_1 W_1 D_0 + ... + D_{t-1}' G_t W_t D_{t-1}
 
-(the D, C and J of Särkkä and García-Fernández, 2021, arXiv 1905.13002, where D is called A, combined by their equation
-15). What the blocks start from is the same recursion again, over as many steps as there are blocks: in place of T steps
+(these are the A, C and J of the elements that Särkkä and García-Fernández, 2021, arXiv 1905.13002, combine by pairs).
+What the blocks start from is the same recursion again, over as many steps as there are blocks: in place of T steps
 one after the other there are 16 or 32 at each of log T / log 16 levels, with twice the work and memory linear in T.
 """
 
@@ -156,7 +156,7 @@ class States(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """It runs the other way."""
         matrix, found = ctx.saved_tensors
-        total = backward(matrix).states(*turned(gradient[..., None])).flip(0)
+        total = backward(matrix).states(*from_last(gradient[..., None])).flip(0)
         return total[1:] @ found[:-1, ..., None].mT, total[1:, ..., 0], total[0, ..., 0]
 
 
@@ -175,7 +175,7 @@ class Covariances(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """It runs the other way."""
         matrix, found = ctx.saved_tensors
-        total = symmetric(backward(matrix).covariances(*turned(symmetric(gradient))).flip(0))
+        total = symmetric(backward(matrix).covariances(*from_last(symmetric(gradient))).flip(0))
         return 2 * total[1:] @ matrix @ found[:-1], total[1:], total[0]
 
 
@@ -184,6 +184,6 @@ def backward(matrix: Tensor) -> Recursion:
     return Recursion(matrix.mT.flip(0))
 
 
-def turned(values: Tensor) -> tuple[Tensor, Tensor]:
+def from_last(values: Tensor) -> tuple[Tensor, Tensor]:
     """What a recursion from the last of them to the first adds at every step, and starts from."""
     return values[:-1].flip(0), values[-1]

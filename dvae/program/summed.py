@@ -309,7 +309,7 @@ class Summation:
         steps = steps - steps.detach().amax((2, 3, 4), keepdim=True)  # as they add up, digits are lost
         if not self.sums.lag:  # no step looks back
             return torch.cat([alpha[:, None], alpha[:, None] + steps.logsumexp(-1).cumsum(1)], 1)
-        return forward(alpha, steps)
+        return forward_sums(alpha, steps)
 
     @torch.no_grad()
     def draw(self) -> dict[str, Tensor]:
@@ -347,7 +347,7 @@ class Summation:
         return found
 
 
-def forward(start: Tensor, steps: Tensor) -> Tensor:
+def forward_sums(start: Tensor, steps: Tensor) -> Tensor:
     """The forward algorithm: (..., B, T + 1, M, W) from (..., B, M, W) and logs (B, T, M, W, K) of steps from W states.
 
     Long series run in blocks (see `laws.scan`) from each of the W states: a block is a step from W states to W.
@@ -358,9 +358,9 @@ def forward(start: Tensor, steps: Tensor) -> Tensor:
         blocks = padded.unflatten(1, (-1, BLOCK)).flatten(0, 1)
         never = torch.finfo(steps.dtype).min / 1000  # at infinity there is no gradient
         each = torch.full_like(steps[0, 0, 0, :, :1].expand(-1, window), never).fill_diagonal_(0.0)
-        own = forward(each[:, None, None].expand(-1, len(blocks), kept, -1), blocks)[:, :, 1:]
+        own = forward_sums(each[:, None, None].expand(-1, len(blocks), kept, -1), blocks)[:, :, 1:]
         own = own.unflatten(1, (batch, -1))  # (W, B, blocks, BLOCK, M, W)
-        starts = forward(start, own[:, :, :, -1].movedim(0, 3))[:, :-1]
+        starts = forward_sums(start, own[:, :, :, -1].movedim(0, 3))[:, :-1]
         joint = starts.movedim(3, 0)[:, :, :, None, :, None] + own
         return torch.cat([start[:, None], joint.logsumexp(0).flatten(1, 2)[:, :length]], 1)
     alphas = [start]
