@@ -23,6 +23,7 @@ from pyro.infer import Trace_ELBO
 from torch import Tensor
 
 from ..graph import audit
+from ..inference.annealing import annealed_bound
 from ..inference.bounds import SequenceELBO
 from ..inference.checkpoints import load_weights, save_weights
 from ..inference.fit import fit
@@ -270,6 +271,19 @@ class FactorizationContract:
         gap = oracle.fit_guide()
         exact = audit(model.generative, model.inference, self.steps, model.observed).exact
         assert (gap < 1e-6) == exact, f"the audit says exact: {exact}, but the best guide's gap is {gap:.2g} nats"
+
+    def test_the_evidence_lies_between_its_annealed_bounds(self) -> None:
+        """Of draws of the model, on average: below from the guide, above from the latents that they were made with."""
+        model = self._model()
+        data = self._data(model, 8)
+        drawn, _ = _run(model.model, {name: data[name] for name in model.context}, length=self.steps, size=8)
+        scored = {name: drawn.get(name, data.get(name)) for name in (*model.context, *model.observed)}
+        latents = {name: drawn[name] for name in model.latents}
+        if not latents or not model.likelihood:
+            pytest.skip("no latents are drawn, or the data are functions of them")
+        below = annealed_bound(model, scored, 2, 2).bound
+        gap = annealed_bound(model, scored, 2, 2, latents=latents).bound - below
+        assert gap.mean() > -4 * gap.std() / math.sqrt(8) - self.tolerance
 
     def test_training_stays_finite(self) -> None:
         """A run of `fit` on `data`, in single precision, and forecasts after it, have no NaN."""
