@@ -123,7 +123,8 @@ def main(
     for name in names:
         print(f"{name} ...", flush=True)
         rows, bounds = measured(name)
-        if failures(rows, bounds, before):
+        slower = (row for row in bounds if row in before and worse(rows[row], before[row], bounds[row][0]) > WORSE)
+        if any(slower):
             for row, value in measured(name)[0].items():
                 rows[row] = better(rows[row], value, bounds.get(row, ("at most", 0))[0])
         for row, value in rows.items():

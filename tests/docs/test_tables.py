@@ -630,7 +630,7 @@ def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(tmp_pat
     run((1.09, 3.7, 70.0))  # within a tenth, and rows without a target are free
     run((1.3, 4.0, 7.0), (1.05, 4.0, 7.0))  # the better of two
     assert run((1.3, 4.0, 7.0), (1.2, 4.0, 7.0)) == "speed: step: 1.20 was 1.00 at the last release"
-    assert run((1.0, 2.0, 7.0), (1.0, 2.9, 7.0)) == (
+    assert run((1.0, 2.0, 7.0), (1.0, 2.9, 7.0)) == (  # a gain is worse where it is less
         "speed: gain: 2.90 is to be at least 3, was 4.00 at the last release"
     )
     assert runs == [0, 0, 0, 1, 1]
