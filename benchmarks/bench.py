@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import math
 import os
 import platform
 import sys
@@ -38,11 +37,12 @@ def measured(name: str) -> tuple[dict[str, float], dict[str, tuple[str, float]]]
     module = importlib.import_module(f".{name}", __package__)
     torch.manual_seed(0)
     found, targets = module.rows(), module.TARGETS
-    return (*({f"{name}: {row}": value for row, value in each.items()} for each in (found, targets)),)
+    own = [{f"{name}: {row}": value for row, value in each.items()} for each in (found, targets)]
+    return own[0], own[1]
 
 
 def met(value: float, target: tuple[str, float]) -> bool:
-    """Whether a target is; of one that is no number it is not."""
+    """Whether a row is where its target has it."""
     side, bound = target
     return value <= bound if side == "at most" else value >= bound
 
@@ -84,9 +84,25 @@ def machine() -> dict[str, Any]:
     }
 
 
+def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
+    """The history with a record; one of that version and as many threads keeps the rows that were not measured anew."""
+
+    def same(each: dict[str, Any]) -> bool:
+        return (each["version"], threads_of(each)) == (record["version"], threads_of(record))
+
+    parts = [*filter(same, records), record]
+    joined = {key: {name: value for part in parts for name, value in part[key].items()} for key in ("rows", "targets")}
+    return [*(each for each in records if not same(each)), record | joined]
+
+
+def threads_of(record: dict[str, Any]) -> int:
+    """On how many threads a record was measured."""
+    return int(record["machine"]["threads"])
+
+
 def page(records: list[dict[str, Any]], path: Path | None = DOCS / "results" / "speed.md") -> None:
-    """Writes the history, newest first, and the ratio of the last two."""
-    newest = records[::-1]
+    """Writes the history, newest first, of as many threads as the last, and the ratio of the last two."""
+    newest = [record for record in records[::-1] if threads_of(record) == threads_of(records[-1])]
     last, before = newest[0], newest[1]["rows"] if len(newest) > 1 else {}
     lines = []
     for name, value in last["rows"].items():
@@ -94,9 +110,13 @@ def page(records: list[dict[str, Any]], path: Path | None = DOCS / "results" / "
         said = "" if target is None else f"{target[0]} {target[1]:g}"
         number = f"{value:.2f}" if target is None or not met(value, target) else f"**{value:.2f}**"
         change = f"{value / before[name]:.2f}" if name in before else "–"
-        lines.append([name, said, number, *(f"{r['rows'].get(name, math.nan):.2f}" for r in newest[1:4]), change])
+        lines.append([name, said, number, *(_number(r["rows"].get(name)) for r in newest[1:4]), change])
     heads = [f"{record['version']}, {record['date']}" for record in newest[:4]]
     write(path, table(["", "target", *heads, "last over the one before"], lines), name="history")
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
 
 
 def main(
@@ -110,13 +130,13 @@ def main(
     Args:
         names: of benchmarks.
         threads: of torch.
-        out: where the numbers are written.
+        out: where the numbers are written, after each benchmark.
         keep: whether they join the history, as those of this version, and its page.
     """
     refuse_unknown("benchmark", names, NAMES)
     torch.set_num_threads(threads)
     records = json.loads(HISTORY.read_text()) if HISTORY.exists() else []
-    releases = [record for record in records if record["machine"]["threads"] == threads]
+    releases = [record for record in records if threads_of(record) == threads]
     before = releases[-1]["rows"] if releases else {}
     found: dict[str, float] = {}
     targets: dict[str, tuple[str, float]] = {}
@@ -130,24 +150,27 @@ def main(
         for row, value in rows.items():
             was = f"{before[row]:8.2f}" if row in before else " " * 8
             print(f"  {row:50} {value:8.2f} {was}   {' '.join(map(str, bounds.get(row, ())))}", flush=True)
-        found |= rows
+        found |= {row: round(value, 4) for row, value in rows.items()}
         targets |= bounds
-    record = {
-        "version": dvae.__version__,
-        "date": date.today().isoformat(),
-        "machine": machine(),
-        "rows": {row: round(value, 4) for row, value in found.items()},
-        "targets": targets,
-    }
-    out.write_text(json.dumps(record, indent=1) + "\n")
-    if keep:
-        records = [each for each in records if each["version"] != record["version"]] + [record]
-        HISTORY.write_text(json.dumps(records, indent=1) + "\n")
-        page(records)
+        record = {
+            "version": dvae.__version__,
+            "date": date.today().isoformat(),
+            "machine": machine(),
+            "rows": found,
+            "targets": targets,
+        }
+        out.write_text(json.dumps(record, indent=1) + "\n")
+        if keep:
+            records = kept(records, record)
+            HISTORY.write_text(json.dumps(records, indent=1) + "\n")
+            page(records)
     failed = failures(found, targets, before)
     print(*failed.values(), sep="\n")
     return int(bool(failed))
 
 
 if __name__ == "__main__":
-    sys.exit(tyro.cli(main, description=__doc__))
+    try:
+        sys.exit(tyro.cli(main, description=__doc__))
+    except KeyboardInterrupt:
+        sys.exit("stopped; benchmarks that had ended are written, give the names of the others to go on")

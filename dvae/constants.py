@@ -25,7 +25,7 @@ def indices(values: Any, like: Tensor) -> Tensor:
     return _made(tuple(values), torch.long, like.device)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=32)  # of a long series each is large
 @torch.inference_mode(False)
 def visible(relation: Any, length: int, device: torch.device) -> Tensor:
     """The mask (T, T) of a relation; not to be written to."""

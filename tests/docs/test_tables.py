@@ -635,6 +635,12 @@ def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(tmp_pat
     )
     assert runs == [0, 0, 0, 1, 1]
     assert "| speed: step | at most 2 | **1.00** | – |" in history.read_text()
+    monkeypatch.setattr(
+        bench, "measured", lambda name: ({"other: row": 3.0, "speed: step": 1.01}, {"speed: step": ("at most", 2.0)})
+    )
+    bench.main(("gsps",), threads=torch.get_num_threads(), out=tmp_path / "out.json", keep=True)
+    [record] = json.loads((tmp_path / "history.json").read_text())  # rows that were not measured stay
+    assert record["rows"] == {"speed: step": 1.01, "speed: gain": 4.0, "speed: seen": 7.0, "other: row": 3.0}
     monkeypatch.setattr(bench.dvae, "__version__", "9.0")
     run((1.05, 5.0, 7.0), keep=True)
     assert "| speed: gain | at least 3 | **5.00** | 4.00 | 1.25 |" in history.read_text()
