@@ -77,8 +77,13 @@ def _as_text(_app: object, _what: str, _name: str, _object: object, _options: ob
     lines[:] = "".join(parts).split("\n")
 
 
-def _with_files(_app: object, _page: str, source: list[str]) -> None:
-    """{{FILE}}, or {{FILE: SECTION}}, is what stands in a file beside this folder, with its links as seen from here."""
+def _with_files(_app: object, page: str, source: list[str]) -> None:
+    """{{FILE}}, or {{FILE: SECTION}}, is what stands in a file beside this folder, with its links as seen from here.
+
+    Links of notebooks are as seen from the copies.
+    """
+    if page.startswith("notebooks/"):
+        source[0] = source[0].replace("](../docs/", "](../")
 
     def text(found: re.Match[str]) -> str:
         file, _, section = found[1].partition(": ")
