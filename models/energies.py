@@ -129,39 +129,37 @@ class EnergyModel(DynamicalVAE):
             self.register_buffer("angle_high", torch.full((len(self.limits),), 1.0))
         self.pose_prior = PosePriorModel(skeleton).requires_grad_(False) if method.pose_prior else None
 
-    def best(self, samples: Tensor, truth: Tensor, batch: Mapping[str, Tensor], frames: slice) -> dict[str, Tensor]:
+    def best(self, samples: Tensor, truth: Tensor, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The energies of the best sample, (B,) each; those of weight 0 are left out.
 
         Args:
-            samples: (S, B, T, D), positions that are turned as the networks see motion.
+            samples: (S, B, T, D), the frames that count, of positions that are turned as the networks see motion.
             truth: (B, T, D), likewise; NaN where it was not observed.
-            batch: with "pseudo" and "valid", where there are further futures.
-            frames: those that count.
+            batch: with "pseudo" and "valid", where there are further futures, whose last T frames count.
         """
         found: dict[str, Tensor] = {}
         if self.method.reconstruction:
-            found["reconstruction"] = energies.best_of_many(samples[:, :, frames], truth[:, frames])
+            found["reconstruction"] = energies.best_of_many(samples, truth)
         if self.method.multimodal:
             found["multimodal"] = truth.new_zeros(len(truth))
             if "pseudo" in batch:
-                others = self._turned(batch["pseudo"], batch)[:, :, frames]
-                found["multimodal"] = energies.multimodal_best_of_many(samples[:, :, frames], others, batch["valid"])
+                others = self._turned(batch["pseudo"], batch)[:, :, -samples.shape[2] :]
+                found["multimodal"] = energies.multimodal_best_of_many(samples, others, batch["valid"])
         return found
 
-    def realism(self, samples: Tensor, truth: Tensor, frames: slice) -> dict[str, Tensor]:
+    def realism(self, samples: Tensor, truth: Tensor, judged: Tensor) -> dict[str, Tensor]:
         """The energies of the limbs' lengths, the angles and the pose prior, (B,) each; as in `best`.
 
         Args:
             samples: (S, B, T, D), whose limbs count in all frames.
             truth: (B, T, D), whose first frame, of those that have the most joints, has the right lengths.
-            frames: whose poses count.
+            judged: (S, B, T, D), those whose poses count.
         """
         found: dict[str, Tensor] = {}
         if self.method.limb:
             fullest = truth.isfinite().sum(-1).argmax(-1)
             reference = truth.take_along_dim(fullest[:, None, None], 1).squeeze(1)
             found["limb"] = energies.limb_length(samples, reference, self.skeleton)
-        judged = samples[:, :, frames]
         if self.limits is not None:
             if self.angles is None or self.angles.low is not self.angle_low:  # checked once, which is waited for
                 self.angles = AngleLimits(self.limits, self.angle_low, self.angle_high)

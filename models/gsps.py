@@ -241,10 +241,11 @@ class GSPSModel(EnergyModel):
         """
         method, past, size = self.method, self.frames, len(truth)
         samples = values[WHOLE].unflatten(0, (-1, size))  # (S, B, T, D)
-        found = self.best(samples, truth, batch, slice(past, None))
+        ahead = samples[:, :, past:]  # once: each cut of its own has a gradient of the whole samples' size
+        found = self.best(ahead, truth[:, past:], batch)
         if method.history:
             found["history"] = energies.history_error(samples[:, :, :past], truth[:, :past])
-        found |= self.realism(samples, truth, slice(past, None))
+        found |= self.realism(samples, truth, ahead)
         draws = list(self.draws.values())
         names = self.observed
         weights, scales = (_each(given, method.parts) for given in (method.diversity, method.diversity_scale))

@@ -322,13 +322,13 @@ class HiTModel(EnergyModel):
                 "the energies are of whole windows; leave 'lengths' out of the batch, or fit with loss='evidence'"
             )
         size = rollout.batch // rollout.draws
-        x, everything = rollout.values[WHOLE], slice(None)
+        x = rollout.values[WHOLE]
         made = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size))
         truth, motions = (self.positions({WHOLE: each}, data)[WHOLE] for each in (self.seen(x[:size], data), made))
-        means = self.realism(motions, truth, everything)
+        means = self.realism(motions, truth, motions)
         method = self.method
         for part, weight, scale in zip(PARTS, method.diversity, method.diversity_scale, strict=True):
             if weight:
                 held = motions.index_select(-1, indices(self.coordinates[part], motions))
                 means[f"diversity_{part}"] = energies.pairwise_diversity(held, scale)
-        return self.best(motions, truth, data, everything) | {n: rollout.length * e for n, e in means.items()}
+        return self.best(motions, truth, data) | {n: rollout.length * e for n, e in means.items()}
