@@ -209,7 +209,7 @@ class PanelWindows:
         with reproducibly(model, seed):
             parts = [
                 model.forecast(on_device_of(model, part), horizon, samples, draw_emission=True)["x"].cpu().numpy()
-                for part in Sequences(past).split(AT_ONCE)
+                for part in Sequences(past).batches(AT_ONCE)
             ]
         keys = [(name, start + observed) for _, name, start in self.keys]
         beside = known[:, :observed], known[:, observed:], columns_of(self), keys
@@ -233,7 +233,7 @@ class PanelWindows:
         with reproducibly(model, seed):
             parts = [
                 model.impute(on_device_of(model, part), samples, draw=True, particles=particles)["x"].cpu().numpy()
-                for part in Sequences(batch).split(AT_ONCE)
+                for part in Sequences(batch).batches(AT_ONCE)
             ]
         count, steps = batch["x"].shape[:2]
         lengths = batch.get("lengths", torch.full((count,), steps))
