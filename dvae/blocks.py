@@ -18,7 +18,7 @@ from torch import Tensor
 
 NUMBERS = 2**17
 """Of a block: copies of it in double precision, a megabyte each, stay in a processor's cache."""
-Rows = TypeVar("Rows", np.ndarray, Tensor)
+_Values = TypeVar("_Values", np.ndarray, Tensor)
 
 
 def ranges(values: np.ndarray | Tensor) -> Iterator[slice]:
@@ -28,7 +28,7 @@ def ranges(values: np.ndarray | Tensor) -> Iterator[slice]:
         yield slice(start, start + rows)
 
 
-def blocks(values: Rows) -> Iterator[Rows]:
+def blocks(values: _Values) -> Iterator[_Values]:
     """Values (N, ...) in order, so many rows at a time."""
     return (values[rows] for rows in ranges(values))
 

@@ -372,7 +372,7 @@ def in_batches(data: Any) -> InBatches:
     return data if isinstance(data, InBatches) else sequences(data)
 
 
-def tensor_of(values: Tensor | np.ndarray) -> Tensor:
+def tensor_of(values: Any) -> Tensor:
     """Return a tensor on an array's own memory, or on the mapped file, to which nobody may write then."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The given NumPy array is not writable")
