@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from math import prod
 from typing import Any, Protocol, TypeVar
 
@@ -31,6 +31,19 @@ def ranges(values: np.ndarray | Tensor) -> Iterator[slice]:
 def blocks(values: _Values) -> Iterator[_Values]:
     """Values (N, ...) in order, so many rows at a time."""
     return (values[rows] for rows in ranges(values))
+
+
+def runs(arrays: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """Rows of arrays (N, C) one after the other in such blocks, in which short arrays are together."""
+    held, size = list[np.ndarray](), 0
+    for block in chain.from_iterable(map(blocks, arrays)):
+        held.append(block)
+        size += block.size
+        if size >= NUMBERS:
+            yield np.concatenate(held)
+            held, size = [], 0
+    if held:
+        yield np.concatenate(held)
 
 
 def cut(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, lengths: Tensor | int) -> Tensor:
