@@ -33,7 +33,7 @@ def blocks(values: _Values) -> Iterator[_Values]:
     return (values[rows] for rows in ranges(values))
 
 
-def runs(arrays: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+def row_blocks(arrays: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     """Rows of arrays (N, C) one after the other in such blocks, in which short arrays are together."""
     held, size = list[np.ndarray](), 0
     for block in chain.from_iterable(map(blocks, arrays)):

@@ -21,7 +21,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from typing_extensions import override
 
-from ..blocks import ColumnSummary, runs
+from ..blocks import ColumnSummary, row_blocks
 from ..laws.base import LawSpec
 from ..laws.family import FAMILIES
 from ..laws.product import Product
@@ -100,7 +100,7 @@ class PanelSchema(Schema):
                 f"{min(map(len, panel.series))} to {max(map(len, panel.series))} steps"
             )
         training = [one.values[part] for one, part in parts]
-        known, steps = ColumnSummary.of(runs(training)), sum(map(len, training))
+        known, steps = ColumnSummary.of(row_blocks(training)), sum(map(len, training))
         means, scales, logarithms, lacking = {}, {}, {}, []
         for place, column in enumerate(panel.columns.columns):
             if not known.count[place]:
@@ -296,8 +296,8 @@ class PanelSchema(Schema):
 
 def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
     """The least positive value of parts (n, 1), and mean and deviation of the logarithms, of others as of that."""
-    floor = ColumnSummary.of(np.where(block > 0, block, np.nan) for block in runs(parts)).least.item()
-    read = ColumnSummary.of(np.log(block.clip(floor)) for block in runs(parts))
+    floor = ColumnSummary.of(np.where(block > 0, block, np.nan) for block in row_blocks(parts)).least.item()
+    read = ColumnSummary.of(np.log(block.clip(floor)) for block in row_blocks(parts))
     spread = float(np.sqrt(read.variance.item()))
     return floor, read.mean.item(), spread if spread > LEAST else 1.0
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..blocks import hash_values, ranges, runs
+from ..blocks import hash_values, ranges, row_blocks
 from ..npy import is_mapped
 from ..options import nearest
 from .columns import Column, Columns
@@ -113,7 +113,7 @@ class Panel:
         for place, column in enumerate(self.columns.columns):
             kinds.setdefault((column.family, len(column.classes)), []).append(place)
         ends, start, gapped = np.cumsum([len(one) for one in self.series]), 0, set[int]()
-        for block in runs(one.values for one in self.series):
+        for block in row_blocks(one.values for one in self.series):
             block = block.astype(np.float64, copy=False)
             absent = np.isnan(block)
             for places in kinds.values():
@@ -166,7 +166,7 @@ class Panel:
     def missing(self) -> bool:
         """Whether some value of a target is."""
         some = (one.values for one in self.series if one.name not in self.complete)
-        return any(bool(np.isnan(block[:, self._targets]).any()) for block in runs(some))
+        return any(bool(np.isnan(block[:, self._targets]).any()) for block in row_blocks(some))
 
     def present(self, one: Series) -> int:
         """Steps of a sequence up to the last one that has a target; rows behind it are of the future."""

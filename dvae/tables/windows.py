@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..blocks import cut, hash_list, runs
+from ..blocks import cut, hash_list, row_blocks
 from ..data import Sequences, columns_of, gapped, past_of
 from ..inference.held import on_device_of, reproducibly
 from ..program.groups import GROUP
@@ -68,7 +68,7 @@ class PanelWindows:
         last = self._lengths if schema.cut.length is None else self._last + schema.cut.length
         parts = [one.values[low:end] for one, low, end in zip(some, self._low.tolist(), last.tolist(), strict=True)]
         gapped = (part for one, part in zip(some, parts, strict=True) if one.name not in panel.complete)
-        self._missing = any(np.isnan(schema.encoded(block)).any() for block in runs(gapped))
+        self._missing = any(np.isnan(schema.encoded(block)).any() for block in row_blocks(gapped))
         if unforeseen := schema.unforeseen(parts):
             warnings.warn(
                 f"the {split} part of {panel.name} lacks values of {', '.join(unforeseen)}, of which training data "
@@ -293,7 +293,7 @@ class PanelWindows:
         starts = self._low[which] + self._stride * place
         if not self._missing or self.length is None or self.split in ("all", "last"):
             return which, starts
-        seen = (~np.isnan(self.schema.encoded(block)) for block in runs(self._values))
+        seen = (~np.isnan(self.schema.encoded(block)) for block in row_blocks(self._values))
         some = np.concatenate([each.all(1) if whole(self.schema.columns) else each.any(1) for each in seen])
         known = torch.cat([torch.zeros(1).long(), torch.from_numpy(some).cumsum(0)])
         first = self._first[which] + starts
