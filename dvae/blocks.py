@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
 from math import prod
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -18,7 +18,6 @@ from torch import Tensor
 
 NUMBERS = 2**17
 """Of a block: copies of it in double precision, a megabyte each, stay in a processor's cache."""
-_Values = TypeVar("_Values", np.ndarray, Tensor)
 
 
 def ranges(values: np.ndarray | Tensor) -> Iterator[slice]:
@@ -28,7 +27,7 @@ def ranges(values: np.ndarray | Tensor) -> Iterator[slice]:
         yield slice(start, start + rows)
 
 
-def blocks(values: _Values) -> Iterator[_Values]:
+def blocks(values: np.ndarray | Tensor) -> Iterator[Any]:
     """Values (N, ...) in order, so many rows at a time."""
     return (values[rows] for rows in ranges(values))
 
@@ -88,7 +87,8 @@ class ColumnSummary:
         """
         found: ColumnSummary | None = None
         for part in parts:
-            own = cls.of_block(np.array(part.detach().double().cpu() if isinstance(part, Tensor) else part, np.float64))
+            values = part.detach().double().cpu().numpy() if isinstance(part, Tensor) else part
+            own = cls.of_block(np.array(values, np.float64))
             found = own if found is None else found.joined(own)
         if found is None:
             raise ValueError("there are no values to summarise")
