@@ -31,7 +31,6 @@ from . import opening, tables
 from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, note, save_figure
 from .futures import joint_names
 
-
 MOST_REMEMBERED = 2**32
 """Bytes of training windows that references hold at once; of mapped data there may be more."""
 
@@ -158,8 +157,8 @@ def _remembered(opened: Any) -> Any:
     if size <= MOST_REMEMBERED:
         return windows
     note(
-        f"no references that know training windows, whose {len(windows):,} would take {size / 2**30:.1f} GB; in Python, "
-        "dvae.evaluate takes others as training_windows"
+        f"no references that know training windows, of which {len(windows):,} would take {size / 2**30:.1f} GB; in "
+        "Python, dvae.evaluate takes others as training_windows"
     )
     return None
 

@@ -305,12 +305,13 @@ class PanelWindows:
         """The windows of ranges that start at these steps of their sequences."""
         lengths = self._lengths[which] if self.length is None else self.length
         x = torch.from_numpy(self.schema.encoded(cut(self._values, which, starts, lengths).numpy())).float()
-        mask = x.isfinite()
-        batch: dict[str, Any] = {"x": x.nan_to_num_(0.0)}
+        batch: dict[str, Any] = {"x": x}
         if isinstance(lengths, Tensor) and (lengths != lengths[0]).any():
             batch["lengths"] = lengths
         if self._missing:
-            batch["mask"] = mask.all(-1, keepdim=True).repeat(1, 1, x.shape[-1]) if whole(self.schema.columns) else mask
+            seen = x.isfinite()
+            batch["mask"] = seen.all(-1, keepdim=True).repeat(1, 1, x.shape[-1]) if whole(self.schema.columns) else seen
+            x.nan_to_num_(0.0)
         for name, values in self._context.items():
             batch[name] = cut(values, which, starts, lengths)
         if COVARIATES in batch and (observed := self.schema.cut.observed) is not None:
