@@ -297,7 +297,7 @@ class PanelSchema(Schema):
 def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
     """The least positive value of parts (n, 1), and mean and deviation of the logarithms, of others as of that."""
     floor = ColumnSummary.of(np.where(block > 0, block, np.nan) for block in row_blocks(parts)).least.item()
-    read = ColumnSummary.of(np.log(block.clip(floor)) for block in row_blocks(parts))
+    read = ColumnSummary.of(np.log(block.astype(np.float64).clip(floor)) for block in row_blocks(parts))
     spread = float(np.sqrt(read.variance.item()))
     return floor, read.mean.item(), spread if spread > LEAST else 1.0
 
