@@ -109,7 +109,9 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
                     "is in Fortran order, in which the numbers of a frame lie far apart; write it with "
                     "numpy.ascontiguousarray"
                 )
-            return np.memmap(file, dtype, "r", file.tell(), shape).view(np.ndarray)
+            found = np.memmap(file, dtype, "r", file.tell(), shape)
+            found.filename = os.path.abspath(path)  # by which joblib's processes map it too
+            return found.view(np.ndarray)
     except Refused as error:
         raise ValueError(f"{os.fspath(path)} {error}") from error
     except OSError as error:

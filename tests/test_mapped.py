@@ -374,6 +374,13 @@ def test_nobody_writes_to_a_mapped_file_and_a_replaced_one_stays(tmp_path):
     np.testing.assert_array_equal(found, walks())
 
 
+def test_other_processes_can_map_the_file_themselves(tmp_path):
+    """As those of joblib do with what has a name, where they would else be sent all of it."""
+    kept = mapped(saved(tmp_path / "a.npy", walks())).base
+    again = np.memmap(kept.filename, kept.dtype, "r", kept.offset, kept.shape)
+    np.testing.assert_array_equal(again, walks())
+
+
 def test_too_many_files_are_said_to_be_too_many(tmp_path, monkeypatch):
     def none_left(*_):
         raise OSError(errno.EMFILE, "Too many open files")
