@@ -8,13 +8,16 @@ of joints beside their positions; any other model passes over it.
 | who | asks for |
 |---|---|
 | the loop, to train | `Source`: draws batches |
-| the loop, to validate, and comparison | `Listed`: all sequences at once; or arrays, or a batch |
+| the loop, to validate | `InBatches`: some sequences after the others; or what comparison does |
+| comparison | `Listed`: all sequences at once; or arrays, or a batch |
 | evaluation and criticism | `HeldOutWindows`: listed windows with a past, names and a fingerprint |
 
-`ArrayWindows` and `Sequences` make them of arrays; windows of motion are in `dvae.motion`.
+`ArrayWindows` and `Sequences` make them of arrays, which may be mapped from a disk (`numpy.memmap`) and are then read
+as they are drawn; windows of motion are in `dvae.motion`.
 """
 
 import hashlib
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
@@ -24,6 +27,8 @@ import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import Protocol, runtime_checkable  # typing's own, in Python 3.11, evaluates properties
+
+from .blocks import hash_values, ranges
 
 Batch = Mapping[str, Any]
 BESIDE = "beside"
@@ -53,6 +58,14 @@ class Listed(Protocol):
 
     def all(self) -> Batch:
         """All sequences, one in each row, always in the same order."""
+
+
+@runtime_checkable
+class InBatches(Protocol):
+    """Data that can be gone through without having them whole."""
+
+    def batches(self, batch_size: int) -> Iterator[Batch]:
+        """All sequences, so many in a batch, always in the same order."""
 
 
 @runtime_checkable
@@ -107,7 +120,7 @@ def scales_of(windows: HeldOutWindows) -> Sequence[float]:
 
 @dataclass(frozen=True)
 class Sequences:
-    """N sequences in memory.
+    """N sequences, in memory or mapped.
 
     Args:
         batch: the variables, each with N rows.
@@ -133,18 +146,23 @@ class Sequences:
                 f"{name} has shape {tuple(value.shape)}; a local variable is (sequences, frames, features), "
                 "a static one (sequences, features)"
             )
-        bad = ~torch.isfinite(value)
-        lengths, mask = self.batch.get("lengths"), self.batch.get("mask")
-        mask = mask.get(name) if isinstance(mask, Mapping) else mask
-        if mask is not None and mask.shape == value.shape:
-            bad &= mask
-        if lengths is not None and value.ndim == 3:
-            bad &= (torch.arange(value.shape[1], device=value.device) < lengths[:, None])[..., None]
-        if bad.any():
+        lengths, mask = self.batch.get("lengths"), mask_of(self.batch, name)
+        count, first = 0, None
+        for rows in ranges(value):
+            bad = ~torch.isfinite(value[rows])
+            if not bad.any():
+                continue
+            if mask is not None and mask.shape == value.shape:
+                bad &= mask[rows]
+            if lengths is not None and value.ndim == 3:
+                bad &= (torch.arange(value.shape[1], device=value.device) < lengths[rows, None])[..., None]
+            if first is None and bad.any():
+                first = rows.start + int(bad.flatten(1).any(1).nonzero()[0])
+            count += int(bad.sum())
+        if count:
             raise ValueError(
-                f"{name} has {int(bad.sum())} entries that are NaN or infinite, the first in sequence "
-                f'{int(bad.flatten(1).any(1).nonzero()[0])}; remove them, or give a boolean "mask" that is '
-                "False there"
+                f"{name} has {count} entries that are NaN or infinite, the first in sequence {first}; remove them, or "
+                'give a boolean "mask" that is False there'
             )
 
     def __len__(self) -> int:
@@ -155,7 +173,7 @@ class Sequences:
         chosen = torch.randperm(len(self), generator=generator)[:batch_size]
         return each(self.batch, itemgetter(chosen))
 
-    def split(self, batch_size: int) -> Iterator[Batch]:
+    def batches(self, batch_size: int) -> Iterator[Batch]:
         """Yield all sequences in order, `batch_size` at a time."""
         for start in range(0, len(self), batch_size):
             yield each(self.batch, itemgetter(slice(start, start + batch_size)))
@@ -325,7 +343,7 @@ def sequences(data: Any) -> Sequences:
     """Return data as `Sequences`.
 
     Args:
-        data: x as a tensor or array (N, T, D), a batch, or `Listed` data.
+        data: x as a tensor or array (N, T, D), which may be mapped, a batch, or `Listed` data.
 
     Raises:
         TypeError, ValueError: when it is none of these.
@@ -333,19 +351,32 @@ def sequences(data: Any) -> Sequences:
     if isinstance(data, Sequences):
         return data
     if isinstance(data, Mapping):
-        return Sequences(each(data, torch.as_tensor))
+        return Sequences(each(data, tensor_of))
     if isinstance(data, Tensor | np.ndarray):
         if data.ndim != 3:
             raise ValueError(
-                f"x has shape {tuple(data.shape)}, expected (sequences, frames, features); a single sequence is x[None]"
+                f"x has shape {tuple(data.shape)}, expected (sequences, frames, features); a single sequence is "
+                "x[None], and windows of a long one are dvae.tables.PanelData.of(x, cut=...).windows('train')"
             )
-        return Sequences({"x": torch.as_tensor(data)})
+        return Sequences({"x": tensor_of(data)})
     if isinstance(data, Listed):
         return Sequences(data.all())
     raise TypeError(
         "expected x as a tensor (N, T, D), a dict of tensors, or an object with sample() or all(), "
         f"got {type(data).__name__}"
     )
+
+
+def in_batches(data: Any) -> InBatches:
+    """Return data that can be gone through: as they are, or those of `sequences`."""
+    return data if isinstance(data, InBatches) else sequences(data)
+
+
+def tensor_of(values: Any) -> Tensor:
+    """Return a tensor on an array's own memory, or on the mapped file, to which nobody may write then."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The given NumPy array is not writable")
+        return torch.as_tensor(values)
 
 
 @dataclass(frozen=True)
@@ -361,7 +392,7 @@ class ArrayWindows:
     """Plain arrays as windows to evaluate on.
 
     Args:
-        x: `(N, T, D)`, tensor or numpy array.
+        x: `(N, T, D)`, tensor or numpy array, which may be mapped.
         observed: frames the model sees; the other T - observed are predicted.
         multimodal_threshold: distance below which two last observed frames are alike, in the unit of x.
         clips: name of the clip each window was cut from; without it the windows count as independent.
@@ -419,12 +450,14 @@ class ArrayWindows:
     @property
     def fingerprint(self) -> str:
         """SHA-256 of the values, their shape and type."""
-        values = np.ascontiguousarray(np.asarray(self.x))
-        seen = b"" if self.mask is None else np.packbits(np.asarray(self.mask)).tobytes()
-        return hashlib.sha256(f"{values.shape} {values.dtype}".encode() + values.tobytes() + seen).hexdigest()
+        values = np.asarray(self.x)
+        digest = hashlib.sha256(f"{values.shape} {values.dtype}".encode())
+        hash_values(digest, values, values.dtype)
+        digest.update(b"" if self.mask is None else np.packbits(np.asarray(self.mask)).tobytes())
+        return digest.hexdigest()
 
     def all(self) -> Batch:
         """All windows, x `(N, T, D)`, whole numbers as floating-point ones, and the mask if there is one."""
-        x = torch.as_tensor(self.x)
+        x = tensor_of(self.x)
         batch = {"x": x if x.is_floating_point() else x.to(torch.get_default_dtype())}
-        return batch if self.mask is None else {**batch, "mask": torch.as_tensor(self.mask)}
+        return batch if self.mask is None else {**batch, "mask": tensor_of(self.mask)}

@@ -11,11 +11,15 @@ made as a multiple of their mean: of the powers of a spectrum as they are, a net
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+
+from .blocks import ColumnSummary, blocks
 
 
 class Coordinate(NamedTuple):
@@ -59,22 +63,25 @@ class Units(nn.Module):
         self.logarithms = any(each.floor for each in coordinates)
 
     @torch.no_grad()
-    def fit(self, values: Tensor) -> None:
-        """Takes mean and root mean variance of values (..., D).
+    def fit(self, values: Tensor | np.ndarray) -> None:
+        """Takes mean and root mean variance of values (..., D), in memory or mapped, which are read in blocks.
 
         Raises:
             ValueError: values that do not vary, or are of another size; coordinates that have their units.
         """
         if self.scale.dim():
             raise ValueError("these coordinates have units of their own, which were given; there is nothing to fit")
-        rows = values.flatten(0, -2)
-        if rows.shape[1:] != self.mean.shape or not rows.var(0).mean() > 0:
+        size, variance = len(self.mean), 0.0
+        if alike := values.shape[-1] == size:
+            known = ColumnSummary.of(block.reshape(-1, size) for block in blocks(values))
+            variance = float((known.variance * known.count / (known.count - 1).clip(1)).mean())
+        if not variance > 0:
             raise ValueError(
-                f"units come from values (..., {len(self.mean)}) that vary, not from {tuple(values.shape)}"
-                f"{'' if rows.shape[1:] != self.mean.shape else ' without variance'}"
+                f"units come from values (..., {size}) that vary, not from {tuple(values.shape)}"
+                f"{' without variance' if alike else ''}"
             )
-        self.mean.copy_(rows.mean(0))
-        self.scale.copy_(rows.var(0).mean().sqrt())
+        self.mean.copy_(torch.from_numpy(known.mean))
+        self.scale.fill_(math.sqrt(variance))
 
     @property
     def filling(self) -> Tensor:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from ..data import Fingerprinted, Sequences, Source, sequences
+from ..data import Fingerprinted, InBatches, Source, in_batches, sequences
 from ..turns import alone
 from .checkpoints import CONFIG, CheckpointError, Run
 from .objectives import Objective
@@ -167,7 +167,8 @@ def fit(
         model: a `DynamicalVAE`, or any module that `SequenceELBO` takes.
         train: x as a tensor (N, T, D), a batch of N sequences, or an object with `sample(batch_size,
             generator)`.
-        validation: x as a tensor, a batch, or an object whose `all()` returns a batch.
+        validation: x as a tensor, a batch, or an object whose `all()` returns a batch, or whose `batches(size)` are
+            some sequences after the others.
         objective: what to minimise; `Evidence()` by default.
         stages: objectives one after the other, in place of `objective`; their steps are those of the run.
         out: run directory for checkpoints and `log.jsonl` (see `checkpoints`).
@@ -200,7 +201,7 @@ def fit(
     svi = SVI(model, objective, stages, **options)
     training = svi.training
     source = train if isinstance(train, Source) else sequences(train)
-    held_out = None if validation is None else sequences(validation)
+    held_out = None if validation is None else in_batches(validation)
     if training.patience is not None and held_out is None:
         raise ValueError("patience counts validations; give validation data, or leave patience out")
     # a hash of all the data, for a run that is kept
@@ -266,7 +267,7 @@ def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapp
 def _train(
     svi: SVI,
     source: Source,
-    held_out: Sequences | None,
+    held_out: InBatches | None,
     run: Run | None,
     receivers: Sequence[Tracker],
     callbacks: Sequence[Callback],

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, Sequences, each, sequences
+from ..data import Batch, InBatches, each, in_batches
 from ..program.protocols import Program
 from ..turns import alone
 from .bounds import SequenceELBO, Terms
@@ -217,9 +217,10 @@ class SVI:
         selects by it. A run with self-feeding also has "self_fed/bound": of the program fed as the run ends.
 
         Args:
-            data: x as a tensor (N, T, D), a batch, or an object whose `all()` returns a batch.
+            data: x as a tensor (N, T, D), a batch, or an object whose `all()` returns a batch, or whose `batches(size)`
+                are some sequences after the others.
         """
-        held_out = data if isinstance(data, Sequences) else sequences(data)
+        held_out = in_batches(data)
         row = self._score(held_out, 0.0)
         if self.final_feeding:
             what = "loss" if "loss" in row else "bound"
@@ -284,7 +285,7 @@ class SVI:
         cuda = {"cuda": torch.cuda.get_rng_state(self.fabric.device)} if on_cuda else {}
         return {"torch": torch.get_rng_state(), **cuda}
 
-    def _score(self, data: Sequences, feeding: float) -> dict[str, float]:
+    def _score(self, data: InBatches, feeding: float) -> dict[str, float]:
         """The unweighted terms on held-out data, per frame, with the same draws each time."""
         sums = dict[str, Tensor]()
         objective = stage_at(self.plan, self.state.step)[1].objective
@@ -292,7 +293,7 @@ class SVI:
         self.module.eval()
         with _forked(self.fabric.device), torch.no_grad():
             torch.manual_seed(self.training.seed)
-            for batch in data.split(self.training.batch_size):
+            for batch in data.batches(self.training.batch_size):
                 terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
                 found = _sums(terms)
                 if not terms.likelihood or (isinstance(objective, Asking) and objective.select == "loss"):

@@ -4,12 +4,14 @@ import pytest
 import torch
 from typing_extensions import get_protocol_members
 
-from dvae.data import BESIDE, Fingerprinted, HeldOutWindows, Listed, Source, leaves, past_of
+from dvae.data import BESIDE, Fingerprinted, HeldOutWindows, InBatches, Listed, Source, leaves, past_of
 from dvae.inference.objectives import Asking
 from dvae.program.protocols import Forecasting, Program
 
 
-@pytest.mark.parametrize("protocol", [Source, Listed, Fingerprinted, HeldOutWindows, Program, Forecasting, Asking])
+@pytest.mark.parametrize(
+    "protocol", [Source, Listed, InBatches, Fingerprinted, HeldOutWindows, Program, Forecasting, Asking]
+)
 def test_asking_what_something_is_reads_nothing_of_it(protocol):
     read = []
     members = {name: property(lambda _, name=name: read.append(name)) for name in get_protocol_members(protocol)}

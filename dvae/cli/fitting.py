@@ -84,7 +84,8 @@ class DataOptions:
     """Data to fit to: motion, or a table.
 
     Args:
-        data: a motion file or a folder of them, or "simulated"; or a table: CSV, TSV, Parquet or npz.
+        data: a motion file or a folder of them, or "simulated"; or a table: CSV, TSV, Parquet or npz; or an npy file or
+            a folder of them, which may be larger than memory.
         skip_bad: leave out clips that cannot be used instead of refusing the file.
         protocol: how windows are cut, by default as suits the skeleton.
         representation: what the model sees: positions; or turns of joints in this form, and bones then keep their

@@ -381,7 +381,7 @@ def draw_futures(
         torch.manual_seed(seed)
         whole = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # parts are fixed as a whole
         parts = []
-        for given in Sequences(past).split(64):
+        for given in Sequences(past).batches(64):
             once = model.forecast(given, whole, 1) if fix else {}
             held = {"fix": {name: once[name][0] for name in fix}} if fix else {}
             made = model.forecast(given, whole, samples, **held)["x"][:, :, :horizon]

@@ -31,6 +31,9 @@ from . import opening, tables
 from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, note, save_figure
 from .futures import joint_names
 
+MOST_REMEMBERED = 2**32
+"""Bytes of training windows that references hold at once; of mapped data there may be more."""
+
 
 @dataclass(frozen=True)
 class Control:
@@ -139,12 +142,25 @@ def _forecasts(paths: Sequence[Path], data: str | None, how: Judged, **settings:
         scores=partial(motion.scores, pose_prior=prior, classifiers=classifiers),
         samples=how.samples,
         log_score_particles=how.log_score_particles,
-        training_windows=opened.windows("train+validation") if own else None,
+        training_windows=_remembered(opened) if own else None,
         configs={name: Run(each.path).config for name, each in called.items()},
         options={} if temperature is None else {"temperature": temperature},
         **settings,
     )
     return result, f"{opening.record('evaluation', loaded[0], opened)}{how.control}"
+
+
+def _remembered(opened: Any) -> Any:
+    """Training windows for the references that know them, where memory is to hold so many."""
+    windows = opened.windows("train+validation")
+    size = 4 * len(windows) * windows.length * windows.schema.sizes["x"]
+    if size <= MOST_REMEMBERED:
+        return windows
+    note(
+        f"no references that know training windows, of which {len(windows):,} would take {size / 2**30:.1f} GB; in "
+        "Python, dvae.evaluate takes others as training_windows"
+    )
+    return None
 
 
 def _segments(paths: Sequence[Path], data: str | None, how: Judged, **settings: Any) -> tuple[Any, str]:
@@ -191,7 +207,7 @@ def _tables(paths: Sequence[Path], data: str | None, how: Judged, **settings: An
         scores=panel_scores,
         samples=how.samples,
         log_score_particles=how.log_score_particles,
-        training_windows=opened.windows("train+validation") if opening.own(loaded[0], opened) else None,
+        training_windows=_remembered(opened) if opening.own(loaded[0], opened) else None,
         configs={name: Run(each.path).config for name, each in called.items()},
         **settings,
     )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from .. import files
+from ..blocks import ColumnSummary, row_blocks
 from ..inference.result import Table
 from ..inference.scores import reaching
 from ..runs import directory as runs
@@ -19,6 +19,8 @@ from ..tables.windows import PanelWindows
 from .console import ERROR, OUT, UsageError, arguments, check_files, note, save_figure
 from .opening import data_of, load_run
 
+OF_MOTION = {".amc", ".bvh", ".c3d", ".npz"}
+"""Ends of names of files that make a folder one of motion, whatever else lies in it."""
 SAMPLES = 100
 """Draws of a table where nobody says how many: its quantiles from 2.5 to 97.5 % need 39, and are rough then."""
 
@@ -29,8 +31,11 @@ def is_table(path: str) -> bool:
         return True
     place = Path(path)
     suffix = place.suffix.lower()
+    if place.is_dir():
+        ends = {Path(name).suffix.lower() for _, _, names in os.walk(place) for name in names}
+        return ".npy" in ends and not ends & OF_MOTION
     if suffix not in SUFFIXES or not place.is_file():
-        return suffix in (".parquet", ".tsv")
+        return suffix in (".npy", ".parquet", ".tsv")
     if schema_beside(path) != (None, None) or suffix in (".parquet", ".tsv"):
         return True
     if suffix == ".csv":
@@ -118,14 +123,14 @@ def info(paths: Sequence[str], out: Path | None) -> None:
         table = Table(title=f"{path}: {panel!r}")
         for name in ("column", "role", "family", "unit", "known", "smallest", "mean", "largest"):
             table.add_column(name, justify="right" if name in ("known", "smallest", "mean", "largest") else "left")
-        values = np.concatenate([one.values for one in panel])
+        own, steps = ColumnSummary.of(row_blocks(one.values for one in panel)), sum(map(len, panel))
         for place, column in enumerate(panel.columns.columns):
-            own = values[:, place][~np.isnan(values[:, place])]
-            known = f"{len(own) / len(values):.1%}"
+            known = f"{own.count[place] / steps:.1%}"
             if column.classes:
                 shown = ["", ", ".join(column.classes[:4]) + (" …" if len(column.classes) > 4 else ""), ""]
             else:
-                shown = [f"{own.min():.4g}", f"{own.mean():.4g}", f"{own.max():.4g}"] if len(own) else ["–"] * 3
+                numbers = (own.least[place], own.mean[place], own.largest[place])
+                shown = [f"{number:.4g}" if own.count[place] else "–" for number in numbers]
             table.add_row(column.name, column.role, column.family, column.unit, known, *shown)
         OUT.print(table)
         for said in opened.parts().values():

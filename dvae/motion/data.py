@@ -18,7 +18,10 @@ import torch
 from rich.console import Group, RenderableType
 from typing_extensions import override
 
+from ..blocks import blocks, hash_values, ranges
+from ..data import tensor_of
 from ..inference.result import Table  # which shows what files say as it is
+from ..npy import is_mapped
 from .kinematics import inverse, rest
 from .rotations import continuous, from_matrix
 from .skeleton import Skeleton
@@ -28,7 +31,7 @@ SMALLEST, TALLEST = 0.3, 3.0
 
 
 MOST_FRAMES = 20_000
-"""From which a rest pose is found."""
+"""From which a rest pose is found, and the size of a body in a clip."""
 
 STIFF = 1e-3
 """Metres of deviation, in a clip, below which a distance between joints is taken for constant."""
@@ -121,26 +124,34 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
         return f"{where} has {positions.shape[1]} joints, skeleton {skeleton.name!r} has {skeleton.joints}"
     if not len(positions):
         return f"{where} has no frames"
-    with np.errstate(over="ignore"):
-        positions = positions.astype(np.float32, copy=False)
-    bad = (np.isinf(positions) if missing else ~np.isfinite(positions)).any(axis=2)
-    if bad.any():
-        frame, joint = np.argwhere(bad)[0]
+    count = frames = 0
+    first, seen = (0, 0), False
+    for rows in ranges(positions):
+        with np.errstate(over="ignore"):
+            some = positions[rows].astype(np.float32, copy=False)
+        lacking = ~np.isfinite(some).all(axis=2)
+        seen |= not lacking.all()
+        bad = np.asarray(np.isinf(some).any(axis=2) if missing else lacking)
+        if bad.any():
+            frame, joint = np.argwhere(bad)[0]
+            first = first if count else (rows.start + frame, joint)
+            count, frames = count + bad.sum(), frames + bad.any(axis=1).sum()
+    if count:
         what = "infinite" if missing else "NaN or infinite"
         kept = not missing and not defect(clip, skeleton, missing=True)
         hint = "; missing=True (--missing) keeps the clip, with these joints missing" if kept else ""
         return (
-            f"{where} has {what} positions, or none that float32 can hold: {bad.sum()} joint positions in "
-            f"{bad.any(axis=1).sum()} of {clip.frames} frames, first {skeleton.names[joint]} at frame {frame}{hint}"
+            f"{where} has {what} positions, or none that float32 can hold: {count} joint positions in "
+            f"{frames} of {clip.frames} frames, first {skeleton.names[first[1]]} at frame {first[0]}{hint}"
         )
-    if np.isnan(positions).any(axis=2).all():
+    if not seen:
         return f"{where} has no joint that is observed in any of its {clip.frames} frames"
     if clip.rotations is not None:
         if clip.rotations.shape != (*positions.shape[:2], 4) or clip.rotations.dtype.kind != "f":
             return f"{where} has rotations {clip.rotations.shape}, expected quaternions {(*positions.shape[:2], 4)}"
-        if not (np.abs(np.square(clip.rotations).sum(-1) - 1) < 1e-3).all():
+        if not all((np.abs(np.square(some).sum(-1) - 1) < 1e-3).all() for some in blocks(clip.rotations)):
             return f"{where} has rotations that are no quaternions of unit length"
-    extent = float(np.median(extents(positions).max(axis=1)))
+    extent = float(np.median(extents(some_frames(positions)).max(axis=1)))
     if not SMALLEST <= extent <= TALLEST:
         unit = "millimetres" if extent >= 300 else "centimetres" if extent >= 30 else "another unit"
         return (
@@ -148,6 +159,12 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
             f"expected {SMALLEST} to {TALLEST} m): it looks like {unit}; convert the positions to metres"
         )
     return None
+
+
+def some_frames(positions: np.ndarray) -> np.ndarray:
+    """Frames of (F, J, 3), evenly spread and at most `MOST_FRAMES`, in which joints were observed."""
+    some = positions[:: -(-len(positions) // MOST_FRAMES)]
+    return positions if np.isnan(some).any(axis=2).all() else some
 
 
 def extents(positions: np.ndarray) -> np.ndarray:
@@ -164,6 +181,14 @@ def fullest(positions: np.ndarray) -> np.ndarray:
     return positions if full.all() else positions[full]  # a copy only where it is another
 
 
+def _taken(values: np.ndarray, copy: bool = True) -> np.ndarray:
+    """As float32 in C order, which nobody else holds, if it is copied; or as it is mapped."""
+    if is_mapped(values) and values.dtype == np.float32 and values.flags.c_contiguous:
+        return values
+    found = np.require(values, np.float32, ["C", "A", "W"])
+    return found.copy() if copy and np.may_share_memory(found, values) else found
+
+
 @dataclass(init=False, frozen=True, eq=False)
 class MotionSet:
     """Clips of one skeleton.
@@ -171,7 +196,7 @@ class MotionSet:
     Iterating gives the clips, `motion["train", "walking_1"]` one of them.
 
     Args:
-        clips: the clips, asked for once; copied as float32.
+        clips: the clips, asked for once; copied as float32, but for arrays of that type that are mapped from a disk.
         skeleton: the tree that all of them have.
         name: what to call the set.
         copy: False takes over arrays that are float32 already, which nobody else may hold.
@@ -213,11 +238,11 @@ class MotionSet:
                 left_out.append((*clip.key, reason))
                 del clip
                 continue
-            positions = np.require(clip.positions, np.float32, ["C", "A", "W"])
-            positions = positions.copy() if copy and np.may_share_memory(positions, clip.positions) else positions
-            if missing and (hidden := np.isnan(positions).any(axis=2)).any():
-                positions[hidden] = np.nan
-            turns = None if clip.rotations is None else clip.rotations.astype(np.float32)
+            positions = _taken(clip.positions, copy)
+            if missing and any((np.isnan(some).sum(axis=2) % 3).any() for some in blocks(positions)):
+                positions = positions.copy() if is_mapped(positions) else positions
+                positions[np.isnan(positions).any(axis=2)] = np.nan
+            turns = None if clip.rotations is None else _taken(clip.rotations)
             single.append(Clip(clip.split, clip.name, positions, clip.labels, clip.truth, turns))
             del clip, positions
         if not single:
@@ -271,13 +296,13 @@ class MotionSet:
             skeleton = self.skeleton
             if not skeleton.rest:
                 every = -(-sum(clip.frames for clip in self) // MOST_FRAMES)
-                some = torch.cat([torch.from_numpy(clip.positions)[::every] for clip in self])
+                some = torch.cat([tensor_of(clip.positions[::every]) for clip in self])
                 skeleton = replace(skeleton, rest=tuple(rest(skeleton, some.double()).flatten().tolist()))
 
             def turned() -> Iterator[Clip]:
                 for clip in self:
                     if not self.skeleton.rest or clip.rotations is None:
-                        turns = inverse(skeleton, torch.from_numpy(clip.positions).double(), skeleton.offsets)
+                        turns = inverse(skeleton, tensor_of(clip.positions).double(), skeleton.offsets)
                         clip = replace(clip, rotations=continuous(from_matrix(turns, "quaternion")).numpy())
                     yield clip
 
@@ -378,7 +403,8 @@ class MotionSet:
         for clip in self.clips:
             digest.update(repr((*clip.key, clip.positions.shape)).encode())
             for values in (clip.positions, clip.rotations):
-                digest.update(b"" if values is None else values.astype("<f4", copy=False).tobytes())
+                if values is not None:
+                    hash_values(digest, values, "<f4")
         return digest.hexdigest()
 
     def summary(self) -> list[dict[str, str | int | float]]:
@@ -409,13 +435,18 @@ class MotionSet:
         for row in rows:
             splits.add_row(*(f"{value:,}" if isinstance(value, int) else str(value) for value in row.values()))
 
-        bones = [self.skeleton.bone_lengths(clip.positions.astype(np.float64)) for clip in self.clips]
-        bones = [np.ma.masked_invalid(lengths) for lengths in bones]
+        found = (self.skeleton.bone_lengths(some_frames(clip.positions).astype(np.float64)) for clip in self.clips)
+        bones = map(np.ma.masked_invalid, found)
         variation = [(b.std(axis=0) / np.maximum(b.mean(axis=0), 1e-9)).filled(0.0) for b in bones]
         worst = int(np.argmax([v.max() for v in variation]))
         bone = self.skeleton.names[self.skeleton.edges[int(np.argmax(variation[worst]))][1]]
-        extent = np.median([np.median(extents(clip.positions)[:, self.skeleton.vertical]) for clip in self])
-        lacking = [np.isnan(clip.positions).any(axis=2).mean() for clip in self]
+        extent = np.median(
+            [np.median(extents(some_frames(clip.positions))[:, self.skeleton.vertical]) for clip in self]
+        )
+        lacking = [
+            sum(np.isnan(some).any(axis=2).mean(axis=1).sum() for some in blocks(clip.positions)) / clip.frames
+            for clip in self
+        ]
 
         facts = Table.grid(padding=(0, 2))
         fact = facts.add_row

@@ -19,17 +19,19 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, astuple, dataclass, field, replace
 from math import pi
 from typing import Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ..data import BESIDE, bridged
+from ..blocks import blocks, cut, hash_list, hash_values
+from ..data import BESIDE, bridged, tensor_of
 from ..options import Amount, Frames, Range, check, nearest, tuples
 from ..schema import Schema, SchemaError
 from ..views import View
@@ -285,7 +287,8 @@ def held_out(count: int, part: float) -> set[int]:
 class Windows:
     """Windows of T frames cut from clips, as tensors (…, T, D) in metres.
 
-    Made by `windows`. `sample` draws windows, `all` lists them every few frames.
+    Made by `windows`. `sample` draws windows, `all` lists them every few frames, `batches` some at a time. Clips stay
+    as they are, perhaps mapped from a disk: windows are put to their root and turned when they are cut.
 
     Attributes:
         protocol, skeleton, split: what they were made from.
@@ -312,19 +315,20 @@ class Windows:
         if protocol.heading:
             self.skeleton.heading(torch.zeros(self.skeleton.joints, 3))  # says now if the skeleton has no sides
 
-        self._frames = torch.cat([torch.from_numpy(clip.positions) for clip in self.clips])
-        self._turns = None
+        self._frames = [clip.positions for clip in self.clips]
+        self._turns: list[Any] | None = None
         if protocol.representation != "positions":
-            self._turns = torch.cat([torch.from_numpy(turned[clip.key].rotations) for clip in self.clips])
+            self._turns = [turned[clip.key].rotations for clip in self.clips]
         frames = torch.tensor([clip.frames for clip in self.clips])
         self._first = frames.cumsum(0) - frames
         self._classes: dict[str, Tensor] = {}  # by variable, the class of every clip
         self._given: Tensor | float | None = None  # see `given`
         self._starts = frames - length + 1
         if self.missing:
-            seen = self._frames.isfinite().all(-1)
-            told = seen[:, self.skeleton.root] & (seen.sum(-1) > 1)
-            self._told = torch.cat([torch.zeros(1, dtype=torch.long), told.cumsum(0)])  # frames before each that tell
+            seen = (np.isfinite(block).all(-1) for frames in self._frames for block in blocks(frames))
+            told = (each[:, self.skeleton.root] & (each.sum(-1) > 1) for each in seen)
+            before = np.concatenate([[False], *told]).cumsum(dtype=np.int32)
+            self._told = torch.from_numpy(before)  # frames before each that tell
             if not len(self):
                 raise ValueError(
                     f"{split} split of {motion.name!r} has no window that has the root beside another joint in some "
@@ -352,8 +356,7 @@ class Windows:
 
     def index(self, stride: int) -> list[tuple[str, str, int]]:
         """(split, clip, first frame) of the windows that `all(stride)` lists."""
-        clips, starts = self._list(stride)
-        return [(*self.clips[c].key, s) for c, s in zip(clips.tolist(), starts.tolist(), strict=True)]
+        return list(self._keys(stride))
 
     def __len__(self) -> int:
         return len(self._list(self.stride)[0])
@@ -399,18 +402,28 @@ class Windows:
         Poses are relative to a root, so that where this is missing they are (with root="relative", where it is missing
         throughout). Listed are windows of which something was observed, both before the present and after.
         """
-        clips, starts = self._list(stride or self.stride)
+        return self._listed(*self._list(stride or self.stride), torch.Generator().manual_seed(0))
+
+    def batches(self, batch_size: int) -> Iterator[dict[str, Any]]:
+        """The windows that `all()` lists, so many at a time."""
+        clips, starts = self._list(self.stride)
+        generator = torch.Generator().manual_seed(0)
+        for some in torch.arange(len(clips)).split(batch_size):
+            yield self._listed(clips[some], starts[some], generator)
+
+    def _listed(self, clips: Tensor, starts: Tensor, generator: torch.Generator) -> dict[str, Any]:
         x = torch.empty(len(clips), self.length, self.size)
         for block in torch.arange(len(clips)).split(512):  # so that memory holds the windows little more than once
             x[block] = self._cut(clips[block], starts[block])
-        batch = self._batch(x, clips, torch.Generator().manual_seed(0))
+        batch = self._batch(x, clips, generator)
         if self._turns is not None:
             batch[BESIDE] = {TURNS: self._turned(clips, starts)}
         return batch
 
     def poses(self) -> Tensor:
         """Every frame of the clips, once, as a window that starts there has it: (N, D) float32; whole poses alone."""
-        poses = self._represented(self._frames[:, None], 0)[:, 0]
+        parts = (tensor_of(block) for frames in self._frames for block in blocks(frames))
+        poses = torch.cat([self._represented(part[:, None], 0)[:, 0] for part in parts])
         return poses[poses.isfinite().all(-1)] if self.missing else poses
 
     def labels(self, name: str) -> list[str]:
@@ -470,7 +483,7 @@ class Windows:
         """
         clips, starts = self._list(self.stride)
         frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
-        joints, root = self._frames[frames], self.skeleton.root
+        joints, root = cut(self._frames, clips, starts, self.length), self.skeleton.root
         if self.protocol.heading:
             heading = self.skeleton.heading_near(joints, self.protocol.observed - 1)[:, None, None]
             positions = rotate_about_up(positions, heading, self.skeleton.up)
@@ -480,7 +493,7 @@ class Windows:
             places = bridged(places.flatten(2), seen.flatten(2))[:, :, None]
         else:
             places = places.take_along_dim(seen.all(-1).byte().argmax(1, keepdim=True)[..., None], 1)
-        found = self._frames.clone()
+        found = torch.from_numpy(np.concatenate(self._frames))
         for where, made in zip(frames, positions + places, strict=True):
             found[where] = torch.where(found[where].isfinite(), found[where], made.to(found))
         whole = found.split([clip.frames for clip in self.clips])
@@ -558,15 +571,19 @@ class Windows:
         protocol = astuple(self.protocol)  # with its last field where that is not what it always was
         protocol = protocol if self._turns is not None else protocol[:-1]
         digest = hashlib.sha256(repr((protocol, self.split, self.length)).encode())
-        digest.update(repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up, self.keys)).encode())
-        digest.update(self._frames.numpy().astype("<f4", copy=False).tobytes())
+        names, parents, up = self.skeleton.names, self.skeleton.parents, self.skeleton.up
+        digest.update(f"({names!r}, {parents!r}, {up!r}, ".encode())
+        hash_list(digest, self._keys(self.stride))
+        digest.update(b")")
+        for frames in self._frames:
+            hash_values(digest, frames, "<f4")
         if (
             self._turns is not None and self._rest
         ):  # turns of files: those that are found each machine rounds in its way
             digest.update(repr(self._rest).encode())
             for clip in self.clips:
-                turns = b"" if clip.rotations is None else clip.rotations.astype("<f4", copy=False).tobytes()
-                digest.update(turns)
+                if clip.rotations is not None:
+                    hash_values(digest, clip.rotations, "<f4")
         for variable, classes in self._classes.items():
             digest.update(repr((variable, classes.tolist())).encode())
         if self._given is not None:
@@ -574,24 +591,32 @@ class Windows:
             digest.update(repr(("given", given)).encode())
         return digest.hexdigest()
 
+    def _keys(self, stride: int) -> Iterator[tuple[str, str, int]]:
+        """Keys of the listed windows, one at a time: those for training may be as many as frames."""
+        for clip, first, count in zip(self.clips, self._first.tolist(), self._starts.tolist(), strict=True):
+            for some in torch.arange(0, count, _at_least_one(stride)).split(4096):
+                kept = some[self._tells(first + some)] if self.missing else some
+                yield from ((*clip.key, start) for start in kept.tolist())
+
     def _list(self, stride: int) -> tuple[Tensor, Tensor]:
         """Clip index and first frame of every listed window."""
-        if stride < 1:
-            raise ValueError(f"stride is {stride}, expected 1 or more")
+        stride = _at_least_one(stride)
         counts = (self._starts + stride - 1) // stride
         clips = torch.repeat_interleave(counts)
         starts = stride * (torch.arange(len(clips)) - (counts.cumsum(0) - counts)[clips])
         if not self.missing:
             return clips, starts
-        first = self._first[clips] + starts
-        before, now, after = (self._told[first + n] for n in (0, min(self.protocol.observed, self.length), self.length))
-        kept = (before < now) & ((now < after) | (self.length <= self.protocol.observed))
+        kept = self._tells(self._first[clips] + starts)
         return clips[kept], starts[kept]
 
+    def _tells(self, first: Tensor) -> Tensor:
+        """Whether windows that start at these frames, counted over all clips, have something observed in both parts."""
+        before, now, after = (self._told[first + n] for n in (0, min(self.protocol.observed, self.length), self.length))
+        return (before < now) & ((now < after) | (self.length <= self.protocol.observed))
+
     def _cut(self, clips: Tensor, starts: Tensor) -> Tensor:
-        """(B,), (B,) -> (B, T, D): one gather, then the protocol's representation."""
-        frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
-        return self._represented(self._frames[frames], self.protocol.observed - 1)
+        """(B,), (B,) -> (B, T, D): copied, and then as the protocol represents them."""
+        return self._represented(cut(self._frames, clips, starts, self.length), self.protocol.observed - 1)
 
     def _represented(self, joints: Tensor, now: int) -> Tensor:
         """Frames (B, T, D) of joints (B, T, J, 3), of whose frame `now` the heading is zero, if it is fixed."""
@@ -609,13 +634,18 @@ class Windows:
 
     def _turned(self, clips: Tensor, starts: Tensor, angle: Tensor | None = None) -> Tensor:
         """Turns (B, T, 4 J) of the joints in windows, whose root turns as the windows do."""
-        frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
-        turns, root = self._turns[frames], self.skeleton.root  # type: ignore[index]
+        assert self._turns is not None
+        turns, root = cut(self._turns, clips, starts, self.length), self.skeleton.root
         if self.protocol.heading:
-            now = self._frames[frames[:, self.protocol.observed - 1]]
-            angle = -self.skeleton.heading(now)
+            angle = -self.skeleton.heading(cut(self._frames, clips, starts + self.protocol.observed - 1, 1)[:, 0])
         if angle is not None:
-            axes = rotate_about_up(torch.eye(3).expand(len(frames), 3, 3), angle.reshape(-1, 1), self.skeleton.up).mT
+            axes = rotate_about_up(torch.eye(3).expand(len(turns), 3, 3), angle.reshape(-1, 1), self.skeleton.up).mT
             world = to_matrix(turns[:, :, root], "quaternion")
             turns[:, :, root] = continuous(from_matrix(axes[:, None] @ world, "quaternion"), dim=1)
         return turns.flatten(-2)
+
+
+def _at_least_one(stride: int) -> int:
+    if stride < 1:
+        raise ValueError(f"stride is {stride}, expected 1 or more")
+    return stride

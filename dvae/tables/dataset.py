@@ -64,7 +64,8 @@ class PanelData:
         """Reads a file, by the schema that stands beside it, if there is one.
 
         Args:
-            path: of a CSV, Parquet or npz file, or the name of a data set of `dvae.tables.domains`.
+            path: of a CSV, Parquet, npz or npy file, of a folder of npy files, or the name of a data set of
+                `dvae.tables.domains`.
             columns: what its columns are, in place of that schema: one, or the targets in words, see `Told`.
             cut: how sequences are divided and cut; by default what the schema says, or what suits them.
             **told: further fields of `Told` and of `Cut`.

@@ -21,6 +21,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from typing_extensions import override
 
+from ..blocks import ColumnSummary, row_blocks
 from ..laws.base import LawSpec
 from ..laws.family import FAMILIES
 from ..laws.product import Product
@@ -98,26 +99,22 @@ class PanelSchema(Schema):
                 f"{panel.name} has no training window of {cut.name}: its sequences have "
                 f"{min(map(len, panel.series))} to {max(map(len, panel.series))} steps"
             )
-        known = np.concatenate([one.values[part] for one, part in parts])
+        training = [one.values[part] for one, part in parts]
+        known, steps = ColumnSummary.of(row_blocks(training)), sum(map(len, training))
         means, scales, logarithms, lacking = {}, {}, {}, []
         for place, column in enumerate(panel.columns.columns):
-            values = known[:, place]
-            values = values[~np.isnan(values)]
-            if not len(values):
+            if not known.count[place]:
                 raise ValueError(f"column {column.name!r} has no value in the training part of {panel.name}")
+            mean, scale = float(known.mean[place]), float(np.sqrt(known.variance[place]))
             if column.family in CENTRED:
-                mean, scale = float(values.mean()), float(values.std())
                 means[column.name], scales[column.name] = mean, scale if scale > LEAST * abs(mean) else 1.0
             elif column.family in SCALED:
-                means[column.name], scales[column.name] = 0.0, float(values.mean()) or 1.0
-                if column.family in LOGARITHMIC and (values > 0).any():
-                    floor = values[values > 0].min()
-                    read = np.log(values.clip(floor))
-                    spread = float(read.std())
-                    logarithms[column.name] = float(floor), float(read.mean()), spread if spread > LEAST else 1.0
+                means[column.name], scales[column.name] = 0.0, mean or 1.0
+                if column.family in LOGARITHMIC and known.largest[place] > 0:
+                    logarithms[column.name] = _logarithms([values[:, place, None] for values in training])
             elif column.family == "binary":
-                means[column.name] = float(values.mean())
-            if column.role == "past" or np.isnan(known[:, place]).any():
+                means[column.name] = mean
+            if column.role == "past" or known.count[place] < steps:
                 lacking.append(column.name)
         shares = np.array([means[c.name] for c in panel.columns.targets if c.family == "binary"])
         spread = float(np.sqrt((shares * (1 - shares)).mean())) if len(shares) else 0.0
@@ -202,8 +199,15 @@ class PanelSchema(Schema):
 
     def targets(self, one: Series) -> np.ndarray:
         """x (T, D) of a sequence, NaN where missing."""
-        parts = [_encoded(one.values[:, self.places[column.name]], column) for column in self.columns.targets]
-        return np.concatenate(parts, 1)
+        return self.encoded(one.values)
+
+    def encoded(self, values: np.ndarray) -> np.ndarray:
+        """x (..., D) of values (..., C) of the columns, NaN where missing."""
+        columns = self.columns.targets
+        places = [self.places[column.name] for column in columns]
+        if all(column.family != "category" for column in columns):
+            return values if places == [*range(values.shape[-1])] else values[..., places]
+        return np.concatenate([_encoded(values[..., n], column) for n, column in zip(places, columns, strict=True)], -1)
 
     def context(self, one: Series) -> np.ndarray:
         """c (T, C) of a sequence, of which what ends with the present goes on."""
@@ -290,11 +294,19 @@ class PanelSchema(Schema):
         return cls(**own)
 
 
+def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """The least positive value of parts (n, 1), and mean and deviation of the logarithms, of others as of that."""
+    floor = ColumnSummary.of(np.where(block > 0, block, np.nan) for block in row_blocks(parts)).least.item()
+    read = ColumnSummary.of(np.log(block.astype(np.float64).clip(floor)) for block in row_blocks(parts))
+    spread = float(np.sqrt(read.variance.item()))
+    return floor, read.mean.item(), spread if spread > LEAST else 1.0
+
+
 def _encoded(values: np.ndarray, column: Column) -> np.ndarray:
-    """A column (T,) as coordinates (T, n); NaN where missing."""
+    """A column (...) as coordinates (..., n); NaN where missing."""
     if column.family != "category":
-        return np.asarray(values[:, None])
-    found = np.asarray(values[:, None] == np.arange(len(column.classes)), float)
+        return np.asarray(values[..., None])
+    found = np.asarray(values[..., None] == np.arange(len(column.classes)), float)
     found[np.isnan(values)] = np.nan
     return found
 

@@ -1,4 +1,4 @@
-"""Panel: sequences of several columns in memory, made of whatever holds them.
+"""Panel: sequences of several columns, made of whatever holds them.
 
 | from | how |
 |---|---|
@@ -7,18 +7,24 @@
 | numpy, torch | (N, T, D), or (T, D) of one sequence |
 | a list of such | sequences of different lengths (T_n, D) |
 | xarray | a `Dataset` whose variables share a dimension of time, and perhaps one of sequences |
+
+All are copied but for arrays that are mapped from a disk (`numpy.memmap`), which may be larger than memory: these stay
+where they are, and are read in blocks and windows.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 
+from ..blocks import hash_values, ranges, row_blocks
+from ..npy import is_mapped
 from ..options import nearest
 from .columns import Column, Columns
 from .parsing import is_number, numeric, tabular, texts, times
@@ -35,7 +41,8 @@ class Series:
 
     Args:
         name: that tells it from the others.
-        values: (T, C) of the columns, float64; a category as the index of its class; NaN where missing.
+        values: (T, C) of the columns, float64, or any real numbers that are mapped; a category as the index of its
+            class; NaN where missing.
         times: (T,) of the steps, increasing, dates in seconds since 1970; None for steps 0, 1, …
         group: that it belongs to.
         split: "train", "validation" or "test", where the data say it.
@@ -68,6 +75,7 @@ class Panel:
         columns: what their columns are.
         name: for titles.
         dates: whether times are dates, in seconds since 1970.
+        complete: names of mapped sequences, in which nothing can change, that lack no value of a target; found.
 
     Raises:
         ValueError: sequences that are empty, of other columns, of one name, out of order, or with values that their
@@ -78,6 +86,7 @@ class Panel:
     columns: Columns
     name: str = "panel"
     dates: bool = False
+    complete: frozenset[str] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.series:
@@ -96,35 +105,41 @@ class Panel:
                 )
             if one.times is not None and (one.times.shape != (len(one),) or not (np.diff(one.times) > 0).all()):
                 raise ValueError(f"{who} has times that do not increase, or two rows of one time")
-        for place, column in enumerate(self.columns.columns):
-            self._check(np.concatenate([one.values[:, place] for one in self.series]), column)
+        object.__setattr__(self, "complete", self._checked())
 
-    def _check(self, values: np.ndarray, column: Column) -> None:
-        """Refuses what the family of a column does not have."""
-        tests = {
-            "category": (lambda v: _counts(v) & (v < len(column.classes)), "the places of its classes"),
-            "binary": (lambda v: (v == 0) | (v == 1), "0 or 1"),
-            **dict.fromkeys(COUNTS, (_counts, "whole numbers from 0")),
-            **dict.fromkeys(("positive", "log-normal"), (lambda v: v > 0, "numbers above 0")),
-            "power": (lambda v: v >= 0, "numbers from 0"),
-            "share": (lambda v: (v > 0) & (v < 1), "numbers above 0 and below 1"),
-            "angle": (lambda v: np.abs(v) <= np.pi + 1e-6, "radians from -pi to pi"),
-        }
-        right, said = tests.get(column.family, (lambda v: ~np.isnan(v), "numbers"))
-        with np.errstate(invalid="ignore", over="ignore"):
-            seen = right(values.astype(np.float32))  # as models compute
-        wrong = ~(seen & (np.abs(values) < LARGEST)) & ~np.isnan(values)
-        if wrong.any():
-            row = first = int(np.argmax(wrong))
-            for one in self.series:
-                if row < len(one):
-                    break
-                row -= len(one)
-            size = f", below {LARGEST:g} in size" if seen[first] else ""
-            raise ValueError(
-                f"sequence {one.name!r} of {self.name} has {values[first]:g} in row {row} of column {column.name!r}, "
-                f"and the family {column.family!r} is of {said}{size}; give it another family"
-            )
+    def _checked(self) -> frozenset[str]:
+        """Refuses what the family of a column does not have; finds what is complete."""
+        kinds: dict[tuple[str, int], list[int]] = {}
+        for place, column in enumerate(self.columns.columns):
+            kinds.setdefault((column.family, len(column.classes)), []).append(place)
+        ends, start, gapped = np.cumsum([len(one) for one in self.series]), 0, set[int]()
+        for block in row_blocks(one.values for one in self.series):
+            block = block.astype(np.float64, copy=False)
+            absent = np.isnan(block)
+            for places in kinds.values():
+                own, (right, said) = block[:, places], _admitted(self.columns.columns[places[0]])
+                with np.errstate(invalid="ignore", over="ignore"):
+                    seen = right(own.astype(np.float32))  # as models compute
+                wrong = ~(seen & (np.abs(own) < LARGEST)) & ~absent[:, places]
+                if wrong.any():
+                    row, nth = np.argwhere(wrong)[0]
+                    of, column = np.searchsorted(ends, start + row, "right"), self.columns.columns[places[nth]]
+                    one, size = self.series[of], f", below {LARGEST:g} in size" if seen[row, nth] else ""
+                    raise ValueError(
+                        f"sequence {one.name!r} of {self.name} has {own[row, nth]:g} in row "
+                        f"{start + row - ends[of] + len(one)} of column {column.name!r}, and the family "
+                        f"{column.family!r} is of {said}{size}; give it another family"
+                    )
+            rows = start + np.flatnonzero(absent[:, self._targets].any(1))
+            gapped |= {*np.searchsorted(ends, rows, "right").tolist()}
+            start += len(block)
+        mapped = (place for place, one in enumerate(self.series) if is_mapped(one.values))
+        return frozenset(self.series[place].name for place in mapped if place not in gapped)
+
+    @cached_property
+    def _targets(self) -> list[int]:
+        """Places of the columns that are targets."""
+        return [place for place, column in enumerate(self.columns.columns) if column.role == "target"]
 
     def __len__(self) -> int:
         return len(self.series)
@@ -143,19 +158,25 @@ class Panel:
         for one in self.series:
             digest.update(repr((one.name, one.group, one.split, one.values.shape)).encode())
             for values in (one.values, one.times):
-                digest.update(b"" if values is None else np.ascontiguousarray(values, "<f8").tobytes())
+                if values is not None:
+                    hash_values(digest, values, "<f8")
         return digest.hexdigest()
 
     @property
     def missing(self) -> bool:
         """Whether some value of a target is."""
-        places = [place for place, column in enumerate(self.columns.columns) if column.role == "target"]
-        return any(bool(np.isnan(one.values[:, places]).any()) for one in self.series)
+        some = (one.values for one in self.series if one.name not in self.complete)
+        return any(bool(np.isnan(block[:, self._targets]).any()) for block in row_blocks(some))
 
     def present(self, one: Series) -> int:
         """Steps of a sequence up to the last one that has a target; rows behind it are of the future."""
-        places = [place for place, column in enumerate(self.columns.columns) if column.role == "target"]
-        return int(np.flatnonzero(~np.isnan(one.values[:, places]).all(1)).max(initial=-1)) + 1
+        if one.name in self.complete:
+            return len(one)
+        for rows in reversed([*ranges(one.values)]):
+            known = ~np.isnan(one.values[rows][:, self._targets]).all(1)
+            if known.any():
+                return int(rows.start + np.flatnonzero(known)[-1]) + 1
+        return 0
 
     @property
     def groups(self) -> list[str]:
@@ -212,15 +233,16 @@ class Panel:
                 f"not of {type(data).__name__}"
             )
         plain = [each.detach().cpu().double().numpy() if isinstance(each, torch.Tensor) else each for each in arrays]
-        found = [np.asarray(each, np.float64).copy() for each in plain]
+        found = [
+            each.view(np.ndarray) if is_mapped(each) and each.dtype.kind in "fiu" else np.array(each, np.float64)
+            for each in plain
+        ]
         if not found or any(each.ndim != 2 for each in found):
             whole = [data] if getattr(data, "ndim", 0) == 1 else found
             shapes = ", ".join(str(tuple(each.shape)) for each in whole[:3])
             advice = "; one sequence of one column is (T, 1), as of x[:, None]" if shapes else ""
             raise ValueError(f"sequences are (T, D); got {shapes or 'none'}{advice}")
-        if not isinstance(columns, Columns):
-            named = columns.columns if isinstance(columns, Told) else columns
-            columns = Columns(tuple(map(Column, named or [f"x{place}" for place in range(found[0].shape[1])])))
+        columns = plain_columns(columns, found[0].shape[1])
         return cls([Series(str(place), each) for place, each in enumerate(found)], columns, name)
 
     @classmethod
@@ -245,6 +267,42 @@ class Panel:
                 part = slice(known[0], known[-1] + 1)
                 series.append(Series(str(each), values[part, None], None if when is None else when[part]))
         return cls(series, Columns((own,)), name, when is not None and not is_number(index))
+
+
+def plain_columns(columns: Columns | Told | Sequence[str] | None, size: int) -> Columns:
+    """Columns of arrays: as told, or real targets x0, x1, …
+
+    Raises:
+        ValueError: something is told that arrays do not have, such as a time.
+    """
+    if isinstance(columns, Told):
+        if strange := [name for name, value in vars(columns).items() if value and name != "columns"]:
+            raise ValueError(
+                f"arrays have no names by which to tell {', '.join(strange)}; give a schema, in Python as "
+                "columns=Columns(...), or as FILE.toml beside the file"
+            )
+        words = (f"{word}::".split(":")[:3] for word in columns.columns)
+        told = tuple(Column(name, "target", family or "real", unit) for name, family, unit in words)
+        columns = Columns(told) if told else None
+    if isinstance(columns, Columns):
+        if strange := [name for name in ("id", "time", "group", "split") if getattr(columns, name)]:
+            raise ValueError(f"the schema names a column of {strange[0]}, and arrays have numbers alone; leave it out")
+        return columns
+    return Columns(tuple(map(Column, columns or [f"x{place}" for place in range(size)])))
+
+
+def _admitted(column: Column) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
+    """Which values the family of a column has, NaN left aside, and that in words."""
+    tests: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+        "category": (lambda v: _counts(v) & (v < len(column.classes)), "the places of its classes"),
+        "binary": (lambda v: (v == 0) | (v == 1), "0 or 1"),
+        **dict.fromkeys(COUNTS, (_counts, "whole numbers from 0")),
+        **dict.fromkeys(("positive", "log-normal"), (lambda v: v > 0, "numbers above 0")),
+        "power": (lambda v: v >= 0, "numbers from 0"),
+        "share": (lambda v: (v > 0) & (v < 1), "numbers above 0 and below 1"),
+        "angle": (lambda v: np.abs(v) <= np.pi + 1e-6, "radians from -pi to pi"),
+    }
+    return tests.get(column.family, (lambda v: ~np.isnan(v), "numbers"))
 
 
 def _counts(values: np.ndarray) -> np.ndarray:

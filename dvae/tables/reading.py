@@ -1,4 +1,6 @@
-"""Files of tables: CSV, Parquet and npz, and the schema that stands beside them.
+"""Files of tables: CSV, Parquet, npz and npy, and the schema that stands beside them.
+
+An npy file, or a folder of them, is mapped: it may be larger than memory. All others are read.
 
 A schema beside `riders.csv` is `riders.toml`, or `schema.toml` in the same folder: columns, see `dvae.tables.columns`,
 and how sequences are divided and cut:
@@ -23,17 +25,18 @@ from contextlib import suppress
 from dataclasses import asdict, fields
 from functools import partial
 from io import BytesIO, StringIO
-from itertools import takewhile
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .. import files
+from ..npy import mapped
 from ..options import nearest
 from .columns import MOST, Columns, parsed
 from .domains import DOMAINS, domain
-from .panel import Panel
+from .panel import SPLITS, Panel, Series, plain_columns
 from .proposing import Told
 from .protocol import Cut
 
@@ -43,6 +46,7 @@ DECIMAL_COMMA = re.compile(r"(?:^|[;\t])\s*[-+]?\d+,\d+\s*(?:[;\t]|$)", re.MULTI
 SUFFIXES = (*SEPARATORS, ".parquet", ".npz")
 LARGEST = 2 * 10**9
 """Bytes of a file, or of what it holds."""
+MOST_FILES = 100_000
 LARGEST_SCHEMA = 10**6
 LARGEST_HEADER = 2**20
 
@@ -187,7 +191,7 @@ def read_panel(path: str | os.PathLike[str], columns: Columns | Told | None = No
     """The sequences of a file, or of one of `dvae.tables.domains`.
 
     Args:
-        path: of the file, or the name of the domain.
+        path: of the file, of a folder of npy files, or the name of the domain.
         columns: what its columns are, or what is told of them; the rest is proposed.
 
     Raises:
@@ -200,7 +204,44 @@ def read_panel(path: str | os.PathLike[str], columns: Columns | Told | None = No
         if columns not in (None, Told(), panel.columns):
             raise ValueError(f"{name} has columns of its own: {', '.join(panel.columns.names[:10])}, …")
         return panel
+    if is_of_arrays(path):
+        return _of_mapped(Path(path), columns)
     return Panel.of(read_frame(path), columns, Path(path).stem)
+
+
+def is_of_arrays(path: str | os.PathLike[str]) -> bool:
+    """Whether a path is that of an npy file, or of a folder of them."""
+    return Path(path).suffix.lower() == ".npy" or Path(path).is_dir()
+
+
+def _of_mapped(place: Path, columns: Columns | Told | None) -> Panel:
+    """The sequences of npy files: (steps, columns), or (sequences, steps, columns).
+
+    Those of a folder are called after their files; train.npy, or what lies in a subfolder train, is of that split, and
+    so on.
+    """
+    found = [("", place.stem, place)]
+    if place.is_dir():
+        paths = (Path(folder, name) for folder, _, names in os.walk(place) for name in names if name.endswith(".npy"))
+        files_in = sorted(islice(paths, MOST_FILES + 1))
+        if not 0 < len(files_in) <= MOST_FILES:
+            raise ValueError(
+                f"{place} is to hold npy files, from 1 to {MOST_FILES:,}; it has {len(files_in):,} or more"
+            )
+        names = [file.relative_to(place).with_suffix("").as_posix() for file in files_in]
+        splits = (name.partition("/")[0] for name in names)
+        found = list(zip((split if split in SPLITS else "" for split in splits), names, files_in, strict=True))
+    series = []
+    for split, name, file in found:
+        values = mapped(file, links=file is place)
+        if values.ndim not in (2, 3) or values.shape[-1] > MOST:
+            raise ValueError(
+                f"{file} has shape {values.shape}; expected (steps, columns), or (sequences, steps, columns), of at "
+                f"most {MOST} columns{'; a single one is (steps, 1)' if values.ndim == 1 else ''}"
+            )
+        parts = [(name, values)] if values.ndim == 2 else [(f"{name}/{n}", each) for n, each in enumerate(values)]
+        series += [Series(own, each, split=split) for own, each in parts]
+    return Panel(series, plain_columns(columns, series[0].values.shape[1]), place.stem)
 
 
 def is_domain(name: str) -> bool:
@@ -246,7 +287,8 @@ def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | None, Cut | N
         ValueError: a schema that cannot be read, saying where.
     """
     place = Path(path)
-    for file in (place.with_suffix(".toml"), place.parent / "schema.toml"):
+    inside = [place / "schema.toml"] if place.is_dir() else []
+    for file in (*inside, place.with_suffix(".toml"), place.parent / "schema.toml"):
         if file.is_file():
             try:
                 return read_schema(files.read(file, LARGEST_SCHEMA, links=True).decode())

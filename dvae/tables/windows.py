@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..blocks import cut, hash_list, row_blocks
 from ..data import Sequences, columns_of, gapped, past_of
 from ..inference.held import on_device_of, reproducibly
 from ..program.groups import GROUP
@@ -30,6 +32,8 @@ AT_ONCE = 64
 class PanelWindows:
     """The windows of one split; a `Source`, and `HeldOutWindows` where forecasts have a horizon.
 
+    Targets are read and encoded as windows are cut, from where they lie; covariates are held ready in memory.
+
     Args:
         panel: the sequences.
         schema: what models see of them.
@@ -47,7 +51,6 @@ class PanelWindows:
         shortest = schema.cut.length or 1
         cut_from = schema.cut.spans(panel, split)
         self.skipped = [panel.series[place].name for place, low, high in cut_from if high - low < shortest]
-        self.untold = 0
         steps = [panel.present(one) for one in panel]
         none = (
             f"{panel.name} has no {split} window of {schema.cut.name}; up to their last targets its {len(panel)} "
@@ -61,15 +64,11 @@ class PanelWindows:
         self._first = rows.cumsum(0) - rows
         self._lengths = torch.tensor([panel.present(one) for one in some])
         self._low, self._last = torch.tensor([ends for _, *ends in self._ranges]).unbind(1)
-        self._x = _joined([schema.targets(one) for one in some])
-        self._mask = self._x.isfinite()
-        if whole(schema.columns):
-            self._mask = self._mask.all(-1, keepdim=True).expand_as(self._x)
+        self._values = [one.values for one in some]
         last = self._lengths if schema.cut.length is None else self._last + schema.cut.length
-        spans = zip((self._first + self._low).tolist(), (self._first + last).tolist(), strict=True)
-        self._missing = not all(bool(self._mask[start:end].all()) for start, end in spans)
-        self._x = self._x.nan_to_num(0.0)
         parts = [one.values[low:end] for one, low, end in zip(some, self._low.tolist(), last.tolist(), strict=True)]
+        gapped = (part for one, part in zip(some, parts, strict=True) if one.name not in panel.complete)
+        self._missing = any(np.isnan(schema.encoded(block)).any() for block in row_blocks(gapped))
         if unforeseen := schema.unforeseen(parts):
             warnings.warn(
                 f"the {split} part of {panel.name} lacks values of {', '.join(unforeseen)}, of which training data "
@@ -79,12 +78,11 @@ class PanelWindows:
         self._context = {}
         for name, make in ((COVARIATES, schema.context), (GAPS, schema.gaps)):
             if name in schema.sizes:
-                self._context[name] = _joined([make(one) for one in some])
+                self._context[name] = [make(one).astype(np.float32) for one in some]
         self._static = None
         if STATICS in schema.sizes:
             self._static = torch.from_numpy(np.stack([schema.static(one) for one in some])).float()
-        self._windows = self._listed()
-        if not len(self):
+        if self._missing and not len(self):
             raise ValueError(f"{none}, and left out are {self.left_out}")
         self._weights = (self._last - self._low + 1).double().cumsum(0)
 
@@ -105,6 +103,11 @@ class PanelWindows:
         return " and ".join(parts)
 
     @property
+    def untold(self) -> int:
+        """Windows that are not listed, as no target was observed in their past or future."""
+        return int(self._counts.sum()) - len(self._listed()[0])
+
+    @property
     def protocol(self) -> Cut:
         """How they are cut."""
         return self.schema.cut
@@ -118,10 +121,14 @@ class PanelWindows:
     @property
     def keys(self) -> list[tuple[str, str, int]]:
         """(split, sequence, first step) of the listed windows."""
+        return list(self._keys())
+
+    def _keys(self) -> Iterator[tuple[str, str, int]]:
         names = [self.panel.series[place].name for place, _, _ in self._ranges]
-        return [
-            (self.split, names[place], start) for place, start in zip(*map(Tensor.tolist, self._windows), strict=True)
-        ]
+        for some in zip(*(part.split(4096) for part in self._windows), strict=True):
+            yield from (
+                (self.split, names[place], start) for place, start in zip(*map(Tensor.tolist, some), strict=True)
+            )
 
     @property
     def clusters(self) -> list[tuple[str, str, int]]:
@@ -147,8 +154,10 @@ class PanelWindows:
     @property
     def fingerprint(self) -> str:
         """SHA-256 of the data, how they are cut, and which part these windows are."""
-        said = repr((self.schema.config(), self.split, self.keys))
-        return hashlib.sha256((self.panel.fingerprint() + said).encode()).hexdigest()
+        digest = hashlib.sha256(f"{self.panel.fingerprint()}({self.schema.config()!r}, {self.split!r}, ".encode())
+        hash_list(digest, self._keys())
+        digest.update(b")")
+        return digest.hexdigest()
 
     def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Any]:
         """Windows drawn with replacement, every start alike; of whole sequences, different ones.
@@ -190,6 +199,13 @@ class PanelWindows:
         """The listed windows, as `keys` has them."""
         return self._cut(*self._windows)
 
+    def batches(self, batch_size: int) -> Iterator[Any]:
+        """The listed windows, so many at a time; all at first where they are not of one length, or of groups."""
+        if self.length is None or self.schema.columns.group:
+            return Sequences(self.all()).batches(batch_size)
+        parts = (part.split(batch_size) for part in self._windows)
+        return (self._cut(which, starts) for which, starts in zip(*parts, strict=True))
+
     def forecast(self, model: DynamicalVAE, samples: int = 100, seed: int = 0) -> PanelForecasts:
         """Draws of the futures of the listed windows, each from what it observes and the covariates that are known.
 
@@ -209,7 +225,7 @@ class PanelWindows:
         with reproducibly(model, seed):
             parts = [
                 model.forecast(on_device_of(model, part), horizon, samples, draw_emission=True)["x"].cpu().numpy()
-                for part in Sequences(past).split(AT_ONCE)
+                for part in Sequences(past).batches(AT_ONCE)
             ]
         keys = [(name, start + observed) for _, name, start in self.keys]
         beside = known[:, :observed], known[:, observed:], columns_of(self), keys
@@ -233,7 +249,7 @@ class PanelWindows:
         with reproducibly(model, seed):
             parts = [
                 model.impute(on_device_of(model, part), samples, draw=True, particles=particles)["x"].cpu().numpy()
-                for part in Sequences(batch).split(AT_ONCE)
+                for part in Sequences(batch).batches(AT_ONCE)
             ]
         count, steps = batch["x"].shape[:2]
         lengths = batch.get("lengths", torch.full((count,), steps))
@@ -252,39 +268,52 @@ class PanelWindows:
         known = [own for own in found if own is not None]
         return (np.stack(known), self.panel.dates) if len(known) == len(found) else (None, False)
 
+    @property
+    def _stride(self) -> int:
+        """Steps between listed windows: of the test as the protocol says, of all others half a horizon."""
+        how = self.schema.cut
+        if how.horizon is None:
+            return 1
+        return how.stride or how.horizon if self.split == "test" else max(how.horizon // 2, 1)
+
+    @property
+    def _counts(self) -> Tensor:
+        """How many windows lie in each range, so far apart."""
+        return (self._last - self._low) // self._stride + 1
+
+    @cached_property
+    def _windows(self) -> tuple[Tensor, Tensor]:
+        """Range and first step of the listed windows; all of them, or `some`."""
+        return self._listed()
+
     def _listed(self) -> tuple[Tensor, Tensor]:
-        """Range and first step: test windows so far apart as the protocol says, all others by half a horizon."""
-        cut = self.schema.cut
-        if cut.length is None:
-            stride = 1
-        else:
-            assert cut.horizon is not None
-            stride = cut.stride or cut.horizon if self.split == "test" else max(cut.horizon // 2, 1)
-        counts = (self._last - self._low) // stride + 1
+        counts = self._counts
         which = torch.arange(len(counts)).repeat_interleave(counts)
         place = torch.arange(len(which)) - (counts.cumsum(0) - counts)[which]
-        starts = self._low[which] + stride * place
-        if cut.length is None or self.split in ("all", "last"):
+        starts = self._low[which] + self._stride * place
+        if not self._missing or self.length is None or self.split in ("all", "last"):
             return which, starts
-        known = torch.cat([torch.zeros(1).long(), self._mask.any(-1).cumsum(0)])
+        seen = (~np.isnan(self.schema.encoded(block)) for block in row_blocks(self._values))
+        some = np.concatenate([each.all(1) if whole(self.schema.columns) else each.any(1) for each in seen])
+        known = torch.cat([torch.zeros(1).long(), torch.from_numpy(some).cumsum(0)])
         first = self._first[which] + starts
-        start, now, end = known[first], known[first + (cut.observed or 0)], known[first + cut.length]
+        start, now, end = known[first], known[first + (self.schema.cut.observed or 0)], known[first + self.length]
         told = (now > start) & (end > now)  # of what it observes something was, and something of its future
-        self.untold = int((~told).sum())
         return which[told], starts[told]
 
     def _cut(self, which: Tensor, starts: Tensor) -> dict[str, Any]:
         """The windows of ranges that start at these steps of their sequences."""
-        lengths = self._lengths[which] if self.length is None else torch.full_like(which, self.length)
-        steps = torch.minimum(torch.arange(int(lengths.max())), lengths[:, None] - 1)  # padding repeats the last step
-        rows = (self._first[which] + starts)[:, None] + steps
-        batch: dict[str, Any] = {"x": self._x[rows]}
-        if (lengths != lengths[0]).any():
+        lengths = self._lengths[which] if self.length is None else self.length
+        x = torch.from_numpy(self.schema.encoded(cut(self._values, which, starts, lengths).numpy())).float()
+        batch: dict[str, Any] = {"x": x}
+        if isinstance(lengths, Tensor) and (lengths != lengths[0]).any():
             batch["lengths"] = lengths
         if self._missing:
-            batch["mask"] = self._mask[rows]
+            seen = x.isfinite()
+            batch["mask"] = seen.all(-1, keepdim=True).repeat(1, 1, x.shape[-1]) if whole(self.schema.columns) else seen
+            x.nan_to_num_(0.0)
         for name, values in self._context.items():
-            batch[name] = values[rows]
+            batch[name] = cut(values, which, starts, lengths)
         if COVARIATES in batch and (observed := self.schema.cut.observed) is not None:
             batch[COVARIATES] = held(batch[COVARIATES], observed, self.schema)
         if self.schema.columns.group:
@@ -313,7 +342,3 @@ def held(context: Tensor, observed: int, schema: PanelSchema) -> Tensor:
         context[:, observed:, values] = context[:, observed - 1 : observed, values]
         context[:, observed:, indicators] = 0.0
     return context
-
-
-def _joined(parts: list[np.ndarray]) -> Tensor:
-    return torch.from_numpy(np.concatenate(parts)).float()

@@ -358,7 +358,7 @@ def test_a_batch_holds_different_sequences_and_all_of_them_if_there_are_few():
         batch = data.sample(size, torch.Generator().manual_seed(0))
         assert len(set(batch["lengths"].tolist())) == min(size, 6)
         assert torch.equal(batch["x"][:, 0, 0], batch["lengths"].float())
-    assert torch.equal(torch.cat([batch["x"] for batch in data.split(4)]), data.batch["x"])
+    assert torch.equal(torch.cat([batch["x"] for batch in data.batches(4)]), data.batch["x"])
 
 
 # Resuming --------------------

@@ -30,6 +30,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ...data import tensor_of
 from ..data import Clip, MotionSet
 from ..kinematics import forward, swing
 from ..matching import parts
@@ -95,7 +96,7 @@ def fitted(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> Motio
         each = _kept(motion, body) if shapes is None else _shapes(shapes, motion, body)
         return _made(motion, body, each, (_turns(clip, motion.skeleton) for clip in motion))
     source = _Source.of(motion, body)
-    seen = [source.seen(torch.from_numpy(clip.positions).double()) for clip in motion]
+    seen = [source.seen(tensor_of(clip.positions).double()) for clip in motion]
     each = torch.zeros(len(motion), body.parameters_of_shape, dtype=torch.float64)
     steep = torch.zeros(len(motion), dtype=torch.float64)
     whose = np.zeros(len(motion), int)
@@ -356,7 +357,7 @@ def _bodies(motion: MotionSet) -> list[list[int]]:
     """The places of clips in which bones have the same lengths."""
     groups: list[tuple[Tensor, list[int]]] = []
     for n, clip in enumerate(motion):
-        lengths = motion.skeleton.bone_lengths(torch.from_numpy(clip.positions).double()).mean(0)
+        lengths = motion.skeleton.bone_lengths(tensor_of(clip.positions).double()).mean(0)
         people = next((people for known, people in groups if (known - lengths).abs().max() < SAME), None)
         if people is None:
             groups.append((lengths, [n]))
@@ -407,8 +408,8 @@ def _kept(motion: MotionSet, body: Body) -> Tensor:
 def _turns(clip: Clip, skeleton: Skeleton) -> tuple[Tensor, Tensor]:
     """Local rotations (F, J, 3, 3) of a clip, and places of its root (F, 3)."""
     assert clip.rotations is not None
-    local = to_matrix(torch.from_numpy(clip.rotations).double(), "quaternion")
-    return local, torch.from_numpy(clip.positions[:, skeleton.root]).double()
+    local = to_matrix(tensor_of(clip.rotations).double(), "quaternion")
+    return local, tensor_of(clip.positions[:, skeleton.root]).double()
 
 
 def _turned_alike(motion: MotionSet, body: Body) -> bool:

@@ -1,7 +1,7 @@
 """Reading npz archives that anybody may have made.
 
-Nothing in one is believed before it is checked, and no native object is built from what it says. The headers and the
-pickle of an archive are read by the few rules here, into names, shapes and bytes; when these fit each other, arrays are
+Nothing in one is believed before it is checked, and no native object is built from what it says. Headers (`dvae.npy`)
+and the pickle of an archive are read by few rules, into names, shapes and bytes; when these fit each other, arrays are
 made of the bytes. numpy's own readers evaluate headers, and fill arrays and dtypes with whatever a pickle holds.
 """
 
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import io
 import pickletools
-import re
 import shutil
+import struct
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -21,6 +21,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from ...npy import LONGEST, Refused, check_bytes, dtype_of, header
 from ..skeleton import is_name
 
 LARGEST = 4 * 2**30
@@ -29,24 +30,23 @@ LARGEST = 4 * 2**30
 DENSEST, SMALL = 100, 2**26
 """How many times its own size a file may unpack to, where that is more than so many bytes. Motion packs to a half."""
 
+MAPPED = 2**28
+"""Bytes of an archive from which it is written as it is, and what it holds can be mapped."""
+
 INSTRUCTIONS = 2**20
 """Of a pickle; that of an archive has about twenty for each clip."""
 
 _CHUNK = 2**20
-_HEADER = re.compile(
-    r"\{(?:\s*(?:'descr'\s*:\s*'(?P<descr>[^'\\]*)'|'fortran_order'\s*:\s*(?P<order>True|False)"
-    r"|'shape'\s*:\s*\((?P<shape>[\dL,\s]*)\))\s*(?:,|(?=\}))){3}\s*\}\s*"
-)
-_CODE = re.compile(r"[<>|=]?(?:[biufcSUOMmV]\d{0,9}|\?)")
-
-
-class Refused(ValueError):
-    """An archive is damaged, or holds what is not data."""
 
 
 @contextmanager
-def archive(path: str | Path) -> Iterator[dict[str, Member]]:
+def archive(path: str | Path, mapping: bool = False) -> Iterator[dict[str, Member]]:
     """The members of an npz file by name, to be read within the context.
+
+    Args:
+        path: the file.
+        mapping: of a large file, map those arrays of float32 that are in it as they are: they are not in memory, last
+            when the context has ended, and nobody can write to them.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -58,7 +58,7 @@ def archive(path: str | Path) -> Iterator[dict[str, Member]]:
         raise FileNotFoundError(f"{path}: no such file")
     try:
         with _damage(), zipfile.ZipFile(path) as file:
-            yield _members(file, path.stat().st_size)
+            yield _members(file, path.stat().st_size, mapping)
     except MemoryError:
         raise ValueError(f"{path}: there is not enough memory to read it") from None
     except Refused as error:
@@ -85,35 +85,40 @@ def _limit(size: int) -> int:
 
 
 def write_arrays(file: BinaryIO, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
-    """Write an npz that `archive` reads, compressed where that may be: motion that hardly moves packs too well.
+    """Write an npz that `archive` reads: compressed, unless it can be mapped or packs too well, as what hardly moves.
 
     Args:
         file: a new one, open for writing and reading.
         arrays: the members by name, one at a time.
     """
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+    with zipfile.ZipFile(file, "w") as stored:
         for name, array in arrays:
-            with packed.open(f"{name}.npy", "w", force_zip64=True) as member:
+            with stored.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)
     size = file.seek(0, io.SEEK_END)
-    with zipfile.ZipFile(file) as packed:
-        unpacked = sum(info.file_size for info in packed.infolist())
-    if unpacked > _limit(size):
-        file.seek(0)
-        small = io.BytesIO(file.read())
+    if size > MAPPED:
+        return
+    with zipfile.ZipFile(file) as stored, zipfile.ZipFile(small := io.BytesIO(), "w", zipfile.ZIP_DEFLATED) as packed:
+        for info in stored.infolist():
+            with stored.open(info) as source, packed.open(info.filename, "w", force_zip64=True) as member:
+                shutil.copyfileobj(source, member, _CHUNK)
+    if size <= _limit(small.tell()):
         file.seek(0)
         file.truncate()
-        with zipfile.ZipFile(small) as packed, zipfile.ZipFile(file, "w") as stored:
-            for info in packed.infolist():
-                with packed.open(info) as source, stored.open(info.filename, "w", force_zip64=True) as member:
-                    shutil.copyfileobj(source, member, _CHUNK)
+        file.write(small.getbuffer())
 
 
-def _members(file: zipfile.ZipFile, size: int) -> dict[str, Member]:
+def _members(file: zipfile.ZipFile, size: int, mapping: bool) -> dict[str, Member]:
     infos = [info for info in file.infolist() if not info.is_dir()]
-    unpacked, limit = sum(info.file_size for info in infos), _limit(size)
+    placed: dict[str, np.ndarray] = {}
+    if mapping and size > MAPPED:
+        content = np.memmap(file.fp, np.uint8, "r").view(np.ndarray)  # type: ignore[call-overload]
+        found = {info.filename: _placed(content, info) for info in infos}
+        placed = {name: array for name, array in found.items() if array is not None}
+    unpacked, limit = sum(info.file_size for info in infos if info.filename not in placed), _limit(size)
     if unpacked > limit:
-        raise Refused(f"it would unpack to {unpacked:,} bytes, at most {limit:,} are read from {size:,}")
+        mapped = f" beside {len(placed)} arrays that are mapped" if placed else ""
+        raise Refused(f"it would unpack to {unpacked:,} bytes{mapped}, at most {limit:,} are read from {size:,}")
     if sum(info.compress_size for info in infos) > size:
         raise Refused("damaged: its members take more bytes than it has")
     members = {}
@@ -132,8 +137,27 @@ def _members(file: zipfile.ZipFile, size: int) -> dict[str, Member]:
             raise Refused(f"{name[:40]!r} is no name for a split and a clip")
         if name in members:
             raise Refused(f"{name} is there twice")
-        members[name] = Member(name, file, info)
+        members[name] = Member(name, file, info, placed.get(info.filename))
     return members
+
+
+def _placed(content: np.ndarray, info: zipfile.ZipInfo) -> np.ndarray | None:
+    """The array of a member where it lies in the bytes of its archive; None of one that has to be read."""
+    if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1 or info.header_offset < 0:
+        return None
+    local = content[info.header_offset :][:30].tobytes()
+    if len(local) < 30 or local[:4] != b"PK\x03\x04":
+        return None
+    start = info.header_offset + 30 + sum(struct.unpack("<HH", local[26:]))
+    own = content[start : start + info.file_size]
+    head = io.BytesIO(own[: LONGEST + 12].tobytes())
+    try:
+        dtype, shape, order = header(head.read)
+        own = own[head.tell() :]
+        check_bytes(dtype, shape, len(own))
+    except Refused:
+        return None
+    return own.view(dtype).reshape(shape) if dtype.str == "<f4" and order == "C" and len(own) else None
 
 
 class _Stream:
@@ -158,6 +182,10 @@ class _Stream:
         if size > self.left:
             raise EOFError(f"{size:,} bytes are announced where {self.left:,} are left")
         return self._taken(self._buffered.read(size))
+
+    def some(self, size: int) -> bytes:
+        """So many bytes, or those that are left."""
+        return self.read(min(size, self.left))
 
     def readline(self) -> bytes:
         return self._taken(self._buffered.readline())
@@ -186,6 +214,7 @@ class Member:
     name: str
     _archive: zipfile.ZipFile
     _info: zipfile.ZipInfo
+    _mapped: np.ndarray | None = None
 
     @property
     def size(self) -> int:
@@ -198,11 +227,13 @@ class Member:
         Raises:
             ValueError: it is damaged, or holds pickled objects.
         """
+        if self._mapped is not None:
+            return self._mapped
         with self._open() as stream:
-            dtype, shape, order = _header(stream)
+            dtype, shape, order = header(stream.some)
             if dtype.hasobject:
                 raise Refused("holds pickled objects, which only a member called positions_3d may")
-            _check_size(dtype, shape, stream.left, "declares")
+            check_bytes(dtype, shape, stream.left)
             array = np.empty(shape, dtype, order)
             stream.readinto(array)
         if dtype.kind == "U":
@@ -218,7 +249,7 @@ class Member:
             ValueError: it is damaged, or anything else; or its pickle asks for something that is not data.
         """
         with self._open() as stream:
-            dtype, shape, _ = _header(stream)
+            dtype, shape, _ = header(stream.some)
             if not dtype.hasobject or shape != ():
                 raise Refused(
                     f"has shape {shape} and dtype {dtype}, expected one pickled dictionary (shape () and dtype object)"
@@ -248,41 +279,6 @@ class Member:
                 yield _Stream(file, self._info.file_size)
         except Refused as error:
             raise Refused(f"{self.name}: {error}") from error
-
-
-def _header(stream: _Stream) -> tuple[np.dtype, tuple[int, ...], Any]:
-    """Dtype, shape and order of an npy file."""
-    magic = stream.read(min(8, stream.left))
-    if magic[:6] != b"\x93NUMPY" or magic[6:] not in (b"\x01\x00", b"\x02\x00"):
-        raise Refused(f"no npy file of version 1 or 2 (it begins with {magic!r}); write it with np.savez")
-    size = int.from_bytes(stream.read(2 if magic[6] == 1 else 4), "little")
-    text = stream.read(size).decode("latin1") if size <= 4096 else ""
-    found = _HEADER.fullmatch(text)
-    if not found or None in found.groups():
-        raise Refused(f"damaged, or no plain array: the header of its npy file is {text[:100]!r}")
-    lengths = [length.strip().removesuffix("L") for length in found["shape"].split(",") if length.strip()]
-    if not all(re.fullmatch(r"\d{1,18}", length) for length in lengths):
-        raise Refused(f"damaged: its shape is ({found['shape'][:100]})")
-    return _dtype(found["descr"]), tuple(map(int, lengths)), "F" if found["order"] == "True" else "C"
-
-
-def _dtype(code: Any) -> np.dtype:
-    """Of numbers, text or objects, from its code such as "<f4"."""
-    try:
-        dtype = np.dtype(code) if isinstance(code, str) and _CODE.fullmatch(code) else None
-    except (TypeError, ValueError, OverflowError):
-        dtype = None
-    if dtype is None or dtype.kind not in "biufOSU" or not dtype.itemsize:
-        what = dtype or (code if isinstance(code, str) else _said(code))
-        raise Refused(f"refused an array of {str(what)[:40]}: expected numbers")
-    return dtype
-
-
-def _check_size(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str) -> None:
-    """Refuse an array that its bytes do not make, and one of a great many places that hold nothing."""
-    needed, places = prod(shape) * dtype.itemsize, prod(n or 1 for n in shape) * dtype.itemsize
-    if len(shape) > 32 or needed != size or places > max(size, _CHUNK):
-        raise Refused(f"{verb} shape {shape} of {dtype}, holds {size:,} bytes")
 
 
 class _Global:
@@ -363,7 +359,7 @@ def _bytes(content: Any) -> bytes | bytearray:
 
 def _of_bytes(content: Any, dtype: np.dtype, shape: Any, order: Any) -> np.ndarray:
     content = _bytes(content)
-    _check_size(dtype, _shape(shape), len(content), "an array declares")
+    check_bytes(dtype, _shape(shape), len(content), "an array declares")
     if not content:
         return np.empty(shape, dtype)
     return np.frombuffer(content, dtype).reshape(shape, order=order)
@@ -520,7 +516,7 @@ _ALLOWED = (
 
 _GLOBALS: dict[str, Callable[..., Any] | None] = {
     "numpy.ndarray": None,
-    "numpy.dtype": lambda code, align=False, copy=True: _Type(_dtype(code)),
+    "numpy.dtype": lambda code, align=False, copy=True: _Type(dtype_of(code if isinstance(code, str) else _said(code))),
     "numpy.core.multiarray._reconstruct": _reconstruct,
     "numpy.core.multiarray.scalar": _scalar,
     "numpy.core.numeric._frombuffer": _from_buffer,

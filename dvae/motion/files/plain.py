@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from ... import files
+from ...npy import is_mapped
 from ..data import Clip, MotionSet
 from ..skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, text_of
-from .archive import archive, write_arrays
+from .archive import LARGEST, archive, write_arrays
 from .recording import MOST_PLACES, MOST_TEXT, Recording, check_joints
 from .settled import doubt
 
@@ -71,12 +72,16 @@ def read_archive(
     found.reverse()
 
     def clips() -> Iterator[Clip]:
+        size = 0
         while found:  # what was read is let go as soon as it is taken over
             split, name, positions, turns = found.pop()
             if joints is not None and positions.ndim == 3 and positions.shape[1] > max(joints):
                 positions, turns = positions[:, list(joints)], None
             if metres is not None and positions.dtype.kind in "fiu":
                 positions = metres * positions
+            size += 0 if is_mapped(positions) else positions.nbytes
+            if size > LARGEST:  # of a larger file that is mapped, some are to be copied
+                raise ValueError(f"it has more than {LARGEST:,} bytes of motion that is not mapped as float32")
             labelled = known.get((split, name), known.get((None, name), {}))
             yield Clip(split, name, positions, labelled, rotations=turns if skeleton.rest else None)
             del positions, turns
@@ -329,7 +334,7 @@ _Read = tuple[str, str, np.ndarray, np.ndarray | None]
 
 
 def _read_clips(path: Path) -> list[_Read]:
-    with archive(path) as members:
+    with archive(path, mapping=True) as members:
         if list(members) == ["positions_3d"]:
             return [(*clip, None) for clip in members["positions_3d"].clips()]
         clips = []

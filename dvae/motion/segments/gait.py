@@ -26,6 +26,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import torch
 
+from ...data import tensor_of
 from ...options import Amount, Positive, Range, Share, check
 from ..data import Clip, MotionSet
 from ..kinematics import forward
@@ -280,7 +281,7 @@ def _turned(clip: Clip, skeleton: Skeleton) -> torch.Tensor:
     """Of both thighs against the pelvis, (F, 2, 3, 3)."""
     found = []
     for *hips, _ in _legs(skeleton):
-        turns = to_matrix(torch.from_numpy(clip.rotations)[:, hips].double(), "quaternion")
+        turns = to_matrix(tensor_of(clip.rotations)[:, hips].double(), "quaternion")
         found.append(reduce(torch.matmul, turns.unbind(1)))
     return torch.stack(found, 1)
 

@@ -18,12 +18,13 @@ from torch import Tensor
 from ...data import Batch
 from ...inference.posteriors import Descent
 from ...inference.result import Table
+from ...npy import Refused
 from ...options import nearest
 from ...turns import alone
 from ...views import WHOLE
 from ..bodies import vertex_error
 from ..data import MotionSet
-from ..files.archive import Refused, archive
+from ..files.archive import archive
 from .completion import (
     FRAMES,
     LATENT,

@@ -1,0 +1,119 @@
+"""Training on 10^7 frames on a disk beside fewer of them in memory: `python -m benchmarks.bench mapped`; takes some
+minutes, and 2.5 GB where temporary files go.
+
+memory          most anonymous memory (Linux tells) of `dvae fit` on 10^7 frames of 48 numbers, over that on 10^5
+memory, motion  likewise of 17 joints, of an archive of 100 clips over one of as many shorter ones, which is in memory
+a step          processor time of drawing a batch and a training step, frames mapped over frames in memory: SRNN, B 32,
+                T 125
+a draw          of the batch alone
+
+All commands end with a validation, on a tenth of the frames. Files were just written, so that the system has most of
+them in its cache; where it has not, a draw waits for the disk, of which processor time says nothing.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import dvae
+from dvae import motion
+from dvae.motion.files.plain import save_clips
+from dvae.tables import Cut, PanelData
+
+from .speed import seconds
+
+FRAMES, FEW, SIZE, BATCH = 10**7, 10**5, 48, 32
+CUT = Cut(observed=25, horizon=100, split="time")
+TARGETS = {"memory": ("at most", 1.1), "memory, motion": ("at most", 1.1), "a step": ("at most", 1.05)}
+
+
+def blocks(frames: int, size: int = FEW) -> Iterator[np.ndarray]:
+    """Frames of smooth numbers, so many at a time."""
+    rng = np.random.default_rng(0)
+    for _ in range(frames // size):
+        yield np.cumsum(rng.standard_normal((size, SIZE), np.float32), 0) / 100
+
+
+def written(path: Path, frames: int) -> Path:
+    """An npy file of so many frames."""
+    with path.open("wb") as file:
+        header = {"descr": "<f4", "fortran_order": False, "shape": (frames, SIZE)}
+        np.lib.format.write_array_header_1_0(file, header)
+        for block in blocks(frames):
+            block.tofile(file)
+    return path
+
+
+def walked(path: Path, frames: int) -> Path:
+    """An archive of a hundred clips of so many frames in all, in its own folder."""
+    path.parent.mkdir()
+    [walk] = motion.simulate(1, FEW, seed=0)
+    length = frames // 100
+    place = np.arange(length) % FEW
+    clips = (
+        replace(walk, split="train", name=f"walk {n}", positions=walk.positions[place], truth={}) for n in range(100)
+    )
+    save_clips(path, clips, lambda: motion.WALKER)
+    return path
+
+
+def anonymous(process: int) -> int:
+    """Bytes that a process holds and no file does; 0 when it has ended."""
+    try:
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("RssAnon:")), 0)
+
+
+def most(data: Path, *options: str) -> int:
+    """Bytes of anonymous memory that fitting to these data takes at most."""
+    with tempfile.TemporaryDirectory() as out:
+        command = [sys.executable, "-m", "dvae.cli", "fit", "srnn", "--data", str(data), "--out", f"{out}/run"]
+        command += ["--steps", "20", "--batch-size", str(BATCH), *options]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        found = 0
+        while process.poll() is None:
+            found = max(found, anonymous(process.pid))
+            time.sleep(0.01)
+        assert process.stderr is not None
+        if process.returncode:
+            raise SystemExit(f"{data} was not fitted to: {process.stderr.read()}")
+    return found
+
+
+def steps(path: Path, frames: int = FRAMES // 10) -> dict[str, float]:
+    """Processor time of training steps and of draws, on frames that are mapped over the first of them in memory."""
+    mapped = PanelData.open(path, cut=CUT)
+    held = PanelData.of(np.array(mapped.panel.series[0].values[:frames]), cut=CUT)
+    sources = [data.windows("train") for data in (mapped, held)]
+    model = dvae.method("srnn").build(held.schema)
+    svi = dvae.SVI(model, progress=False)
+    svi.init()
+    generator = torch.Generator().manual_seed(0)
+    trained = seconds(*(lambda s=s: svi.step(s.sample(BATCH, generator)) for s in sources), repeat=50)
+    drawn = seconds(*(lambda s=s: s.sample(BATCH, generator) for s in sources), repeat=200)
+    return {"a step": trained[0] / trained[1], "a draw": drawn[0] / drawn[1]}
+
+
+def rows() -> dict[str, float]:
+    cut = ["--observed", str(CUT.observed), "--horizon", str(CUT.horizon), "--split", CUT.split]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if shutil.disk_usage(folder).free < 2.5e9:
+            raise SystemExit(f"{folder} has less than 2.5 GB of room; set TMPDIR to a folder that has more")
+        many, few = written(folder / "many.npy", FRAMES), written(folder / "few.npy", FEW)
+        found = {"memory": most(many, *cut) / most(few, *cut), **steps(many)}
+        many.unlink()
+        walks = [most(walked(folder / str(frames) / "walks.npz", frames)) for frames in (FRAMES, FEW)]
+    return found | {"memory, motion": walks[0] / walks[1]}
