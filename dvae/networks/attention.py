@@ -271,6 +271,12 @@ class AttentionNetwork(Network):
                 stream = layer(stream, cache.keys, cache.values, bias)
         return self.norm(stream[:, 0]), state
 
+    @override
+    def reach(
+        self, state: Attending, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
+    ) -> tuple[Tensor, Any]:
+        return self.step(state, t + count - 1, drawn)  # what it has not seen yet enters the cache
+
 
 class SelfAttentionNetwork(Network):
     """What `SelfAttention` describes."""
@@ -344,6 +350,10 @@ class SelfAttentionNetwork(Network):
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         return (state[t], state) if self.after is None else self.after.step(state, t, drawn)
+
+    @override
+    def reach(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        return self.step(state, t + count - 1, drawn)
 
 
 ENCODED = "encoded frame"
