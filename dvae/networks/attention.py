@@ -138,8 +138,9 @@ class Layer(nn.Module):
         """`forward` at one step: the stream (B, W) after attending to tokens (B, S, C), under a bias (B, heads, S)."""
         keys, values, offset = absorbed
         query = self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1)).transpose(0, 1)
-        shares = ((query @ keys).transpose(0, 1) @ tokens.mT + bias).softmax(-1)
-        seen = ((shares @ tokens).transpose(0, 1) @ values).transpose(0, 1).flatten(1)
+        query, tokens = (query @ keys).transpose(0, 1)[:, None], tokens[:, None]
+        seen = functional.scaled_dot_product_attention(query, tokens, tokens, attn_mask=bias[:, None], scale=1.0)
+        seen = (seen[:, 0].transpose(0, 1) @ values).transpose(0, 1).flatten(1)
         stream = stream + functional.linear(seen, self.out.weight, offset)
         update: Tensor = self.perceptron(stream)
         return stream + update
