@@ -306,7 +306,8 @@ def forecasts_of(name: str, forecaster: Forecaster, samples: int, held: Held, pa
     expected = (samples, *held.futures[part].shape)
     if forecasts.shape != expected:
         raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
-    refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
+    if not forecasts.sum().isfinite():  # what is not finite survives a sum, which takes a fortieth of the time
+        refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
     return forecasts.movedim(0, 1)
 
 

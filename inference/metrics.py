@@ -91,7 +91,7 @@ def multimodal_errors(samples: Array, truths: Array) -> Tensor:
     """
 
     def errors(x: Tensor, y: Tensor) -> Tensor:
-        apart = torch.stack([_cross(x, y), _cross(x, y, LAST)])  # (2, K, M)
+        apart = _cross(x, y)
         return torch.cat([apart.amin(1), _median(apart, 1)]).mean(-1)
 
     samples, truths = _multimodal(samples, truths)
@@ -162,7 +162,7 @@ def cumulative_motion_distance(motion: Array, real: Array) -> Tensor:
     return (frames * (motion - real[..., None]).abs()).sum(-1)
 
 
-def energy_score(samples: Array, truth: Array) -> Tensor:
+def energy_score(samples: Array, truth: Array, diversity: Array | None = None) -> Tensor:
     """Energy score of the future as one vector; proper, lower is better (Gneiting and Raftery 2007).
 
     ES = mean_k ||vec(X_k) - vec(y)|| - 1/2 mean_{j<k} ||vec(X_j) - vec(X_k)||, the unbiased ("fair")
@@ -173,15 +173,18 @@ def energy_score(samples: Array, truth: Array) -> Tensor:
     Args:
         samples: `(..., K, T, D)`.
         truth: `(..., T, D)`.
+        diversity: `(...)`, the APD of the samples where it is known and nothing is missing; None to find it.
 
     Returns:
         `(...)`, in the unit of the data.
     """
 
     def score(x: Tensor, y: Tensor) -> Tensor:
-        return _displacement(x.flatten(1), y.flatten()).mean() - _pairwise(x) / 2
+        distance = _displacement(x.flatten(1), y.flatten()).mean()
+        return distance - _pairwise(x) / 2 if diversity is None else distance
 
-    return _per_window(_observed(score), *_paired(samples, truth))
+    found = _per_window(_observed(score), *_paired(samples, truth))
+    return found if diversity is None else found - torch.as_tensor(diversity) / 2
 
 
 def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
@@ -398,11 +401,15 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
     windows = samples.reshape(-1, count, steps, size), truth.reshape(-1, steps, size)
     for x, y in zip(*(part.split(max(1, CACHED // (count * steps * size))) for part in windows), strict=True):
         seen, total = (~y.isnan()).sum(-1), y.new_zeros(len(y))  # seen by frame
-        # Pairs (i, i + lag): a slice stays in the cache, where all D * D pairs at once would not.
-        for lag in range(1, size):
-            actual = (y[..., lag:] - y[..., :-lag]).abs().pow(order)
-            forecast = (x[..., lag:] - x[..., :-lag]).abs().pow(order).mean(1)
-            total = total + torch.where(actual.isnan(), 0.0, (actual - forecast).square()).sum((-2, -1))
+        missing = bool((seen < size).any())
+        # Coordinates first, so that what is subtracted lies side by side. Pairs with one of them stay in the cache,
+        # where all D * D at once would not.
+        x, y = (part.movedim(-1, 0).contiguous() for part in (x, y))
+        for i in range(size - 1):
+            forecast = (x[i + 1 :] - x[i]).abs_().pow_(order).mean(2)
+            actual = (y[i + 1 :] - y[i]).abs_().pow_(order)
+            errors = (actual - forecast).square_()
+            total = total + (torch.where(actual.isnan(), 0.0, errors) if missing else errors).sum((0, 2))
         scores.append(total / ((seen * (seen - 1)).sum(-1) // 2).clamp(min=1))
     return torch.cat(scores).reshape(lead)
 
@@ -530,7 +537,6 @@ def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Te
     return mean, (squares - count[..., None] * mean[:, :, None] * mean[:, None]) / (count[..., None] - 1)
 
 
-LAST = slice(-1, None)
 CACHED = 2**17
 """Numbers that a processor's cache holds."""
 
@@ -576,15 +582,20 @@ def _pairwise(samples: Tensor) -> Tensor:
     return torch.pdist(rows).mean() if len(rows) > 1 else samples.new_zeros(())
 
 
-def _cross(samples: Tensor, truths: Tensor, frames: slice = slice(None)) -> Tensor:
-    """Displacement averaged over frames between each of (K, T, D) and each of (M, T, D): (K, M)."""
-    if truths.isnan().any():
-        apart = _observed(lambda x, y: _displacement(x[:, frames], y[frames]).mean(-1))
-        return torch.stack([apart(samples, truth) for truth in truths], -1)
-    samples, truths = samples[:, frames], truths[:, frames]
-    # cdist expands |x - y|^2 into products; about the centre of the truths the cancellation is harmless.
+def _cross(samples: Tensor, truths: Tensor) -> Tensor:
+    """Displacement of each of (K, T, D) from each of (M, T, D), averaged over frames, and at the last: (2, K, M)."""
+
+    def both(apart: Tensor) -> Tensor:
+        return torch.stack([apart.mean(0), apart[-1]])
+
     centre = truths.mean(0)
-    return torch.cdist((samples - centre).transpose(0, 1), (truths - centre).transpose(0, 1)).mean(0)
+    if centre.isnan().any():
+        each = _observed(lambda x, y: both(_displacement(x, y).T))
+        return torch.stack([each(samples, truth) for truth in truths], -1)
+    # |x - y|^2 as products, as cdist has it but for its copies; about the centre the cancellation is harmless.
+    x, y = ((frames - centre).transpose(0, 1) for frames in (samples, truths))
+    squares = x.square().sum(-1)[:, :, None] + y.square().sum(-1)[:, None]
+    return both(squares.baddbmm_(x, y.mT, alpha=-2).clamp_(min=0).sqrt_())
 
 
 def _median(errors: Tensor, dim: int = 0) -> Tensor:

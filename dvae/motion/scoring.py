@@ -40,7 +40,7 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import torch
@@ -58,6 +58,8 @@ from .skeleton import SHORTEST, Skeleton
 
 SEAM = 3
 """Observed frames of which the jerk of a future is, too, so that it has that of the seam."""
+TOGETHER = 64
+"""Windows, one after the other, whose multimodal ground truths are compared together: they have many in common."""
 
 
 def scores(
@@ -103,13 +105,8 @@ def scores(
     return [*found, *(accuracy for accuracy, _ in judged if accuracy), *(distance for _, distance in judged)]
 
 
-def _diversity(forecasts: Tensor, *_: Any) -> Tensor:
-    return metrics.average_pairwise_distance(forecasts)
-
-
 _ADE = Measure("ADE", paired(metrics.average_displacement_error), "m", headline=True)
 _FDE = Measure("FDE", paired(metrics.final_displacement_error), "m", headline=True)
-_BEST = (Measure("APD", _diversity, "m", "higher"), _ADE, _FDE)
 _MEDIAN = (
     Measure("ADEm", paired(metrics.median_average_displacement_error), "m"),
     Measure("FDEm", paired(metrics.median_final_displacement_error), "m"),
@@ -133,11 +130,20 @@ def displacements(windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = la
 
         return replace(measure, function=function, unit="m")
 
-    several = [] if isinstance(windows, Exchanged) else _multimodal(windows, body)
-    return list(map(of_body, [*_BEST, *several[:2], *_MEDIAN, *several[2:], ENERGY, VARIOGRAM]))
+    diversity = lru_cache(maxsize=1)(metrics.average_pairwise_distance)  # for all scores of a batch
+
+    def energy(forecasts: Tensor, truth: Tensor, *_: Any) -> Tensor:
+        return metrics.energy_score(forecasts, truth, None if truth.isnan().any() else diversity(forecasts))
+
+    apd = Measure("APD", lambda forecasts, *_: diversity(forecasts), "m", "higher")
+    several = [] if isinstance(windows, Exchanged) else _multimodal(windows, body, diversity)
+    proper = [replace(ENERGY, function=energy), VARIOGRAM]
+    return list(map(of_body, [apd, _ADE, _FDE, *several[:2], *_MEDIAN, *several[2:], *proper]))
 
 
-def _multimodal(windows: HeldOutWindows, body: Callable[[Tensor], Tensor]) -> list[Measure]:
+def _multimodal(
+    windows: HeldOutWindows, body: Callable[[Tensor], Tensor], diversity: Callable[[Tensor], Tensor]
+) -> list[Measure]:
     """Errors averaged over the futures of all windows in almost the same pose, and the APDE."""
     truths = multimodal_truths(windows)
     futures = body(gapped(windows.all())[:, windows.protocol.observed :])
@@ -153,16 +159,20 @@ def _multimodal(windows: HeldOutWindows, body: Callable[[Tensor], Tensor]) -> li
     def error(place: int) -> Callable[..., Tensor]:
         return lambda forecasts, truth, past, index: errors(forecasts, index)[:, place]
 
+    @cache
+    def real() -> Tensor:
+        together = range(0, len(truths), TOGETHER)
+        return torch.cat([_diversities(futures, truths[start : start + TOGETHER]) for start in together])
+
     def diversity_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        real = _diversities(futures, [truths[n] for n in index.tolist()])
-        return (metrics.average_pairwise_distance(forecasts) - real).abs()
+        return (diversity(forecasts) - real()[index]).abs()
 
     found = [
         Measure(name, error(place), headline=name in ("MMADE", "MMFDE"), **shared)
         for place, name in enumerate(_MULTIMODAL)
     ]
-    diversity = Measure("APDE", diversity_error, pool=means_of_those_that_count, **shared)
-    return [*found, *([diversity] if lonely < len(truths) else [])]
+    apde = Measure("APDE", diversity_error, pool=means_of_those_that_count, **shared)
+    return [*found, *([apde] if lonely < len(truths) else [])]
 
 
 def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
@@ -179,9 +189,8 @@ def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
     rows = futures[among].flatten(1).double()
     rows = rows - rows.mean(0)  # cdist takes products, in which distances that are small beside the rows blur
     apart = torch.cdist(rows, rows).fill_diagonal_(0.0)
-    places = [torch.searchsorted(among, held) for held in sets]
-    sums = torch.stack([apart[held[:, None], held].sum() for held in places])
-    counts = torch.tensor([len(held) for held in sets])
+    chosen = torch.stack([torch.isin(among, held) for held in sets]).to(apart)
+    sums, counts = (chosen @ apart * chosen).sum(1), chosen.sum(1)
     return (sums / (counts * (counts - 1))).to(futures)
 
 
@@ -220,53 +229,75 @@ def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Me
     """Errors of bone lengths, stretch and jitter of limbs, and errors of the angles between them."""
     skeleton = windows.skeleton
 
-    @lru_cache(maxsize=2)  # of forecasts and futures, for all scores of a batch
-    def lengths(x: Tensor) -> Tensor:
-        found: Tensor = skeleton.bone_lengths(windows.positions(x))[..., bones]
-        return found
-
-    def of_errors(score: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
-        """The mean over limbs and futures of a score (B, K, limbs) of relative errors (B, K, T, limbs) of lengths."""
-
-        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-            return mean_of_known(
-                score(lengths(forecasts) / mean_of_known(lengths(truth), 1)[:, None, None] - 1), (1, 2)
-            )
-
-        return function
-
-    scores: dict[str, Callable[[Tensor], Tensor]] = {
-        "limb stretch": lambda errors: errors.abs().mean(2),
-        "limb stretch RMS": lambda errors: errors.square().mean(2).sqrt(),
-    }
-    if windows.protocol.predicted > 1:
-        scores["limb jitter"] = lambda errors: errors.diff(dim=2).abs().mean(2)
-        scores["limb jitter RMS"] = lambda errors: errors.diff(dim=2).square().mean(2).sqrt()
-
-    def bone_length_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        reference = mean_of_known(skeleton.bone_lengths(windows.positions(gapped(past)))[..., bones], 1)
-        return mean_of_known((lengths(forecasts) / reference[:, None, None] - 1).abs(), (1, 2, 3))
-
-    shared: Any = {"partial": windows.missing, "note": note}
-    functions = {"bone-length error": bone_length_error, **{name: of_errors(score) for name, score in scores.items()}}
-    found = [Measure(name, function, "relative", **shared) for name, function in functions.items()]
-
     edges = [skeleton.edges[bone] for bone in bones]
     starts, ends = (list(joints) for joints in zip(*edges, strict=True))
     pairs = [(ends.index(parent), ends.index(child)) for parent, child in edges if parent in ends]
     first, second = ([pair[side] for pair in pairs] for side in (0, 1))
 
+    def limbs(x: Tensor) -> Tensor:
+        """(3, limbs, ..., T) of frames (..., T, D)."""
+        joints = _coordinates(windows.positions(x).flatten(-2))
+        return joints[:, ends] - joints[:, starts]
+
+    @lru_cache(maxsize=2)  # of forecasts and futures, for all scores of a batch
+    def lengths(x: Tensor) -> Tensor:
+        """(B, limbs, ..., T)."""
+        return torch.stack([_norm(limbs(window)) for window in x])
+
+    def of_errors(score: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
+        """The mean over limbs and futures of a score (B, limbs, K) of relative errors (B, limbs, K, T) of lengths."""
+
+        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+            true = mean_of_known(lengths(truth), -1)[..., None, None]
+            return mean_of_known(score(lengths(forecasts) / true - 1), (1, 2))
+
+        return function
+
+    scores: dict[str, Callable[[Tensor], Tensor]] = {
+        "limb stretch": lambda errors: errors.abs().mean(-1),
+        "limb stretch RMS": lambda errors: errors.square().mean(-1).sqrt(),
+    }
+    if windows.protocol.predicted > 1:
+        scores["limb jitter"] = lambda errors: errors.diff(dim=-1).abs().mean(-1)
+        scores["limb jitter RMS"] = lambda errors: errors.diff(dim=-1).square().mean(-1).sqrt()
+
+    def bone_length_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        reference = mean_of_known(lengths(gapped(past)), -1)
+        return mean_of_known((lengths(forecasts) / reference[..., None, None] - 1).abs(), (1, 2, 3))
+
+    shared: Any = {"partial": windows.missing, "note": note}
+    functions = {"bone-length error": bone_length_error, **{name: of_errors(score) for name, score in scores.items()}}
+    found = [Measure(name, function, "relative", **shared) for name, function in functions.items()]
+
     def angles(x: Tensor) -> Tensor:
-        joints = windows.positions(x)
-        limbs = joints[..., ends, :] - joints[..., starts, :]  # `skeleton.limbs`, but for what is NaN
-        u, v = limbs[..., first, :], limbs[..., second, :]
-        return torch.atan2(torch.linalg.cross(u, v).norm(dim=-1), (u * v).sum(-1)).rad2deg()
+        """(pairs, ..., T)."""
+        vectors = limbs(x)
+        u, v = vectors[:, first], vectors[:, second]
+        return torch.atan2(_norm(_cross(u, v)), (u * v).sum(0)).rad2deg()
 
     def angle_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        return mean_of_known((angles(forecasts) - angles(truth)[:, None]).abs(), (2, 3)).amin(1)
+        errors = ((angles(x) - angles(y)[:, None]).abs() for x, y in zip(forecasts, truth, strict=True))
+        return torch.stack([mean_of_known(each, (0, 2)).amin() for each in errors])
 
     angular = Measure("limb-angle error", angle_error, "degrees", **shared)
     return [*found, *([angular] if pairs else [])]
+
+
+def _coordinates(x: Tensor) -> Tensor:
+    """Joints (..., T, D) with their coordinates first, (3, D / 3, ..., T): numbers that are alike lie side by side."""
+    return x.unflatten(-1, (-1, 3)).movedim((-1, -2), (0, 1)).contiguous()
+
+
+def _norm(vectors: Tensor) -> Tensor:
+    """(...) of vectors (3, ...): in a third of the time of torch's norm over a first dimension, or less."""
+    x, y, z = vectors
+    return (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
+
+
+def _cross(first: Tensor, second: Tensor) -> Tensor:
+    """Cross products of vectors (3, ...)."""
+    (a, b, c), (x, y, z) = first, second
+    return torch.stack([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
 def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
@@ -281,11 +312,12 @@ def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
     body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
 
     def moved(x: Tensor) -> Tensor:
-        """What joints move by, (..., T - 1), of frames (..., T, D)."""
-        return mean_of_known(body(x).unflatten(-1, (-1, 3)).diff(dim=-3).norm(dim=-1), -1).double()
+        """What joints move by, (B, ..., T - 1), of frames (B, ..., T, D)."""
+        steps = (_norm(_coordinates(window).diff(dim=-1)) for window in body(x))
+        return torch.stack([mean_of_known(each, 0) for each in steps]).double()
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        return mean_of_known(moved(forecasts.masked_fill(truth[:, None].isnan(), torch.nan)), 1)
+        return mean_of_known(moved(_where_true(forecasts, truth)), 1)
 
     real = mean_of_known(moved(gapped(windows.all())[:, windows.protocol.observed :]), -1)
     what = f"of the windows of each {label}, {len(names)} in all" if label else "of all windows as one class"
@@ -306,17 +338,23 @@ def _jerk(windows: Windows | Exchanged) -> Measure:
     start = max(windows.protocol.observed - SEAM, 0)
 
     def jerk(x: Tensor) -> Tensor:
-        """(...) of frames (..., T, D)."""
-        change: Tensor = body(x).unflatten(-1, (-1, 3)).diff(n=3, dim=-3) * windows.protocol.fps**3
-        return mean_of_known(change.norm(dim=-1), (-2, -1))
+        """(B, ...) of frames (B, ..., T, D)."""
+        changes = (_norm(_coordinates(window).diff(n=3, dim=-1)) for window in body(x))
+        return torch.stack([mean_of_known(each, (0, -1)) for each in changes]) * windows.protocol.fps**3
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         seen = gapped(past)[:, start:, None].expand(-1, -1, forecasts.shape[1], -1).transpose(1, 2)
-        return mean_of_known(jerk(torch.cat([seen, forecasts.masked_fill(truth[:, None].isnan(), torch.nan)], 2)), 1)
+        return mean_of_known(jerk(torch.cat([seen, _where_true(forecasts, truth)], 2)), 1)
 
     real = mean_of_known(jerk(gapped(windows.all())[:, start:]), 0)
     note = f"jerk: {real:.1f} m/s³ of real motion"
     return Measure("jerk", function, "m/s³", "", partial=windows.missing, note=note)
+
+
+def _where_true(forecasts: Tensor, truth: Tensor) -> Tensor:
+    """Forecasts (B, K, T, D), NaN where the truth (B, T, D) was not observed."""
+    missing = truth.isnan()
+    return forecasts.masked_fill(missing[:, None], torch.nan) if missing.any() else forecasts
 
 
 def _pose_nll(prior: Any, observed: int) -> Measure:

@@ -111,11 +111,37 @@ class Layer(nn.Module):
 
     def forward(self, stream: Tensor, keys: Tensor, values: Tensor, bias: Tensor) -> Tensor:
         """The stream (B, T, W) after attending under the additive bias, broadcastable to (B, heads, T, S)."""
-        if stream.shape[1] == 1:  # a step of a loop, for which the fused kernel takes several times as long
+        if stream.shape[1] == 1:  # a single query, for which the fused kernel takes several times as long
             seen = self.weights(stream, keys, bias) @ values
         else:
             seen = functional.scaled_dot_product_attention(self.queries(stream), keys, values, attn_mask=bias)
         stream = stream + self.out(seen.transpose(1, 2).flatten(2))
+        update: Tensor = self.perceptron(stream)
+        return stream + update
+
+    def absorbed(self, columns: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """For `step`: from queries to C numbers (heads, W / heads, C), from these to values, and the bias of `out`.
+
+        Keys and values are linear in tokens, so that a query can be put to these themselves: a loop keeps them alone.
+        What a bias adds to all keys is the same for all, and the shares of the values add up to one.
+
+        Args:
+            columns: (C, W), tokens of C numbers as tokens of W; None where they have so many.
+        """
+        keys, values = self.keys_values.weight.unflatten(0, (2 * self.heads, -1)).chunk(2)
+        if columns is not None:
+            keys, values = keys @ columns.mT, values @ columns.mT
+        bias = functional.linear(self.keys_values.bias[self.out.in_features :], self.out.weight, self.out.bias)
+        return keys / math.sqrt(keys.shape[1]), values.mT, bias
+
+    def step(self, stream: Tensor, tokens: Tensor, bias: Tensor, absorbed: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+        """`forward` at one step: the stream (B, W) after attending to tokens (B, S, C), under a bias (B, heads, S)."""
+        keys, values, offset = absorbed
+        query = self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1)).transpose(0, 1)
+        query, tokens = (query @ keys).transpose(0, 1)[:, None], tokens[:, None]
+        seen = functional.scaled_dot_product_attention(query, tokens, tokens, attn_mask=bias[:, None], scale=1.0)
+        seen = (seen[:, 0].transpose(0, 1) @ values).transpose(0, 1).flatten(1)
+        stream = stream + functional.linear(seen, self.out.weight, offset)
         update: Tensor = self.perceptron(stream)
         return stream + update
 
@@ -148,6 +174,7 @@ class AttentionNetwork(Network):
         if self.ranged:
             self.start_token = nn.Parameter(torch.randn(spec.width) / math.sqrt(spec.width))
         self.embed = nn.ModuleDict({p.name: nn.Linear(p.size, spec.width) for p in self.ranged})
+        self.narrow = len(self.ranged) == 1 and self.ranged[0].size + 2 < spec.width
         sizes = [parent.size for parent, _ in self.points]
         self.point = Join(sizes, (spec.width, spec.width), spec.activation) if sizes else None
         self.origin = nn.Parameter(torch.randn(spec.width) / math.sqrt(spec.width))
@@ -213,6 +240,23 @@ class AttentionNetwork(Network):
         bias = functional.pad(self.biases(parents, length, lengths), (1, 0))
         return torch.cat([self.start_token.expand(batch, 1, -1), *tokens], dim=1), bias
 
+    def kept(self, name: str, values: Tensor) -> Tensor:
+        """What a loop keeps of a parent's values (..., D): tokens (..., W), or where these are wider what makes them.
+
+        That is (..., D + 2), the values and a 1 for the bias of their embedding; the last one is of the start token.
+        """
+        if self.narrow:
+            return torch.cat([values, values.new_tensor((1.0, 0.0)).expand(*values.shape[:-1], 2)], -1)
+        tokens: Tensor = self.embed[name](values)
+        return tokens
+
+    def columns(self) -> Tensor | None:
+        """(D + 2, W), to make tokens of what is kept; None where that is tokens."""
+        if not self.narrow:
+            return None
+        embed = self.embed[self.ranged[0].name]
+        return torch.cat([embed.weight.mT, embed.bias[None], self.start_token[None]])
+
     def biases(self, parents: Sequence[Input], length: int, lengths: Tensor | None) -> Tensor:
         """(B or 1, heads or 1, T or 1, T * parents), of every step to the parents' valid ones."""
         none = self.slopes.new_zeros(len(self.slopes) if self.local else 1, length if self.local else 1, 0)
@@ -228,10 +272,12 @@ class AttentionNetwork(Network):
         queries = self.point.hoist(known, batch, length) if self.point is not None else None
         fixed = [p for p in self.ranged if p.name in given]
         live = [p for p in self.ranged if p.name not in given]
-        tokens = bias = self.origin.new_zeros(1, 1, 1)
+        columns, tokens, bias = self.columns(), self.origin.new_zeros(1, 1, 1), self.origin.new_zeros(1, 1, 1)
         if self.ranged:
-            tokens, bias = self.tokens(fixed, given, batch, length, lengths)
-            bias = torch.cat([bias, self.biases(live, length, lengths)], dim=-1)
+            first = self.start_token if columns is None else functional.pad(columns.new_ones(1), (len(columns) - 1, 0))
+            kept = [self.kept(parent.name, given[parent.name]) for parent in fixed]
+            tokens = torch.cat([first.expand(batch, 1, -1), *kept], dim=1)
+            bias = functional.pad(self.biases([*fixed, *live], length, lengths), (1, 0))
         return Attending(
             queries=queries,
             points=[entry for i, entry in enumerate(self.points) if i not in known],
@@ -243,7 +289,8 @@ class AttentionNetwork(Network):
             masks=np.concatenate(
                 [np.zeros((length, 0), bool), *(p.relation.mask(length) for p in live if p.relation)], 1
             ),
-            caches=[Cache(layer.project(tokens), room=length * len(live)) for layer in self.layers],
+            cache=Cache(tokens, room=length * len(live)),
+            absorbed=[layer.absorbed(columns) for layer in self.layers],
             extracted=self.extractors.start(length),
             lengths=lengths,
         )
@@ -255,21 +302,24 @@ class AttentionNetwork(Network):
         parts = [at(drawn[p.name], t + lag, stream, p.size) for p, lag in state.points if lag is not None]
         if state.queries is not None and self.point is not None:
             stream = stream + self.point.add(state.queries, t, parts)
-        stream = stream[:, None]
         if self.layers:
             fresh = []
             for token in state.fresh(t):
                 i, s = divmod(token, state.length)
                 name = state.live[i].name
-                fresh.append(self.embed[name](drawn[name][s]))
+                fresh.append(self.kept(name, drawn[name][s]))
             if fresh:
-                tokens = torch.stack(fresh, dim=1)
-                for layer, cache in zip(self.layers, state.caches, strict=True):
-                    cache.append(*layer.project(tokens))
+                state.cache.append(torch.stack(fresh, dim=1))
             bias = state.row(t)
-            for layer, cache in zip(self.layers, state.caches, strict=True):
-                stream = layer(stream, cache.keys, cache.values, bias)
-        return self.norm(stream[:, 0]), state
+            for layer, absorbed in zip(self.layers, state.absorbed, strict=True):
+                stream = layer.step(stream, state.cache.tokens, bias, absorbed)
+        return self.norm(stream), state
+
+    @override
+    def reach(
+        self, state: Attending, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
+    ) -> tuple[Tensor, Any]:
+        return self.step(state, t + count - 1, drawn)  # what it has not seen yet enters the cache
 
 
 class SelfAttentionNetwork(Network):
@@ -345,6 +395,10 @@ class SelfAttentionNetwork(Network):
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         return (state[t], state) if self.after is None else self.after.step(state, t, drawn)
 
+    @override
+    def reach(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        return self.step(state, t + count - 1, drawn)
+
 
 ENCODED = "encoded frame"
 """How an encoder's output is called among the parents of what comes after it."""
@@ -363,35 +417,31 @@ def _closed(parent: Input) -> bool:
 
 
 class Cache:
-    """Keys and values seen so far, (B, heads, S, W / heads). Written in place where no gradient is wanted."""
+    """Tokens seen so far, (B, S, C), written in place where no gradient is wanted."""
 
-    def __init__(self, tokens: tuple[Tensor, Tensor], room: int):
-        keys, values = tokens
-        self.size = keys.shape[2]
-        self.keys, self.values = keys, values
-        self.buffers: tuple[Tensor, ...] | None = None
+    def __init__(self, tokens: Tensor, room: int):
+        self.tokens = tokens
+        self.buffer: Tensor | None = None
         if not torch.is_grad_enabled() and room:
-            self.buffers = tuple(functional.pad(old, (0, 0, 0, room)) for old in (keys, values))
+            self.buffer = functional.pad(tokens, (0, 0, 0, room))
 
-    def append(self, keys: Tensor, values: Tensor) -> None:
-        """Add the keys and values of new tokens."""
-        if self.buffers is None:
-            self.keys, self.values = torch.cat([self.keys, keys], 2), torch.cat([self.values, values], 2)
+    def append(self, tokens: Tensor) -> None:
+        """Add new tokens."""
+        if self.buffer is None:
+            self.tokens = torch.cat([self.tokens, tokens], 1)
             return
-        end = self.size + keys.shape[2]
-        for buffer, new in zip(self.buffers, (keys, values), strict=True):
-            buffer[:, :, self.size : end] = new
-        self.size = end
-        self.keys, self.values = (buffer[:, :, :end] for buffer in self.buffers)
+        end = self.tokens.shape[1] + tokens.shape[1]
+        self.buffer[:, self.tokens.shape[1] : end] = tokens
+        self.tokens = self.buffer[:, :end]
 
     def select(self, rows: Tensor) -> Cache:
         """Its rows."""
         chosen = copy.copy(self)
-        if self.buffers is None:
-            chosen.keys, chosen.values = (old.index_select(0, rows) for old in (self.keys, self.values))
+        if self.buffer is None:
+            chosen.tokens = self.tokens.index_select(0, rows)
         else:
-            chosen.buffers = tuple(buffer.index_select(0, rows) for buffer in self.buffers)
-            chosen.keys, chosen.values = (buffer[:, :, : self.size] for buffer in chosen.buffers)
+            chosen.buffer = self.buffer.index_select(0, rows)
+            chosen.tokens = chosen.buffer[:, : self.tokens.shape[1]]
         return chosen
 
 
@@ -409,7 +459,9 @@ class Attending:
     length: int
     masks: np.ndarray
     """(T, parents * T): the live tokens that a step sees."""
-    caches: list[Cache]
+    cache: Cache
+    absorbed: list[tuple[Tensor, Tensor, Tensor]]
+    """By layer, see `Layer.absorbed`; the same for all rows."""
     extracted: dict[str, tuple[Any, Rows]]
     lengths: Tensor | None
     seen: list[int] = field(default_factory=list)
@@ -420,7 +472,7 @@ class Attending:
 
     def select(self, rows: Tensor) -> Attending:
         """Its rows."""
-        moved = {name: select(getattr(self, name), rows) for name in ("queries", "caches", "extracted", "lengths")}
+        moved = {name: select(getattr(self, name), rows) for name in ("queries", "cache", "extracted", "lengths")}
         masks, seen = self.masks.copy(), list(self.seen)
         rows = rows if self.rows is None else self.rows.index_select(0, rows)
         return replace(self, **moved, batch=len(rows), masks=masks, seen=seen, rows=rows)
@@ -435,8 +487,8 @@ class Attending:
         return found
 
     def row(self, t: int) -> Tensor:
-        """The bias of step t to every token in the cache, broadcastable to (B, heads, 1, S)."""
-        row = self.bias[:, :, t : t + 1]
+        """The bias of step t to every token in the cache, broadcastable to (B, heads, S)."""
+        row = self.bias[:, :, t]
         if self.rows is not None and row.shape[0] > 1:
             row = row.index_select(0, self.rows)
         if self.in_order:

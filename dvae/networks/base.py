@@ -22,7 +22,7 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..relations import Relation
-from .rows import select
+from .rows import Rows, select
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "gelu": nn.GELU, "elu": nn.ELU}
 
@@ -154,6 +154,14 @@ class Network(nn.Module):
             features.append(found)
         return torch.stack(features, dim=1), state
 
+    def reach(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        """Features (B, H) at the last of the N steps of a `stretch`, where nobody asks for those before, and the state.
+
+        A network that need not find these does without.
+        """
+        features, state = self.stretch(state, t, count, drawn)
+        return features[:, -1], state
+
     def refuse_ragged(self, lengths: Tensor | None) -> None:
         """Refuses padding, for a network in which every step sees all of a sequence."""
         if lengths is not None:
@@ -252,6 +260,34 @@ def once_valid(module: nn.Module, values: Tensor, lengths: Tensor | None) -> Ten
         return found * valid_steps(lengths, found.shape[1])[..., None]
 
     return once(module, [values, lengths], compute)
+
+
+def follow(
+    rows: Rows,
+    drawn: Sequence[Any],
+    module: nn.Module,
+    lengths: Tensor | None,
+    change: Callable[[Tensor], Tensor] | None = None,
+) -> Rows:
+    """What a module makes of the draws (B, D) of a loop so far, 0 at padding; once for all that read the same draws.
+
+    Args:
+        rows: of the steps before, to which those of the others are added.
+        drawn: by step; None where there is none yet.
+        module, lengths: see `once_valid`.
+        change: the module as the loop has it, with its work done that is the same at all steps.
+    """
+    fresh = [s for s in range(len(drawn)) if rows.values[s] is None and drawn[s] is not None]
+    values = [drawn[s] for s in fresh]
+
+    def compute() -> Sequence[Tensor]:
+        if len(values) == 1:
+            return [(change or module)(values[0])]
+        return (change or module)(torch.stack(values, dim=1)).unbind(1)  # type: ignore[no-any-return]
+
+    for s, made in zip(fresh, once(module, [lengths, *values], compute) if fresh else [], strict=True):
+        rows[s] = made if lengths is None else made * (s < lengths)[:, None]
+    return rows
 
 
 def reverse(values: Tensor, lengths: Tensor | None) -> Tensor:

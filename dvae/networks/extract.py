@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from torch import Tensor, nn
 
-from .base import Input, once_valid, perceptron
+from .base import Input, follow, once_valid, perceptron
 from .rows import Rows
 
 
@@ -60,7 +60,8 @@ class Extractors(nn.ModuleDict):
         self, kept: Mapping[str, tuple[Any, Rows]], drawn: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
     ) -> dict[str, Sequence[Tensor]]:
         """The draws of a loop so far as the network reads them; each passes through its extractor once."""
-        return {**drawn, **{n: kept[n][1].follow(drawn[n], kept[n][0], lengths) for n in self.keys() & drawn}}
+        found = {n: follow(kept[n][1], drawn[n], self[n], lengths, kept[n][0]) for n in self.keys() & drawn}
+        return {**drawn, **found}
 
 
 def share(name: str, *networks: Any) -> None:

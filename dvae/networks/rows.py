@@ -7,11 +7,10 @@ is read and not before, so that a run costs the same per step however long it is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-import torch
 from torch import Tensor
 
 
@@ -35,17 +34,6 @@ class Rows(Sequence[Any]):
         chosen.moves = [*self.moves, rows]
         chosen.origin = rows if self.origin is None else self.origin.index_select(0, rows)
         return chosen
-
-    def follow(self, drawn: Sequence[Any], change: Callable[[Tensor], Tensor], lengths: Tensor | None) -> Rows:
-        """What `change` makes of the draws of a loop so far, of each once; 0 at padding."""
-        fresh = [s for s in range(len(drawn)) if self.values[s] is None and drawn[s] is not None]
-        if len(fresh) > 1:
-            made: Sequence[Tensor] = change(torch.stack([drawn[s] for s in fresh], dim=1)).unbind(1)
-        else:
-            made = [change(drawn[s]) for s in fresh]
-        for s, changed in zip(fresh, made, strict=True):
-            self[s] = changed if lengths is None else changed * (s < lengths)[:, None]
-        return self
 
     def __getitem__(self, t: Any) -> Any:
         value, since = self.values[t], self.written[t]

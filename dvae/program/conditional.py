@@ -19,6 +19,7 @@ from ..networks.base import (
     Network,
     NetworkSpec,
     at,
+    follow,
     indicator,
     once,
     once_valid,
@@ -265,12 +266,17 @@ class Conditional(nn.Module):
             return state
         return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)
 
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Parameters, Any]:
-        """The law's parameters (B, D) at step t, and the next state."""
+    def step(
+        self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1
+    ) -> tuple[Parameters, Any]:
+        """The law's parameters (B, D) at step t, the last of so many that are taken at once, and the next state."""
         if self.network is None:
             return tuple(p[t] for p in state), state
         inner, read = self._without_unit(state, drawn)
-        features, inner = self.network.step(inner, t, read)
+        if count > 1:
+            features, inner = self.network.reach(inner, t + 1 - count, count, read)
+        else:
+            features, inner = self.network.step(inner, t, read)
         previous = None
         if self.law.residual:
             previous = at((drawn if self._made_in is None else read)[self.factor.child], t - 1, features, self.size)
@@ -292,7 +298,7 @@ class Conditional(nn.Module):
         """The state of the network, and the draws as it reads them."""
         if not isinstance(state, Standardised):
             return state, drawn
-        found = {n: rows.follow(drawn[n], self.units[n], state.lengths) for n, rows in state.kept.items()}
+        found = {n: follow(rows, drawn[n], self.units[n], state.lengths) for n, rows in state.kept.items()}
         return state.network, {**drawn, **found}
 
     @staticmethod

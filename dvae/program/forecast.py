@@ -52,18 +52,21 @@ def forecast(
     seen = {name: value[:, :past] if name in local else value for name, value in data.items()}
     if past:
         model._rollout(model.inference, model.encoder, seen, None, 1)  # refuses what cannot be read, of all sequences
+    # what the guide makes of the past alone, once for all samples
+    forked = model.latents[:1] if not redrawn and model.latents[:1] == model.prior_order[:1] else ()
 
     def futures(part: slice, count: int) -> dict[str, Tensor]:
-        known, held, observed = (repeat(rows(each, part), count) for each in (data, fixed, seen))
+        known, held = (repeat(rows(each, part), count) for each in (data, fixed))
+        observed = rows(seen, part) if forked else repeat(rows(seen, part), count)
         for name in redrawn:
             law, some = model.shared[name].distribution(model.sizes[name]), len(known[name]) // count
             known[name] = observed[name] = law.sample((count,)).to(known[name]).repeat_interleave(some, 0)
         latents = {name: value for name, value in held.items() if name in model.latents}
         if past:
-            latents = poutine.condition(model.guide, latents)(observed)
+            latents = poutine.condition(model.guide, latents)(observed, draws=dict.fromkeys(forked, count))
         statics = {name: value for name, value in latents.items() if not model.generative.local(name)}
         if past and model.summed:
-            latents = latents | _given(model, observed, latents).summation.draw()
+            latents |= _given(model, repeat(rows(seen, part), count), latents).summation.draw()
         program = poutine.condition(model.model, data=statics) if statics else model.model
         prefix = {name: value for name, value in latents.items() if name not in statics}
         known |= {name: value for name, value in held.items() if name in model.observed}

@@ -379,9 +379,14 @@ class DynamicalVAE(nn.Module):
         """`model`, so that the module itself is the Pyro model of `elbo(model, model.guide)`."""
         return self.model(batch, **options)
 
+    @property
+    def prior_order(self) -> tuple[str, ...]:
+        """The latents in the order in which the model draws them; `latents` is that of the guide."""
+        return tuple(name for block in self.generative.blocks for name in block.names if name in self.latents)
+
     def _check_draws(self, draws: Mapping[str, int]) -> None:
-        ours = [name for block in self.generative.blocks for name in block.names if name in self.latents]
-        rows = [dict(zip(o, accumulate((draws.get(n, 1) for n in o), mul), strict=True)) for o in (ours, self.latents)]
+        ours, orders = self.prior_order, (self.prior_order, self.latents)
+        rows = [dict(zip(o, accumulate((draws.get(n, 1) for n in o), mul), strict=True)) for o in orders]
         if set(draws) - set(self.latents) or rows[0] != rows[1]:
             raise ValueError(
                 f"draws are of latents, in one order for model and guide; got {', '.join(draws)}, where the model "

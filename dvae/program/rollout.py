@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from ..laws.base import Parameters
-from ..networks.base import indicator, presence, valid_steps
+from ..networks.base import computing_once, indicator, presence, valid_steps
 from ..notation import Block, Factorization
 from .conditional import Conditional, like
 from .groups import Grouped, Groups
@@ -428,6 +428,7 @@ class Rollout:
                 self._evaluated[name] = (drawn[name], parameters)
         return drawn
 
+    @computing_once()
     def _loop(
         self,
         block: Block,
@@ -450,20 +451,22 @@ class Rollout:
         evaluated: dict[str, list[Parameters]] = {name: [] for name in live}
         steps = {name: values.unbind(1) for name, values in noise.items()}
         known = self._told_whole(live, hidden, told)
-        for first, count in _runs(known, block.direction, ahead=len(live) == 1):
+        # parameters by which something is scored: not a future, nor what is read in place of the data
+        kept = not self.prefix if hidden is None else self._fed_with_gradient
+        for first, count in _runs(known, block.direction):
             t = first + count - 1
             end = t + known[t]
             for name in live if end > first else ():
                 drawn[name][first:end] = told[name][:, first:end].unbind(1)
             for name in live:
                 conditional = self.conditionals[name]
-                if count > 1:
+                if count > 1 and kept:
                     at_all, states[name] = conditional.stretch(states[name], first, count, drawn)
-                    evaluated[name].append(at_all)
                     parameters = tuple(p[:, -1] for p in at_all)
                 else:
-                    parameters, states[name] = conditional.step(states[name], t, drawn)
-                    evaluated[name].append(tuple(p[:, None] for p in parameters))
+                    parameters, states[name] = conditional.step(states[name], t, drawn, count)
+                    at_all = tuple(p[:, None] for p in parameters)
+                evaluated[name] += [at_all] if kept else []
                 if known[t]:
                     continue
                 law = conditional.law
@@ -476,7 +479,7 @@ class Rollout:
                     value = value * self._valid[:, t]  # type: ignore[index]
                 drawn[name][t] = value
         values = {name: self._hide(torch.stack(drawn[name], dim=1)) for name in live}
-        if hidden is None or self._fed_with_gradient:  # by which the data are scored too
+        if kept:
             for name in live:
                 in_time = evaluated[name] if block.direction >= 0 else evaluated[name][::-1]
                 stacked = tuple(torch.cat(p, dim=1) for p in zip(*in_time, strict=True))
@@ -627,11 +630,11 @@ class Marginal(Sequence):
         return self.by_step(value).flatten(1).sum(-1) if len(self._event_shape) == 2 else self.by_step(value)
 
 
-def _runs(known: list[bool], direction: int, ahead: bool) -> Iterator[tuple[int, int]]:
+def _runs(known: list[bool], direction: int) -> Iterator[tuple[int, int]]:
     """First step and number of steps of what a loop evaluates at once.
 
-    Forward in time these are runs of steps at which all values are known, and with `ahead` the step after such a run,
-    whose parameters read no other values than these.
+    Forward in time these are runs of steps at which all values are known, and the step after such a run, whose
+    parameters read no other values than these, and what was drawn at that step before.
     """
     if direction < 0:
         yield from ((t, 1) for t in reversed(range(len(known))))
@@ -639,7 +642,7 @@ def _runs(known: list[bool], direction: int, ahead: bool) -> Iterator[tuple[int,
     t = 0
     while t < len(known):
         end = next((s for s in range(t, len(known)) if not known[s]), len(known))
-        count = max(min(end + ahead, len(known)) - t, 1)
+        count = max(min(end + 1, len(known)) - t, 1)
         yield t, count
         t += count
 
