@@ -18,6 +18,7 @@ from torch import nn
 
 from ..data import Fingerprinted, Sequences, Source, sequences
 from ..turns import alone
+from . import processes
 from .checkpoints import CONFIG, CheckpointError, Run
 from .objectives import Objective
 from .result import as_they_are
@@ -213,10 +214,10 @@ def fit(
         state, first = svi.init(), svi.fabric.is_global_zero
         if run is not None and first:
             stack.enter_context(run.locked())
-        svi.fabric.barrier()  # every process has looked for an earlier run before the first one writes
+        processes.wait(svi.fabric)  # every process has looked for an earlier run before the first one writes
         if run is not None and resume:
             restore(svi, run)
-            svi.fabric.barrier()  # every process has read the checkpoint before the first one writes
+            processes.wait(svi.fabric)  # every process has read the checkpoint before the first one writes
         history, receivers = InMemory(), list[Tracker]()
         if first:
             if run is not None:
@@ -291,17 +292,24 @@ def _train(
         except KeyboardInterrupt:  # the step is complete, so this is as good a place to stop as any
             signals.received = signal.SIGINT
 
+    def asked_to_stop() -> bool:
+        """Whether a signal has come to any process; a callback's `stop` in one of them is one in all."""
+        asked = torch.tensor([bool(signals.received), state.stop]).int()
+        stopped, state.stop = (svi.total(asked) > 0).tolist()
+        return bool(stopped)
+
     begun = time.process_time() - state.processor_seconds
     while state.status == "running":
         svi.step(source.sample(training.batch_size, svi.generator))
         if state.step % training.log_every == 0 or state.step == training.steps:
             report(svi.row())
         call("on_step")
+        stopped = asked_to_stop()
         due = state.step % training.validate_every == 0 or state.step == training.steps or state.stop
         if due and held_out is not None:
             report(svi.validate(held_out))
             call("on_validation")
-        stopped = svi.total(torch.tensor(float(bool(signals.received)))).item() > 0  # in any process
+            stopped = asked_to_stop()
         state.status = "interrupted" if stopped else _status(state, training)
         state.processor_seconds = time.process_time() - begun
         if run is not None and (due or state.status != "running"):
