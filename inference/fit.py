@@ -188,6 +188,7 @@ def fit(
         Interrupted: after Ctrl-C or SIGTERM; the step is complete, the checkpoint written.
         CheckpointError: when `out` holds a run and `resume` is False, or a run that cannot be resumed, such as one
             fitted on training data with another `fingerprint`.
+        LostProcess: another one of several processes has ended, or does not answer; the last checkpoint stays.
 
     Example:
         >>> import torch, dvae
@@ -236,6 +237,7 @@ def fit(
         if run is not None and (not resume or state.status not in ("running", before)):
             store(svi, run)  # also of a run that was interrupted at its last step
         _train(svi, source, held_out, run, receivers, callbacks, signals)
+        processes.wait(svi.fabric)  # whoever goes on may read what the first one has written
         if state.best is not None:
             model.load_state_dict(state.best)
     path = run.path if run else None

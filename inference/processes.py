@@ -65,6 +65,14 @@ def first() -> bool:
     return os.environ.get("RANK" if _torchrun() else "LOCAL_RANK", "0") == "0"
 
 
+def restartable() -> bool:
+    """Whether torchrun starts the processes again when one of them has ended (`--max-restarts`).
+
+    It counts restarts, but not those that another host has asked for.
+    """
+    return _torchrun() and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
+
+
 def seed_of(seed: int, process: int) -> int:
     """The seed of a process: the run's own for the first, streams that no run of another seed has for the others."""
     return int(np.random.SeedSequence([seed % 2**64, process]).generate_state(1)[0]) if process else seed
