@@ -64,6 +64,9 @@ class Listed(Protocol):
 class InBatches(Protocol):
     """Data that can be gone through without having them whole."""
 
+    def __len__(self) -> int:
+        """How many sequences."""
+
     def batches(self, batch_size: int) -> Iterator[Batch]:
         """All sequences, so many in a batch, always in the same order."""
 

@@ -18,6 +18,7 @@ from torch import nn
 
 from ..data import Fingerprinted, InBatches, Source, in_batches, sequences
 from ..turns import alone
+from . import processes
 from .checkpoints import CONFIG, CheckpointError, Run
 from .objectives import Objective
 from .result import as_they_are
@@ -188,6 +189,7 @@ def fit(
         Interrupted: after Ctrl-C or SIGTERM; the step is complete, the checkpoint written.
         CheckpointError: when `out` holds a run and `resume` is False, or a run that cannot be resumed, such as one
             fitted on training data with another `fingerprint`.
+        LostProcess: another one of several processes has ended, or does not answer; the last checkpoint stays.
 
     Example:
         >>> import torch, dvae
@@ -214,10 +216,10 @@ def fit(
         state, first = svi.init(), svi.fabric.is_global_zero
         if run is not None and first:
             stack.enter_context(run.locked())
-        svi.fabric.barrier()  # every process has looked for an earlier run before the first one writes
+        processes.wait(svi.fabric)  # every process has looked for an earlier run before the first one writes
         if run is not None and resume:
             restore(svi, run)
-            svi.fabric.barrier()  # every process has read the checkpoint before the first one writes
+            processes.wait(svi.fabric)  # every process has read the checkpoint before the first one writes
         history, receivers = InMemory(), list[Tracker]()
         if first:
             if run is not None:
@@ -236,6 +238,7 @@ def fit(
         if run is not None and (not resume or state.status not in ("running", before)):
             store(svi, run)  # also of a run that was interrupted at its last step
         _train(svi, source, held_out, run, receivers, callbacks, signals)
+        processes.wait(svi.fabric)  # whoever goes on may read what the first one has written
         if state.best is not None:
             model.load_state_dict(state.best)
     path = run.path if run else None
@@ -292,17 +295,24 @@ def _train(
         except KeyboardInterrupt:  # the step is complete, so this is as good a place to stop as any
             signals.received = signal.SIGINT
 
+    def asked_to_stop() -> bool:
+        """Whether a signal has come to any process; a callback's `stop` in one of them is one in all."""
+        asked = torch.tensor([bool(signals.received), state.stop]).int()
+        stopped, state.stop = (svi.total(asked) > 0).tolist()
+        return bool(stopped)
+
     begun = time.process_time() - state.processor_seconds
     while state.status == "running":
         svi.step(source.sample(training.batch_size, svi.generator))
         if state.step % training.log_every == 0 or state.step == training.steps:
             report(svi.row())
         call("on_step")
+        stopped = asked_to_stop()
         due = state.step % training.validate_every == 0 or state.step == training.steps or state.stop
         if due and held_out is not None:
             report(svi.validate(held_out))
             call("on_validation")
-        stopped = svi.total(torch.tensor(float(bool(signals.received)))).item() > 0  # in any process
+            stopped = asked_to_stop()
         state.status = "interrupted" if stopped else _status(state, training)
         state.processor_seconds = time.process_time() - begun
         if run is not None and (due or state.status != "running"):

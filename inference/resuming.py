@@ -22,6 +22,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from ..laws.base import renamed
+from . import processes
 from .checkpoints import BEST, LAST, OPTIMISER, CheckpointError, Run, read_weights, state_bytes, weights
 from .objectives import Adapting
 from .svi import SVI, NonFiniteError
@@ -38,7 +39,8 @@ _STORED = ("step", "best_step", "best_bound", "waited", "status", "processor_sec
 def store(svi: SVI, run: Run) -> None:
     """Write a checkpoint of where a run stands; every process calls it, and the first one writes."""
     state = svi.state
-    random = {name: _gathered(svi, value) for name, value in _random(svi).items()}
+    random = {name: processes.gathered(svi.fabric, value) for name, value in _random(svi).items()}
+    svi.settle()
     if not svi.fabric.is_global_zero:
         return
     buffer = io.BytesIO()
@@ -76,10 +78,11 @@ def restore(svi: SVI, run: Run) -> None:
             f"{run.path} was fitted with optimizer={content['name']!r}, not "
             f"{training.optimizer!r}; resume with the same optimiser"
         )
-    processes = len(content["random"]["generator"])
-    if processes != svi.fabric.world_size:
+    count = len(content["random"]["generator"])
+    if count != svi.fabric.world_size:
         raise CheckpointError(
-            f"{run.path} was fitted by {processes} processes, not {svi.fabric.world_size}; resume with as many"
+            f"{run.path} was fitted by {count} processes, not {svi.fabric.world_size}; resume with as many, as each "
+            "has random numbers of its own: on fewer hosts, with more processes on each"
         )
     # a copy: set_state reads the storage, so it takes another row's bytes for a view, or crashes
     random = {name: value[svi.fabric.global_rank].clone() for name, value in content["random"].items()}
@@ -115,12 +118,6 @@ def marking_failure(svi: SVI, run: Run) -> Iterator[None]:
 def _random(svi: SVI) -> dict[str, Tensor]:
     """The states of the random number generators by name."""
     return {"generator": svi.generator.get_state(), **svi.random}
-
-
-def _gathered(svi: SVI, value: Tensor) -> Tensor:
-    """The values (N,) of every process, (processes, N), on the CPU."""
-    gathered: Any = svi.fabric.all_gather(value)
-    return gathered.reshape(svi.fabric.world_size, -1).cpu()  # one process gets no leading axis
 
 
 def _check_state(svi: SVI, run: Run, content: Any) -> None:

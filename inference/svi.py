@@ -6,12 +6,12 @@ over time is a schedule of the global step, and random numbers are the run's own
 changes nothing, nor the reverse.
 """
 
-import atexit
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import islice
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -19,12 +19,16 @@ from torch import Tensor, nn
 from ..data import Batch, InBatches, each, in_batches
 from ..program.protocols import Program
 from ..turns import alone
+from . import processes
 from .bounds import SequenceELBO, Terms
 from .checkpoints import weights
 from .objectives import Adapting, Adaptive, Asking, Objective
 from .result import reason
 from .schedules import schedule
 from .training import Stage, lay_out, stage_at
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
 
 # each of them can be fused
 OPTIMISERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch.optim.SGD}
@@ -128,16 +132,8 @@ class SVI:
     @alone
     def init(self) -> State:
         """Begin at step 0, with a new optimiser and the random numbers of the seed; the weights stay as they are."""
-        from lightning_fabric import Fabric  # over a second to import, half of what `import dvae` would take
-
         training = self.training
-        self.fabric: Fabric = Fabric(
-            accelerator=training.accelerator, devices=training.devices, precision=training.precision
-        )
-        self.fabric.launch()
-        if self.fabric.world_size > 1:
-            atexit.unregister(_leave)
-            atexit.register(_leave)
+        self.fabric: Fabric = processes.launched(training)
         with _forked(self.fabric.device):
             own: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
             optimizer = OPTIMISERS[training.optimizer](
@@ -145,7 +141,8 @@ class SVI:
             )
             bound = _Bound(self.model, SequenceELBO(training.particles))
             self.module, self.optimizer = self.fabric.setup(bound, optimizer)
-            self.generator = torch.Generator().manual_seed(training.seed + self.fabric.global_rank)
+            processes.agree(self.fabric, self.model.state_dict().values())
+            self.generator = torch.Generator().manual_seed(self._seed)
             # Another seed than the generator's own: equal seeds would tie the latent draws to the choice of the batch.
             torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
             self.random = self._random_state()
@@ -177,11 +174,11 @@ class SVI:
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
             if name.startswith(stage.frozen):
                 parameter.grad = None  # which the optimiser leaves out, with its state
+        whole, self._share = processes.together(self.fabric, self.parameters, loss, terms.frames.sum())
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
-        numbers = torch.stack([loss.detach(), norm])
         # the one place where a step waits for the device, on which all is queued up to the optimiser's step
-        *self._numbers, of_all = torch.cat([numbers, self.total(numbers).sum()[None]]).tolist()
+        *self._numbers, of_all = torch.stack([loss.detach(), norm, whole + norm]).tolist()
         if not math.isfinite(of_all):
             impossible = any((value == -math.inf).any() for value in terms.log_likelihood.values())
             advice = "a lower learning rate, a smaller gradient_clip or a longer warm-up"
@@ -212,9 +209,10 @@ class SVI:
     def evaluate(self, data: Any) -> dict[str, float]:
         """Return the terms of the unweighted bound on data, in nats per frame; the model is left in evaluation mode.
 
-        The draws from the guide are the same each time, so that bounds differ by the weights alone. Every process
-        scores all the data. A model without a likelihood has no bound but a "loss", and so has an objective that
-        selects by it. A run with self-feeding also has "self_fed/bound": of the program fed as the run ends.
+        The draws from the guide are the same each time, so that bounds differ by the weights alone. Processes share
+        the data, and all have the terms of the whole. A model without a likelihood has no bound but a "loss", and so
+        has an objective that selects by it. A run with self-feeding also has "self_fed/bound": of the program fed as
+        the run ends.
 
         Args:
             data: x as a tensor (N, T, D), a batch, or an object whose `all()` returns a batch, or whose `batches(size)`
@@ -274,11 +272,21 @@ class SVI:
 
     def total(self, value: Tensor) -> Tensor:
         """The sum over the processes."""
-        return self.fabric.all_reduce(value.clone(), reduce_op="sum")  # type: ignore[return-value]
+        return processes.total(self.fabric, value)
 
     def mean(self, value: Tensor) -> Tensor:
-        """The mean over the processes."""
-        return self.total(value) / self.fabric.world_size
+        """The mean over the processes of what the last step's batches have a frame."""
+        return self.total(value * self._share)
+
+    def settle(self) -> None:
+        """Have what training moves beside parameters, such as running means, be the first process's in all of them."""
+        parameters = dict(self.model.named_parameters())
+        moved = [value for name, value in self.model.state_dict().items() if name not in parameters]
+        processes.agree(self.fabric, moved)
+
+    @property
+    def _seed(self) -> int:
+        return processes.seed_of(self.training.seed, self.fabric.global_rank)
 
     def _random_state(self) -> dict[str, Tensor]:
         on_cuda = self.fabric.device.type == "cuda"
@@ -287,21 +295,26 @@ class SVI:
 
     def _score(self, data: InBatches, feeding: float) -> dict[str, float]:
         """The unweighted terms on held-out data, per frame, with the same draws each time."""
-        sums = dict[str, Tensor]()
         objective = stage_at(self.plan, self.state.step)[1].objective
         last = self.training.steps  # of the weights, so that losses can be compared
+        self.settle()
+        sums, fabric = dict[str, Tensor](), self.fabric
+        size = min(self.training.batch_size, math.ceil(len(data) / fabric.world_size))
+        shares = fabric.global_rank * size < len(data)
+        # of a process that has no batch, the first one for the names alone
+        first, end = (fabric.global_rank, None) if shares else (0, 1)
+        own = islice(data.batches(size), first, end, fabric.world_size)
         self.module.eval()
         with _forked(self.fabric.device), torch.no_grad():
-            torch.manual_seed(self.training.seed)
-            for batch in data.batches(self.training.batch_size):
+            torch.manual_seed(self._seed)
+            for batch in own:
                 terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
                 found = _sums(terms)
                 if not terms.likelihood or (isinstance(objective, Asking) and objective.select == "loss"):
                     found["loss"] = objective(terms, last).double() * found["frames"]
                 for name, value in found.items():
                     sums[name] = sums[name] + value if name in sums else value
-        # one verdict for every process, whatever the rounding on its device
-        totals = self.total(torch.stack(list(sums.values())))
+        totals = self.total(torch.stack(list(sums.values())) * shares)
         return _per_frame(dict(zip(sums, totals, strict=True)))
 
     def _terms(
@@ -345,12 +358,6 @@ class _Bound(nn.Module):
             with torch.autocast(terms.frames.device.type, enabled=False):
                 measure(terms)
         return dict(vars(terms))
-
-
-def _leave() -> None:
-    """Leave the group of processes: threads of it that outlive the interpreter abort it. For NCCL Fabric does so."""
-    if torch.distributed.is_initialized():
-        torch.distributed.destroy_process_group()
 
 
 def _forked(device: torch.device) -> AbstractContextManager[None]:

@@ -32,9 +32,9 @@ class Training:
         validate_every: steps from one validation and checkpoint to the next.
         patience: validations without a better bound after which the run stops; None to run all steps.
         log_every: steps from one row of the log to the next.
-        seed: seed of batches and latent draws; each process adds its rank.
+        seed: seed of batches and latent draws, from which each of several processes has its own.
         accelerator: where to run: "auto", "cpu", "gpu", "cuda" or "mps".
-        devices: number of devices, with one process each.
+        devices: number of devices, with one process each; under torchrun, which starts them, as many as these are.
         precision: precision of the computation; "32-true" leaves the model's own.
         progress: whether to show the terms on the terminal.
 

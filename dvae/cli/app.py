@@ -18,9 +18,10 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 
+from ..inference.processes import first
 from ..inference.result import reason
 from ..options import nearest
-from .console import ERROR, UsageError, note
+from .console import ERROR, OUT, UsageError, note
 
 COMMANDS = {
     "list": ("methods:list_methods", "List the methods: their equations and where they come from."),
@@ -74,6 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     warnings.showwarning = note
+    OUT.quiet = ERROR.quiet = not first()
     try:
         _run(given)
         return 0
@@ -86,6 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ERROR.print(str(stop) or "interrupted")
         return 128 + getattr(stop, "signal", signal.SIGINT)
     except Exception as error:
+        ERROR.quiet = False  # it may be this process alone that fails
         if debug:
             traceback.print_exc()
         expected = isinstance(error, ValueError | OSError | RuntimeError | FloatingPointError | ImportError)

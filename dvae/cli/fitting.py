@@ -16,6 +16,7 @@ from joblib import parallel_config
 from .. import motion
 from ..inference.checkpoints import Run
 from ..inference.fit import Fit, Interrupted
+from ..inference.processes import restartable
 from ..inference.recipe import Trainable
 from ..inference.schedules import Schedule
 from ..inference.trackers import TensorBoard
@@ -199,6 +200,9 @@ def fit(
     """
     if out.is_file():
         raise UsageError(f"--out {out} is a file; name a directory for the run")
+    if Run(out).exists and restartable():
+        ERROR.print(f"{out} holds a run, which goes on")
+        return resume(out, tensorboard=tensorboard)
     if Run(out).exists:
         raise ValueError(f"{out} already holds a run; continue it with: dvae resume {out}, or choose another directory")
     with arguments():

@@ -316,9 +316,7 @@ class AttentionNetwork(Network):
         return self.norm(stream), state
 
     @override
-    def reach(
-        self, state: Attending, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
-    ) -> tuple[Tensor, Any]:
+    def reach(self, state: Attending, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         return self.step(state, t + count - 1, drawn)  # what it has not seen yet enters the cache
 
 
