@@ -423,7 +423,8 @@ class Cache:
         self.tokens = tokens
         self.buffer: Tensor | None = None
         if not torch.is_grad_enabled() and room:
-            self.buffer = functional.pad(tokens, (0, 0, 0, room))
+            self.buffer = tokens.new_empty(len(tokens), tokens.shape[1] + room, tokens.shape[2])
+            self.buffer[:, : tokens.shape[1]] = tokens
 
     def append(self, tokens: Tensor) -> None:
         """Add new tokens."""
