@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from ..data import BESIDE, Batch
 from ..laws.product import ProductSupport
-from ..networks.base import once, valid_steps
+from ..networks.base import again, once, valid_steps
 from ..notation import Factorization
 from ..views import LOG_DET, WHOLE, View
 from .conditional import Conditional
@@ -308,7 +308,7 @@ def repeat(value: Any, samples: int) -> Any:
     if isinstance(value, Mapping):
         found = {name: repeat(v, samples) for name, v in value.items()}
         return found | ({GROUP: Groups.of(value[GROUP]).again(samples).place} if GROUP in value else {})
-    return value.repeat(samples, *[1] * (value.dim() - 1))
+    return again(value, samples)
 
 
 def rows(value: Any, part: slice) -> Any:

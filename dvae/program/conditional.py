@@ -266,9 +266,7 @@ class Conditional(nn.Module):
             return state
         return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)
 
-    def step(
-        self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1
-    ) -> tuple[Parameters, Any]:
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1) -> tuple[Parameters, Any]:
         """The law's parameters (B, D) at step t, the last of so many that are taken at once, and the next state."""
         if self.network is None:
             return tuple(p[t] for p in state), state
