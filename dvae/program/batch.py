@@ -337,9 +337,7 @@ def in_chunks(
         part = slice(first, min(first + chunk, size))
         at_once = chunk // max(part.stop - first, 1)
         for start in range(0, samples, at_once):
-            with torch.inference_mode():  # nothing of it is left but the numbers
-                made = make(part, min(at_once, samples - start))
-            for name, value in made.items():
+            for name, value in make(part, min(at_once, samples - start)).items():
                 if name not in found:
                     found[name] = value.new_empty(samples, size, *value.shape[2:])
                 found[name][start : start + at_once, part] = value
