@@ -238,8 +238,8 @@ def gapped(batch: Batch) -> Tensor:
 
 def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
     """Means over some dimensions of what is not NaN."""
-    found: Tensor = values.nanmean(dims) if values.isnan().any() else values.mean(dims)
-    return found
+    found: Tensor = values.mean(dims)
+    return values.nanmean(dims) if found.isnan().any() else found
 
 
 def past_of(batch: Batch, observed: int) -> dict[str, Any]:

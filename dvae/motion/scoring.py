@@ -46,6 +46,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..constants import indices
 from ..data import Batch, HeldOutWindows, bridged, gapped, mask_of, mean_of_known
 from ..inference import metrics
 from ..inference.held import clip_places, on_device_of, reproducibly
@@ -182,13 +183,16 @@ def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
         futures: (N, T, D).
         sets: which of them; of one future alone the diversity is NaN.
     """
-    if futures.isnan().any():
-        apds = [metrics.average_pairwise_distance(futures[held]) if len(held) > 1 else None for held in sets]
-        return torch.stack([futures.new_tensor(math.nan) if apd is None else apd for apd in apds])
     among = torch.cat([*sets]).unique()
     rows = futures[among].flatten(1).double()
-    rows = rows - rows.mean(0)  # cdist takes products, in which distances that are small beside the rows blur
-    apart = torch.cdist(rows, rows).fill_diagonal_(0.0)
+    centre = rows.mean(0)
+    if centre.isnan().any():
+        apds = [metrics.average_pairwise_distance(futures[held]) if len(held) > 1 else None for held in sets]
+        return torch.stack([futures.new_tensor(math.nan) if apd is None else apd for apd in apds])
+    rows = rows - centre  # or distances that are small beside the rows would blur in products
+    products = rows @ rows.T
+    squares = products.diagonal()
+    apart = (squares[:, None] + squares).sub_(products, alpha=2).clamp_(min=0).sqrt_().fill_diagonal_(0.0)
     chosen = torch.stack([torch.isin(among, held) for held in sets]).to(apart)
     sums, counts = (chosen @ apart * chosen).sum(1), chosen.sum(1)
     return (sums / (counts * (counts - 1))).to(futures)
@@ -237,21 +241,21 @@ def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Me
     def limbs(x: Tensor) -> Tensor:
         """(3, limbs, ..., T) of frames (..., T, D)."""
         joints = _coordinates(windows.positions(x).flatten(-2))
-        return joints[:, ends] - joints[:, starts]
+        return joints.index_select(1, indices(ends, x)) - joints.index_select(1, indices(starts, x))
 
-    @lru_cache(maxsize=2)  # of forecasts and futures, for all scores of a batch
+    @lru_cache(maxsize=1)  # of forecasts, for all scores of a batch
     def lengths(x: Tensor) -> Tensor:
         """(B, limbs, ..., T)."""
         return torch.stack([_norm(limbs(window)) for window in x])
 
+    @lru_cache(maxsize=1)
+    def relative(forecasts: Tensor, truth: Tensor) -> Tensor:
+        """Errors (B, limbs, K, T) of lengths, in those of the truth."""
+        return lengths(forecasts) / mean_of_known(lengths(truth), -1)[..., None, None] - 1
+
     def of_errors(score: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
-        """The mean over limbs and futures of a score (B, limbs, K) of relative errors (B, limbs, K, T) of lengths."""
-
-        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-            true = mean_of_known(lengths(truth), -1)[..., None, None]
-            return mean_of_known(score(lengths(forecasts) / true - 1), (1, 2))
-
-        return function
+        """The mean over limbs and futures of a score (B, limbs, K) of relative errors."""
+        return lambda forecasts, truth, past, index: mean_of_known(score(relative(forecasts, truth)), (1, 2))
 
     scores: dict[str, Callable[[Tensor], Tensor]] = {
         "limb stretch": lambda errors: errors.abs().mean(-1),
@@ -272,7 +276,7 @@ def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Me
     def angles(x: Tensor) -> Tensor:
         """(pairs, ..., T)."""
         vectors = limbs(x)
-        u, v = vectors[:, first], vectors[:, second]
+        u, v = (vectors.index_select(1, indices(each, x)) for each in (first, second))
         return torch.atan2(_norm(_cross(u, v)), (u * v).sum(0)).rad2deg()
 
     def angle_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
@@ -343,7 +347,7 @@ def _jerk(windows: Windows | Exchanged) -> Measure:
         return torch.stack([mean_of_known(each, (0, -1)) for each in changes]) * windows.protocol.fps**3
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        seen = gapped(past)[:, start:, None].expand(-1, -1, forecasts.shape[1], -1).transpose(1, 2)
+        seen = gapped(past)[:, None, start:].expand(-1, forecasts.shape[1], -1, -1)
         return mean_of_known(jerk(torch.cat([seen, _where_true(forecasts, truth)], 2)), 1)
 
     real = mean_of_known(jerk(gapped(windows.all())[:, start:]), 0)

@@ -309,7 +309,7 @@ class AttentionNetwork(Network):
                 name = state.live[i].name
                 fresh.append(self.kept(name, drawn[name][s]))
             if fresh:
-                state.cache.append(torch.stack(fresh, dim=1))
+                state.cache.append(fresh)
             bias = state.row(t)
             for layer, absorbed in zip(self.layers, state.absorbed, strict=True):
                 stream = layer.step(stream, state.cache.tokens, bias, absorbed)
@@ -421,16 +421,17 @@ class Cache:
         self.tokens = tokens
         self.buffer: Tensor | None = None
         if not torch.is_grad_enabled() and room:
-            self.buffer = functional.pad(tokens, (0, 0, 0, room))
+            self.buffer = tokens.new_empty(len(tokens), tokens.shape[1] + room, tokens.shape[2])
+            self.buffer[:, : tokens.shape[1]] = tokens
 
-    def append(self, tokens: Tensor) -> None:
-        """Add new tokens."""
+    def append(self, tokens: Sequence[Tensor]) -> None:
+        """Add new tokens (B, C)."""
         if self.buffer is None:
-            self.tokens = torch.cat([self.tokens, tokens], 1)
+            self.tokens = torch.cat([self.tokens, torch.stack(list(tokens), 1)], 1)
             return
-        end = self.tokens.shape[1] + tokens.shape[1]
-        self.buffer[:, self.tokens.shape[1] : end] = tokens
-        self.tokens = self.buffer[:, :end]
+        for place, token in enumerate(tokens, self.tokens.shape[1]):
+            self.buffer[:, place] = token
+        self.tokens = self.buffer[:, : self.tokens.shape[1] + len(tokens)]
 
     def select(self, rows: Tensor) -> Cache:
         """Its rows."""

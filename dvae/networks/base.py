@@ -83,11 +83,11 @@ def once(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed]) 
     return result
 
 
-def keep(module: nn.Module, inputs: Sequence[Tensor | None], result: Tensor) -> None:
+def keep(owner: object, inputs: Sequence[Tensor | None], result: Any) -> None:
     """Tells `once` a result that came about in another way, such as within a loop."""
     kept = _ONCE.get()
     if kept is not None:
-        kept[_key(module, inputs)] = (inputs, result)
+        kept[_key(owner, inputs)] = (inputs, result)
 
 
 def _key(owner: object, inputs: Sequence[Any]) -> tuple[Any, ...]:
@@ -250,10 +250,32 @@ def valid_steps(lengths: Tensor, length: int) -> Tensor:
     return torch.arange(length, device=lengths.device) < lengths[:, None]
 
 
+def again(values: Tensor, n: int) -> Tensor:
+    """Every row n times over, (n B, ...), row after row; `once_valid` finds features of the rows as they were."""
+    repeated = values.repeat(n, *[1] * (values.dim() - 1))
+    keep(again, [repeated], (values, n))
+    return repeated
+
+
+def steps_of(values: Tensor) -> Sequence[Tensor]:
+    """The steps of values (B, T, ...), which `whole_of` knows."""
+    steps = values.unbind(1)
+    keep(steps_of, steps, values)
+    return steps
+
+
+def whole_of(steps: Sequence[Tensor]) -> Tensor:
+    """Values (B, T, ...) of these steps: what they are steps of, if that is known."""
+    return once(steps_of, steps, lambda: torch.stack(list(steps), dim=1))
+
+
 def once_valid(module: nn.Module, values: Tensor, lengths: Tensor | None) -> Tensor:
     """The module's features of (B, T, D) or (B, D), 0 at padding; once for all that read the same values."""
 
     def compute() -> Tensor:
+        first, n = once(again, [values], lambda: (values, 1))
+        if n > 1 and lengths is None:
+            return again(once_valid(module, first, None), n)
         found: Tensor = module(values)
         if lengths is None or found.dim() == 2:
             return found
@@ -281,9 +303,11 @@ def follow(
     values = [drawn[s] for s in fresh]
 
     def compute() -> Sequence[Tensor]:
-        if len(values) == 1:
-            return [(change or module)(values[0])]
-        return (change or module)(torch.stack(values, dim=1)).unbind(1)  # type: ignore[no-any-return]
+        return (
+            [(change or module)(values[0])]
+            if len(values) == 1
+            else steps_of(once_valid(module, whole_of(values), None))
+        )
 
     for s, made in zip(fresh, once(module, [lengths, *values], compute) if fresh else [], strict=True):
         rows[s] = made if lengths is None else made * (s < lengths)[:, None]

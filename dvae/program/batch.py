@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from ..data import BESIDE, Batch
 from ..laws.product import ProductSupport
-from ..networks.base import once, valid_steps
+from ..networks.base import again, once, valid_steps
 from ..notation import Factorization
 from ..views import LOG_DET, WHOLE, View
 from .conditional import Conditional
@@ -308,7 +308,7 @@ def repeat(value: Any, samples: int) -> Any:
     if isinstance(value, Mapping):
         found = {name: repeat(v, samples) for name, v in value.items()}
         return found | ({GROUP: Groups.of(value[GROUP]).again(samples).place} if GROUP in value else {})
-    return value.repeat(samples, *[1] * (value.dim() - 1))
+    return again(value, samples)
 
 
 def rows(value: Any, part: slice) -> Any:
@@ -337,9 +337,7 @@ def in_chunks(
         part = slice(first, min(first + chunk, size))
         at_once = chunk // max(part.stop - first, 1)
         for start in range(0, samples, at_once):
-            with torch.inference_mode():  # nothing of it is left but the numbers
-                made = make(part, min(at_once, samples - start))
-            for name, value in made.items():
+            for name, value in make(part, min(at_once, samples - start)).items():
                 if name not in found:
                     found[name] = value.new_empty(samples, size, *value.shape[2:])
                 found[name][start : start + at_once, part] = value

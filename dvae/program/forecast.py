@@ -12,6 +12,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from ..networks.base import computing_once
 from ..views import WHOLE
 from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like
@@ -55,6 +56,7 @@ def forecast(
     # what the guide makes of the past alone, once for all samples
     forked = model.latents[:1] if not redrawn and model.latents[:1] == model.prior_order[:1] else ()
 
+    @computing_once()
     def futures(part: slice, count: int) -> dict[str, Tensor]:
         known, held = (repeat(rows(each, part), count) for each in (data, fixed))
         observed = rows(seen, part) if forked else repeat(rows(seen, part), count)

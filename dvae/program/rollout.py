@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from ..laws.base import Parameters
-from ..networks.base import computing_once, indicator, presence, valid_steps
+from ..networks.base import again, computing_once, indicator, presence, steps_of, valid_steps
 from ..notation import Block, Factorization
 from .conditional import Conditional, like
 from .groups import Grouped, Groups
@@ -196,19 +196,19 @@ class Rollout:
     def again(self, n: int) -> Rollout:
         """Another run, with every row n times over, draw by draw."""
 
-        def again(values: Any) -> Any:
-            return {name: value.repeat(n, *[1] * (value.dim() - 1)) for name, value in values.items()}
+        def each(values: Any) -> Any:
+            return {name: again(value, n) for name, value in values.items()}
 
         return replace(
             self,
             batch=n * self.batch,
             draws=n * self.draws,
-            values=again(self.values),
-            states=again(self.states),
+            values=each(self.values),
+            states=each(self.states),
             lengths=None if self.lengths is None else self.lengths.repeat(n),
-            observed=again(self.observed),
-            present=again(self.present),
-            prefix=again(self.prefix),
+            observed=each(self.observed),
+            present=each(self.present),
+            prefix=each(self.prefix),
             groups=None if self.groups is None else self.groups.again(n),
         )
 
@@ -457,7 +457,8 @@ class Rollout:
             t = first + count - 1
             end = t + known[t]
             for name in live if end > first else ():
-                drawn[name][first:end] = told[name][:, first:end].unbind(1)
+                whole = told[name] if end - first == told[name].shape[1] else told[name][:, first:end]
+                drawn[name][first:end] = steps_of(whole)
             for name in live:
                 conditional = self.conditionals[name]
                 if count > 1 and kept:
