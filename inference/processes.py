@@ -60,9 +60,14 @@ def launched(training: Training) -> "Fabric":
     return fabric
 
 
+def by_torchrun() -> bool:
+    """Whether torchrun has started this process."""
+    return distributed.is_available() and distributed.is_torchelastic_launched()
+
+
 def first() -> bool:
     """Whether this process is the one that writes and speaks, which is known before processes have met."""
-    return os.environ.get("RANK" if _torchrun() else "LOCAL_RANK", "0") == "0"
+    return os.environ.get("RANK" if by_torchrun() else "LOCAL_RANK", "0") == "0"
 
 
 def restartable() -> bool:
@@ -70,7 +75,7 @@ def restartable() -> bool:
 
     It counts restarts, but not those that another host has asked for.
     """
-    return _torchrun() and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
+    return by_torchrun() and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
 
 
 def seed_of(seed: int, process: int) -> int:
@@ -142,16 +147,12 @@ def wait(fabric: "Fabric") -> None:
 
 def _places(devices: int) -> tuple[int, int]:
     """Processes on this host, and hosts."""
-    if not _torchrun():
+    if not by_torchrun():
         return devices, 1
     here, all_processes = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
     if devices not in (1, here):
         raise ValueError(f"devices is {devices}, and torchrun has started {here} processes here; leave devices out")
     return here, all_processes // here
-
-
-def _torchrun() -> bool:
-    return distributed.is_available() and distributed.is_torchelastic_launched()
 
 
 @contextmanager
