@@ -27,7 +27,7 @@ from .tables.pages import DOCS, refuse_unknown, table, write
 
 HERE = Path(__file__).parent
 HISTORY = HERE / "history.json"
-NAMES = ("speed", "gsps", "hit_dvae", "mix_and_match", "trajevae", "completion", "startup", "files")
+NAMES = ("speed", "gsps", "hit_dvae", "mix_and_match", "trajevae", "completion", "startup", "files", "scaling")
 WORSE = 1.1
 Targets = Mapping[str, tuple[str, float]]
 

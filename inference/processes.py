@@ -85,11 +85,7 @@ def seed_of(seed: int, process: int) -> int:
 
 def total(fabric: "Fabric", value: Tensor) -> Tensor:
     """The sum over the processes."""
-    if fabric.world_size > 1:
-        value = value.to(fabric.device, copy=True)
-        with _answered():
-            distributed.all_reduce(value)  # fabric's own has them wait for one another first, in a message more
-    return value
+    return _summed(value.to(fabric.device, copy=True)) if fabric.world_size > 1 else value
 
 
 def together(
@@ -114,12 +110,13 @@ def together(
     given = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
     numbers = torch.tensor([1.0, *had], device=loss.device)
     own = torch.cat([loss.detach()[None], numbers, *(gradient.flatten() for gradient in given)])
-    summed = total(fabric, own * frames)
-    whole, _, has, *means = (summed / summed[1]).split([1, 1, len(had), *(gradient.numel() for gradient in given)])
+    summed = _summed(own.mul_(frames))
+    all_frames = summed[1].clone()
+    whole, _, has, *means = summed.div_(all_frames).split([1, 1, len(had), *(p.numel() for p in parameters)])
     anywhere = had if all(had) else (has > 0).tolist()
     for parameter, mean, there in zip(parameters, means, anywhere, strict=True):
         parameter.grad = mean.view_as(parameter).to(parameter.dtype) if there else None
-    return whole[0], frames / summed[1]
+    return whole[0], frames / all_frames
 
 
 def agree(fabric: "Fabric", values: Iterable[Tensor]) -> None:
@@ -143,6 +140,13 @@ def wait(fabric: "Fabric") -> None:
     """Go on when every process has come here."""
     with _answered():
         fabric.barrier()
+
+
+def _summed(value: Tensor) -> Tensor:
+    """The sum over the processes, in place of the value."""
+    with _answered():
+        distributed.all_reduce(value)  # fabric's own has them wait for one another first, in a message more
+    return value
 
 
 def _places(devices: int) -> tuple[int, int]:
