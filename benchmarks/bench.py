@@ -27,7 +27,18 @@ from .tables.pages import DOCS, refuse_unknown, table, write
 
 HERE = Path(__file__).parent
 HISTORY = HERE / "history.json"
-NAMES = ("speed", "gsps", "hit_dvae", "mix_and_match", "trajevae", "completion", "startup", "files", "mapped")
+NAMES = (
+    "speed",
+    "gsps",
+    "hit_dvae",
+    "mix_and_match",
+    "trajevae",
+    "completion",
+    "startup",
+    "files",
+    "mapped",
+    "scaling",
+)
 WORSE = 1.1
 Targets = Mapping[str, tuple[str, float]]
 

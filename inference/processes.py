@@ -60,9 +60,14 @@ def launched(training: Training) -> "Fabric":
     return fabric
 
 
+def by_torchrun() -> bool:
+    """Whether torchrun has started this process."""
+    return distributed.is_available() and distributed.is_torchelastic_launched()
+
+
 def first() -> bool:
     """Whether this process is the one that writes and speaks, which is known before processes have met."""
-    return os.environ.get("RANK" if _torchrun() else "LOCAL_RANK", "0") == "0"
+    return os.environ.get("RANK" if by_torchrun() else "LOCAL_RANK", "0") == "0"
 
 
 def restartable() -> bool:
@@ -70,7 +75,7 @@ def restartable() -> bool:
 
     It counts restarts, but not those that another host has asked for.
     """
-    return _torchrun() and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
+    return by_torchrun() and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
 
 
 def seed_of(seed: int, process: int) -> int:
@@ -80,11 +85,7 @@ def seed_of(seed: int, process: int) -> int:
 
 def total(fabric: "Fabric", value: Tensor) -> Tensor:
     """The sum over the processes."""
-    if fabric.world_size > 1:
-        value = value.to(fabric.device, copy=True)
-        with _answered():
-            distributed.all_reduce(value)  # fabric's own has them wait for one another first, in a message more
-    return value
+    return _summed(value.to(fabric.device, copy=True)) if fabric.world_size > 1 else value
 
 
 def together(
@@ -109,12 +110,13 @@ def together(
     given = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
     numbers = torch.tensor([1.0, *had], device=loss.device)
     own = torch.cat([loss.detach()[None], numbers, *(gradient.flatten() for gradient in given)])
-    summed = total(fabric, own * frames)
-    whole, _, has, *means = (summed / summed[1]).split([1, 1, len(had), *(gradient.numel() for gradient in given)])
+    summed = _summed(own.mul_(frames))
+    all_frames = summed[1].clone()
+    whole, _, has, *means = summed.div_(all_frames).split([1, 1, len(had), *(p.numel() for p in parameters)])
     anywhere = had if all(had) else (has > 0).tolist()
     for parameter, mean, there in zip(parameters, means, anywhere, strict=True):
         parameter.grad = mean.view_as(parameter).to(parameter.dtype) if there else None
-    return whole[0], frames / summed[1]
+    return whole[0], frames / all_frames
 
 
 def agree(fabric: "Fabric", values: Iterable[Tensor]) -> None:
@@ -140,18 +142,21 @@ def wait(fabric: "Fabric") -> None:
         fabric.barrier()
 
 
+def _summed(value: Tensor) -> Tensor:
+    """The sum over the processes, in place of the value."""
+    with _answered():
+        distributed.all_reduce(value)  # fabric's own has them wait for one another first, in a message more
+    return value
+
+
 def _places(devices: int) -> tuple[int, int]:
     """Processes on this host, and hosts."""
-    if not _torchrun():
+    if not by_torchrun():
         return devices, 1
     here, all_processes = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
     if devices not in (1, here):
         raise ValueError(f"devices is {devices}, and torchrun has started {here} processes here; leave devices out")
     return here, all_processes // here
-
-
-def _torchrun() -> bool:
-    return distributed.is_available() and distributed.is_torchelastic_launched()
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Sweeps: methods x seeds fitted side by side with joblib, one process and one torch thread to a run.
+"""Sweeps: methods x seeds fitted side by side, one process and one torch thread to a run, by joblib or as jobs.
 
 Every run has a directory of its own, as `fit_run` writes it, with the same weights bit for bit. The same call again
 continues a sweep: finished runs are left as they are, others go on from their last checkpoint.
@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from uuid import uuid4
 
 import torch
@@ -34,6 +34,7 @@ from typing_extensions import override
 from .. import files
 from ..inference.checkpoints import Run
 from ..inference.fit import Callback, Fit, Interrupted
+from ..inference.processes import by_torchrun
 from ..inference.recipe import Trainable
 from ..inference.result import Plain, Table, reason
 from ..inference.schedules import clamp
@@ -84,6 +85,13 @@ class Outcome:
         return ", ".join(filter(None, [f"{self.path.name} {self.status} at step {self.step} {how}", self.best]))
 
 
+class Executor(Protocol):
+    """What has jobs done elsewhere, such as `submitit.AutoExecutor` or one of `concurrent.futures`."""
+
+    def submit(self, function: Any, /, *arguments: Any) -> Any:
+        """A job, whose `done()` tells whether it has ended; `result()` is then what the function gives, or raises."""
+
+
 class SweepInterrupted(KeyboardInterrupt):
     """A sweep was stopped by Ctrl-C or SIGTERM. The same sweep, started again, continues.
 
@@ -106,7 +114,7 @@ def sweep(
     out: str | os.PathLike[str],
     seeds: Sequence[int] = (0, 1, 2),
     training: Training | Mapping[str, Any] | None = None,
-    jobs: int = 2,
+    jobs: int | Executor = 2,
 ) -> list[Outcome]:
     """Fits each method with each seed, several runs at a time.
 
@@ -124,7 +132,9 @@ def sweep(
         seeds: of the runs of each method; `training` has none to tell.
         training: the other options, or some of them beside each method's own. `progress` shows the runs: a table on a
             terminal, or else a line as each starts and ends.
-        jobs: runs at a time; a cluster has as many as workers.
+        jobs: runs at a time, of which a cluster of joblib's has as many as workers; or an executor, to which each run
+            is a job. A job that is killed is a run that failed, and goes on with the same sweep again; of submitit one
+            that has used up its time goes to the queue again.
 
     Returns:
         A result for each run, by seed and then by method, also for those that failed.
@@ -138,6 +148,8 @@ def sweep(
         methods = [dvae.method("srnn", latent=latent) for latent in (8, 16)]
         results = sweep(methods, MotionData.open("people.npz"), "runs", training=dvae.Training(steps=4000), jobs=4)
     """
+    if by_torchrun():
+        raise ValueError("a sweep starts processes itself; start it without torchrun")
     out = Path(out)
     lease = out.absolute() / f".sweep-{uuid4().hex}"
     source = data.location
@@ -171,9 +183,7 @@ def sweep(
             for result in results.values():
                 progress.end(result)
             with _ignored_signals():
-                ended = Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")(
-                    delayed(_fit)(run) for run in waiting
-                )
+                ended = _joined(waiting, jobs) if isinstance(jobs, int) else _submitted(waiting, jobs, stop)
             for result, said in ended:
                 results[result.path] = result
                 notes += said
@@ -209,6 +219,50 @@ class _Run:
     training: Training
     lease: Path
     owner: int = field(default_factory=os.getpid)
+
+
+_Ended = Iterator[tuple[Outcome, list[str]]]
+"""Results in the order in which they come, with the warnings of each."""
+
+
+def _joined(runs: Sequence[_Run], jobs: int) -> _Ended:
+    """The runs as tasks of joblib, by the backend that the caller has chosen."""
+    found: _Ended = Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")(
+        delayed(_fit)(run) for run in runs
+    )
+    return found
+
+
+def _submitted(runs: Sequence[_Run], executor: Executor, stop: Signals) -> _Ended:
+    """The runs as jobs; they are not waited for when the sweep is told to stop, as some may stand in a queue."""
+    jobs = {executor.submit(_Job(), run): run for run in runs}
+
+    def ended() -> _Ended:
+        while jobs and stop.received is None:
+            for job in [job for job in jobs if job.done()]:
+                run = jobs.pop(job)
+                try:
+                    yield job.result()
+                except Exception as lost:  # of the executor's own type: killed, or out of time or memory
+                    told, left = reason(lost).strip().partition("\n")[0], _left(run)
+                    error = f"its job has ended without a result ({type(lost).__name__}: {told})"
+                    status = left.status if left.status in ENDED else "failed"
+                    yield _outcome(run, replace(left, status=status), error=error), []
+            time.sleep(0.2)
+
+    return ended()
+
+
+class _Job:
+    """A run, which submitit has begin again, from its checkpoint, when the time of its job has ended."""
+
+    def __call__(self, run: _Run) -> tuple[Outcome, list[str]]:
+        return _fit(run)
+
+    def checkpoint(self, run: _Run) -> Any:
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, run)
 
 
 def _fit(run: _Run) -> tuple[Outcome, list[str]]:
@@ -348,11 +402,17 @@ def _earlier(run: _Run) -> Outcome | None:
             f"{run.path} holds a run of other options: its {name} is {there.get(name)!r}, the sweep's "
             f"{here.get(name)!r}{others}; give the sweep those options, or another directory"
         )
-    if state["status"] not in ENDED:
-        return None
+    return _outcome(run, _left(run)) if state["status"] in ENDED else None
+
+
+def _left(run: _Run) -> Fit:
+    """What a run has left in its directory."""
+    if not (earlier := Run(run.path)).exists:
+        return Fit([], 0, None, None, "failed", run.path)
+    state = earlier.state
     found = {name: state[name] for name in ("status", "step", "best_step", "best_bound")}
     found |= {"per": state.get("per", Fit.per), "processor_seconds": state.get("processor_seconds", 0.0)}
-    return _outcome(run, Fit(JSONLines(run.path / "log.jsonl").read(), run=run.path, **found))
+    return Fit(JSONLines(run.path / "log.jsonl").read(), run=run.path, **found)
 
 
 def _options(method: Trainable, schema: Schema, training: Training, fingerprint: str) -> dict[str, Any]:

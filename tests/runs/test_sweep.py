@@ -6,12 +6,16 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import pytest
 import torch
 from joblib import parallel_config
+from stopping import At, interrupt
 
 import dvae
 from dvae import motion
@@ -220,6 +224,54 @@ def test_the_callers_backend_is_used_and_threads_take_turns(swept, data, tmp_pat
     monkeypatch.setattr(sweeps._Leased, "check", gone)  # as if on a machine without the file system of the sweep
     with parallel_config(backend="threading"), pytest.raises(RuntimeError, match="a worker does not see the files in"):
         sweep([VAE], data, tmp_path / "far", seeds=(0, 1), training=TRAINING)
+
+
+class Losing(ThreadPoolExecutor):
+    """The job of the second seed is killed when its run has a checkpoint."""
+
+    def submit(self, function, /, run):
+        def killed():
+            with suppress(KeyboardInterrupt):
+                runs.fit_run(run.method, run.data, run.path, run.training, callbacks=[At(3, interrupt)])
+            raise BrokenExecutor("killed\nat a place in the code")
+
+        return super().submit(killed if run.training.seed else partial(function, run))
+
+
+def test_runs_are_jobs_of_an_executor_and_one_that_is_killed_goes_on_with_the_same_sweep(swept, data, tmp_path):
+    out, _, _ = swept
+    methods = {"vae-z3": VAE}
+    with Losing(1) as jobs:
+        whole, lost = sweep(methods, data, tmp_path, (0, 1), TRAINING, jobs)
+    assert (whole.status, lost.status, lost.step) == ("finished", "failed", 3)
+    assert lost.error == "its job has ended without a result (BrokenExecutor: killed)"
+    with ThreadPoolExecutor(1) as jobs:
+        sweep(methods, data, tmp_path, (0, 1), TRAINING, jobs)
+    assert [weights(tmp_path / f"vae-z3-seed{i}") for i in (0, 1)] == [weights(out / f"vae-z3-seed{i}") for i in (0, 1)]
+
+
+def test_a_sweep_that_is_stopped_does_not_wait_for_jobs_in_a_queue(data, tmp_path):
+    class Queue:
+        def submit(self, function, run):
+            return self
+
+        def done(self):
+            signal.raise_signal(signal.SIGINT)
+            return False
+
+    with pytest.raises(SweepInterrupted, match="interrupted with 0 of 1 runs finished"):
+        sweep([VAE], data, tmp_path, [0], TRAINING, Queue())
+    assert not list(tmp_path.iterdir())  # nor the lease, without which a job that begins ends at once
+
+
+@pytest.mark.slow
+def test_runs_are_jobs_of_submitit(swept, data, tmp_path, monkeypatch):
+    submitit = pytest.importorskip("submitit")
+    out, _, _ = swept
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+    jobs = submitit.AutoExecutor(tmp_path / "jobs", cluster="local")
+    (result,) = sweep({"vae-z3": VAE}, data, tmp_path, [0], TRAINING, jobs)
+    assert (result.status, weights(result.path)) == ("finished", weights(out / "vae-z3-seed0"))
 
 
 SMALL_GSPS = {

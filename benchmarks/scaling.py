@@ -1,0 +1,172 @@
+"""How a fit grows with processes and with sizes, as ratios within one run: `python -m benchmarks.bench scaling`.
+
+    METHOD, two processes     windows a second of two processes over those of one, with the same batch in each
+    METHOD, two alone         the same where neither knows of the other: what the machine allows
+    METHOD, exchange          share of a step's processor time in which gradients are made those of both
+    METHOD over T, K, B, D    exponents of power laws: a training step over frames, particles, windows in a batch and
+                              numbers in a frame
+    METHOD over clips         of a batch drawn from so many clips, and a step on it
+    METHOD, held-out clips    of the bound of so many
+
+Processes that wait for one another are timed by the clock, and need two cores of their own: the sides take turns, a few
+steps at a time, and the shortest turn of each counts. Exponents are of processor time.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from unittest import mock
+
+import torch
+from torch import Tensor
+
+import dvae
+from dvae import motion
+from dvae.inference import processes
+
+from .speed import seconds
+
+SIZE, FRAMES = 48, 75
+METHODS = {"srnn": 32, "hit-dvae": 16}
+"""Windows in a batch."""
+TARGETS = {
+    "srnn, two processes": ("at least", 1.9),
+    "hit-dvae, two processes": ("at least", 1.9),
+    **{f"srnn over {what}": ("at most", 1.1) for what in "TKBD"},  # 1 is linear
+    **{f"hit-dvae over {what}": ("at most", 1.1) for what in "KBD"},
+    "hit-dvae over T": ("at most", 2.0),  # it attends to every frame before
+    "srnn over clips": ("at most", 0.1),
+    "srnn, held-out clips": ("at most", 1.1),
+}
+OPTIONS = {"steps": 10**6, "accelerator": "cpu", "progress": False}
+
+
+def begun(name: str, size: int = SIZE, **options: int) -> dvae.SVI:
+    torch.manual_seed(0)
+    svi = dvae.SVI(dvae.method(name).build({"x": size}), **OPTIONS | options)
+    svi.init()
+    return svi
+
+
+# ------------------------------------------------------------------------------------------------ two processes
+
+
+def worker(name: str, turns: int = 25, steps: int = 4) -> None:
+    """What each of two processes does; the first prints the rows."""
+    with mock.patch.dict(os.environ):
+        del os.environ["TORCHELASTIC_RUN_ID"]
+        alone = begun(name)
+    joined, spent, together = begun(name), [0.0], processes.together
+    fabric, x, go_on = joined.fabric, torch.randn(METHODS[name], FRAMES, SIZE), torch.zeros(2, dtype=torch.int)
+
+    def timed(*given: object) -> tuple[Tensor, Tensor | float]:
+        start = time.process_time()
+        try:
+            return together(*given)  # type: ignore[arg-type]
+        finally:
+            spent[0] += time.process_time() - start
+
+    def turn(svi: dvae.SVI) -> tuple[float, float]:
+        """Seconds of the clock until both have come to its end, and of the processor."""
+        processes.wait(fabric)
+        start, busy = time.perf_counter(), time.process_time()
+        for _ in range(steps):
+            svi.step(x)
+            svi.total(go_on)  # as `fit` does after each
+        busy = time.process_time() - busy
+        last = torch.tensor([0.0, 0.0])
+        last[fabric.global_rank] = time.perf_counter() - start
+        return processes.total(fabric, last).max().item(), busy
+
+    def one() -> float:
+        processes.wait(fabric)
+        start = time.perf_counter()
+        for _ in range(steps if fabric.global_rank == 0 else 0):
+            alone.step(x)
+        return time.perf_counter() - start
+
+    def exchange() -> float:
+        spent[0] = 0.0
+        _, busy = turn(joined)
+        return spent[0] / busy
+
+    with mock.patch.object(processes, "together", timed):
+        found = [(one(), turn(joined)[0], turn(alone)[0], exchange()) for _ in range(turns)][2:]
+    if fabric.global_rank == 0:
+        single, both, apart, share = (min(each) for each in zip(*found, strict=True))
+        rows = {"two processes": 2 * single / both, "two alone": 2 * single / apart, "exchange": share}
+        print(json.dumps({f"{name}, {row}": value for row, value in rows.items()}))
+
+
+def two(name: str) -> dict[str, float]:
+    """Rows of a method in two processes."""
+    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", __spec__.name, name]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(done.stderr)
+    return dict(json.loads(done.stdout))
+
+
+# ------------------------------------------------------------------------------------------------ sizes
+
+
+def exponent(sizes: Sequence[int], action: Callable[[int], Callable[[], object]], repeat: int = 5) -> float:
+    """Of the size in the least time of what is made for it."""
+    times = seconds(*map(action, sizes), repeat=repeat)
+    return math.log(times[-1] / times[0]) / math.log(sizes[-1] / sizes[0])
+
+
+def sizes(name: str) -> dict[str, float]:
+    """Exponents of a method's step."""
+
+    def step(batch: int = 8, frames: int = FRAMES, size: int = SIZE, particles: int = 1) -> Callable[[], object]:
+        svi, x = begun(name, size, particles=particles), torch.randn(batch, frames, size)
+        return lambda: svi.step(x)
+
+    return {
+        f"{name} over T": exponent([100, 200, 400], lambda n: step(frames=n)),
+        f"{name} over K": exponent([1, 2, 4, 8], lambda n: step(particles=n)),
+        f"{name} over B": exponent([8, 16, 32, 64], lambda n: step(batch=n)),
+        f"{name} over D": exponent([24, 48, 96, 192], lambda n: step(size=n)),
+    }
+
+
+def clips(name: str) -> dict[str, float]:
+    """Exponents of the number of clips: of what a step takes from them, and of a validation."""
+    svi = begun(name)
+
+    def windows(count: int, split: str) -> motion.Windows:
+        return motion.windows(motion.simulate(clips=count), motion.PROTOCOLS["simulated"], split)
+
+    def step(count: int) -> Callable[[], object]:
+        train = windows(count, "train")
+        return lambda: svi.step(train.sample(32, svi.generator))
+
+    def validation(count: int) -> Callable[[], object]:
+        held_out = windows(count, "test").all()
+        return lambda: svi.evaluate(held_out)
+
+    return {
+        f"{name} over clips": exponent([50, 400], step, repeat=20),
+        f"{name}, held-out clips": exponent([50, 400], validation),
+    }
+
+
+def rows() -> dict[str, float]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    found = {row: value for name in METHODS for row, value in (two(name) | sizes(name)).items()} | clips("srnn")
+    torch.set_num_threads(threads)
+    return found
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    worker(sys.argv[1])
