@@ -8,14 +8,16 @@ changes nothing, nor the reverse.
 
 import atexit
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from ..compiled import compiling, require_compiler
 from ..data import Batch, Sequences, each, sequences
 from ..program.protocols import Program
 from ..turns import alone
@@ -135,6 +137,8 @@ class SVI:
             accelerator=training.accelerator, devices=training.devices, precision=training.precision
         )
         self.fabric.launch()
+        if training.compile:
+            require_compiler(self.fabric.device)
         if self.fabric.world_size > 1:
             atexit.unregister(_leave)
             atexit.register(_leave)
@@ -163,17 +167,23 @@ class SVI:
             NonFiniteError: the loss or a gradient is NaN or infinite; the weights stay as they are.
         """
         state, training = self.state, self.training
-        (_, stage), rates, objective = stage_at(self.plan, state.step), self.rates(state.step), self.objective
+        (first, stage), rates, objective = stage_at(self.plan, state.step), self.rates(state.step), self.objective
         for group in self.optimizer.param_groups:
             group["lr"] = rates["learning_rate"]
         if not self.model.training:
             self.module.train()
         where = f"step {state.step + 1}"
-        with self.drawing():
+        with self.drawing(), compiling() if training.compile else nullcontext() as compiled:
             terms = self._terms(batch, stage.objective, where, rates["self_feeding"], rates.get("curriculum"))
             loss = objective(terms, state.step)
             self.optimizer.zero_grad()
             self.fabric.backward(loss)
+        if compiled is not None and not compiled.used and state.step == first:
+            warnings.warn(
+                f"compile=True changes nothing in this stage of the run: a step of {type(self.model).__name__} has "
+                "nothing in it that is faster compiled (docs/results/speed.md)",
+                stacklevel=3,  # `alone` is between
+            )
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
             if name.startswith(stage.frozen):
                 parameter.grad = None  # which the optimiser leaves out, with its state
