@@ -7,8 +7,9 @@ changes nothing, nor the reverse.
 """
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from ..compiled import compiling, require_compiler
 from ..data import Batch, InBatches, each, in_batches
 from ..program.protocols import Program
 from ..turns import alone
@@ -134,6 +136,8 @@ class SVI:
         """Begin at step 0, with a new optimiser and the random numbers of the seed; the weights stay as they are."""
         training = self.training
         self.fabric: Fabric = processes.launched(training)
+        if training.compile:
+            require_compiler(self.fabric.device)
         with _forked(self.fabric.device):
             own: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
             optimizer = OPTIMISERS[training.optimizer](
@@ -160,17 +164,23 @@ class SVI:
             NonFiniteError: the loss or a gradient is NaN or infinite; the weights stay as they are.
         """
         state, training = self.state, self.training
-        (_, stage), rates, objective = stage_at(self.plan, state.step), self.rates(state.step), self.objective
+        (first, stage), rates, objective = stage_at(self.plan, state.step), self.rates(state.step), self.objective
         for group in self.optimizer.param_groups:
             group["lr"] = rates["learning_rate"]
         if not self.model.training:
             self.module.train()
         where = f"step {state.step + 1}"
-        with self.drawing():
+        with self.drawing(), compiling() if training.compile else nullcontext() as compiled:
             terms = self._terms(batch, stage.objective, where, rates["self_feeding"], rates.get("curriculum"))
             loss = objective(terms, state.step)
             self.optimizer.zero_grad()
             self.fabric.backward(loss)
+        if compiled is not None and not compiled.used and state.step == first:
+            warnings.warn(
+                f"compile=True changes nothing in this stage of the run: a step of {type(self.model).__name__} has "
+                "nothing in it that is faster compiled (docs/results/speed.md)",
+                stacklevel=3,  # `alone` is between
+            )
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
             if name.startswith(stage.frozen):
                 parameter.grad = None  # which the optimiser leaves out, with its state

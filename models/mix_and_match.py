@@ -28,6 +28,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
+from ..compiled import compiled
 from ..constants import constant
 from ..inference.objectives import Evidence
 from ..inference.recipe import Recipe
@@ -200,21 +201,21 @@ class MixAndMatchModel(DynamicalVAE):
         value = rollout.values[WHOLE]
         made = rollout.parameters(WHOLE, value)[0]
         with torch.no_grad():
-            theirs = self._aligned(value, data[LENGTHS])
-        ours = self._aligned(made, data[LENGTHS])
+            theirs = _aligned(value, data[LENGTHS], self.turns)
+        ours = _aligned(made, data[LENGTHS], self.turns)
         return {"skeleton": (ours - theirs).square().mean(-1).sum(-1)}
 
-    def _aligned(self, quaternions: Tensor, lengths: Tensor) -> Tensor:
-        """Positions (B, T, 3 J') of poses (B, T, D) whose root is at the origin and not turned."""
-        view = self.turns
-        place = view.turning.index(view.skeleton.root)
-        start = 3 * view.root
-        unturned = constant((1.0, 0.0, 0.0, 0.0), quaternions).expand(*quaternions.shape[:-1], 4)
-        first = torch.zeros_like(quaternions[..., :start])
-        turns = quaternions[..., start:].unflatten(-1, (-1, 4))
-        turns = torch.cat([turns[..., :place, :], unturned[..., None, :], turns[..., place + 1 :, :]], -2)
-        found: Tensor = view.inverse({WHOLE: torch.cat([first, turns.flatten(-2)], -1), LENGTHS: lengths})[WHOLE]
-        return found
+
+@compiled
+def _aligned(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
+    """Positions (B, T, 3 J') of poses (B, T, D) whose root is at the origin and not turned."""
+    place, start = view.turning.index(view.skeleton.root), 3 * view.root
+    unturned = constant((1.0, 0.0, 0.0, 0.0), quaternions).expand(*quaternions.shape[:-1], 4)
+    first = torch.zeros_like(quaternions[..., :start])
+    turns = quaternions[..., start:].unflatten(-1, (-1, 4))
+    turns = torch.cat([turns[..., :place, :], unturned[..., None, :], turns[..., place + 1 :, :]], -2)
+    found: Tensor = view.inverse({WHOLE: torch.cat([first, turns.flatten(-2)], -1), LENGTHS: lengths})[WHOLE]
+    return found
 
 
 @dataclass(frozen=True)

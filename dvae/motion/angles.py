@@ -9,7 +9,7 @@ bend backwards. Cosines do not change when a pose is turned or scaled, nor when 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -202,6 +202,34 @@ def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
     return cosines.reshape(*poses.shape[:-1], len(plan.first))
 
 
+def cosines_one_by_one(poses: Tensor, matrix: Tensor, places: Places) -> list[Tensor]:
+    """The same, NaN where a pose lacks an angle, for torch to compile: a thousand operations on rows of numbers.
+
+    Args:
+        poses: (N, D).
+        matrix: of the differences, see `differences`.
+        places: of the angles.
+
+    Returns:
+        A tensors (N,).
+    """
+    with torch.autocast(poses.device.type, enabled=False):
+        rows = (matrix.T @ poses.T).unbind(0)
+    vectors = [rows[i : i + 3] for i in range(0, len(rows), 3)]
+    for crosses in places.crosses:
+        factors = [(*vectors[a], *vectors[b]) for a, b in crosses]
+        vectors += [(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx) for ax, ay, az, bx, by, bz in factors]
+    inverse = [inverse_lengths(torch.stack(vector, -1)) for vector in vectors]
+
+    def inner(a: int, b: int) -> Tensor:
+        return sum(one * other for one, other in zip(vectors[a], vectors[b], strict=True))  # type: ignore[return-value]
+
+    found = [inner(a, b) * inverse[a] * inverse[b] for a, b in places.angles]
+    for angle, u, v, negative in places.partial:
+        found[angle] = found[angle].masked_fill((inner(u, v) < 0) != negative, torch.nan)
+    return found
+
+
 class _Cosines(Function):
     """With its derivative by hand, which takes half the time of the recorded one.
 
@@ -305,25 +333,39 @@ def _angles(skeleton: Skeleton) -> tuple[Angle, ...]:
     return ANGLES[skeleton.name]
 
 
+class Places(NamedTuple):
+    """Which vectors to make, and between which of them the cosines of a skeleton are, by their places."""
+
+    differences: tuple[tuple[int, int], ...]
+    """The first vectors, from joint to joint."""
+    crosses: tuple[tuple[tuple[int, int], ...], ...]
+    """Of each round of cross products, which are appended, their factors."""
+    angles: tuple[tuple[int, int], ...]
+    partial: tuple[tuple[int, int, int, bool], ...]
+    """The angles that some poses do not have, and when: u v < 0, or not."""
+
+
 class _Plan(NamedTuple):
-    """Which vectors to make, and between which of them the cosines are, all by index."""
+    """The same as tensors."""
 
     vectors: int
     differences: tuple[tuple[int, int], ...]
     crosses: list[tuple[Tensor, Tensor]]
-    """The vectors that each round of cross products appends."""
     first: Tensor
     second: Tensor
     partial: Tensor
-    """The angles that some poses do not have, and when: u v < 0, or not."""
     u: Tensor
     v: Tensor
     negative: Tensor
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # as of `differences`
-def _plan(skeleton: Skeleton, device: torch.device) -> _Plan:
+def places_of(skeleton: Skeleton) -> Places:
+    """Those of a skeleton's angles.
+
+    Raises:
+        ValueError: the skeleton has no angles.
+    """
     angles = _angles(skeleton)
     needed: dict[Vector, int] = {}  # vector -> how deep its cross products are nested
     for angle in angles:
@@ -331,24 +373,28 @@ def _plan(skeleton: Skeleton, device: torch.device) -> _Plan:
             _depth(vector, needed)
     vectors = sorted(needed, key=needed.__getitem__)
     place = {vector: i for i, vector in enumerate(vectors)}
-
-    def places(chosen: list[Vector]) -> Tensor:
-        return torch.tensor([place[vector] for vector in chosen], dtype=torch.long, device=device)
-
     rounds = [[vector for vector in vectors if needed[vector] == depth] for depth in range(max(needed.values()) + 1)]
-    operands = [[vector for vector in crosses if not isinstance(vector, str)] for crosses in rounds[1:]]
-    partial = [(i, angle.when) for i, angle in enumerate(angles) if angle.when]
-    return _Plan(
-        len(vectors),
+    return Places(
         tuple(_joints(vector, skeleton) for vector in rounds[0]),
-        [(places([a for a, _, _ in crosses]), places([b for _, _, b in crosses])) for crosses in operands],
-        places([angle.first for angle in angles]),
-        places([angle.second for angle in angles]),
-        torch.tensor([i for i, _ in partial], dtype=torch.long, device=device),
-        places([u for _, (u, _, _) in partial]),
-        places([v for _, (_, v, _) in partial]),
-        torch.tensor([sign < 0 for _, (_, _, sign) in partial], dtype=torch.bool, device=device),
+        tuple(tuple((place[v[0]], place[v[2]]) for v in crosses if not isinstance(v, str)) for crosses in rounds[1:]),
+        tuple((place[angle.first], place[angle.second]) for angle in angles),
+        tuple((i, place[a.when[0]], place[a.when[1]], a.when[2] < 0) for i, a in enumerate(angles) if a.when),
     )
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)  # as of `differences`
+def _plan(skeleton: Skeleton, device: torch.device) -> _Plan:
+    found = places_of(skeleton)
+
+    def columns(rows: Sequence[tuple[int, ...]], count: int) -> Any:
+        return torch.tensor(rows, dtype=torch.long, device=device).reshape(-1, count).T.contiguous().unbind(0)
+
+    crosses = [columns(crosses, 2) for crosses in found.crosses]
+    first, second = columns(found.angles, 2)
+    partial, u, v, negative = columns(found.partial, 4)
+    made = len(found.differences) + sum(map(len, found.crosses))
+    return _Plan(made, found.differences, crosses, first, second, partial, u, v, negative.bool())
 
 
 def _depth(vector: Vector, needed: dict[Vector, int]) -> int:

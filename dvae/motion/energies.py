@@ -18,9 +18,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import Function, once_differentiable
 
+from ..compiled import compiled, requested
 from ..constants import constant
-from .angles import AngleLimits, angle_names, cosines
-from .skeleton import Skeleton
+from .angles import AngleLimits, Places, angle_names, cosines, cosines_one_by_one, places_of
+from .skeleton import Skeleton, differences
 
 BLOCK = 2**18
 """Numbers that are worked on at once on a CPU, so that what is made of them stays in cache."""
@@ -98,17 +99,27 @@ def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
     _check(samples)
     if not scale > 0:
         raise ValueError(f"scale is {scale}, expected a distance above 0, in metres")
+    if requested() and len(samples) > 1:
+        return _likeness(samples, scale)
     first, second = torch.triu_indices(len(samples), len(samples), 1, device=samples.device)
     one = torch.eye(len(samples), dtype=samples.dtype, device=samples.device)
-    differences = one[first] - one[second]  # as a matrix product, a third faster than by indices
+    pairs = one[first] - one[second]  # as a matrix product, a third faster than by indices
 
     def energy(x: Tensor) -> Tensor:
         with torch.autocast(x.device.type, enabled=False):
-            apart = (differences @ x.flatten(1)).view(len(first), *x.shape[1:])
+            apart = (pairs @ x.flatten(1)).view(len(first), *x.shape[1:])
         return (-apart.abs().sum((2, 3)) / scale).exp().sum(0) / max(len(first), 1)
 
     diversity: Tensor = _InBlocks.apply(energy, samples)
     return diversity
+
+
+@compiled
+def _likeness(samples: Tensor, scale: float) -> Tensor:
+    """By one sample after the other, beside those behind it: compiled, with no room for the differences."""
+    apart = torch.cat([(samples[i] - samples[i + 1 :]).abs().sum((2, 3)) for i in range(len(samples) - 1)])
+    likeness: Tensor = (-apart / scale).exp().mean(0)
+    return likeness
 
 
 def gaussian_diversity(samples: Tensor, scale: float) -> Tensor:
@@ -202,16 +213,26 @@ def limb_length(samples: Tensor, reference: Tensor, skeleton: Skeleton) -> Tenso
     """
     _check(samples, reference=(reference, (*samples.shape[1:2], *samples.shape[3:])))
 
-    def lengths(poses: Tensor) -> Tensor:
-        return skeleton.limbs(poses).square().sum(-1).clamp_min(1e-30).sqrt()  # the gradient at 0 is 0, not NaN
-
-    def energy(poses: Tensor, expected: Tensor) -> Tensor:
-        return _errors(lengths(poses), expected[:, None]).sum(3).mean((0, 2))
-
+    limbs = differences(skeleton, tuple(skeleton.edges), samples.shape[-1], samples.dtype, samples.device)
     pose = reference.detach()
     lacking = skeleton.bone_lengths(skeleton.with_root(pose.unflatten(-1, (-1, 3)))).isnan()
-    error: Tensor = _InBlocks.apply(energy, samples, torch.where(lacking, torch.nan, lengths(pose.nan_to_num(0.0))))
+    expected = torch.where(lacking, torch.nan, _lengths(pose.nan_to_num(0.0), limbs))
+    if requested():
+        return _limb_errors(samples, expected, limbs)
+    error: Tensor = _InBlocks.apply(lambda block, other: _limb_errors(block, other, limbs), samples, expected)
     return error
+
+
+@compiled
+def _limb_errors(samples: Tensor, expected: Tensor, limbs: Tensor) -> Tensor:
+    return _errors(_lengths(samples, limbs), expected[:, None]).sum(3).mean((0, 2))
+
+
+def _lengths(poses: Tensor, limbs: Tensor) -> Tensor:
+    """Of the limbs, vectors as `Skeleton.limbs` has them."""
+    with torch.autocast(poses.device.type, enabled=False):
+        vectors: Tensor = (poses @ limbs).unflatten(-1, (-1, 3))
+    return vectors.square().sum(-1).clamp_min(1e-30).sqrt()  # the gradient at 0 is 0, not NaN
 
 
 class _InBlocks(Function):
@@ -271,8 +292,23 @@ def joint_angles(samples: Tensor, limits: AngleLimits, skeleton: Skeleton) -> Te
     low, high = limits.low.to(samples), limits.high.to(samples)
     low, high = low.masked_fill(low < -0.98, -torch.inf), high.masked_fill(high > 0.98, torch.inf)
     same = constant(tuple(tuple(float(name == other) for other in names) for name in names), samples)
+    if requested():
+        places = places_of(skeleton)
+        matrix = differences(skeleton, places.differences, samples.shape[-1], samples.dtype, samples.device)
+        return _excess(samples, low, high, same, matrix, places)
     excess: Tensor = _JointAngles.apply(samples, low, high, same, skeleton)
     return excess
+
+
+@compiled
+def _excess(samples: Tensor, low: Tensor, high: Tensor, same: Tensor, matrix: Tensor, places: Places) -> Tensor:
+    _, sequences, frames, size = samples.shape
+    cos = torch.stack(cosines_one_by_one(samples.reshape(-1, size), matrix, places))
+    low, high = low[:, None], high[:, None]
+    over = torch.where(cos < low, cos - low, torch.where(cos > high, cos - high, 0))
+    below, above = ((same @ side.sum(1).to(same)).clamp_min(1)[:, None] for side in (over < 0, over > 0))
+    share = sequences * over.square() / torch.where(over < 0, below, above)
+    return share.sum(0).view(-1, sequences, frames).sum((0, 2))
 
 
 class _JointAngles(Function):

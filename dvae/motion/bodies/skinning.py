@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from ...compiled import compiled
 from ...constants import indices
 from ..kinematics import forward
 
@@ -174,14 +175,11 @@ class Body(nn.Module):
             shape: of each body, (..., S).
             first, second: rotations (..., T, J, 3, 3) and translation (..., T, 3) of each, as `forward` takes them.
         """
-        ours, theirs = (_flat(self._posed(shape, *motion)[0]) for motion in (first, second))
-        apart = (ours - theirs).unflatten(-1, (-1, 4))
-        moved = (first[1] - second[1]).flatten(-2)[..., None]  # all joints alike, as weights have the sum 1
-        apart = torch.cat([apart[..., :3], apart[..., 3:] + moved[..., None, :]], -1).flatten(-2)
+        for motion in (first, second):
+            self._check(shape, *motion)
         surface = self._hung(shape)
         form = surface.mT @ surface / surface.shape[-2]
-        found: Tensor = ((apart @ form) * apart).sum(-1).unflatten(-1, (-1, 3)).sum(-1)
-        return found
+        return _squared_error(form, self._pivots(shape), *first, *second, self.parents)
 
     def _hung(self, shape: Tensor) -> Tensor:
         """Vertices at rest by the joints that they hang on, (..., V, 4 J)."""
@@ -196,6 +194,10 @@ class Body(nn.Module):
 
     def _posed(self, shape: Tensor, rotations: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
         """What joints do to what hangs on them (..., T, J, 3, 4), and where they are (..., T, J, 3), not translated."""
+        self._check(shape, rotations, translation)
+        return _posed(self._pivots(shape), rotations, self.parents)
+
+    def _check(self, shape: Tensor, rotations: Tensor, translation: Tensor) -> None:
         frames = translation.shape[:-1]
         if rotations.shape != (*frames, self.joints, 3, 3) or shape.shape[:-1] != frames[:-1] or not frames:
             raise ValueError(
@@ -203,12 +205,35 @@ class Body(nn.Module):
                 f"translation (..., T, 3), got {tuple(shape.shape)}, {tuple(rotations.shape)} and "
                 f"{tuple(translation.shape)}"
             )
-        pivots = self._pivots(shape)[..., None, :, :]
-        root = self.parents.index(-1)
-        offsets = pivots - pivots.index_select(-2, indices([max(parent, 0) for parent in self.parents], pivots))
-        joints, turns = forward(self.parents, rotations, offsets, pivots[..., root, :].expand_as(translation))
-        moved = joints - (turns @ pivots[..., None]).squeeze(-1)
-        return torch.cat([turns, moved[..., None]], -1), joints
+
+
+@compiled
+def _squared_error(
+    form: Tensor,
+    pivots: Tensor,
+    rotations: Tensor,
+    translation: Tensor,
+    others: Tensor,
+    elsewhere: Tensor,
+    parents: tuple[int, ...],
+) -> Tensor:
+    """By the quadratic form (..., 4 J, 4 J) of what two motions do to joints at these places."""
+    ours, theirs = (_flat(_posed(pivots, turns, parents)[0]) for turns in (rotations, others))
+    apart = (ours - theirs).unflatten(-1, (-1, 4))
+    moved = (translation - elsewhere).flatten(-2)[..., None]  # all joints alike, as weights have the sum 1
+    apart = torch.cat([apart[..., :3], apart[..., 3:] + moved[..., None, :]], -1).flatten(-2)
+    found: Tensor = ((apart @ form) * apart).sum(-1).unflatten(-1, (-1, 3)).sum(-1)
+    return found
+
+
+def _posed(pivots: Tensor, rotations: Tensor, parents: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """What joints do (..., T, J, 3, 4), and where they are (..., T, J, 3), of bodies that rest with them at places."""
+    pivots = pivots[..., None, :, :]
+    offsets = pivots - pivots.index_select(-2, indices([max(parent, 0) for parent in parents], pivots))
+    root = pivots[..., parents.index(-1), :].expand(*rotations.shape[:-3], 3)
+    joints, turns = forward(parents, rotations, offsets, root)
+    moved = joints - (turns @ pivots[..., None]).squeeze(-1)
+    return torch.cat([turns, moved[..., None]], -1), joints
 
 
 def _flat(moves: Tensor) -> Tensor:
