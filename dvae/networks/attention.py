@@ -272,7 +272,7 @@ class AttentionNetwork(Network):
         queries = self.point.hoist(known, batch, length) if self.point is not None else None
         fixed = [p for p in self.ranged if p.name in given]
         live = [p for p in self.ranged if p.name not in given]
-        columns, tokens, bias = self.columns(), self.origin.new_zeros(1, 1, 1), self.origin.new_zeros(1, 1, 1)
+        columns, tokens, bias = self.columns(), self.origin.new_zeros(batch, 1, 1), self.origin.new_zeros(1, 1, 1)
         if self.ranged:
             first = self.start_token if columns is None else functional.pad(columns.new_ones(1), (len(columns) - 1, 0))
             kept = [self.kept(parent.name, given[parent.name]) for parent in fixed]
