@@ -82,7 +82,7 @@ def worker(name: str, turns: int = 25, steps: int = 4) -> None:
         busy = time.process_time() - busy
         last = torch.tensor([0.0, 0.0])
         last[fabric.global_rank] = time.perf_counter() - start
-        return processes.total(fabric, last).max().item(), busy
+        return processes.summed(fabric, last).max().item(), busy
 
     def one() -> float:
         processes.wait(fabric)

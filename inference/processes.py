@@ -65,11 +65,6 @@ def by_torchrun() -> bool:
     return distributed.is_available() and distributed.is_torchelastic_launched()
 
 
-def first() -> bool:
-    """Whether this process is the one that writes and speaks, which is known before processes have met."""
-    return os.environ.get("RANK" if by_torchrun() else "LOCAL_RANK", "0") == "0"
-
-
 def restartable() -> bool:
     """Whether torchrun starts the processes again when one of them has ended (`--max-restarts`).
 
@@ -83,9 +78,9 @@ def seed_of(seed: int, process: int) -> int:
     return int(np.random.SeedSequence([seed % 2**64, process]).generate_state(1)[0]) if process else seed
 
 
-def total(fabric: "Fabric", value: Tensor) -> Tensor:
+def summed(fabric: "Fabric", value: Tensor) -> Tensor:
     """The sum over the processes."""
-    return _summed(value.to(fabric.device, copy=True)) if fabric.world_size > 1 else value
+    return _all_reduce(value.to(fabric.device, copy=True)) if fabric.world_size > 1 else value
 
 
 def together(
@@ -110,9 +105,9 @@ def together(
     given = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
     numbers = torch.tensor([1.0, *had], device=loss.device)
     own = torch.cat([loss.detach()[None], numbers, *(gradient.flatten() for gradient in given)])
-    summed = _summed(own.mul_(frames))
-    all_frames = summed[1].clone()
-    whole, _, has, *means = summed.div_(all_frames).split([1, 1, len(had), *(p.numel() for p in parameters)])
+    joint = _all_reduce(own.mul_(frames))
+    all_frames = joint[1].clone()
+    whole, _, has, *means = joint.div_(all_frames).split([1, 1, len(had), *(p.numel() for p in parameters)])
     anywhere = had if all(had) else (has > 0).tolist()
     for parameter, mean, there in zip(parameters, means, anywhere, strict=True):
         parameter.grad = mean.view_as(parameter).to(parameter.dtype) if there else None
@@ -133,7 +128,7 @@ def gathered(fabric: "Fabric", value: Tensor) -> Tensor:
     """The values (N,) of all processes, (processes, N), on the CPU."""
     rows = value.new_zeros(fabric.world_size, *value.shape)
     rows[fabric.global_rank] = value
-    return total(fabric, rows).cpu()
+    return summed(fabric, rows).cpu()
 
 
 def wait(fabric: "Fabric") -> None:
@@ -142,7 +137,7 @@ def wait(fabric: "Fabric") -> None:
         fabric.barrier()
 
 
-def _summed(value: Tensor) -> Tensor:
+def _all_reduce(value: Tensor) -> Tensor:
     """The sum over the processes, in place of the value."""
     with _answered():
         distributed.all_reduce(value)  # fabric's own has them wait for one another first, in a message more

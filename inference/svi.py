@@ -282,7 +282,7 @@ class SVI:
 
     def total(self, value: Tensor) -> Tensor:
         """The sum over the processes."""
-        return processes.total(self.fabric, value)
+        return processes.summed(self.fabric, value)
 
     def mean(self, value: Tensor) -> Tensor:
         """The mean over the processes of what the last step's batches have a frame."""

@@ -18,10 +18,9 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 
-from ..inference.processes import first
 from ..inference.result import reason
 from ..options import nearest
-from .console import ERROR, OUT, UsageError, note
+from .console import ERROR, OUT, UsageError, note, speaks
 
 COMMANDS = {
     "list": ("methods:list_methods", "List the methods: their equations and where they come from."),
@@ -75,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     warnings.showwarning = note
-    OUT.quiet = ERROR.quiet = not first()
+    OUT.quiet = ERROR.quiet = not speaks()
     try:
         _run(given)
         return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,6 +26,11 @@ Missing = Annotated[
     tyro.conf.arg(help="keep clips that lack joints, which are NaN where they were not observed"),
 ]
 """The option of every command that reads motion."""
+
+
+def speaks() -> bool:
+    """Whether this process is the first of a run's, which it is where there is one; known before torch is imported."""
+    return os.environ.get("RANK" if "TORCHELASTIC_RUN_ID" in os.environ else "LOCAL_RANK", "0") == "0"
 
 
 class UsageError(ValueError):

@@ -378,6 +378,30 @@ def test_tensorboard_files_lie_in_the_run(people, tmp_path):
     assert (before, len(list(out.glob("events.*")))) == (1, 2)
 
 
+def test_of_several_processes_the_first_speaks_and_each_tells_why_it_fails(capsys, monkeypatch):
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert main(["list"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert "unknown command" in failure(capsys, "lst", code=2)
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    monkeypatch.setenv("RANK", "0")
+    assert main(["list"]) == 0
+    assert "srnn" in capsys.readouterr().out
+
+
+def test_what_torchrun_starts_again_goes_on_with_its_run(people, tmp_path, capsys, monkeypatch):
+    told = {"TORCHELASTIC_RUN_ID": "none", "TORCHELASTIC_MAX_RESTARTS": "1", "WORLD_SIZE": "1", "LOCAL_WORLD_SIZE": "1"}
+    for name, value in told.items():
+        monkeypatch.setenv(name, value)
+    arguments = ["fit", "vae", "--data", str(people), "--out", str(tmp_path / "run"), "--steps", "5", *SMALL]
+    assert main(arguments) == 0
+    assert main(arguments) == 0
+    assert "holds a run, which goes on" in capsys.readouterr().err
+    monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
+    assert "already holds a run" in failure(capsys, *arguments)
+    assert "start it without torchrun" in failure(capsys, "sweep", "vae", "--out", str(tmp_path / "runs"))
+
+
 def test_a_method_with_an_objective_of_its_own_resumes(people, tmp_path, monkeypatch):
     seen = []
 
