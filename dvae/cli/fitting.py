@@ -41,7 +41,7 @@ from .tables import is_table
 def options_of(name: str, kind: type[Any], *aside: str) -> Any:
     """A dataclass of the options of another that can be written as words, but those that are left aside.
 
-    Options are None where they are not given.
+    Options are None where they are not given, and flags False.
 
     Args:
         name: of the class.
@@ -54,7 +54,8 @@ def options_of(name: str, kind: type[Any], *aside: str) -> Any:
         hint = hints[option.name]
         if schedules & {*get_args(hint)}:
             hint = reduce(or_, [part for part in get_args(hint) if part not in schedules])
-        found.append((option.name, hint | None, None))
+        flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+        found.append((option.name, flag, False) if hint is bool else (option.name, hint | None, None))
     kept = [option for option in found if option[0] not in aside]
     return make_dataclass(name, kept, frozen=True, namespace={"__doc__": kind.__doc__})
 
@@ -218,6 +219,7 @@ def resume(
     data: str | None = None,
     steps: int | None = None,
     learning_rate: float | None = None,
+    compile: bool | None = None,
     tensorboard: bool = False,
 ) -> None:
     """Continue a run from its last checkpoint.
@@ -229,9 +231,10 @@ def resume(
         data: where the data lie now, if the path in the run no longer leads there.
         steps: optimiser steps in all, to make the run longer.
         learning_rate: step size of the optimiser from here on.
+        compile: whether inner functions are compiled from here on, such as not where there is no compiler.
         tensorboard: write TensorBoard files to the run directory too.
     """
-    given = {"steps": steps, "learning_rate": learning_rate}
+    given = {"steps": steps, "learning_rate": learning_rate, "compile": compile}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     with arguments():
         Training(**options)
@@ -304,7 +307,7 @@ def sweep(
 
 def given_options(training: Any) -> dict[str, Any]:
     """The options of training that are given, each of which may be."""
-    given = {name: value for name, value in vars(training).items() if value is not None}
+    given = {name: value for name, value in vars(training).items() if value is not None and value is not False}
     Training(**given)
     return given
 

@@ -360,7 +360,7 @@ class _Plan(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def places_of(skeleton: Skeleton) -> Places:
+def angle_places(skeleton: Skeleton) -> Places:
     """Those of a skeleton's angles.
 
     Raises:
@@ -385,7 +385,7 @@ def places_of(skeleton: Skeleton) -> Places:
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)  # as of `differences`
 def _plan(skeleton: Skeleton, device: torch.device) -> _Plan:
-    found = places_of(skeleton)
+    found = angle_places(skeleton)
 
     def columns(rows: Sequence[tuple[int, ...]], count: int) -> Any:
         return torch.tensor(rows, dtype=torch.long, device=device).reshape(-1, count).T.contiguous().unbind(0)

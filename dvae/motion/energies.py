@@ -20,7 +20,7 @@ from torch.autograd.function import Function, once_differentiable
 
 from ..compiled import compiled, requested
 from ..constants import constant
-from .angles import AngleLimits, Places, angle_names, cosines, cosines_one_by_one, places_of
+from .angles import AngleLimits, Places, angle_names, angle_places, cosines, cosines_one_by_one
 from .skeleton import Skeleton, differences
 
 BLOCK = 2**18
@@ -293,7 +293,7 @@ def joint_angles(samples: Tensor, limits: AngleLimits, skeleton: Skeleton) -> Te
     low, high = low.masked_fill(low < -0.98, -torch.inf), high.masked_fill(high > 0.98, torch.inf)
     same = constant(tuple(tuple(float(name == other) for other in names) for name in names), samples)
     if requested():
-        places = places_of(skeleton)
+        places = angle_places(skeleton)
         matrix = differences(skeleton, places.differences, samples.shape[-1], samples.dtype, samples.device)
         return _excess(samples, low, high, same, matrix, places)
     excess: Tensor = _JointAngles.apply(samples, low, high, same, skeleton)

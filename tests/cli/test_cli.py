@@ -16,10 +16,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
+import tyro
 
 import dvae
 from dvae import motion
 from dvae.cli import main
+from dvae.cli.fitting import TrainingOptions, given_options
 from dvae.inference.stein import SteinDiscrepancy
 from dvae.inference.yardstick import ReferencePosterior
 from dvae.motion.dataset import MotionData
@@ -694,3 +696,8 @@ def test_forecasts_become_tubes_on_validation_windows_or_on_clips_of_a_label(cap
     ):
         assert main(["tubes", str(run), "--samples", "4", *wrong])
         assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_compile_is_a_flag_which_says_nothing_where_it_is_not_given():
+    for arguments, given in ([], {}), (["--compile", "--seed", "0"], {"compile": True, "seed": 0}):
+        assert given_options(tyro.cli(TrainingOptions, args=arguments)) == given
