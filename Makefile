@@ -3,7 +3,7 @@
 # make quick   lint, types, and the tests that are not slow
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
 # make coverage   the tests, and which lines none of them runs
-# make bench   the benchmarks, beside their targets and the last release; as JSON in bench.json
+# make bench   the benchmarks, beside their targets and the last release; as JSON in bench.json; on a GPU with DEVICE=cuda
 # make notebooks   runs the notebooks and stores them with what they show
 # make docs    the site, in docs/_build/html
 # make dist    sdist, and from it the wheel, in dist; installed and started where there is nothing else
@@ -59,8 +59,10 @@ fuzz: venv
 coverage: venv
 	$(BIN)/pytest -n 2 --cov --cov-report=term-missing:skip-covered
 
+DEVICE := cpu
+
 bench: venv
-	$(BIN)/python -m benchmarks.bench
+	$(BIN)/python -m benchmarks.bench --device $(DEVICE)
 
 notebooks: venv
 	$(BIN)/python -m benchmarks.tables.notebooks notebooks/*.ipynb

@@ -6,14 +6,14 @@
     curvature  of what comes once, above all the posterior's curvature
 
 Of one segment most time goes into starting operations, of many into the operations themselves. The decoder is not
-fitted, which changes no time; a segment stands for all of those that are completed one by one. Times are the
-processor's.
+fitted, which changes no time; a segment stands for all of those that are completed one by one.
 """
 
 from __future__ import annotations
 
-import time
 from itertools import cycle, islice
+
+import torch
 
 import dvae
 from dvae import motion
@@ -22,22 +22,26 @@ from dvae.motion import bodies
 from dvae.motion.segments.completion import complete, glimpsed
 from dvae.motion.segments.embodied import Segments
 
+from .speed import moved, stopwatch
+
 MANY, STEPS = 100, 101
 TARGETS = {"whole": ("at least", 20.0), "descent": ("at least", 20.0)}
 
 
-def rows() -> dict[str, float]:
+def rows(device: torch.device) -> dict[str, float]:
     people = bodies.fitted(motion.simulate(clips=4, frames=90, seed=1), bodies.human())
     segments = Segments(motion.gait_cycles(people))
-    model, batch = MotionLatent().build(segments).eval(), segments.all()
+    model, batch = MotionLatent().build(segments).to(device).eval(), moved(segments.all(), device)
     rows = list(islice(cycle(range(len(segments))), MANY))
     x, shape = batch["x"][rows], batch["beta"][rows]
     seen = glimpsed(model, x, shape, "markers", frames=range(0, 100, 20))
 
+    clock = stopwatch()
+
     def seconds(descent: dvae.Descent, end: int) -> float:
-        begun = time.process_time()
+        begun = clock()
         complete(model, {name: value[:end] for name, value in seen.items()}, descent=descent)
-        return time.process_time() - begun
+        return clock() - begun
 
     descents = {steps: dvae.Descent(steps=steps, starts=1, candidates=1, newton=0) for steps in (1, STEPS)}
     descents |= {"whole": dvae.Descent(starts=1), "starts": dvae.Descent()}

@@ -15,6 +15,8 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import torch
+
 from dvae import motion
 from dvae.cli import main as dvae
 
@@ -70,6 +72,6 @@ def page(folder: Path) -> dict[str, float]:
     return {"MB of a page": out.stat().st_size / 1e6}
 
 
-def rows() -> dict[str, float]:
+def rows(_: torch.device) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         return converting(Path(folder)) | page(Path(folder))

@@ -4,7 +4,7 @@
               frames, 10 x 10 futures each), over its matrix products alone
     energies  the share of a step that the energies of futures take that are there, forward and backward
     prior     the pose prior's energy, with the reflections of its layers one after the other over all at once
-    memory    the most that the process held, in GB; the public implementation 6.7
+    memory    the most that the process held, in GB, not that of a GPU; the public implementation 6.7
     futures   50 futures of 16 windows, over their matrix products alone
 
 Motion is simulated, on the same tree of joints. Times are the least of several, in turns with what they compare to.
@@ -22,7 +22,7 @@ from dvae import motion
 from dvae.laws.flow import QRFlowLaw
 from dvae.models.gsps import PRESETS, GSPSModel
 
-from .speed import products, seconds, training_step
+from .speed import moved, products, seconds, training_step
 
 TARGETS = {"energies": ("at most", 0.25), "prior": ("at least", 3.0), "memory": ("at most", 6.7)}
 
@@ -39,19 +39,21 @@ def sequential(flow: QRFlowLaw, x: torch.Tensor) -> torch.Tensor:
     return x
 
 
-def rows() -> dict[str, float]:
+def rows(device: torch.device) -> dict[str, float]:
     protocol = replace(motion.PROTOCOLS["simulated"], observed=25, predicted=100)
     windows = motion.windows(motion.simulate(), protocol, "train")
     method = dvae.method("gsps", **PRESETS["human36m"], pose_prior=0.01)
     model = method.build(windows).train()
     assert isinstance(model, GSPSModel)
     method.train(windows).prepare(model)
+    model.to(device)
     source, generator = method.train(windows).batches, torch.Generator().manual_seed(0)
     elbo, objective = dvae.SequenceELBO(), method.train(windows).objective
-    step = training_step(model, lambda: objective(elbo.terms(model, source.sample(16, generator)), 0))
+    draw = lambda: moved(source.sample(16, generator), device)  # noqa: E731
+    step = training_step(model, lambda: objective(elbo.terms(model, draw()), 0))
     for _ in range(5):
         step()
-    batch = source.sample(16, generator)
+    batch = draw()
     with torch.no_grad():
         values = model.model(batch)
     drawn = {name: values[name].requires_grad_() for name in ("lower", "upper")}
@@ -65,7 +67,7 @@ def rows() -> dict[str, float]:
     whole, alone, energies, ahead, apart = seconds(step, products(step), scored, futures, products(futures), repeat=5)
     found = {"step": whole / alone, "energies": energies / whole, "futures": ahead / apart}
 
-    flow, poses = model.pose_prior.flow, torch.randn(53_000, 48, requires_grad=True)
+    flow, poses = model.pose_prior.flow, torch.randn(53_000, 48, device=device, requires_grad=True)
     both = seconds(
         *(
             lambda f=f: f().square().sum().backward()
@@ -74,5 +76,6 @@ def rows() -> dict[str, float]:
         repeat=3,
     )
     found["prior"] = both[0] / both[1]
-    found["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    if device.type == "cpu":
+        found["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     return found

@@ -14,7 +14,6 @@ Motion is simulated. Times are the least of several, in turns with what they com
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import torch
@@ -24,7 +23,7 @@ import dvae
 from dvae import motion
 from dvae.program.rollout import SelfFeeding
 
-from .speed import products, seconds, training_step
+from .speed import moved, products, seconds, stopwatch, training_step
 
 TARGETS = {
     "frame": ("at most", 3.0),
@@ -50,12 +49,13 @@ def without_caches(model: dvae.DynamicalVAE, past: Tensor, horizon: int, samples
     return x
 
 
-def rows() -> dict[str, float]:
+def rows(device: torch.device) -> dict[str, float]:
     windows = motion.windows(motion.simulate(), motion.PROTOCOLS["simulated"], "train")
     method = dvae.method("hit-dvae", pose_prior=0.0, decoder=256).suited(windows)  # the paper's width
     model = method.build(windows)
     method.train(windows).prepare(model)
-    past = model.turned(windows.all()["x"][:100, : windows.protocol.observed])
+    model.to(device)
+    past = model.turned(windows.all()["x"][:100, : windows.protocol.observed].to(device))
     found: dict[str, float] = {}
 
     model.eval()
@@ -66,16 +66,17 @@ def rows() -> dict[str, float]:
         lambda: model.forecast(one, 300, 50),
         repeat=3,
     )
-    small = dvae.method("hit-dvae", pose_prior=0.0).build(windows).eval()
+    small = dvae.method("hit-dvae", pose_prior=0.0).build(windows).to(device).eval()
     generation = lambda: small.forecast(one, 60, 50)  # noqa: E731
     made, apart = seconds(generation, products(generation), repeat=3)
     found["frame"] = made / apart
     found["cache"] = anew / cached
     found["growth"] = (long - cached) / (300 - 60) / (cached / 60)
-    begun = time.perf_counter()
+    clock = stopwatch()
+    begun = clock()
     for part in past.split(20):
         model.forecast(part, 60, 50)
-    found["seconds"] = time.perf_counter() - begun
+    found["seconds"] = clock() - begun
 
     model.train()
     source, objective, elbo = method.train(windows).batches, method.train(windows).objective, dvae.SequenceELBO()
@@ -84,7 +85,8 @@ def rows() -> dict[str, float]:
     def step(feeding: SelfFeeding | None):
         fed = None if feeding is None else replace(feeding, start=windows.protocol.observed)
         program = {"draws": objective.draws, "self_feeding": fed}
-        return training_step(model, lambda: objective(elbo.terms(model, source.sample(16, generator), **program), 0))
+        draw = lambda: moved(source.sample(16, generator), device)  # noqa: E731
+        return training_step(model, lambda: objective(elbo.terms(model, draw(), **program), 0))
 
     kinds = {
         "exact": SelfFeeding(1.0, gradient=False),

@@ -16,18 +16,18 @@ import torch
 import dvae
 from dvae import motion
 
-from .speed import seconds, training_step
+from .speed import moved, seconds, training_step
 
 TARGETS = {"feeding": ("at most", 1.75)}
 
 
-def rows() -> dict[str, float]:
+def rows(device: torch.device) -> dict[str, float]:
     protocol = replace(motion.PROTOCOLS["simulated"], representation="quaternion")
     windows = motion.windows(motion.simulate(), protocol, "train")
     method = dvae.method("mix-and-match").suited(windows)
-    model = method.build(windows)
+    model = method.build(windows).to(device)
     objective, bound = method.train(windows).objective, dvae.SequenceELBO()
-    batch = windows.sample(32, torch.Generator().manual_seed(0))
+    batch = moved(windows.sample(32, torch.Generator().manual_seed(0)), device)
     own, true = seconds(
         *(
             training_step(model, lambda p=p: objective(bound.terms(model, batch, self_feeding=p), 1000))

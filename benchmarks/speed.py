@@ -10,7 +10,7 @@
               implementation over the LSTM layers that are in it, forward and backward, alone
 
 Times are the least of several repetitions, the two sides of a ratio alternating, so that what else the machine does
-counts least; with one thread they are the processor's.
+counts least; with one thread they are the processor's. On a GPU they end when all is done that was asked of it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import dvae
 from dvae import motion
+from dvae.data import each
 from dvae.laws import scan
 from dvae.laws.chain import gaussian_chain
 from dvae.laws.kalman import LinearGaussianChain
@@ -62,7 +63,7 @@ FAMILY = {
 
 def seconds(*actions: Callable[[], object], repeat: int = 15) -> list[float]:
     """The least time of each action, taken in turns."""
-    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+    clock = stopwatch()
     best = [math.inf] * len(actions)
     for action in actions:
         action()
@@ -74,10 +75,28 @@ def seconds(*actions: Callable[[], object], repeat: int = 15) -> list[float]:
     return best
 
 
+def stopwatch() -> Callable[[], float]:
+    """Tells seconds: the processor's with one thread; where there is a GPU at work, the clock's, once it has done."""
+    if not torch.cuda.is_initialized():
+        return time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+
+    def clock() -> float:
+        torch.cuda.synchronize()
+        return time.perf_counter()
+
+    return clock
+
+
+def moved(batch: Any, device: torch.device) -> Any:
+    """A batch on a device."""
+    return each(batch, lambda value: value.to(device))
+
+
 def layers(model: nn.Module, x: Tensor) -> Callable[[], None]:
     """The LSTM layers of a model, forward and backward, on numbers for as many sequences and steps as x (B, T, D)."""
     found = [module for module in model.modules() if isinstance(module, nn.LSTM)]
-    inputs = [torch.randn(*x.shape[:2], layer.input_size, requires_grad=True) for layer in found]
+    options: Any = {"device": x.device, "requires_grad": True}
+    inputs = [torch.randn(*x.shape[:2], layer.input_size, **options) for layer in found]
 
     def run() -> None:
         for layer, given in zip(found, inputs, strict=True):
@@ -107,7 +126,7 @@ class Products(TorchDispatchMode):
         """Of that shape and layout, the same for all of them."""
         key = tuple(value.shape), tuple(value.stride()), value.dtype
         if key not in self.made:
-            self.made[key] = torch.empty_strided(*key[:2], dtype=value.dtype).fill_(0.5)
+            self.made[key] = value.new_empty_strided(*key[:2]).fill_(0.5)
         return self.made[key]
 
     @torch.no_grad()
@@ -152,7 +171,7 @@ class ByHand(nn.Module):
         g = self.future(torch.tanh(self.x_future(torch.cat([h, x], -1))).flip(1))[0].flip(1)
         fixed, recurrent = self.guide.weight.split([h.shape[-1], self.z], dim=1)
         base = functional.linear(g, fixed, self.guide.bias)
-        noise = torch.randn(x.shape[1], x.shape[0], self.z)
+        noise = torch.randn(x.shape[1], x.shape[0], self.z, device=x.device)
         layers = [(recurrent, None), (self.guide_out.weight, self.guide_out.bias)]
         z, loc, scale, _ = gaussian_chain(base.transpose(0, 1), noise, layers, min_scale=1e-3)
         z, loc, scale = (v.transpose(0, 1) for v in (z, loc, scale))
@@ -168,8 +187,8 @@ class ByHand(nn.Module):
 
 def program(x: Tensor) -> float:
     """Pyro step over hand-written step."""
-    model = dvae.method("srnn", latent=10).build({"x": SIZE})
-    by_hand = ByHand(SIZE, 10)
+    model = dvae.method("srnn", latent=10).build({"x": SIZE}).to(x.device)
+    by_hand = ByHand(SIZE, 10).to(x.device)
     elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
     ours = training_step(model, lambda: evidence(elbo.terms(model, x), 0))
     theirs = training_step(by_hand, lambda: by_hand(x))
@@ -179,7 +198,7 @@ def program(x: Tensor) -> float:
 
 def chain(x: Tensor) -> float:
     """SRNN step with a plain loop over that with the fused chain."""
-    model = dvae.method("srnn", latent=10).build({"x": SIZE})
+    model = dvae.method("srnn", latent=10).build({"x": SIZE}).to(x.device)
     plain = copy.deepcopy(model)
     plain.encoder["z"].chain = lambda *_: None
     elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
@@ -187,15 +206,15 @@ def chain(x: Tensor) -> float:
     return a / b
 
 
-def cache(length: int = 100, samples: int = 50) -> float:
+def cache(device: torch.device, length: int = 100, samples: int = 50) -> float:
     """Time of recomputing over time of caching, for the same free run."""
-    model = dvae.method("hit-dvae", pose_width=8).build({"x": SIZE}).eval()
+    model = dvae.method("hit-dvae", pose_width=8).build({"x": SIZE}).to(device).eval()
     parts = model.generator
 
     @torch.no_grad()
     def recomputing() -> None:
-        w = torch.randn(samples, model.sizes["w"])
-        values = {"z": torch.zeros(samples, 0, model.sizes["z"]), "x": torch.zeros(samples, 0, SIZE)}
+        w = torch.randn(samples, model.sizes["w"], device=device)
+        values = {name: torch.zeros(samples, 0, model.sizes[name], device=device) for name in ("z", "x")}
         for t in range(length):
             for name in ("z", "x"):
                 parents = {"w": w} | {k: functional.pad(v, (0, 0, 0, t + 1 - v.shape[1])) for k, v in values.items()}
@@ -207,12 +226,12 @@ def cache(length: int = 100, samples: int = 50) -> float:
     return a / b
 
 
-def linear() -> float:
+def linear(device: torch.device) -> float:
     """Exponent of T in the time of a training step."""
-    model = dvae.method("srnn").build({"x": SIZE})
+    model = dvae.method("srnn").build({"x": SIZE}).to(device)
     elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
     lengths = [125, 250, 500, 1000]
-    data = [torch.randn(8, length, SIZE) for length in lengths]
+    data = [torch.randn(8, length, SIZE, device=device) for length in lengths]
     times = seconds(*(training_step(model, lambda x=x: evidence(elbo.terms(model, x), 0)) for x in data), repeat=5)
     return math.log(times[-1] / times[0]) / math.log(lengths[-1] / lengths[0])
 
@@ -231,16 +250,16 @@ def segments() -> float:
     return a / b
 
 
-def filters(steps: int = 10_000, batch: int = 1, size: int = 4) -> tuple[float, float]:
+def filters(device: torch.device, steps: int = 10_000, batch: int = 1, size: int = 4) -> tuple[float, float]:
     """Time of a Kalman chain in blocks over that of one step after the other: forward, and with its gradients."""
-    options = {"dtype": torch.float32, "requires_grad": True}
-    emission = 0.3 * torch.randn(steps, batch, 2 * size, size)
+    options: Any = {"device": device, "requires_grad": True}
+    emission, one = 0.3 * torch.randn(steps, batch, 2 * size, size, device=device), torch.eye(size, device=device)
     chain = LinearGaussianChain(
-        transition=torch.normal(0.95 * torch.eye(size).expand(steps - 1, batch, size, size), 0.05).requires_grad_(),
+        transition=torch.normal(0.95 * one.expand(steps - 1, batch, size, size), 0.05).requires_grad_(),
         offset=torch.randn(steps - 1, batch, size, **options),
-        noise=0.08 * torch.eye(size),
-        mean=torch.zeros(batch, size),
-        covariance=20 * torch.eye(size).expand(batch, size, size),
+        noise=0.08 * one,
+        mean=torch.zeros(batch, size, device=device),
+        covariance=20 * one.expand(batch, size, size),
         information=(emission.mT @ emission / 0.03).requires_grad_(),
         potential=torch.randn(steps, batch, size, **options),
     )
@@ -261,14 +280,16 @@ def filters(steps: int = 10_000, batch: int = 1, size: int = 4) -> tuple[float, 
 
 def member(name: str, x: Tensor) -> float:
     """Training step of a member of the family over its LSTM layers."""
-    model = dvae.method(name, **FAMILY[name]).build({"x": SIZE})
+    model = dvae.method(name, **FAMILY[name]).build({"x": SIZE}).to(x.device)
     elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
     step, alone = seconds(training_step(model, lambda: evidence(elbo.terms(model, x), 0)), layers(model, x))
     return step / alone
 
 
-def rows() -> dict[str, float]:
-    x = torch.randn(BATCH, STEPS, SIZE)
-    found = {"program": program(x), "chain": chain(x), "cache": cache(), "linear": linear(), "segments": segments()}
-    found["filter"], found["filter-step"] = filters()
+def rows(device: torch.device) -> dict[str, float]:
+    x = torch.randn(BATCH, STEPS, SIZE, device=device)
+    found = {"program": program(x), "chain": chain(x), "cache": cache(device), "linear": linear(device)}
+    if device.type == "cpu":
+        found["segments"] = segments()
+    found["filter"], found["filter-step"] = filters(device)
     return found | {name: member(name, x) for name in FAMILY}

@@ -7,6 +7,8 @@ import subprocess
 import sys
 import time
 
+import torch
+
 TORCH = ("-c", "import torch")
 COMMANDS = {
     "dvae --help": ("-m", "dvae.cli", "--help"),
@@ -30,7 +32,7 @@ def seconds(*arguments: str) -> float:
     return time.perf_counter() - start
 
 
-def rows() -> dict[str, float]:
+def rows(_: torch.device) -> dict[str, float]:
     least = dict.fromkeys(["torch", *COMMANDS], float("inf"))
     for _ in range(5):
         for name, arguments in {"torch": TORCH, **COMMANDS}.items():

@@ -10,7 +10,6 @@ Motion is simulated, on the same tree of joints. Times are the least of several,
 
 from __future__ import annotations
 
-import time
 import warnings
 from dataclasses import replace
 
@@ -19,31 +18,33 @@ import torch
 import dvae
 from dvae import motion
 
-from .speed import products, seconds, training_step
+from .speed import moved, products, seconds, stopwatch, training_step
 
 TARGETS: dict[str, tuple[str, float]] = {}
 
 
-def rows() -> dict[str, float]:
+def rows(device: torch.device) -> dict[str, float]:
     protocol = replace(motion.PROTOCOLS["simulated-trajectories"], predicted=100)
     windows = motion.windows(motion.simulate(), protocol, "train")
     method = dvae.method("trajevae")
     method = method.filled(method.preset(motion.HUMAN36M))
-    model = method.build(windows).train()
+    model = method.build(windows).to(device).train()
     source, generator = method.train(windows).batches, torch.Generator().manual_seed(0)
     elbo, objective = dvae.SequenceELBO(), method.train(windows).objective
-    step = training_step(model, lambda: objective(elbo.terms(model, source.sample(32, generator)), 0))
-    batch = {name: value[:1] for name, value in windows.given(["RFoot", "LFoot"]).all().items()}
+    draw = lambda: moved(source.sample(32, generator), device)  # noqa: E731
+    step = training_step(model, lambda: objective(elbo.terms(model, draw()), 0))
+    batch = {name: value[:1].to(device) for name, value in windows.given(["RFoot", "LFoot"]).all().items()}
     past = {"x": batch["x"][:, :1], "y": batch["y"]}
     sampling = lambda: model.forecast(past, 100, 50)  # noqa: E731
     times = seconds(step, products(step), sampling, products(sampling), repeat=3)
     found = {"step": times[0] / times[1], "sampling": times[2] / times[3]}
 
-    positions = windows.positions(batch["x"])[0].numpy()
+    positions = windows.positions(batch["x"].cpu())[0].numpy()
     path = {"LWrist": positions[1:, windows.skeleton.find("LWrist")]}
-    begun = time.perf_counter()
+    clock = stopwatch()
+    begun = clock()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the model is not fitted, and stretches bones
         model.complete(positions[0], path, samples=5, exact=True)
-    found["bend"] = time.perf_counter() - begun
+    found["bend"] = clock() - begun
     return found

@@ -621,7 +621,7 @@ def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(tmp_pat
 
     def run(*found, keep=False):
         left = [dict(zip((*targets, "speed: seen"), rows, strict=True)) for rows in found]
-        monkeypatch.setattr(bench, "measured", lambda name: (dict(left.pop(0)), targets))
+        monkeypatch.setattr(bench, "measured", lambda name, device: (dict(left.pop(0)), targets))
         runs.append(bench.main(("speed",), threads=torch.get_num_threads(), out=tmp_path / "out.json", keep=keep))
         assert not left
         return capsys.readouterr().out.splitlines()[-1]
@@ -636,7 +636,9 @@ def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(tmp_pat
     assert runs == [0, 0, 0, 1, 1]
     assert "| speed: step | at most 2 | **1.00** | – |" in history.read_text()
     monkeypatch.setattr(
-        bench, "measured", lambda name: ({"other: row": 3.0, "speed: step": 1.01}, {"speed: step": ("at most", 2.0)})
+        bench,
+        "measured",
+        lambda name, device: ({"other: row": 3.0, "speed: step": 1.01}, {"speed: step": ("at most", 2.0)}),
     )
     bench.main(("gsps",), threads=torch.get_num_threads(), out=tmp_path / "out.json", keep=True)
     [record] = json.loads((tmp_path / "history.json").read_text())  # rows that were not measured stay

@@ -11,6 +11,8 @@ from torch.utils._pytree import tree_leaves
 
 import dvae
 from dvae import motion
+from dvae.laws.chain import gaussian_chain
+from dvae.laws.kalman import LinearGaussianChain
 from dvae.models.motion_latent import MotionLatent
 from dvae.models.registry import METHODS
 from dvae.models.trajectories import TrajectoryMethod
@@ -152,6 +154,43 @@ def test_terms_have_the_precision_of_the_model_under_autocast(name, trained):
             parameter.copy_(weight * (1 + 2**-8 * torch.randn_like(weight)))
         squares.append((value(terms()) - exact) ** 2)
     assert abs(value(mixed) - exact) <= 4 * (sum(squares) / len(squares)) ** 0.5
+
+
+def drawn(cell):
+    """The chain of an SRNN's guide, or of a VRNN's with its LSTM."""
+    base, noise, gates = (torch.randn(5, 2, size).to("cuda") for size in (4, 3, 24))
+    recurrent, first, out, bias = (
+        torch.randn(*shape).to("cuda") for shape in ((24, 9), (4, 6 if cell else 3), (6, 4), (6,))
+    )
+    given = [value.requires_grad_() for value in (base, gates, recurrent, first, out, bias)]
+    return lambda: gaussian_chain(
+        base, noise, [(first, None), (out, bias)], cell=(gates, recurrent) if cell else None
+    ), given
+
+
+def filtered(steps):
+    """A Kalman filter, of so many steps."""
+    one, mean = torch.eye(2).to("cuda"), torch.zeros(1, 2).to("cuda")
+    transition, information = (0.5 * one.expand(n, 1, 2, 2) for n in (steps - 1, steps))
+    offset, potential = (torch.randn(n, 1, 2).to("cuda") for n in (steps - 1, steps))
+    given = [value.requires_grad_() for value in (transition, offset, potential)]
+    chain = LinearGaussianChain(transition, offset, one, mean, one[None], information, potential)
+    return lambda: replace(chain).predicted, given
+
+
+@pytest.mark.parametrize(
+    ("loop", "option"),
+    [(drawn, False), (drawn, True), (filtered, 6), (filtered, 200)],
+    ids=["chain", "chain with a cell", "filter", "filter in blocks"],
+)
+def test_a_loop_over_time_waits_for_nothing_and_brings_nothing(loop, option):
+    """As it has to, to be captured as a graph: it goes by its arguments alone, forward and backward."""
+    with on_device() as traffic:
+        run, given = loop(option)
+        traffic.clear()
+        torch.autograd.grad(sum(part.sum() for part in run() if part is not None), given, allow_unused=True)
+        assert not traffic.reads
+        assert not traffic.uploads
 
 
 # ------------------------------------------------------------------------------------------------ the device itself
