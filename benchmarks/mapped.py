@@ -106,7 +106,7 @@ def steps(path: Path, frames: int = FRAMES // 10) -> dict[str, float]:
     return {"a step": trained[0] / trained[1], "a draw": drawn[0] / drawn[1]}
 
 
-def rows() -> dict[str, float]:
+def rows(_: torch.device) -> dict[str, float]:
     cut = ["--observed", str(CUT.observed), "--horizon", str(CUT.horizon), "--split", CUT.split]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -159,7 +159,7 @@ def clips(name: str) -> dict[str, float]:
     }
 
 
-def rows() -> dict[str, float]:
+def rows(_: torch.device) -> dict[str, float]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     found = {row: value for name in METHODS for row, value in (two(name) | sizes(name)).items()} | clips("srnn")
