@@ -795,7 +795,8 @@ def run(name, steps, resume=False):
 whole = run("whole", 20)
 run("halves", 10)
 halves = run("halves", 20, resume=True)
-print("weights", torch.equal(whole, halves), hashlib.sha256(whole.numpy(force=True)).hexdigest())  # both write at once
+digest = hashlib.sha256(whole.numpy(force=True)).hexdigest()
+sys.stdout.write(f"weights {torch.equal(whole, halves)} {digest}\\n")  # in one piece, as both write at once
 """
 
 
