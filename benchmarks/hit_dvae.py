@@ -5,6 +5,8 @@
     growth     the cost of a frame among 300 against that of a frame among 60: at most in proportion to the frames
     frame      of generation at the preset for small sets, 50 futures of one window, over its matrix products alone
     seconds    to make 50 futures of 60 frames for each of 100 windows
+    evaluation of 50 futures of each of a few windows at that preset, with all scores of motion and the bound, over its
+               matrix products alone; seconds: that a processor takes for 1,834 windows, as many as bandai2's test has
     step       a training step (16 windows, K motions each; forward, backward, Adam) in which the model reads its own
                output, against one in which it reads the truth: exactly, step by step; the same with gradients back in
                time; and in two parallel passes
@@ -14,6 +16,7 @@ Motion is simulated. Times are the least of several, in turns with what they com
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -31,7 +34,9 @@ TARGETS = {
     "cache": ("at least", 10.0),
     "growth": ("at most", 5.0),
     "seconds": ("at most", 30.0),
+    "evaluation, seconds": ("at most", 90.0),
 }
+WINDOWS = 1834
 
 
 @torch.no_grad()
@@ -77,6 +82,18 @@ def rows(device: torch.device) -> dict[str, float]:
     for part in past.split(20):
         model.forecast(part, 60, 50)
     found["seconds"] = clock() - begun
+
+    def evaluation(clips: int, batch_size: int) -> tuple[Callable[[], object], int]:
+        """Of a fifth of so many clips, and its number of windows."""
+        held = motion.windows(motion.simulate(clips), motion.PROTOCOLS["simulated"], "test")
+        options = {"scores": motion.scores, "batch_size": batch_size, "references": False, "progress": False}
+        return lambda: dvae.evaluate(small, held, **options), len(held)
+
+    few, _ = evaluation(10, batch_size=6)  # products of as many shapes as there are frames are held
+    made, apart = seconds(few, products(few), repeat=3)
+    found["evaluation"] = made / apart
+    more, count = evaluation(64, batch_size=64)
+    found["evaluation, seconds"] = seconds(more, repeat=1)[0] / count * WINDOWS
 
     model.train()
     source, objective, elbo = method.train(windows).batches, method.train(windows).objective, dvae.SequenceELBO()

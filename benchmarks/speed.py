@@ -106,21 +106,26 @@ def layers(model: nn.Module, x: Tensor) -> Callable[[], None]:
 
 
 class Products(TorchDispatchMode):
-    """Within it matrix products are noted, those of backward passes too; `run` makes as many of the same shapes."""
+    """Within it matrix products are noted, those of backward passes too; `run` makes as many of the same shapes.
 
-    KINDS = (torch.ops.aten.mm, torch.ops.aten.addmm, torch.ops.aten.bmm, torch.ops.aten.baddbmm)
+    Attention's kernel is two products and what lies between them.
+    """
+
+    ATTENTION = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
+    KINDS = (torch.ops.aten.mm, torch.ops.aten.addmm, torch.ops.aten.bmm, torch.ops.aten.baddbmm, ATTENTION)
 
     def __init__(self) -> None:
         super().__init__()
-        self.calls: list[tuple[Any, list[Any]]] = []
+        self.calls: list[tuple[Any, list[Any], dict[str, Any]]] = []
         self.made: dict[Any, Tensor] = {}
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
         if func.overloadpacket in self.KINDS:
-            self.calls.append(
-                (func.overloadpacket.default, [self.like(v) if isinstance(v, Tensor) else v for v in args])
-            )
-        return func(*args, **(kwargs or {}))
+            given = [self.like(value) if isinstance(value, Tensor) else value for value in (*args, *kwargs.values())]
+            named = dict(zip(kwargs, given[len(args) :], strict=True))
+            self.calls.append((func.overloadpacket.default, given[: len(args)], named))
+        return func(*args, **kwargs)
 
     def like(self, value: Tensor) -> Tensor:
         """Of that shape and layout, the same for all of them."""
@@ -131,8 +136,8 @@ class Products(TorchDispatchMode):
 
     @torch.no_grad()
     def run(self) -> None:
-        for func, args in self.calls:
-            func(*args)
+        for func, args, kwargs in self.calls:
+            func(*args, **kwargs)
 
 
 def products(action: Callable[[], object]) -> Callable[[], None]:

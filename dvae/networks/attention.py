@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from ..constants import indices, visible
+from ..constants import constant, indices, visible
 from ..relations import Relation
 from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, at, part, valid_steps
 from .extract import Extract, Extractors
@@ -246,7 +246,7 @@ class AttentionNetwork(Network):
         That is (..., D + 2), the values and a 1 for the bias of their embedding; the last one is of the start token.
         """
         if self.narrow:
-            return torch.cat([values, values.new_tensor((1.0, 0.0)).expand(*values.shape[:-1], 2)], -1)
+            return torch.cat([values, constant((1.0, 0.0), values).expand(*values.shape[:-1], 2)], -1)
         tokens: Tensor = self.embed[name](values)
         return tokens
 

@@ -299,7 +299,8 @@ def follow(
         module, lengths: see `once_valid`.
         change: the module as the loop has it, with its work done that is the same at all steps.
     """
-    fresh = [s for s in range(len(drawn)) if rows.values[s] is None and drawn[s] is not None]
+    there = drawn.values if isinstance(drawn, Rows) else drawn
+    fresh = [s for s, (made, value) in enumerate(zip(rows.values, there, strict=False)) if made is None is not value]
     values = [drawn[s] for s in fresh]
 
     def compute() -> Sequence[Tensor]:

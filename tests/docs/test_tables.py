@@ -651,13 +651,20 @@ def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(tmp_pat
 
 def test_products_alone_are_those_of_the_work():
     x, y = torch.randn(3, 4, requires_grad=True), torch.randn(4, 2)
+    query, token = torch.randn(2, 1, 5, 4), torch.randn(2, 1, 6, 4)
     with speed.Products() as noted:
         (x @ y).sum().backward()
         torch.baddbmm(torch.zeros(5, 3, 2), torch.randn(5, 3, 4), torch.randn(5, 4, 2))
-    assert [[tuple(v.shape) for v in args if isinstance(v, torch.Tensor)] for _, args in noted.calls] == [
+        torch.nn.functional.scaled_dot_product_attention(query, token, token, attn_mask=torch.zeros(5, 6))
+    shapes = [
+        [tuple(value.shape) for value in (*args, *kwargs.values()) if isinstance(value, torch.Tensor)]
+        for _, args, kwargs in noted.calls
+    ]
+    assert shapes == [
         [(3, 4), (4, 2)],
         [(3, 2), (2, 4)],
         [(5, 3, 2), (5, 3, 4), (5, 4, 2)],
+        [(2, 1, 5, 4), (2, 1, 6, 4), (2, 1, 6, 4), (2, 1, 5, 6)],
     ]
     noted.run()
 
