@@ -181,6 +181,7 @@ class ModesModel(FutureModel):
     """
 
     extras: ClassVar[tuple[str, ...]] = (WHOLE_SETS,)
+    forks: ClassVar[bool] = False
 
     def __init__(self, method: ModesMethod, frames: int, skeleton: Skeleton | None, **options: Any) -> None:
         super().__init__(method, frames, skeleton, **options)

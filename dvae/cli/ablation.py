@@ -72,7 +72,8 @@ def ablate(
         raise UsageError("give the name of a method, or --generative, with --inference for a guide of your own")
     if method is not None and inference is not None:
         raise UsageError(f"--inference is the guide of --generative; {method} has its own")
-    if out is None and (source != DataOptions() or any(value is not None for value in vars(training).values())):
+    trained = [value for value in vars(training).values() if value not in (None, False)]
+    if out is None and (trained or source != DataOptions()):
         raise UsageError("fits need a directory for their runs: give --out DIR")
     if out is not None and (out.is_file() or not seeds):
         raise UsageError(f"give at least one seed, and a directory for the runs: --out {out} --seeds {seeds}")

@@ -11,31 +11,11 @@ import pyro.distributions as dist
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
-from torch.distributions import register_kl
 from torch.nn import functional
 from typing_extensions import override
 
+from . import normal
 from .base import Law, Parameters, Shape
-
-HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
-
-
-class Normals(dist.Normal):
-    """Independent normals, whose densities and divergences take fewer passes over memory than torch's.
-
-    Of a training step of STORN that saves a twentieth (docs/results/speed.md).
-    """
-
-    @override
-    def log_prob(self, value: Tensor) -> Tensor:
-        distance = (value - self.loc) / self.scale
-        return torch.addcmul(-HALF_LOG_2_PI - self.scale.log(), distance, distance, value=-0.5)
-
-
-@register_kl(Normals, Normals)
-def _divergence(q: Normals, p: Normals) -> Tensor:
-    ratio, distance = q.scale / p.scale, (q.loc - p.loc) / p.scale
-    return torch.addcmul(torch.addcmul(-0.5 - ratio.log(), ratio, ratio, value=0.5), distance, distance, value=0.5)
 
 
 class Gaussian(Law):
@@ -46,7 +26,7 @@ class Gaussian(Law):
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         """The normals."""
         loc, scale = parameters
-        return Normals(loc, scale, validate_args=False)
+        return normal.Normal(loc, scale, validate_args=False)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         """Reparameterised values (..., D)."""

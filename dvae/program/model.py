@@ -80,6 +80,8 @@ class DynamicalVAE(nn.Module):
 
     extras: ClassVar[tuple[str, ...]] = ()
     """What a batch may hold that is no variable, for `penalties`."""
+    forks: ClassVar[bool] = True
+    """Whether `draws` are continuations of a row; a program may mean something else by them."""
     per: str = "frame"
     """What there is one log-likelihood of."""
 
