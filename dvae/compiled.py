@@ -3,7 +3,7 @@
 Not a whole program: Pyro's handlers break its graph sixteen times a step, and it is slower then. Nor, on a processor,
 networks: their time goes into products, which are the same compiled, and into activations, for which torch has faster
 code than it generates. What gains are many operations on each of many numbers, as in energies and kinematics of motion
-(docs/results/speed.md has what was measured). Such a function is marked by `compiled`; nothing else is ever compiled.
+(`benchmarks/compiled.py` measures it). Such a function is marked by `compiled`; nothing else is ever compiled.
 """
 
 from __future__ import annotations

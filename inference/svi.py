@@ -178,7 +178,7 @@ class SVI:
         if compiled is not None and not compiled.used and state.step == first:
             warnings.warn(
                 f"compile=True changes nothing in this stage of the run: a step of {type(self.model).__name__} has "
-                "nothing in it that is faster compiled (docs/results/speed.md)",
+                "nothing in it that is faster compiled (docs/accelerators.md)",
                 stacklevel=3,  # `alone` is between
             )
         for name, parameter in self.model.named_parameters() if stage.frozen else ():

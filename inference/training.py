@@ -37,7 +37,7 @@ class Training:
         devices: number of devices, with one process each; under torchrun, which starts them, as many as these are.
         precision: precision of the computation; "32-true" leaves the model's own.
         compile: compile the inner functions that are faster so, which takes from seconds to a minute at first
-            (`dvae.compiled`; docs/results/speed.md has gains by method). Validation is as without.
+            (`dvae.compiled`; `benchmarks/compiled.py` measures gains by method). Validation is as without.
         progress: whether to show the terms on the terminal.
 
     Raises:
