@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from . import normal
 from .base import Law, Parameters, Shape
+from .normal import Normals
 
 
 class Gaussian(Law):
@@ -26,7 +26,7 @@ class Gaussian(Law):
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         """The normals."""
         loc, scale = parameters
-        return normal.Normal(loc, scale, validate_args=False)
+        return Normals(loc, scale, validate_args=False)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         """Reparameterised values (..., D)."""

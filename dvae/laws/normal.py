@@ -17,7 +17,7 @@ from typing_extensions import override
 HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
 
 
-class Normal(distributions.Normal):
+class Normals(distributions.Normal):
     """Normals with locations and scales (..., D)."""
 
     @override
@@ -26,7 +26,7 @@ class Normal(distributions.Normal):
         return torch.addcmul(-HALF_LOG_2_PI - self.scale.log(), distance, distance, value=-0.5)
 
 
-@register_kl(Normal, Normal)
-def _divergence(q: Normal, p: Normal) -> Tensor:
+@register_kl(Normals, Normals)
+def _divergence(q: Normals, p: Normals) -> Tensor:
     ratio, distance = q.scale / p.scale, (q.loc - p.loc) / p.scale
     return torch.addcmul(torch.addcmul(-0.5 - ratio.log(), ratio, ratio, value=0.5), distance, distance, value=0.5)

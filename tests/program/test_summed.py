@@ -303,7 +303,7 @@ def test_refusals_of_runs():
         dvae.particle_bound(model, data)
     with pytest.raises(ValueError, match="at least two states"):
         Discrete(1)
-    with pytest.raises(ValueError, match="is Normal; leave it to be that of categories"):
+    with pytest.raises(ValueError, match="is Normals; leave it to be that of categories"):
         build(HMM, {"k": 2}, laws={"p(k)": dvae.laws.Normal()})
     with pytest.raises(ValueError, match="nothing is summed out"):
         build(("p(x_t | x_{<t})", ""), {}).states(data)
