@@ -289,13 +289,15 @@ def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Me
 
 def _coordinates(x: Tensor) -> Tensor:
     """Joints (..., T, D) with their coordinates first, (3, D / 3, ..., T): numbers that are alike lie side by side."""
-    return x.unflatten(-1, (-1, 3)).movedim((-1, -2), (0, 1)).contiguous()
+    found: Tensor = x.unflatten(-1, (-1, 3)).movedim((-1, -2), (0, 1)).contiguous()
+    return found
 
 
 def _norm(vectors: Tensor) -> Tensor:
     """(...) of vectors (3, ...): in a third of the time of torch's norm over a first dimension, or less."""
     x, y, z = vectors
-    return (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
+    found: Tensor = (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
+    return found
 
 
 def _cross(first: Tensor, second: Tensor) -> Tensor:

@@ -254,7 +254,7 @@ class AttentionNetwork(Network):
         """(D + 2, W), to make tokens of what is kept; None where that is tokens."""
         if not self.narrow:
             return None
-        embed = self.embed[self.ranged[0].name]
+        embed: Any = self.embed[self.ranged[0].name]
         return torch.cat([embed.weight.mT, embed.bias[None], self.start_token[None]])
 
     def biases(self, parents: Sequence[Input], length: int, lengths: Tensor | None) -> Tensor:
