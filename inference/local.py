@@ -169,11 +169,13 @@ class Local(nn.Module):
             return tuple(p.unbind(1) for p in self.own(given, batch, length, lengths)), None, known, steps
         return None, self.own.start(given, batch, length, lengths), known, steps
 
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Parameters, Any]:
+    def step(
+        self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1
+    ) -> tuple[Parameters, Any]:
         """See `Conditional`."""
         fixed, inner, known, steps = state
         if fixed is None:
-            own, inner = self.own.step(inner, t, drawn)
+            own, inner = self.own.step(inner, t, drawn, count)
         else:
             own = tuple(p[t] for p in fixed)
         return _alone(steps[t](_with_step(own), {**drawn, **known})), (fixed, inner, known, steps)
