@@ -123,7 +123,7 @@ class Products(TorchDispatchMode):
         kwargs = kwargs or {}
         if func.overloadpacket in self.KINDS:
             given = [self.like(value) if isinstance(value, Tensor) else value for value in (*args, *kwargs.values())]
-            named = dict(zip(kwargs, given[len(args) :], strict=True))
+            named = {name: value for name, value in zip(kwargs, given[len(args) :], strict=True) if name != "out"}
             self.calls.append((func.overloadpacket.default, given[: len(args)], named))
         return func(*args, **kwargs)
 

@@ -54,8 +54,8 @@ def forecast(
     if past:
         model._rollout(model.inference, model.encoder, seen, None, 1)  # refuses what cannot be read, of all sequences
     # what the guide makes of the past alone, once for all samples
-    may_fork = model.forks and not redrawn and model.latents[:1] == model.prior_order[:1]
-    forked = model.latents[:1] if may_fork else ()
+    alike = model.forks and not redrawn and not model.grouped and model.latents[:1] == model.prior_order[:1]
+    forked = model.latents[:1] if alike else ()
 
     @computing_once()
     def futures(part: slice, count: int) -> dict[str, Tensor]:

@@ -142,6 +142,12 @@ def test_energy_score_of_a_point_is_its_distance():
     assert energy_score(sample, truth) == pytest.approx((sample[0] - truth).norm().item())
 
 
+def test_energy_score_takes_a_diversity_that_is_known():
+    samples, truth = draw(3, 5, 4, 2), draw(3, 4, 2, seed=1)
+    known = energy_score(samples, truth, average_pairwise_distance(samples))
+    torch.testing.assert_close(known, energy_score(samples, truth))
+
+
 def test_energy_score_prefers_the_true_distribution_to_a_narrow_a_wide_and_a_shifted_one():
     samples, truth = draw(2000, 20, 3, 2), draw(2000, 3, 2, seed=1)
     right = energy_score(samples, truth)

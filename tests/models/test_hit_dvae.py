@@ -311,6 +311,25 @@ def test_any_past_is_continued_over_any_horizon(windows, observed, horizon, head
     assert torch.isfinite(futures["x"]).all()
 
 
+def test_a_forecast_finds_features_of_a_frame_once(windows, monkeypatch):
+    """For both factors, and of what was observed for all samples, whose draws are those of as many sequences."""
+    model, past, shapes = build(windows).eval(), drawn(windows)["x"][:, :5], []
+    hoisted = NodeFeatures.hoisted
+
+    def counted(self):
+        features = hoisted(self)
+        return lambda frames: shapes.append(tuple(frames.shape[:-1])) or features(frames)
+
+    monkeypatch.setattr(NodeFeatures, "hoisted", counted)
+    torch.manual_seed(0)
+    futures = model.forecast(past, 4, 6)
+    assert shapes == [(3, 5), (3, 5), *[(18,)] * 3]  # the guide, the past, and all but the last frame
+    torch.manual_seed(0)
+    with torch.no_grad():
+        latents = {name: value.unflatten(0, (6, 3)) for name, value in model.guide(past.repeat(6, 1, 1)).items()}
+    torch.testing.assert_close({"w": futures["w"], "z": futures["z"][:, :, :5]}, latents)
+
+
 def test_turning_people_turns_their_futures_and_changes_no_score(windows):
     model, batch = build(windows, heading=True).eval(), drawn(windows)
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dvae.networks import Attention, Dense, FrameGraph, Input, Linear, NodeGraph, Recurrent, SelfAttention
-from dvae.networks.base import computing_once, shift
+from dvae.networks.base import again, computing_once, once_valid, shift, steps_of, whole_of
 from dvae.networks.recurrent import tie
 from dvae.relations import Relation
 
@@ -329,6 +329,21 @@ def test_a_stretch_is_its_steps_and_the_loop_goes_on_from_it(kind):
             torch.testing.assert_close((out, gradient), (together, gradients[0]), rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_what_a_loop_reaches_is_the_last_of_a_stretch_and_it_goes_on_from_there(kind):
+    network = build(kind, loop_inputs(kind, 1))
+    parents = draw(network.inputs, 3)
+    together = network(parents, T)
+    for live in ({"z", "x", "u", "v"}, {"x", "v"}):
+        for grad in (True, False):
+            with torch.set_grad_enabled(grad):
+                state = network.start({name: v for name, v in parents.items() if name not in live}, 3, T)
+                drawn = {name: parents[name].unbind(1) for name in live}
+                found, state = network.reach(state, 0, T - 2, drawn)
+                then, _ = network.step(state, T - 2, drawn)
+            torch.testing.assert_close(torch.stack([found, then], 1), together[:, -3:-1], rtol=0, atol=1e-10)
+
+
 def test_a_recurrent_stretch_takes_no_steps(monkeypatch):
     network = build("lstm", [Input("z", 2, Relation.parse("<t"))])
     monkeypatch.setattr(network.memories[0], "step", None)
@@ -439,6 +454,24 @@ def test_computing_once_ends_with_its_block_and_sees_new_inputs():
     with torch.no_grad():
         first.past.layers[0].weight_ih_l0.add_(1)
     assert not torch.equal(before, first(parents, T))
+
+
+def test_features_of_repeated_rows_are_found_once_and_learn_from_every_row():
+    values, scale = torch.randn(3, T, 2, dtype=torch.float64), torch.randn(5, 5, dtype=torch.float64)
+    first, second = (torch.nn.Linear(*sizes).double() for sizes in ((2, 5), (5, 5)))
+    sizes = []
+    second.register_forward_pre_hook(lambda _, read: sizes.append(len(read[0])))
+    found = {}
+    for known in (True, False):
+        with computing_once():
+            rows = again(values, 4) if known else values.repeat(4, 1, 1)
+            features = once_valid(second, once_valid(first, rows, None), None)
+            steps = steps_of(rows)
+            assert whole_of(steps) is rows
+        weighed = (features * torch.arange(12)[:, None, None] @ scale).sum()
+        found[known] = features, *torch.autograd.grad(weighed, [*first.parameters(), *second.parameters()])
+    assert sizes == [3, 12]
+    torch.testing.assert_close(found[True], found[False], rtol=0, atol=1e-9)
 
 
 def test_memories_of_different_pasts_are_not_tied():
