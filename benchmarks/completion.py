@@ -31,10 +31,11 @@ TARGETS = {"whole": ("at least", 20.0), "descent": ("at least", 20.0)}
 def rows(device: torch.device) -> dict[str, float]:
     people = bodies.fitted(motion.simulate(clips=4, frames=90, seed=1), bodies.human())
     segments = Segments(motion.gait_cycles(people))
-    model, batch = MotionLatent().build(segments).to(device).eval(), moved(segments.all(), device)
+    model, batch = MotionLatent().build(segments).eval(), segments.all()
     rows = list(islice(cycle(range(len(segments))), MANY))
     x, shape = batch["x"][rows], batch["beta"][rows]
-    seen = glimpsed(model, x, shape, "markers", frames=range(0, 100, 20))
+    seen = moved(glimpsed(model, x, shape, "markers", frames=range(0, 100, 20)), device)
+    model.to(device)
 
     clock = stopwatch()
 
