@@ -1,9 +1,13 @@
 """Runs benchmarks, compares them with the last release and keeps them: `python -m benchmarks.bench`, or `make bench`.
 
 A benchmark is a module of this folder with `rows(device)`, from names to numbers, and `TARGETS`, from some of these
-names to a bound. Numbers are ratios within one run, so that they mean the same on other machines, or sizes. The exit
-status is 1 where a target is missed, or where a row with a target is worse by more than a tenth than at the last
-release on such a device; such a row is measured once more before, and the better one counts.
+names to a side and a bound, or None. Numbers are ratios within one run, or sizes. "at most" is a row that is better the
+less it is, as all are that `TARGETS` does not name, and "at least" one that is better the more; "under" and "over" have
+a bound alone, as exponents and seconds do, of which a tenth means nothing on another machine.
+
+The exit status is 1 where a row is worse by more than a tenth than at the last release, which is the first record of
+the last version, or misses a target that it met there. Machines of one name differ by as much. So such a row is
+measured once more, of which the better counts, and then beside the code of that record, which git has.
 """
 
 from __future__ import annotations
@@ -12,7 +16,9 @@ import importlib
 import json
 import os
 import platform
+import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
@@ -50,45 +56,79 @@ PROCESSORS = {
 }
 """Rows that are left out on a GPU, or all of a benchmark, and why."""
 WORSE = 1.1
-Targets = Mapping[str, tuple[str, float]]
+Target = tuple[str, float | None]
+Targets = Mapping[str, Target]
+Rows = dict[str, float]
+LESS = ("at most", "under")
+COMPARED = ("at most", "at least")
 
 
-def measured(name: str, device: torch.device) -> tuple[dict[str, float], dict[str, tuple[str, float]]]:
+def measured(name: str, device: torch.device) -> tuple[Rows, dict[str, Target]]:
     """Rows of a benchmark and their targets, named after it."""
     module = importlib.import_module(f".{name}", __package__)
     torch.manual_seed(0)
     found = module.rows(device)
-    targets = {row: target for row, target in module.TARGETS.items() if row in found}
-    own = [{f"{name}: {row}": value for row, value in each.items()} for each in (found, targets)]
-    return own[0], own[1]
+    targets = {f"{name}: {row}": module.TARGETS.get(row, ("at most", None)) for row in found}
+    return {f"{name}: {row}": value for row, value in found.items()}, targets
 
 
-def met(value: float, target: tuple[str, float]) -> bool:
+def met(value: float, target: Target) -> bool:
     """Whether a row is where its target has it."""
     side, bound = target
-    return value <= bound if side == "at most" else value >= bound
+    return bound is None or (value <= bound if side in LESS else value >= bound)
 
 
-def worse(value: float, before: float, side: str) -> float:
-    """How many times worse a row is than before."""
-    return value / before if side == "at most" else before / value
+def better(one: Rows, other: Mapping[str, float], targets: Targets) -> Rows:
+    """Of two measurements of each row."""
+    both = {row: (value, other.get(row, value)) for row, value in one.items()}
+    return {row: (min if targets[row][0] in LESS else max)(values) for row, values in both.items()}
 
 
-def better(one: float, other: float, side: str) -> float:
-    """Of two measurements of a row."""
-    return min(one, other) if side == "at most" else max(one, other)
+def slower(found: Mapping[str, float], targets: Targets, before: Mapping[str, float]) -> list[str]:
+    """Rows that are worse than before by more than a tenth, or miss a target that they met."""
+
+    def is_slower(row: str) -> bool:
+        (side, _), now, then = targets[row], found[row], before[row]
+        costs = side in COMPARED and (now > WORSE * then if side in LESS else then > WORSE * now)
+        return costs or (met(then, targets[row]) and not met(now, targets[row]))
+
+    return [row for row in found if row in before and is_slower(row)]
 
 
-def failures(found: Mapping[str, float], targets: Targets, before: Mapping[str, float]) -> dict[str, str]:
-    """Rows that miss their target or are worse than before, and what is to be said of them."""
-    said = {}
-    for name, (side, bound) in targets.items():
-        parts = [] if met(found[name], (side, bound)) else [f"is to be {side} {bound:g}"]
-        if name in before and worse(found[name], before[name], side) > WORSE:
-            parts.append(f"was {before[name]:.2f} at the last release")
-        if parts:
-            said[name] = f"{name}: {found[name]:.2f} " + ", ".join(parts)
-    return said
+def missed(found: Mapping[str, float], targets: Targets) -> list[str]:
+    """What is to be said of rows that miss their targets."""
+    rows = [row for row in found if not met(found[row], targets[row])]
+    return [f"{row}: {found[row]:.2f} is to be {targets[row][0]} {targets[row][1]:g}" for row in rows]
+
+
+def commit() -> str:
+    """Of what is measured; "" where git does not know."""
+    return _git("rev-parse", "--short", "HEAD")
+
+
+def _git(*arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", "-C", HERE, *arguments], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return done.stdout.strip() or "done"
+
+
+def there(commit: str, name: str, device: str, threads: int) -> Rows:
+    """Rows of a benchmark by the code of a commit, measured here and now; none where it cannot be had or run."""
+    with tempfile.TemporaryDirectory() as folder:
+        path, out = Path(folder) / "code", Path(folder) / "rows.json"
+        if not commit or not _git("worktree", "add", "--detach", str(path), commit):
+            return {}
+        try:
+            options = ["--threads", str(threads), "--out", str(out), *(["--device", device] if device != "cpu" else [])]
+            command = [sys.executable, "-m", "benchmarks.bench", name, *options]
+            environment = os.environ | {"PYTHONPATH": str(path)}
+            subprocess.run(command, cwd=path, env=environment, capture_output=True, check=False)
+            rows: Rows = json.loads(out.read_text())["rows"] if out.exists() else {}
+            return rows
+        finally:
+            _git("worktree", "remove", "--force", str(path))
 
 
 def machine(device: torch.device) -> dict[str, Any]:
@@ -108,14 +148,24 @@ def machine(device: torch.device) -> dict[str, Any]:
 
 
 def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
-    """The history with a record; one of that version, measured alike, keeps the rows that were not measured anew."""
+    """The history with a record; one of that commit, measured alike, keeps the rows that were not measured anew."""
 
     def same(each: dict[str, Any]) -> bool:
-        return (each["version"], how(each)) == (record["version"], how(record))
+        return bool((each["version"], each["commit"], how(each)) == (record["version"], record["commit"], how(record)))
 
     parts = [*filter(same, records), record]
     joined = {key: {name: value for part in parts for name, value in part[key].items()} for key in ("rows", "targets")}
     return [*(each for each in records if not same(each)), record | joined]
+
+
+def released(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str, tuple[float, str]]:
+    """What a record is compared with, and of which commit that is: of each row the first number of the last version."""
+    others = [each for each in records if how(each) == how(record) and each["commit"] != record["commit"]]
+    found: dict[str, tuple[float, str]] = {}
+    for each in others:
+        if each["version"] == others[-1]["version"]:
+            found = {row: (value, each["commit"]) for row, value in each["rows"].items()} | found
+    return found
 
 
 def how(record: dict[str, Any]) -> tuple[str, int]:
@@ -129,17 +179,32 @@ def page(records: list[dict[str, Any]], path: Path | None = DOCS / "results" / "
     Of the processor and of a GPU there is one each.
     """
     newest = [record for record in records[::-1] if how(record) == how(records[-1])]
-    last, before = newest[0], newest[1]["rows"] if len(newest) > 1 else {}
+    last, before = newest[0], released(records, records[-1])
     lines = []
-    for name, value in last["rows"].items():
-        target = last["targets"].get(name)
-        said = "" if target is None else f"{target[0]} {target[1]:g}"
-        number = f"{value:.2f}" if target is None or not met(value, target) else f"**{value:.2f}**"
-        change = f"{value / before[name]:.2f}" if name in before else "–"
-        lines.append([name, said, number, *(_number(r["rows"].get(name)) for r in newest[1:4]), change])
-    heads = [f"{record['version']}, {record['date']}" for record in newest[:4]]
-    history = table(["", "target", *heads, "last over the one before"], lines)
+    for name in sorted(last["rows"], key=_place):
+        value = last["rows"][name]
+        target = last["targets"].get(name, ("at most", None))
+        aimed = target[1] is not None
+        number = f"**{value:.2f}**" if aimed and met(value, target) else f"{value:.2f}"
+        change = f"{value / before[name][0]:.2f}" if name in before and target[0] in COMPARED else "–"
+        lines.append(
+            [
+                name,
+                f"{target[0]} {target[1]:g}" if aimed else "",
+                number,
+                *(_number(r["rows"].get(name)) for r in newest[1:4]),
+                change,
+            ]
+        )
+    heads = [f"{record['version']} ({record['commit']}), {record['date']}" for record in newest[:4]]
+    history = table(["", "target", *heads, "last over the release"], lines)
     write(path, history, name="history" if how(last)[0] == "cpu" else "GPU history")
+
+
+def _place(row: str) -> int:
+    """Of a row's benchmark among all."""
+    name = row.partition(":")[0]
+    return NAMES.index(name) if name in NAMES else len(NAMES)
 
 
 def _number(value: float | None) -> str:
@@ -166,14 +231,23 @@ def main(
     if device == "cuda" and not torch.cuda.is_available():
         built = "" if torch.version.cuda else ", as it is built without CUDA"
         sys.exit(f"torch {torch.__version__} finds no GPU{built}; leave the device out, or take a machine with one")
+    if threads < 1:
+        sys.exit(f"threads is {threads}, expected 1 or more")
+    if not out.parent.is_dir():
+        sys.exit(f"{out} has no folder to be written to; make {out.parent} first, or name another file by --out")
     torch.set_num_threads(threads)
-    there = torch.device(device)
-    on = machine(there)
+    place = torch.device(device)
+    record = {
+        "version": dvae.__version__,
+        "commit": commit(),
+        "date": date.today().isoformat(),
+        "machine": machine(place),
+    }
     records = json.loads(HISTORY.read_text()) if HISTORY.exists() else []
-    releases = [record for record in records if how(record) == how({"machine": on})]
-    before = releases[-1]["rows"] if releases else {}
-    found: dict[str, float] = {}
-    targets: dict[str, tuple[str, float]] = {}
+    release = released(records, record)
+    found: Rows = {}
+    targets: dict[str, Target] = {}
+    failed: list[str] = []
     for name in names:
         print(f"{name} ...", flush=True)
         left_out = {row: why for row, why in PROCESSORS.items() if device != "cpu" and row.partition(":")[0] == name}
@@ -181,30 +255,33 @@ def main(
             print(f"  {row} is left out: it {why}", flush=True)
         if name in left_out:
             continue
-        rows, bounds = measured(name, there)
-        slower = (row for row in bounds if row in before and worse(rows[row], before[row], bounds[row][0]) > WORSE)
-        if any(slower):
-            for row, value in measured(name, there)[0].items():
-                rows[row] = better(rows[row], value, bounds.get(row, ("at most", 0))[0])
+        rows, bounds = measured(name, place)
+        before = {row: release[row][0] for row in rows if row in release}
+        if slower(rows, bounds, before):
+            rows = better(rows, measured(name, place)[0], bounds)
+        if doubtful := slower(rows, bounds, before):
+            for old in {release[row][1] for row in doubtful}:
+                beside = there(old, name, device, threads)
+                before |= {row: value for row, value in beside.items() if row in before and release[row][1] == old}
+            failed += [
+                f"{row}: {rows[row]:.2f} was {before[row]:.2f} at the last release"
+                for row in slower(rows, bounds, before)
+            ]
         for row, value in rows.items():
             was = f"{before[row]:8.2f}" if row in before else " " * 8
-            print(f"  {row:50} {value:8.2f} {was}   {' '.join(map(str, bounds.get(row, ())))}", flush=True)
+            side, bound = bounds[row]
+            print(f"  {row:50} {value:8.2f} {was}   {'' if bound is None else f'{side} {bound:g}'}", flush=True)
         found |= {row: round(value, 4) for row, value in rows.items()}
         targets |= bounds
-        record = {
-            "version": dvae.__version__,
-            "date": date.today().isoformat(),
-            "machine": on,
-            "rows": found,
-            "targets": targets,
-        }
-        out.write_text(json.dumps(record, indent=1) + "\n")
+        written = record | {"rows": found, "targets": targets}
+        out.write_text(json.dumps(written, indent=1) + "\n")
         if keep:
-            records = kept(records, record)
+            records = kept(records, written)
             HISTORY.write_text(json.dumps(records, indent=1) + "\n")
             page(records)
-    failed = failures(found, targets, before)
-    print(*failed.values(), sep="\n")
+    for title, lines in (("targets missed:", missed(found, targets)), ("slower than at the last release:", failed)):
+        if lines:
+            print(title, *lines, sep="\n  ")
     return int(bool(failed))
 
 

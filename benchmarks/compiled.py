@@ -41,8 +41,12 @@ from .speed import BATCH, FAMILY, SIZE, STEPS, moved, seconds
 NETWORKS = (_Convolution, Layer, NodeFeatures, FrameConvolution, TransformerLayer, nn.Sequential)
 """What is compiled of networks: the largest of these parts, without those within them."""
 GAIN = ("gsps, human36m", "gsps", "hit-dvae", "mix-and-match", "motion-latent")
-TARGETS = {f"{name}, step": ("at most", 1.0) for name in GAIN} | {
-    f"{name}, difference": ("at most", 1.0) for name in GAIN
+TARGETS = {
+    "start": ("under", None),
+    **{f"{name}, step": ("at most", 1.0) for name in GAIN},
+    **{f"{name}, difference": ("under", 1.0) for name in GAIN},
+    **{f"{name}, warm-up": ("under", None) for name in GAIN},
+    **{f"{name}, networks": ("under", None) for name in (*GAIN, "trajevae", "srnn", "storn", "kvae")},
 }
 Loss = Callable[[], Tensor]
 

@@ -25,7 +25,12 @@ from dvae.motion.segments.embodied import Segments
 from .speed import moved, stopwatch
 
 MANY, STEPS = 100, 101
-TARGETS = {"whole": ("at least", 20.0), "descent": ("at least", 20.0)}
+TARGETS = {
+    "whole": ("at least", 20.0),
+    "descent": ("at least", 20.0),
+    "starts": ("at least", None),
+    "curvature": ("at least", None),
+}
 
 
 def rows(device: torch.device) -> dict[str, float]:

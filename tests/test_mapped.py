@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dvae
+from benchmarks.speed import Held
 from dvae import motion, npy
 from dvae.blocks import ColumnSummary, blocks, cut, hash_list, hash_values, row_blocks
 from dvae.cli import main
@@ -240,11 +241,12 @@ def test_windows_are_cut_where_they_are_asked_for():
 
 
 def most(action, path):
-    """Bytes that arrays take at most while something is done with a file."""
+    """Bytes that arrays and tensors take at most while something is done with a file."""
     tracemalloc.start()
     try:
-        action(path)
-        return tracemalloc.get_traced_memory()[1]
+        with Held() as held:
+            action(path)
+        return tracemalloc.get_traced_memory()[1] + held.most
     finally:
         tracemalloc.stop()
 

@@ -1,7 +1,7 @@
 """Independent normals, whose densities and divergences take fewer passes over memory than torch's.
 
 They are written with quotients, which are used twice, in place of squares of scales: of a training step of STORN that
-saves a twentieth (docs/results/speed.md).
+saves a hundredth to a twentieth (docs/results/speed.md).
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import subprocess
 from dataclasses import replace
 from functools import partial
 
@@ -611,42 +612,111 @@ def test_gaps_are_as_long_as_they_are():
     assert occlusion.bursts(mask[None, :, None])[0, :, 0].tolist() == [0, 2, 2, 0, 0, 3, 3, 3, 0, 1]
 
 
-def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def benches(tmp_path, monkeypatch, capsys):
+    """Runs of benchmarks whose rows are given, one tuple a measurement; and what they say and keep."""
+    (tmp_path / "speed.md").write_text("<!-- history -->\n<!-- end of history -->\n")
     monkeypatch.setattr(bench, "HISTORY", tmp_path / "history.json")
-    history = tmp_path / "speed.md"
-    history.write_text("<!-- history -->\n<!-- end of history -->\n")
-    monkeypatch.setattr(bench, "page", partial(bench.page, path=history))
-    targets = {"speed: step": ("at most", 2.0), "speed: gain": ("at least", 3.0)}
-    runs = []
+    monkeypatch.setattr(bench, "page", partial(bench.page, path=tmp_path / "speed.md"))
+    monkeypatch.setattr(bench, "there", lambda *_: {})
 
-    def run(*found, keep=False):
-        left = [dict(zip((*targets, "speed: seen"), rows, strict=True)) for rows in found]
+    def run(*found, targets=BENCHES, commit="b", version="1.0", keep=False):
+        left = [dict(zip(targets, rows, strict=True)) for rows in found]
         monkeypatch.setattr(bench, "measured", lambda name, device: (dict(left.pop(0)), targets))
-        runs.append(bench.main(("speed",), threads=torch.get_num_threads(), out=tmp_path / "out.json", keep=keep))
+        monkeypatch.setattr(bench, "commit", lambda: commit)
+        monkeypatch.setattr(bench.dvae, "__version__", version)
+        status = bench.main(("speed",), threads=torch.get_num_threads(), out=tmp_path / "out.json", keep=keep)
         assert not left
-        return capsys.readouterr().out.splitlines()[-1]
+        return status, capsys.readouterr().out.splitlines()[-1].strip()
 
-    run((1.0, 4.0, 7.0), keep=True)
-    run((1.09, 3.7, 70.0))  # within a tenth, and rows without a target are free
-    run((1.3, 4.0, 7.0), (1.05, 4.0, 7.0))  # the better of two
-    assert run((1.3, 4.0, 7.0), (1.2, 4.0, 7.0)) == "speed: step: 1.20 was 1.00 at the last release"
-    assert run((1.0, 2.0, 7.0), (1.0, 2.9, 7.0)) == (  # a gain is worse where it is less
-        "speed: gain: 2.90 is to be at least 3, was 4.00 at the last release"
+    run.page, run.history = tmp_path / "speed.md", tmp_path / "history.json"
+    return run
+
+
+BENCHES = {
+    "speed: step": ("at most", 2.0),
+    "speed: gain": ("at least", 3.0),
+    "speed: cost": ("at most", None),
+    "speed: exponent": ("under", 1.1),
+}
+
+
+def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(benches):
+    benches((1.0, 4.0, 7.0, 0.01), commit="a", keep=True)
+    assert benches((1.09, 3.7, 7.6, 0.9))[0] == 0  # within a tenth, or of an exponent within its bound
+    assert benches((1.3, 4.0, 9.0, 0.01), (1.05, 4.0, 7.0, 0.01))[0] == 0  # the better of two
+    step = (1, "speed: step: 1.20 was 1.00 at the last release")
+    assert benches((1.3, 4.0, 7.0, 0.01), (1.2, 4.0, 7.0, 0.01)) == step
+    gain = (1, "speed: gain: 2.90 was 4.00 at the last release")  # is worse where it is less
+    assert benches((1.0, 2.0, 7.0, 0.01), (1.0, 2.9, 7.0, 0.01)) == gain
+    cost = (1, "speed: cost: 8.00 was 7.00 at the last release")  # which has no target
+    assert benches((1.0, 4.0, 8.0, 0.01), (1.0, 4.0, 8.0, 0.01)) == cost
+    assert benches((1.0, 4.0, 7.0, 1.2), (1.0, 4.0, 7.0, 1.2)) == (
+        1,
+        "speed: exponent: 1.20 was 0.01 at the last release",
     )
-    assert runs == [0, 0, 0, 1, 1]
-    assert "| speed: step | at most 2 | **1.00** | – |" in history.read_text()
-    monkeypatch.setattr(
-        bench,
-        "measured",
-        lambda name, device: ({"other: row": 3.0, "speed: step": 1.01}, {"speed: step": ("at most", 2.0)}),
+
+
+def test_a_target_that_was_missed_before_is_told_and_fails_nothing(benches):
+    benches((2.5, 4.0, 7.0, 0.01), commit="a", keep=True)
+    assert benches((2.6, 4.0, 7.0, 0.01)) == (0, "speed: step: 2.60 is to be at most 2")
+
+
+def test_a_slower_row_is_measured_beside_the_code_of_the_release(benches, monkeypatch):
+    """This machine may be the slower one."""
+    benches((1.0, 4.0, 7.0, 0.01), commit="a", keep=True)
+    asked = []
+    monkeypatch.setattr(bench, "there", lambda *given: asked.append(given[:2]) or {"speed: step": 1.15})
+    assert benches((1.2, 4.0, 7.0, 0.01), (1.2, 4.0, 7.0, 0.01))[0] == 0
+    assert benches((1.3, 4.0, 7.0, 0.01), (1.3, 4.0, 7.0, 0.01)) == (
+        1,
+        "speed: step: 1.30 was 1.15 at the last release",
     )
-    bench.main(("gsps",), threads=torch.get_num_threads(), out=tmp_path / "out.json", keep=True)
-    [record] = json.loads((tmp_path / "history.json").read_text())  # rows that were not measured stay
-    assert record["rows"] == {"speed: step": 1.01, "speed: gain": 4.0, "speed: seen": 7.0, "other: row": 3.0}
-    monkeypatch.setattr(bench.dvae, "__version__", "9.0")
-    run((1.05, 5.0, 7.0), keep=True)
-    assert "| speed: gain | at least 3 | **5.00** | 4.00 | 1.25 |" in history.read_text()
-    assert len(json.loads((tmp_path / "history.json").read_text())) == 2
+    assert asked == [("a", "speed")] * 2
+
+
+def test_a_release_is_the_first_record_of_its_version(benches):
+    benches((1.0, 4.0, 7.0, 0.01), commit="a", keep=True)
+    benches((1.05, 5.0, 7.0, 0.01), keep=True)
+    assert "| speed: gain | at least 3 | **5.00** | 4.00 | 1.25 |" in benches.page.read_text()
+    fewer = {"speed: step": BENCHES["speed: step"], "speed: other": ("at most", None)}
+    benches((1.08, 3.0), targets=fewer, keep=True)
+    first, second = json.loads(benches.history.read_text())
+    assert first["rows"] == dict(zip(BENCHES, (1.0, 4.0, 7.0, 0.01), strict=True))
+    assert second["rows"] == {**dict(zip(BENCHES, (1.08, 5.0, 7.0, 0.01), strict=True)), "speed: other": 3.0}
+    assert benches((1.12, 5.0, 7.0, 0.01), (1.12, 5.0, 7.0, 0.01), commit="c")[0] == 1  # though not of the second
+    benches((1.1, 5.0, 7.0, 0.01), commit="d", version="2.0", keep=True)
+    assert benches((1.2, 5.0, 7.0, 0.01), commit="e", version="2.0")[0] == 0
+    assert "| speed: step | at most 2 | **1.10** | 1.08 | 1.00 | 1.10 |" in benches.page.read_text()
+
+
+def test_a_release_is_measured_by_its_own_code(tmp_path, monkeypatch):
+    """In a folder of its own, which is gone after it."""
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-C", tmp_path]
+    (tmp_path / "benchmarks").mkdir()
+    program = 'import sys, pathlib; pathlib.Path(sys.argv[-1]).write_text(\'{"rows": {"speed: step": %s}}\')'
+    for value in (1, 2):
+        (tmp_path / "benchmarks" / "bench.py").write_text(program % value)
+        subprocess.run([*git, "init", "-q"], check=True)
+        subprocess.run([*git, "add", "-A"], check=True)
+        subprocess.run([*git, "commit", "-qm", str(value)], check=True)
+    monkeypatch.setattr(bench, "HERE", tmp_path / "benchmarks")
+    before = subprocess.run([*git, "rev-parse", "HEAD~1"], check=True, capture_output=True, text=True).stdout.strip()
+    assert bench.there(before, "speed", "cpu", 1) == {"speed: step": 1}
+    assert bench.there(bench.commit(), "speed", "cpu", 1) == {"speed: step": 2}
+    assert bench.there("0" * 40, "speed", "cpu", 1) == {}
+    listed = subprocess.run([*git, "worktree", "list"], check=True, capture_output=True, text=True).stdout
+    assert len(listed.splitlines()) == 1
+
+
+def test_wrong_arguments_of_benchmarks_are_told_before_anything_is_measured(tmp_path):
+    for options, message in (
+        ({"threads": 0}, "threads is 0, expected 1 or more"),
+        ({"out": tmp_path / "no" / "x.json"}, "has no folder to be written to; make .*no first"),
+        ({"names": ("sped",)}, "sped"),
+    ):
+        with pytest.raises(SystemExit, match=message):
+            bench.main(**options)
 
 
 def test_products_alone_are_those_of_the_work():
