@@ -266,6 +266,7 @@ def main(
             failed += [
                 f"{row}: {rows[row]:.2f} was {before[row]:.2f} at the last release"
                 for row in slower(rows, bounds, before)
+                if row in doubtful
             ]
         for row, value in rows.items():
             was = f"{before[row]:8.2f}" if row in before else " " * 8

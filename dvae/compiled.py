@@ -114,7 +114,8 @@ def require_compiler(device: torch.device) -> None:
             _trifle(torch.ones(2, device=device))
     except Exception as error:
         needed = "a C++ compiler and Python's headers" if device.type == "cpu" else "Triton and a C compiler"
-        said = next(line for line in str(error).splitlines() if line.strip())
+        lines = [line for line in str(error).splitlines() if line.strip() and not line.endswith("raised:")]
+        said = lines[0] if lines else "it does not say why"
         raise RuntimeError(
             f"compile=True takes {needed}, and torch cannot compile for {device.type} here ({type(error).__name__}: "
             f"{said}); install them (on Debian and Ubuntu: apt install g++ python3-dev), name another compiler by the "

@@ -36,9 +36,9 @@ def angles(skeleton):
 
 
 def surfaces(rotations):
-    body, moved = bodies.human().double(), torch.zeros(B, T, 3, dtype=torch.float64)
-    turns = torch.linalg.qr(torch.randn(B, T, body.joints, 3, 3, dtype=torch.float64))[0]
-    return body.squared_error(torch.zeros(B, body.parameters_of_shape).double(), (rotations, moved), (turns, moved + 1))
+    body, moved = bodies.human().to(rotations), rotations.new_zeros(B, T, 3)
+    turns = torch.linalg.qr(torch.randn(B, T, body.joints, 3, 3, dtype=torch.float64))[0].to(rotations)
+    return body.squared_error(rotations.new_zeros(B, body.parameters_of_shape), (rotations, moved), (turns, moved + 1))
 
 
 VIEW = motion.Rotations(motion.simulate(clips=1, frames=4).with_rotations().skeleton, "quaternion")
@@ -49,7 +49,7 @@ CASES = {
     "_excess": (angles(WALKER), poses(WALKER, S, B, T)),
     "_excess, angles that some poses lack": (angles(HUMAN36M), poses(HUMAN36M, S, B, T)),
     "_squared_error": (surfaces, torch.randn(B, T, bodies.human().joints, 3, 3, dtype=torch.float64)),
-    "_aligned": (lambda x: _aligned(x, torch.ones(B, VIEW.skeleton.joints - 1).double(), VIEW), QUATERNIONS),
+    "_aligned": (lambda x: _aligned(x, x.new_ones(B, VIEW.skeleton.joints - 1), VIEW), QUATERNIONS),
 }
 
 
@@ -143,19 +143,28 @@ def test_a_run_asks_for_what_is_marked_and_says_where_there_is_nothing(tmp_path,
 
 
 @pytest.mark.slow
-def test_it_is_compiled_where_there_is_a_compiler(tmp_path):
-    """The energy of the limbs in single precision, and a run; as in training, the gradient may be taken twice."""
+@pytest.mark.parametrize("name", ["_limb_errors", "_likeness"])
+def test_what_is_compiled_makes_the_same_numbers(name):
+    """In single precision, to 1e-5; as in training, the gradient may be taken twice.
+
+    The others take a quarter of a minute each; `benchmarks/compiled.py`, which compiles all, ends above 1e-5.
+    """
     require_compiler(torch.device("cpu"))
-    function, values = CASES["_limb_errors"]
+    function, values = CASES[name]
     expected = valued(function, values.float())
-    with compiling():
+    with compiling() as used:
         found = valued(function, values.float())
         given = values.float().requires_grad_()
         total = function(given).sum()
         first, second = (torch.autograd.grad(total, given, retain_graph=True)[0] for _ in range(2))
+    assert used.used == {name.partition(",")[0]}
     for ours, theirs in zip((found[0], *found[1]), (expected[0], *expected[1]), strict=True):
         assert (ours - theirs).norm() <= 1e-5 * theirs.norm()
     assert torch.equal(first, second)
+
+
+@pytest.mark.slow
+def test_runs_are_compiled_where_there_is_a_compiler(tmp_path):
     check_runs(tmp_path)
 
 
@@ -170,6 +179,7 @@ require_compiler(torch.device("cpu"))
     done = subprocess.run([sys.executable, "-c", code], env=missing, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     said = done.stderr.splitlines()[-1]
+    assert "raised:" not in said
     assert said.startswith("RuntimeError: compile=True takes a C++ compiler and Python's headers")
     assert "no-such-compiler" in said
     assert "apt install g++" in said

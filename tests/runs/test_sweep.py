@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
 
+import psutil
 import pytest
+import submitit
 import torch
 from joblib import parallel_config
 from stopping import At, interrupt
@@ -20,6 +22,7 @@ from stopping import At, interrupt
 import dvae
 from dvae import motion
 from dvae.cli import main
+from dvae.inference.checkpoints import Run
 from dvae.motion.dataset import MotionData
 from dvae.motion.judges.action_classifier import ActionClassifier
 from dvae.runs import directory as runs
@@ -264,14 +267,35 @@ def test_a_sweep_that_is_stopped_does_not_wait_for_jobs_in_a_queue(data, tmp_pat
     assert not list(tmp_path.iterdir())  # nor the lease, without which a job that begins ends at once
 
 
+class OutOfTime:
+    """A job of submitit on this machine, which is sent the signal of a cluster once its run has a checkpoint."""
+
+    def __init__(self, folder):
+        self.executor, self.path, self.job = submitit.LocalExecutor(folder), None, None
+
+    def submit(self, function, run):
+        self.path, self.job = run.path, self.executor.submit(function, run)
+        return self
+
+    def done(self):
+        if self.path is not None and Run(self.path).exists:
+            self.path = None
+            psutil.Process(int(self.job.job_id)).children()[0].send_signal(signal.SIGUSR2)
+        return self.job.done()
+
+    def result(self):
+        return self.job.result()
+
+
 @pytest.mark.slow
-def test_runs_are_jobs_of_submitit(swept, data, tmp_path, monkeypatch):
-    submitit = pytest.importorskip("submitit")
-    out, _, _ = swept
+def test_a_job_of_submitit_that_is_out_of_time_goes_on_from_its_checkpoint(data, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
-    jobs = submitit.AutoExecutor(tmp_path / "jobs", cluster="local")
-    (result,) = sweep({"vae-z3": VAE}, data, tmp_path, [0], TRAINING, jobs)
-    assert (result.status, weights(result.path)) == ("finished", weights(out / "vae-z3-seed0"))
+    training = replace(TRAINING, steps=500, validate_every=50)
+    jobs = OutOfTime(tmp_path / "jobs")
+    (result,) = sweep({"vae-z3": VAE}, data, tmp_path, [0], training, jobs)
+    assert "Requeued job" in jobs.job.stdout()
+    (whole,) = sweep({"vae-z3": VAE}, data, tmp_path / "whole", [0], training, 1)
+    assert (result.status, weights(result.path)) == ("finished", weights(whole.path))
 
 
 SMALL_GSPS = {
