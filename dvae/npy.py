@@ -71,7 +71,8 @@ def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = 
     """Refuses an array that its bytes do not make, and one of a great many places that hold nothing."""
     needed, places = prod(shape) * dtype.itemsize, prod(n or 1 for n in shape) * dtype.itemsize
     if len(shape) > 32 or needed != size or places > max(size, NOTHING):
-        raise Refused(f"{verb} shape {shape} of {dtype}, holds {size:,} bytes")
+        short = f", needs {needed:,}; it was cut short, copy or write it again" if needed > size else ""
+        raise Refused(f"{verb} shape {shape} of {dtype}, holds {size:,} bytes{short}")
 
 
 def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
@@ -99,9 +100,9 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
         with files.open_plain(path, links=links) as file:
             dtype, shape, order = header(file.read)
             size = os.fstat(file.fileno()).st_size - file.tell()
-            check_bytes(dtype, shape, size)
             if dtype.kind not in "fiu":
-                raise Refused(f"holds {dtype}, expected real numbers")
+                raise Refused(f"holds {dtype}, expected real numbers; write it with numpy.asarray(values, float)")
+            check_bytes(dtype, shape, size)
             if not size:
                 raise Refused(f"has shape {shape}, in which there is no number")
             if order == "F" and len(shape) > 1:

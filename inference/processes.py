@@ -10,6 +10,7 @@ lightning-fabric starts the processes of one machine, torchrun those of several 
 
 import atexit
 import os
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
@@ -36,8 +37,10 @@ def launched(training: Training) -> "Fabric":
     """Start the processes of a run, or join those that torchrun has started.
 
     Raises:
-        ValueError: torchrun has started another number of processes than `devices`.
+        ValueError: torchrun has started another number of processes than `devices`, or there is no program that could
+            be started as often, or no such accelerator.
     """
+    _check(training)
     from lightning_fabric import Fabric  # over a second to import, half of what `import dvae` would take
     from lightning_fabric.strategies.ddp import DDPStrategy
 
@@ -144,6 +147,16 @@ def _all_reduce(value: Tensor) -> Tensor:
     return value
 
 
+def _check(training: Training) -> None:
+    accelerator, devices = training.accelerator, training.devices
+    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    there["gpu"] = any(there.values())
+    if not there.get(accelerator, True):
+        raise ValueError(f"accelerator is {accelerator!r}, and torch {torch.__version__} finds none here; leave it out")
+    if devices > 1 and not by_torchrun() and sys.argv[0] in ("", "-", "-c"):
+        raise ValueError(f"devices={devices} starts the program as often, and this one is in no file; write it to one")
+
+
 def _places(devices: int) -> tuple[int, int]:
     """Processes on this host, and hosts."""
     if not by_torchrun():
@@ -163,7 +176,7 @@ def _answered() -> Iterator[None]:
         minutes = LONGEST_WAIT.total_seconds() / 60
         raise LostProcess(
             f"another process of this run has ended, or has not answered for {minutes:g} minutes; its own output says "
-            "why. Start all of them again to go on from the last checkpoint"
+            "why. Resume the run with as many processes to go on from its last checkpoint"
         ) from error
 
 

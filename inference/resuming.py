@@ -82,7 +82,7 @@ def restore(svi: SVI, run: Run) -> None:
     if count != svi.fabric.world_size:
         raise CheckpointError(
             f"{run.path} was fitted by {count} processes, not {svi.fabric.world_size}; resume with as many, as each "
-            "has random numbers of its own: on fewer hosts, with more processes on each"
+            f"has random numbers of its own: with devices={count} on one host, or by torchrun on several"
         )
     # a copy: set_state reads the storage, so it takes another row's bytes for a view, or crashes
     random = {name: value[svi.fabric.global_rank].clone() for name, value in content["random"].items()}

@@ -306,8 +306,11 @@ def described(descr="'<f4'", order="False", shape="(2, 3)"):
         (b"", "no npy file"),
         (b"PK\x03\x04 an archive", "no npy file"),
         (npy_of(described(), b"\0" * 24, version=3), "no npy file of version 1 or 2"),
-        (npy_of(described(), b"\0" * 23), r"declares shape \(2, 3\) of float32, holds 23 bytes"),
-        (npy_of(described(), b"\0" * 25), r"declares shape \(2, 3\) of float32, holds 25 bytes"),
+        (
+            npy_of(described(), b"\0" * 23),
+            r"declares shape .2, 3. of float32, holds 23 bytes, needs 24; it was cut short",
+        ),
+        (npy_of(described(), b"\0" * 25), r"declares shape \(2, 3\) of float32, holds 25 bytes$"),
         (npy_of(described(shape="(1000000000000, 48)"), b"\0" * 24), "holds 24 bytes"),
         (npy_of(described(shape="(99999999999999999999, 3)")), "damaged: its shape"),
         (npy_of(described(shape="(-2, 3)"), b"\0" * 24), "no plain array"),
@@ -468,8 +471,14 @@ def test_a_folder_of_arrays_is_a_table_with_their_splits(tmp_path):
     assert PanelData.open(folder).protocol.name == "5 + 5 steps"
     (folder / "walk.bvh").touch()
     assert not is_table(str(folder))
+    np.save(folder / "test" / "b", walks((30, 2)))
+    (folder / "test" / "b.npy").rename(folder / "test" / "B.NPY")
+    assert {one.name for one in PanelData.open(folder).panel} == {*said, "test/B"}
+    (folder / "test" / "c.csv").write_text("1,2")
+    with pytest.raises(ValueError, match=r"walks holds test.c.csv beside npy files; .* write it as one, or move it"):
+        PanelData.open(folder)
     (tmp_path / "none").mkdir()
-    with pytest.raises(ValueError, match="none is to hold npy files"):
+    with pytest.raises(ValueError, match="none is to hold npy files, from 1 to 100,000; it has none"):
         PanelData.open(tmp_path / "none")
 
 

@@ -140,7 +140,7 @@ def sweep(
         A result for each run, by seed and then by method, also for those that failed.
 
     Raises:
-        ValueError: nothing to fit, a run given twice, or a run of other options in its directory.
+        ValueError: nothing to fit, a run given twice, a run of other options in its directory, or no jobs.
         CheckpointError: a damaged run.
         SweepInterrupted: after Ctrl-C or SIGTERM.
 
@@ -167,6 +167,8 @@ def sweep(
     ]
     if not runs or len({run.path for run in runs}) < len(runs):
         raise ValueError(f"a sweep has at least one method and one seed, each once; seeds are {list(seeds)}")
+    if not (isinstance(jobs, int) and jobs) and not hasattr(jobs, "submit"):
+        raise ValueError(f"jobs is {jobs!r}, expected how many runs go on at a time, or an executor with submit(…)")
     if devices := [run.training.devices for run in runs if run.training.devices != 1]:
         raise ValueError(f"devices is {devices[0]}; a run of a sweep has one device, fit it alone for more")
     results = {run.path: result for run in runs if (result := _earlier(run)) is not None}

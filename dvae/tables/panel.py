@@ -125,10 +125,13 @@ class Panel:
                     row, nth = np.argwhere(wrong)[0]
                     of, column = np.searchsorted(ends, start + row, "right"), self.columns.columns[places[nth]]
                     one, size = self.series[of], f", below {LARGEST:g} in size" if seen[row, nth] else ""
+                    advice = (
+                        "give it another family" if np.isfinite(own[row, nth]) else "where none is known, write NaN"
+                    )
                     raise ValueError(
                         f"sequence {one.name!r} of {self.name} has {own[row, nth]:g} in row "
                         f"{start + row - ends[of] + len(one)} of column {column.name!r}, and the family "
-                        f"{column.family!r} is of {said}{size}; give it another family"
+                        f"{column.family!r} is of {said}{size}; {advice}"
                     )
             rows = start + np.flatnonzero(absent[:, self._targets].any(1))
             gapped |= {*np.searchsorted(ends, rows, "right").tolist()}

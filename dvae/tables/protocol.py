@@ -109,7 +109,11 @@ class Cut:
         units = [one.group if self.split == "group" else one.name for one in panel.series]
         said = {unit: one.split for unit, one in zip(units, panel.series, strict=True) if one.split}
         if said and len({one.split == "" for one in panel.series}) > 1:
-            raise ValueError(f"some sequences of {panel.name} say their split and others do not; let all, or none")
+            silent = next(one.name for one in panel.series if not one.split)
+            raise ValueError(
+                f"some sequences of {panel.name} say their split ({', '.join(sorted(set(said.values())))}) and others, "
+                f"such as {silent!r}, do not; let all, or none"
+            )
         if said:
             return [one.split for one in panel.series]
         if self.split == "group" and not any(units):

@@ -222,12 +222,16 @@ def _of_mapped(place: Path, columns: Columns | Told | None) -> Panel:
     """
     found = [("", place.stem, place)]
     if place.is_dir():
-        paths = (Path(folder, name) for folder, _, names in os.walk(place) for name in names if name.endswith(".npy"))
-        files_in = sorted(islice(paths, MOST_FILES + 1))
-        if not 0 < len(files_in) <= MOST_FILES:
+        tables = (file for file in _files(place) if file.suffix.lower() in (".npy", *SUFFIXES))
+        files_in = sorted(islice(tables, MOST_FILES + 1))
+        if others := [file for file in files_in if file.suffix.lower() != ".npy"]:
             raise ValueError(
-                f"{place} is to hold npy files, from 1 to {MOST_FILES:,}; it has {len(files_in):,} or more"
+                f"{place} holds {others[0].relative_to(place)} beside npy files; of a folder npy files alone are read, "
+                "so write it as one, or move it elsewhere"
             )
+        if not 0 < len(files_in) <= MOST_FILES:
+            many = f"more than {MOST_FILES:,}" if files_in else "none"
+            raise ValueError(f"{place} is to hold npy files, from 1 to {MOST_FILES:,}; it has {many}")
         names = [file.relative_to(place).with_suffix("").as_posix() for file in files_in]
         splits = (name.partition("/")[0] for name in names)
         found = list(zip((split if split in SPLITS else "" for split in splits), names, files_in, strict=True))
@@ -242,6 +246,10 @@ def _of_mapped(place: Path, columns: Columns | Told | None) -> Panel:
         parts = [(name, values)] if values.ndim == 2 else [(f"{name}/{n}", each) for n, each in enumerate(values)]
         series += [Series(own, each, split=split) for own, each in parts]
     return Panel(series, plain_columns(columns, series[0].values.shape[1]), place.stem)
+
+
+def _files(place: Path) -> Iterator[Path]:
+    return (Path(folder, name) for folder, _, names in os.walk(place) for name in names)
 
 
 def is_domain(name: str) -> bool:

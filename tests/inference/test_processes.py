@@ -198,6 +198,15 @@ def test_streams_are_of_one_process_of_one_seed():
     assert len({seed_of(seed, rank) for seed, rank in product(range(-20, 20), range(20))}) == 800
 
 
+def test_what_cannot_be_started_is_told(monkeypatch):
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    with pytest.raises(ValueError, match=r"accelerator is 'mps', and torch \S+ finds none here; leave it out"):
+        processes.launched(Training(accelerator="mps"))
+    monkeypatch.setattr("sys.argv", ["-c"])
+    with pytest.raises(ValueError, match="devices=2 starts the program as often, and this one is in no file"):
+        processes.launched(Training(accelerator="cpu", devices=2))
+
+
 def test_torchrun_says_how_many_processes_there_are(monkeypatch):
     assert processes._places(2) == (2, 1)
     for name, value in {"TORCHELASTIC_RUN_ID": "none", "LOCAL_WORLD_SIZE": "2", "WORLD_SIZE": "6"}.items():

@@ -122,6 +122,11 @@ def test_a_sweep_that_makes_no_sense_is_refused(data, tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             sweep(methods, data, tmp_path / "out", seeds, TRAINING)
+    for jobs in (0, None, 2.0, "4"):
+        with pytest.raises(
+            ValueError, match=f"jobs is {jobs!r}, expected how many runs go on at a time, or an executor"
+        ):
+            sweep([VAE], data, tmp_path / "out", [0], TRAINING, jobs)
     with pytest.raises(ValueError, match="devices is 2"):
         sweep([VAE], data, tmp_path / "out", [0], replace(TRAINING, devices=2))
     equations = [dvae.method("equations", generative=f"p(z_t) p(x_t | {z})") for z in ("z_t", "z_{<=t}")]
