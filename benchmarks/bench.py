@@ -148,14 +148,16 @@ def machine(device: torch.device) -> dict[str, Any]:
 
 
 def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
-    """The history with a record; one of that commit, measured alike, keeps the rows that were not measured anew."""
-
-    def same(each: dict[str, Any]) -> bool:
-        return bool((each["version"], each["commit"], how(each)) == (record["version"], record["commit"], how(record)))
-
-    parts = [*filter(same, records), record]
-    joined = {key: {name: value for part in parts for name, value in part[key].items()} for key in ("rows", "targets")}
-    return [*(each for each in records if not same(each)), record | joined]
+    """The history with a record. Of a version there are two, its first and its last, which keep what is not in it."""
+    alike = [each for each in records if (each["version"], how(each)) == (record["version"], how(record))]
+    own = [each for n, each in enumerate(alike) if (n > 0) == (record["commit"] != alike[0]["commit"])]
+    joined = {
+        key: {name: value for part in (*own, record) for name, value in part[key].items()}
+        for key in ("rows", "targets")
+    }
+    if not own:
+        return [*records, record]
+    return [record | joined if each is own[0] else each for each in records]
 
 
 def released(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str, tuple[float, str]]:
