@@ -26,7 +26,7 @@ from ..inference.objectives import Evidence, Objective
 from ..inference.recipe import Recipe
 from ..inference.training import Stage, Training
 from ..laws import FixedNormal, LawSpec
-from ..motion import HUMAN36M, Heading, Skeleton, energies
+from ..motion import HUMAN36M, HUMANEVA, Heading, Skeleton, energies
 from ..motion.protocols import Poses
 from ..networks import Input, Network
 from ..networks.base import once, perceptron, share_modules
@@ -37,7 +37,7 @@ from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, SelfFeeding
 from ..schema import Schema
 from ..views import WHOLE, Past, Views
-from .poses import PoseMethod, without_gaps
+from .poses import PoseMethod, table, without_gaps
 
 HISTORY = "h"
 
@@ -48,22 +48,25 @@ class FutureMethod(PoseMethod):
 
     Args:
         latent: size of the latent.
-        beta: weight of the KL, beside squared errors in square metres.
+        beta: weight of the KL, beside squared errors in square metres. None for the papers' with the poses of Human3.6M
+            and HumanEva, and for Human3.6M's with others.
         join: weight of the squared distance from the last observed pose to the first one that is made.
         heading: turn every window so that its last observed pose faces one way, and the futures back. None for not with
-            Human3.6M's poses, as in the papers, and for so with others whose left and right are known.
+            the papers' poses, of Human3.6M and HumanEva, and for so with others whose left and right are known.
     """
 
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = table(
+        "beta heading", {HUMAN36M.name: (0.1, False), HUMANEVA.name: (0.01, False), "": (0.1, True)}
+    )
 
     trainings: ClassVar[Mapping[str, Training]] = {
         HUMAN36M.name: Training(39_063, 64, 1e-3, 0.8),
-        "humaneva": Training(7813, 64, 1e-3, 0.8),
+        HUMANEVA.name: Training(7813, 64, 1e-3, 0.8),
         "": Training(learning_rate=3e-3, decay=0.5),
     }
 
     latent: Size | None = 128
-    beta: Amount = 0.1
+    beta: Amount | None = None
     join: Amount = 0.0
     heading: bool | None = None
 
@@ -110,10 +113,11 @@ class FutureMethod(PoseMethod):
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """Minimises squared errors and the weighted KL; the best weights are those of the lowest loss."""
-        return Recipe(train, validation, [Stage(steps, self.objective())], 1.0)
+        return Recipe(train, validation, [Stage(steps, self.suited(train).objective())], 1.0)
 
     def objective(self) -> Objective:
         """What training minimises."""
+        assert self.beta is not None  # of a method that is suited
         return Evidence(kl_weight=self.beta, energy_weights={"join": self.join} if self.join else {}, select="loss")
 
 

@@ -50,7 +50,9 @@ from ..views import WHOLE
 from .futures import HISTORY, FutureMethod, FutureModel
 from .poses import table
 
-PRESETS = table("latent width heading", {"human36m": (512, 1024, False), "": (64, 128, True)})
+PRESETS = table(
+    "latent width heading", {**dict.fromkeys(("human36m", "humaneva"), (512, 1024, False)), "": (64, 128, True)}
+)
 """Skeleton to options: the public code's, and smaller ones for others."""
 FIRST = 8
 """Frames whose velocities count."""
@@ -76,7 +78,10 @@ class MTVAE(FutureMethod):
     generative = "p(w) p(x_t | h, w)"
     inference = "q(w | x_{1:T}, h)"
     presets = PRESETS
-    trainings: ClassVar[Mapping[str, Training]] = {"human36m": Training(60_000, 256, 1e-4), "": Training(decay=0.5)}
+    trainings: ClassVar[Mapping[str, Training]] = {
+        **dict.fromkeys(("human36m", "humaneva"), Training(60_000, 256, 1e-4)),
+        "": Training(decay=0.5),
+    }
 
     latent: Size | None = None
     beta: Amount = 1.0

@@ -6,7 +6,8 @@ stand beside the full method with as few. Scores are kept, and the script goes o
 without `--data` nothing is fitted. Printed numbers are of other data.
 
 Sources: Bie et al., 2022, arXiv 2204.01565, tables 1 to 3 and 5; Mao, Liu and Salzmann, 2021, arXiv 2108.08422,
-tables 1 to 3; Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, tables 1 and 3 to 6, and figure 6.
+tables 1 to 3; Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, tables 1 and 3 to 6, and figure 6 (table 2 is the
+list of predictors that GSPS's has, on Human3.6M).
 """
 
 from __future__ import annotations
@@ -51,16 +52,24 @@ class Further:
     """Views of some rows, with a table of their own.
 
     Args:
+        caption: what it is of.
         views: the views.
         rows: of the paper's.
         columns: of that table; none for those of all its tables.
         printed: rows of the paper.
+        apart: rows that have a view of their own there.
     """
 
+    caption: str
     views: Sequence[View]
     rows: Sequence[str]
     columns: Sequence[str] = ()
     printed: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    apart: Mapping[str, View] = field(default_factory=dict)
+
+    def views_of(self, row: str) -> list[View]:
+        """In which a row is scored for that table."""
+        return [*(self.views if row in self.rows else ()), *(view for name, view in self.apart.items() if name == row)]
 
 
 @dataclass(frozen=True)
@@ -89,7 +98,7 @@ class Paper:
 
     def views_of(self, row: str) -> list[View]:
         """In which a row is scored."""
-        return [*self.views, *(view for each in self.further if row in each.rows for view in each.views)]
+        return list(dict.fromkeys([*self.views, *(view for each in self.further for view in each.views_of(row))]))
 
 
 HIT, COPYING = "hit-dvae", {"nearest": False, "residual": 0.0}
@@ -107,7 +116,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "no copies": COPYING,
     "no copies, no attention": {**COPYING, "attention": False},
     "observed frames fed": {"feed_observed": True},
-    "weights read literally": {"kl_local": 0.0067, "kl_static": 0.1},
+    "KL weights read literally": {"kl_local": 0.0067, "kl_static": 0.1},
 }
 """Ablations of HiT-DVAE: the paper's, then ours."""
 TERMS: dict[str, dict[str, Any]] = {
@@ -129,15 +138,18 @@ SIMPLER: dict[str, dict[str, Any]] = {
     STANDARD: {"complement": False, "cosine": False, "latent": 8, "learned_prior": False, "beta": 0.1},
 }
 """TrajeVAE without what it adds, one after the other; latents of all have 480 numbers."""
-EXCHANGES: tuple[dict[str, Any], ...] = ({}, {"own": True}, {"truth": "pose"})
-"""Another's pose and the paths' motion as the truth; own poses of the same windows; the truth of the public code."""
+EXCHANGES: dict[str, dict[str, Any]] = {
+    "Another's pose, whose joints are within 1 cm, and the paths' motion as the truth": {},
+    "Own poses, of the same windows": {"own": True},
+    "Another's pose, and its motion as the truth, as in the public code": {"truth": "pose"},
+}
 ANOTHERS = printed(
     "APD,ADE,FDE",
     """
-    TrajeVAE, 1 | 5.373 .370 .476
-    TrajeVAE, 2 | 5.400 .362 .472
-    TrajeVAE, 3 | 5.096 .375 .491
-    TrajeVAE, 4 | 4.175 .332 .433
+    Human3.6M: TrajeVAE, 1 | 5.373 .370 .476
+    Human3.6M: TrajeVAE, 2 | 5.400 .362 .472
+    Human3.6M: TrajeVAE, 3 | 5.096 .375 .491
+    Human3.6M: TrajeVAE, 4 | 4.175 .332 .433
     """,
 )
 PAPERS = {
@@ -172,8 +184,9 @@ PAPERS = {
             """,
         ),
         further=(
-            Further((View(observed=5), View(observed=30)), (HIT,)),
+            Further("Other lengths of what is observed, in frames", (View(observed=5), View(observed=30)), (HIT,)),
             Further(
+                "Contents in groups, by a judge of their own",
                 (View(judges="content+group"),),
                 (HIT, "gsps", "dlow"),
                 (*GROUPED, "ACC content", "FID content"),
@@ -239,8 +252,14 @@ PAPERS = {
             """,
         ),
         further=(
-            Further((View(parts="free"),), ("gsps", "bom-parts", "dlow", LOWER), ("APD", *PARTED)),
             Further(
+                "How far futures are apart, by parts of the body",
+                (View(parts="free"),),
+                ("gsps", "bom-parts", "dlow"),
+                ("APD", *PARTED),
+            ),
+            Further(
+                "The same where the lower body is held",
                 (View(parts="held"),),
                 ("gsps", "bom-parts"),
                 ("APD", *PARTED),
@@ -257,6 +276,7 @@ PAPERS = {
                     HumanEva-I: GSPS | 0 5.096
                     """,
                 ),
+                {LOWER: View(parts="free")},  # which has learned to hold it
             ),
         ),
     ),
@@ -269,73 +289,86 @@ PAPERS = {
             "cvae-rnn": {},
             "motion-infilling": PATHS["motion-infilling"],
         },
-        (("APD", "energy score", *ERRORS[:4], "path error", "global ADE", "limb stretch", "limb jitter"),),
+        (("APD", "energy score", *ERRORS[:4], "path error", "global ADE", *REAL[:4]),),
         [("6,000 steps", WHOLE), (WHOLE, TIME), (TIME, STANDARD), (FULL, "cvae-rnn")],
         ("ADE", "APD"),
         printed(
             "APD,ADE,FDE,MMADE,MMFDE",
             """
-            TrajeVAE, 0 | 8.462 .518 .678 .596 .703
-            TrajeVAE, 1 | 6.641 .463 .602 .581 .672
-            TrajeVAE, 2 | 6.334 .450 .581 .581 .668
-            TrajeVAE, 3 | 5.037 .375 .488 .579 .664
-            TrajeVAE, 4 | 4.069 .325 .428 .584 .674
-            + masked poses, 0 | 8.936 .539 .724 .616 .748
-            + masked poses, 1 | 6.803 .472 .623 .594 .695
-            + masked poses, 2 | 6.286 .448 .587 .587 .681
-            + masked poses, 3 | 4.861 .361 .474 .585 .674
-            + masked poses, 4 | 3.857 .312 .412 .594 .689
-            + cosine transform, 0 | 9.483 .560 .742 .634 .762
-            + cosine transform, 1 | 7.014 .487 .637 .602 .703
-            + cosine transform, 2 | 6.561 .465 .604 .594 .688
-            + cosine transform, 3 | 5.367 .389 .503 .590 .681
-            + cosine transform, 4 | 4.524 .338 .443 .595 .692
-            + learned prior, 0 | 1.860 .502 .694 .611 .740
-            + learned prior, 1 | 1.749 .448 .622 .618 .753
-            + learned prior, 2 | 1.719 .418 .577 .616 .750
-            + learned prior, 3 | 1.725 .327 .449 .632 .767
-            + learned prior, 4 | 1.720 .281 .385 .646 .783
-            standard prior, 0 | 1.237 .525 .749 .634 .801
-            standard prior, 1 | 1.220 .481 .695 .640 .811
-            standard prior, 2 | 1.217 .466 .672 .642 .812
-            standard prior, 3 | 1.248 .376 .549 .639 .802
-            standard prior, 4 | 1.261 .339 .498 .641 .805
-            CVAE-RNN, 0 | 9.579 .611 .723 .639 .724
-            CVAE-RNN, 1 | 9.498 .603 .733 .647 .753
-            CVAE-RNN, 2 | 9.496 .588 .714 .642 .745
-            CVAE-RNN, 3 | 9.309 .516 .626 .614 .699
-            CVAE-RNN, 4 | 9.242 .459 .560 .602 .679
-            Motion Infilling, 0 | 0 1.203 1.209 1.197 1.207
-            Motion Infilling, 1 | 0 >10⁴ >10⁴ >10⁴ >10⁴
-            Motion Infilling, 2 | 0 >10⁴ >10⁴ >10⁴ >10⁴
-            Motion Infilling, 3 | 0 22.727 76.233 22.801 76.326
-            Motion Infilling, 4 | 0 1.067 1.220 1.258 1.468
+            Human3.6M: TrajeVAE, 0 | 8.462 .518 .678 .596 .703
+            Human3.6M: TrajeVAE, 1 | 6.641 .463 .602 .581 .672
+            Human3.6M: TrajeVAE, 2 | 6.334 .450 .581 .581 .668
+            Human3.6M: TrajeVAE, 3 | 5.037 .375 .488 .579 .664
+            Human3.6M: TrajeVAE, 4 | 4.069 .325 .428 .584 .674
+            Human3.6M: + masked poses, 0 | 8.936 .539 .724 .616 .748
+            Human3.6M: + masked poses, 1 | 6.803 .472 .623 .594 .695
+            Human3.6M: + masked poses, 2 | 6.286 .448 .587 .587 .681
+            Human3.6M: + masked poses, 3 | 4.861 .361 .474 .585 .674
+            Human3.6M: + masked poses, 4 | 3.857 .312 .412 .594 .689
+            Human3.6M: + cosine transform, 0 | 9.483 .560 .742 .634 .762
+            Human3.6M: + cosine transform, 1 | 7.014 .487 .637 .602 .703
+            Human3.6M: + cosine transform, 2 | 6.561 .465 .604 .594 .688
+            Human3.6M: + cosine transform, 3 | 5.367 .389 .503 .590 .681
+            Human3.6M: + cosine transform, 4 | 4.524 .338 .443 .595 .692
+            Human3.6M: + learned prior, 0 | 1.860 .502 .694 .611 .740
+            Human3.6M: + learned prior, 1 | 1.749 .448 .622 .618 .753
+            Human3.6M: + learned prior, 2 | 1.719 .418 .577 .616 .750
+            Human3.6M: + learned prior, 3 | 1.725 .327 .449 .632 .767
+            Human3.6M: + learned prior, 4 | 1.720 .281 .385 .646 .783
+            Human3.6M: standard prior, 0 | 1.237 .525 .749 .634 .801
+            Human3.6M: standard prior, 1 | 1.220 .481 .695 .640 .811
+            Human3.6M: standard prior, 2 | 1.217 .466 .672 .642 .812
+            Human3.6M: standard prior, 3 | 1.248 .376 .549 .639 .802
+            Human3.6M: standard prior, 4 | 1.261 .339 .498 .641 .805
+            Human3.6M: CVAE-RNN, 0 | 9.579 .611 .723 .639 .724
+            Human3.6M: CVAE-RNN, 1 | 9.498 .603 .733 .647 .753
+            Human3.6M: CVAE-RNN, 2 | 9.496 .588 .714 .642 .745
+            Human3.6M: CVAE-RNN, 3 | 9.309 .516 .626 .614 .699
+            Human3.6M: CVAE-RNN, 4 | 9.242 .459 .560 .602 .679
+            Human3.6M: MoGlow, 0 | 1.786 .548 .776 .626 .803
+            Human3.6M: MoGlow, 1 | 1.813 .546 .773 .625 .801
+            Human3.6M: MoGlow, 2 | 1.861 .544 .768 .623 .797
+            Human3.6M: MoGlow, 3 | 1.844 .540 .766 .623 .798
+            Human3.6M: MoGlow, 4 | 1.858 .530 .750 .619 .790
+            Human3.6M: MotionGAN, 0 | 0 1.174 1.274 1.174 1.270
+            Human3.6M: MotionGAN, 1 | 0 .936 1.120 .958 1.147
+            Human3.6M: MotionGAN, 2 | 0 .904 1.131 .953 1.185
+            Human3.6M: MotionGAN, 3 | 0 .812 1.063 .948 1.220
+            Human3.6M: MotionGAN, 4 | 0 .675 .919 .932 1.226
+            Human3.6M: Motion Infilling, 0 | 0 1.203 1.209 1.197 1.207
+            Human3.6M: Motion Infilling, 1 | 0 >10⁴ >10⁴ >10⁴ >10⁴
+            Human3.6M: Motion Infilling, 2 | 0 >10⁴ >10⁴ >10⁴ >10⁴
+            Human3.6M: Motion Infilling, 3 | 0 22.727 76.233 22.801 76.326
+            Human3.6M: Motion Infilling, 4 | 0 1.067 1.220 1.258 1.468
             """,
         ),
         tuple(map(View, range(5))),
         (
-            Further(tuple(map(View, (6, 8, 10, 13, 16, 19, 21))), (FULL,)),
+            Further("More paths", tuple(map(View, (6, 8, 10, 13, 16, 19, 21))), (FULL,)),
             Further(
+                "One motion, at the mean of the prior",
                 tuple(View(count, single=True) for count in range(5)),
                 (FULL, "6,000 steps", WHOLE, TIME, STANDARD, "cvae-rnn"),
                 printed=printed(
                     "ADE,FDE",
                     """
-                    TrajeVAE, 0 | .529 .779
-                    TrajeVAE, 1 | .491 .735
-                    TrajeVAE, 2 | .477 .710
-                    TrajeVAE, 3 | .396 .593
-                    TrajeVAE, 4 | .345 .522
+                    Human3.6M: DLow, – | 1.126 1.652
+                    Human3.6M: TrajeVAE, 0 | .529 .779
+                    Human3.6M: TrajeVAE, 1 | .491 .735
+                    Human3.6M: TrajeVAE, 2 | .477 .710
+                    Human3.6M: TrajeVAE, 3 | .396 .593
+                    Human3.6M: TrajeVAE, 4 | .345 .522
                     """,
                 ),
             ),
             *(
                 Further(
+                    caption,
                     tuple(View(count, exchanged=0.01, **how) for count in range(1, 5)),
                     (FULL, "cvae-rnn"),
                     printed={} if how else ANOTHERS,
                 )
-                for how in EXCHANGES
+                for caption, how in EXCHANGES.items()
             ),
         ),
     ),
@@ -395,6 +428,11 @@ def more_joints(found: Found, paper: Paper) -> str:
     return table(["", "", *header], lines)
 
 
+def captioned(caption: str, made: str) -> str:
+    """A table below what it is of; nothing where it has no rows."""
+    return f"*{caption}:*\n\n{made}" if made.count("\n") > 2 else ""
+
+
 def main(
     runs: tyro.conf.Positional[Path],
     data: Path | None = None,
@@ -427,14 +465,17 @@ def main(
             work(data, runs, stored, paper.set, fitted, views, seeds, samples)
         found = {view: entries(stored, paper.set, view, paper.rows) for view in paper.views}
         tables = [scores(found, columns, paper.printed) for columns in paper.columns]
-        tables.append(changes(found, paper))
+        tables.append(captioned("What each change does, paired", changes(found, paper)))
         if len(found) > 1:
-            tables.append(more_joints(found, paper))
+            tables.append(captioned("What each further path does, paired", more_joints(found, paper)))
         for each in paper.further:
             seen = {view: rows for view in each.views if (rows := entries(stored, paper.set, view, each.rows))}
-            chosen = [each.columns] if each.columns else paper.columns
-            tables += [scores(seen, columns, each.printed) for columns in chosen] if seen else []
-        write(None if pages is None else pages / f"{name.replace('-', '_')}.md", *tables, name="rows")
+            for row, view in each.apart.items():
+                own = {name: entry for name, entry in entries(stored, paper.set, view, [row]).items() if name == row}
+                seen |= {view: seen.get(view, {}) | own} if own else {}
+            for columns in ([each.columns] if each.columns else paper.columns) if seen else []:
+                tables.append(captioned(each.caption, scores(seen, columns, each.printed)))
+        write(None if pages is None else pages / f"{name.replace('-', '_')}.md", *filter(None, tables), name="rows")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import math
 import statistics
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -166,6 +165,8 @@ SHOWN = {*COLUMNS, *JUDGED, *OTHERS, *GROUPED, *PARTED}
 RANKED = "energy score"
 """By which rows stand in order; it is proper, and the lowest is best."""
 NEIGHBOURS = "nearest neighbours"
+ENOUGH = 3
+"""Seeds that a row has which may be called the best: of fewer, what they spread tells next to nothing."""
 
 
 @dataclass(frozen=True)
@@ -429,7 +430,10 @@ def alike(basis: Sequence[Any]) -> list[Any]:
 
 def titled(name: str, entry: Entry) -> str:
     """A row as it is called, with what sets it apart."""
-    return f"{name} (drawn)" if entry.seeds[0].basis[EMISSION] == "drawn" else name
+    first = entry.seeds[0]
+    modes = first.config.get("method", {}).get("modes")
+    apart = ["drawn"] * (first.basis[EMISSION] == "drawn") + ([] if modes is None else [f"{modes} modes"])
+    return f"{name} ({', '.join(apart)})" if apart else name
 
 
 def cell(estimate: Estimate | None) -> str:
@@ -468,13 +472,13 @@ def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
         means = [None if crossed is None else crossed.estimate() for crossed in map(own.crossed, columns)]
         lines.append([titled(name, own), *trained(own), *map(cell, [*behind, *means])])
     scores = {name: score_of(name) for name in order}
-    known = {name: score for name, score in scores.items() if not math.isnan(score.seeds)}
+    known = {name: score for name, score in scores.items() if score.count >= ENOUGH}
     if not any(found[name].minutes for name in known):
         return table(header, lines)
     members = ", ".join(confidence_set(known).members)
     return (
         table(header, lines)
-        + f"\nMay be the best, at 90 % over clips and seeds, of rows with two seeds or more: {members}.\n"
+        + f"\nMay be the best, at 90 % over clips and seeds, of rows with {ENOUGH} seeds or more: {members}.\n"
     )
 
 

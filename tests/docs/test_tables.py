@@ -445,6 +445,7 @@ def test_ranking(folder, page, monkeypatch):
     small = {name: {**options, "steps": 2, "batch_size": 4} for name, options in methods.items()}
     monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", small)})
     monkeypatch.setattr(ranking, "fitted_judges", lambda *arguments: {})
+    monkeypatch.setattr(ranking, "ENOUGH", 2)
     page.write_text(page.read_text().replace("tables", "simulated"))
     runs, scores = folder / "ranked", folder / "scores"
     options = {"scores": scores, "page": page, "samples": 2, "sets": ("simulated",)}
@@ -458,7 +459,7 @@ def test_ranking(folder, page, monkeypatch):
     ranking.main(runs, **options)
     assert before == {file: file.stat().st_mtime_ns for file in scores.rglob("*.json.gz")}
     page.write_text(page.read_text().replace("simulated", "tables"))
-    (best,) = re.findall(r"^May be the best, .* with two seeds or more: (.*)\.$", page.read_text(), re.MULTILINE)
+    (best,) = re.findall(r"^May be the best, .* with 2 seeds or more: (.*)\.$", page.read_text(), re.MULTILINE)
     assert set(best.split(", ")) <= {"zero velocity", "nearest neighbours", "srnn"}  # of the other there is one seed
     (rows,) = tables(page)
     by_name = {row[0]: row for row in rows[1:]}
@@ -504,11 +505,11 @@ def test_papers(folder, page, monkeypatch):
         (("APD", "ADE"),),
         [("trajevae", "whole poses")],
         ("ADE",),
-        papers.printed("APD,ADE", "TrajeVAE, 0 | 8.462 .518"),
+        papers.printed("APD,ADE", "Human3.6M: TrajeVAE, 0 | 8.462 .518"),
         (ranking.View(0), ranking.View(1)),
         [
-            papers.Further([ranking.View(1, single=True)], ["trajevae"]),
-            papers.Further([ranking.View(1, exchanged=9.0)], []),
+            papers.Further("One motion", [ranking.View(1, single=True)], ["trajevae"]),
+            papers.Further("Another", [ranking.View(1, exchanged=9.0)], []),
         ],
     )
     monkeypatch.setattr(papers, "PAPERS", {"page": paper})
@@ -523,8 +524,8 @@ def test_papers(folder, page, monkeypatch):
     rows, compared, more, single = tables(page)
     named = {(row[0], row[1]): row[2:] for row in rows[1:]}
     runs = {(name, count) for name in paper.rows for count in "01"}
-    assert named.keys() == {("zero velocity", ""), ("nearest neighbours", ""), ("*TrajeVAE*", "0"), *runs}
-    assert named["*TrajeVAE*", "0"] == ["", "", "8.462", ".518"]
+    assert named.keys() == {("zero velocity", ""), ("nearest neighbours", ""), ("*Human3.6M: TrajeVAE*", "0"), *runs}
+    assert named["*Human3.6M: TrajeVAE*", "0"] == ["", "", "8.462", ".518"]
     ades = {key: float(named[key][3].split()[0]) for key in runs}
     for count, change in zip("01", compared[1][3:], strict=True):
         assert abs(float(change.split()[0]) - (ades["trajevae", count] - ades["whole poses", count])) < 0.0016

@@ -96,6 +96,15 @@ def test_the_loss_is_the_squared_error_the_first_step_and_the_weighted_divergenc
     assert loss.item() == pytest.approx(expected.item(), rel=1e-6)  # the scale is kept in single precision
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_with_the_poses_of_the_papers_the_weight_of_the_divergence_is_theirs(name):
+    for skeleton, weight in ((motion.HUMAN36M, 0.1), (motion.HUMANEVA, 0.01), (motion.WALKER, 0.1)):
+        preset = dvae.method(name).preset(skeleton)
+        assert preset == {"beta": weight, "heading": skeleton is motion.WALKER}
+        assert dvae.method(name).filled(preset).objective().kl_weight == weight
+        assert dvae.method(name, beta=2.0).filled(preset).objective().kl_weight == 2.0
+
+
 def test_best_of_many_pays_for_the_nearest_future_alone(windows):
     model, batch = built(windows, "bom", samples=4), batch_of(windows)
     objective = small("bom", samples=4).train(windows).objective
