@@ -28,6 +28,7 @@ from .ranking import JOINTS, JUDGES, SCORES, fitted_judges, folder, judging, par
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
+REFERENCES = ("zero velocity", "nearest neighbours")
 COLUMNS_OF_JUDGES = ("pose NLL", "ACC content")
 COLUMNS = ("ADE", "FDE", "ADEm", "APD", "energy score", "ACC content", "FID content", "pose NLL", "KL w", "KL z")
 """Scores that pages show, where there are."""
@@ -241,6 +242,21 @@ def of_judges(data: MotionData, runs: Path, store: Store, judged: Mapping[str, P
                 store.add(row, 0, {each: score.mean for each, score in found["real motion"].items()})
 
 
+def of_references(data: MotionData, store: Store, judged: Mapping[str, Path]) -> None:
+    """Scores what is not fitted; it knows no paths."""
+    drop, name = data.protocol.root == "drop", data.protocol.name
+    rows = [row for row in REFERENCES if store.lacks(f"{name}: {row}", 0)]
+    if not rows:
+        return
+    train = motion.windows(data.motion, data.protocol, "train+validation")
+    options = {"scores": judging(judged) if drop else motion.scores, "references": rows, "training_windows": train}
+    found = dvae.evaluate({}, seen(data), samples=SAMPLES, progress=False, **options)
+    for row in rows:
+        means = {score: each.mean for score, each in found[row].items()}
+        ways = [""] if drop else [f", {count} given" for count in range(len(JOINTS) + 1)]
+        store.add(f"{name}: {row}", 0, {f"{score}{way}": mean for score, mean in means.items() for way in ways})
+
+
 def seen(data: MotionData) -> motion.Windows:
     """Every fourth window of the judging group."""
     protocol = replace(data.protocol, test_stride=EVERY * data.protocol.test_stride)
@@ -286,6 +302,7 @@ def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: in
             continue
         section = SECTIONS[name]
         own = opened[section.protocol.name]
+        of_references(own, Store(stored, "references"), judged)
         for case in section.cases:
             if seeds := [seed for seed in section.seeds if store.lacks(case, seed)]:
                 method, training = section.of(case, prior)
@@ -320,6 +337,10 @@ def main(
         found = Store(stored, name).found
         cases = OF_JUDGES if name == "judges" else SECTIONS[name].cases
         scored = {case: [*found[case].values()] for case in cases if case in found}
+        if name != "judges":
+            known, on = Store(stored, "references").found, SECTIONS[name].protocol.name
+            beside = {row: [*known[f"{on}: {row}"].values()] for row in REFERENCES if f"{on}: {row}" in known}
+            scored = beside | scored
         lines = [[case, *(shown(found, column) for column in columns)] for case, found in scored.items()]
         write(page, table([name, *columns], lines), name=name)
 

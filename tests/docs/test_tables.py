@@ -562,6 +562,8 @@ def test_tuning(folder, page, monkeypatch):
         assert [name for name, _ in rows] == ["preset", "wide, longer", "preset"]
         assert re.match(r"[\d.]+ \([\d.]+, [\d.]+\)", rows[0][1])
         assert rows[0][1] != rows[1][1]
+        for reference in tuning.REFERENCES:
+            assert len(re.findall(rf"^\| {reference} \| \d\.\d+ \|", page.read_text(), re.MULTILINE)) == 2
         assert tuning.Store(folder / "tuning", "cvae").found.keys() == cases.keys()
         shutil.rmtree(folder / "tuned", ignore_errors=True)  # scored, which is enough
 
