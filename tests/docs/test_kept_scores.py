@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 
 import pytest
 
@@ -66,3 +67,18 @@ def test_what_was_tuned_stands_on_the_page(name):
     assert found.keys() <= set(tuning.OF_JUDGES if name == "judges" else tuning.SECTIONS[name].cases)
     for case in found:
         assert f"| {case} |" in page
+
+
+NUMBER = r"0?(\.\d+|\d+\.\d+) ± 0?(\.\d+) ± 0?(\.\d+)"
+
+
+@pytest.mark.parametrize("name", ["gsps", "hit_dvae", "trajevae"])
+def test_what_a_page_says_of_three_seeds_stands_in_its_tables(name):
+    """A mean with both errors; below the tables, where they are read."""
+    folder = ranking.SCORES.parents[1] / "docs" / "results"
+    lines = [line for page in ("index", name) for line in (folder / f"{page}.md").read_text("utf-8").splitlines()]
+    known = {found for line in lines if line.startswith("|") for found in re.findall(NUMBER, line)}
+    read = (folder / f"{name}.md").read_text("utf-8").split("<!-- end of rows -->")[1].split("## As it was")[0]
+    said = re.findall(NUMBER, " ".join(read.split()))
+    assert said
+    assert set(said) <= known
