@@ -668,6 +668,9 @@ def test_a_target_that_was_missed_before_is_told_and_fails_nothing(benches):
 def test_a_slower_row_is_measured_beside_the_code_of_the_release(benches, monkeypatch):
     """This machine may be the slower one."""
     benches((1.0, 4.0, 7.0, 0.01), commit="a", keep=True)
+    monkeypatch.setenv(bench.BESIDE, "1")
+    assert benches((9.0, 1.0, 9.0, 0.01))[0] == 0  # is not compared itself
+    monkeypatch.delenv(bench.BESIDE)
     asked = []
     beside = {"speed: step": 1.15, "speed: cost": 6.0}  # of which the second was not in doubt
     monkeypatch.setattr(bench, "there", lambda *given: asked.append(given[:2]) or beside)
