@@ -148,6 +148,7 @@ def _all_reduce(value: Tensor) -> Tensor:
 
 
 def _check(training: Training) -> None:
+    """Refuses an accelerator that is not there, and more processes of a program that cannot be started again."""
     accelerator, devices = training.accelerator, training.devices
     there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     there["gpu"] = any(there.values())
