@@ -15,6 +15,9 @@ BIN := .venv/bin
 # One thread: the models are small, and on cores that others use too, two threads wait for each other many times longer.
 export OMP_NUM_THREADS := 1
 
+# Tests start a hundred processes, each of which would compile the library anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Numerical tests, for the second run: other instructions round otherwise.
 NUMERICAL := laws/test_laws.py networks/test_networks.py networks/test_graphconv.py test_oracle.py program/test_model.py \
 	models/test_trajectories.py motion/test_control.py motion/test_forecasts.py $(addprefix inference/test_,bounds.py metrics.py particles.py)

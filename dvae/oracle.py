@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy import optimize
 from torch import Tensor, nn
 
 from .inversion import FAITHFUL, guide
@@ -407,7 +407,7 @@ def _lost(oracle: Oracle, less: Factorization) -> float:
 
     start = np.concatenate([np.log(scale[n:]), root[free]])
     options = {"maxiter": 20_000, "maxfun": 40_000, "maxcor": 50, "ftol": 1e-14, "gtol": 1e-9}
-    return float(optimize.minimize(divergence, start, jac=True, method="L-BFGS-B", options=options).fun)
+    return float(scipy.optimize.minimize(divergence, start, jac=True, method="L-BFGS-B", options=options).fun)
 
 
 def arrow_prices(

@@ -15,9 +15,9 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+import scipy
 import torch
 from pyro import poutine
-from scipy import fft, special
 from torch import Tensor
 from typing_extensions import override
 
@@ -144,8 +144,6 @@ class Calibration(Result):
         Histograms are relative to uniform, with a band that holds a bin in 99 % of cases. ECDF differences have the
         envelope that all quantities keep to, at all points, with 95 % probability (Bonferroni over quantities).
         """
-        from scipy.stats import binom  # most of a second to import, as below
-
         order = np.argsort(self.p_values, kind="stable")[:worst]
         columns = min(4, len(order))
         rows = math.ceil(len(order) / columns)
@@ -155,7 +153,7 @@ class Calibration(Result):
         levels, count = self.draws + 1, len(self.ranks)
         edges = np.linspace(0, levels, min(20, levels) + 1).round().astype(int)
         width = np.diff(edges) / levels
-        band = [binom.ppf(level, count, width) / (count * width) for level in (0.005, 0.995)]
+        band = [scipy.stats.binom.ppf(level, count, width) / (count * width) for level in (0.005, 0.995)]
         for place, q in enumerate(order):
             row, column = divmod(place, columns)
             top, bottom = panels[2 * row, column], panels[2 * row + 1, column]
@@ -428,8 +426,8 @@ def _tails(count: int, draws: int) -> np.ndarray:
     """(L, N + 1): the smaller tail of k in a Binomial(N, i / (L + 1)), which the number of ranks below i follows."""
     points = np.arange(1, draws + 1)[:, None] / (draws + 1)
     number = np.arange(count + 1.0)
-    at_least = np.where(number > 0, special.bdtrc(np.maximum(number - 1, 0), count, points), 1.0)
-    return np.minimum(special.bdtr(number, count, points), at_least)
+    at_least = np.where(number > 0, scipy.special.bdtrc(np.maximum(number - 1, 0), count, points), 1.0)
+    return np.minimum(scipy.special.bdtr(number, count, points), at_least)
 
 
 def _ecdf_test(least: np.ndarray, count: int, draws: int) -> np.ndarray:
@@ -439,13 +437,13 @@ def _ecdf_test(least: np.ndarray, count: int, draws: int) -> np.ndarray:
     within bounds is a chain of convolutions (Säilynoja et al. have binomial steps). `arviz_stats` simulates the same
     probability, but drops the upper tail of every simulation with no rank below some point.
     """
-    step, size = _poisson(count, count / (draws + 1)), fft.next_fast_len(2 * count + 1, real=True)
-    transform = fft.rfft(step, size)
+    step, size = _poisson(count, count / (draws + 1)), scipy.fft.next_fast_len(2 * count + 1, real=True)
+    transform = scipy.fft.rfft(step, size)
     bound = least[:, None] * (1 + 1e-9)  # tails that are equal but for rounding are equal
     within = np.zeros((len(least), count + 1))
     within[:, 0] = 1
     for tails in _tails(count, draws):
-        moved = fft.irfft(fft.rfft(within, size) * transform, size)[:, : count + 1]
+        moved = scipy.fft.irfft(scipy.fft.rfft(within, size) * transform, size)[:, : count + 1]
         within = np.where(tails > bound, moved, 0.0)
     inside = within @ step[::-1] / _poisson(count, count)[-1]
     # Where rounding hides the difference from 1, the sum over points bounds the probability from above.
@@ -455,7 +453,7 @@ def _ecdf_test(least: np.ndarray, count: int, draws: int) -> np.ndarray:
 def _poisson(largest: int, mean: float) -> np.ndarray:
     """Probabilities of 0 to `largest`."""
     number = np.arange(largest + 1)
-    return np.exp(special.xlogy(number, mean) - mean - special.gammaln(number + 1))
+    return np.exp(scipy.special.xlogy(number, mean) - mean - scipy.special.gammaln(number + 1))
 
 
 @lru_cache(maxsize=32)
@@ -471,7 +469,7 @@ def _rank_table(draws: int) -> tuple[np.ndarray, np.ndarray]:
     """Edges of fine intervals of the real line, and P(rank | truth in the interval) among standard normal draws."""
     edges = np.linspace(-8, 8, 801)
     middles = np.concatenate([edges[:1], (edges[1:] + edges[:-1]) / 2, edges[-1:]])
-    number = np.arange(draws + 1.0)[:, None]
+    number, special = np.arange(draws + 1.0)[:, None], scipy.special
     choices = special.gammaln(draws + 1) - special.gammaln(number + 1) - special.gammaln(draws - number + 1)
     return edges, np.exp(choices + number * special.log_ndtr(middles) + (draws - number) * special.log_ndtr(-middles))
 
@@ -483,16 +481,15 @@ def _likeliest_normal(
 
     Ranks 0 and L are tails: they do not say how far beyond all draws a truth lies.
     """
-    from scipy.optimize import minimize  # slow to import
 
     edges, table = _rank_table(draws)
-    scores = special.ndtri((np.arange(draws + 1) + 0.5) / (draws + 1))
+    scores = scipy.special.ndtri((np.arange(draws + 1) + 0.5) / (draws + 1))
 
     def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
         spread = math.exp(parameters[1])
         t = (edges - parameters[0]) / spread
         density = np.exp(-(t**2) / 2) / math.sqrt(2 * math.pi)
-        below = np.stack([special.ndtr(t), -density / spread, -density * t])  # and its two derivatives
+        below = np.stack([scipy.special.ndtr(t), -density / spread, -density * t])  # and its two derivatives
         share, *slopes = np.diff(below, prepend=0.0, append=[[1.0], [0.0], [0.0]]) @ table.T
         share = np.maximum(share, 1e-300)
         weak = parameters / (100.0, 1.0)  # gradient of a prior with standard deviations of 10 and 1
@@ -503,7 +500,7 @@ def _likeliest_normal(
     ratio = math.sqrt(counts @ (scores - mean) ** 2 / counts.sum() / (scores**2).mean())
     limits = [(-12.0, 12.0) if bias is None else (bias, bias), (-3.0, 3.0) if log_spread is None else (log_spread,) * 2]
     start = np.clip([mean, math.log(max(ratio, 1.0))], *np.transpose(limits))  # wide, so that all ranks have a slope
-    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=limits)
+    found = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=limits)
     return found.x, -float(found.fun)
 
 

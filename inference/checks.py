@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 import torch
 from rich.text import Text
 from torch import Tensor
@@ -163,9 +164,7 @@ class Check:
     @property
     def wasserstein(self) -> float:
         """Distance between the distributions of real and replicated values, in their unit."""
-        from scipy.stats import wasserstein_distance
-
-        return float(wasserstein_distance(self.real, self.replicated.ravel()))
+        return float(scipy.stats.wasserstein_distance(self.real, self.replicated.ravel()))
 
     def document(self) -> dict[str, Any]:
         """What the table shows and the tail area of every window, in JSON's types."""

@@ -27,7 +27,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
+import scipy
 
 from .uncertainty import clustered_variance, decimals, linearised, student_interval
 
@@ -69,7 +69,7 @@ class Estimate:
         scale, freedom = self._error(error)
         if scale == 0:
             return float(self.mean == 0)
-        return float(2 * special.stdtr(freedom, -abs(self.mean) / scale))
+        return float(2 * scipy.special.stdtr(freedom, -abs(self.mean) / scale))
 
     def _error(self, name: str) -> tuple[float, float]:
         if name not in _ERRORS:

@@ -21,10 +21,11 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 
 import numpy as np
-from scipy import special, stats
+import scipy
 
 from .estimates import Crossed, Estimate, number
 from .result import Shown, Table
@@ -180,7 +181,7 @@ def confidence_set(
     worse, other = (places.ravel() for places in np.indices((len(rows), len(rows))))  # than which, of all pairs
     null = drawn[:, worse] - drawn[:, other]
     single = (null >= means[worse] - means[other]).mean(0)
-    null = stats.rankdata(-null, "max", axis=0) / draws
+    null = scipy.stats.rankdata(-null, "max", axis=0) / draws
     left, p_values, running = np.ones(len(rows), bool), {}, 0.0
     while left.sum() > 1:
         (pairs_left,) = np.nonzero(left[worse] & left[other] & (worse != other))
@@ -294,20 +295,21 @@ def required(
         over = (common + sum(r / n for r, _, n in both)) / clips
         between = [(o + r / clips) / n for r, o, n in both]
         shared = sum(r / n for r, _, n in both) / clips
-        found = over * special.chdtri(clips - 1, RANKS[0]) / (clips - 1)
+        found = over * scipy.special.chdtri(clips - 1, _ranks()[0]) / (clips - 1)
         of_seeds = [
-            v * special.chdtri(n - 1, ranks) / (n - 1)
-            for v, (*_, n), ranks in zip(between, both, RANKS[1:], strict=True)
+            v * scipy.special.chdtri(n - 1, ranks) / (n - 1)
+            for v, (*_, n), ranks in zip(between, both, _ranks()[1:], strict=True)
         ]
         total = np.maximum(found + sum(of_seeds) - shared, np.maximum(found, sum(of_seeds)))
         uncertain = found**2 / (clips - 1) + sum(v**2 / (n - 1) for v, n in zip(of_seeds, numbers, strict=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             freedom = np.maximum(np.nan_to_num(total**2 / uncertain, nan=1e9), min(clips, *numbers) - 1)
-        beyond = special.stdtrit(np.minimum(freedom, 1e9), (1 + level) / 2) * np.sqrt(total)
+        beyond = scipy.special.stdtrit(np.minimum(freedom, 1e9), (1 + level) / 2) * np.sqrt(total)
         scale = math.sqrt(over + sum(o / n for _, o, n in both))
         if not scale:
             return 1.0
-        return float((special.ndtr((sought - beyond) / scale) + special.ndtr((-sought - beyond) / scale)).mean())
+        tails = scipy.special.ndtr((np.array([[sought], [-sought]]) - beyond) / scale)
+        return float(tails.sum(0).mean())
 
     def least(number: int) -> float:
         low = high = FEWEST
@@ -326,5 +328,9 @@ def required(
 
 FEWEST, MOST_CLIPS = 5, 10**7
 """Clips of which errors can be told, and beyond which no number counts as enough."""
-RANKS = stats.qmc.Halton(3, seed=0).random(2000).T
-"""Of the measured variances over clips and of two models' seeds, over which power is averaged."""
+
+
+@cache
+def _ranks() -> np.ndarray:
+    """Of the measured variances over clips and of two models' seeds, over which power is averaged."""
+    return scipy.stats.qmc.Halton(3, seed=0).random(2000).T

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from scipy import special
+import scipy
 
 
 def linearised(clip_means: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -36,7 +36,7 @@ def effective_number(shares: np.ndarray, deviations: np.ndarray, most: float) ->
     if most <= clips:  # of one draw each, which are independent
         return int(most)
     effects = clips / (clips - 1) * (deviations**2).sum(-1) / (shares * (1 - shares))
-    wider = (special.stdtrit(clips - 1, 0.975) / special.ndtri(0.975)) ** 2
+    wider = (scipy.special.stdtrit(clips - 1, 0.975) / scipy.special.ndtri(0.975)) ** 2
     size = wider * math.sqrt((effects**2).mean())
     return int(max(1.0, min(most, 1 / size if size else math.inf)))
 
@@ -59,5 +59,5 @@ def student_interval(mean: float, error: float, freedom: float, level: float = 0
     """
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
-    reach = error * float(special.stdtrit(freedom, (1 + level) / 2)) if error else 0.0
+    reach = error * float(scipy.special.stdtrit(freedom, (1 + level) / 2)) if error else 0.0
     return mean - reach, mean + reach

@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from scipy.stats import chi2
+import scipy
 from torch import Tensor
 from typing_extensions import override
 
@@ -94,7 +94,7 @@ class DSFModel(ModesModel):
             return found
         method, codes = self.method, self.sampler(rollout.values[HISTORY])
         squares = codes.square().sum(2).T
-        excess = (squares - float(chi2.ppf(method.radius, codes.shape[2]))).clamp_min(0)
+        excess = (squares - float(scipy.special.chdtri(codes.shape[2], 1 - method.radius))).clamp_min(0)
         made = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (self.modes, -1))
         quality, scale = method.quality * (-excess).exp(), method.diversity_scale or 1.0
         found["cardinality"] = energies.determinantal_diversity(made, quality, scale)

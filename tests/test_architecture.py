@@ -202,6 +202,7 @@ def test_what_is_shown_is_found_where_it_is_imported_from():
         ("import dvae; dvae.audit(*map(dvae.Factorization.parse, ('p(z_t) p(x_t | z_t)', 'q(z_t | x_t)')))", "torch"),
         ("import dvae; list(dvae.methods())", "torch"),
         ("import dvae.motion", "roma"),
+        ("import dvae.cli.fitting", "scipy.special"),
     ],
 )
 def test_what_takes_long_to_import_is_imported_when_it_is_used(program, unused):

@@ -29,12 +29,20 @@ SHARED = re.compile(
     r"(\b(?:steps|particles|samples|fitting|warm_up)=|\b(?:Stage|draw)\(|\"warm_up\": )(\d{3,}|(?<=samples=)\d\d)"
 )
 CLIPS, FEWEST = re.compile(r"(\bclips=)(\d{2,})"), 0.35  # a share of them, so that every split has some
+SEEDS = re.compile(r"(\bseeds=)(\d+)")
 LIGHT = np.array([-0.5, -0.6, 0.63])  # towards it, from the left, above and in front
 TEXTS = ("text/plain", "text/html", "text/latex")
 
 
 CLEAR = "%reset -f\nimport matplotlib.pyplot, pyro\nmatplotlib.pyplot.close('all')\npyro.clear_param_store()"
 """What a kernel is told before another notebook."""
+SHORT = """
+from functools import partial
+from dvae.models import energies
+from dvae.motion.judges.pose_prior import fit_pose_prior
+energies.fit_pose_prior = partial(fit_pose_prior, steps={steps})
+%reset -f"""
+"""And where it trains less: methods that fit a pose prior first do not tell its steps."""
 
 
 def kernel() -> KernelManager:
@@ -51,18 +59,19 @@ def execute(path: Path, share: float = 1.0, on: KernelManager | None = None) -> 
 
     Args:
         path: the notebook.
-        share: of the steps of training, of particles and of samples, and of simulated clips a third at least; fewer
+        share: of the steps of training, of particles, samples and seeds, and of simulated clips a third at least; fewer
             change no more than numbers and pictures.
         on: a kernel, which is cleared before; one of its own without.
     """
     notebook = nbformat.read(path, as_version=4)
     sources = [cell.source for cell in notebook.cells]
     for cell in notebook.cells:
-        for pattern, part in ((SHARED, share), (CLIPS, max(share, FEWEST))):
+        for pattern, part in ((SHARED, share), (SEEDS, share), (CLIPS, max(share, FEWEST))):
             cell.source = pattern.sub(
                 lambda found, part=part: f"{found[1]}{max(int(part * int(found[2])), 2)}", cell.source
             )
-    notebook.cells.insert(0, nbformat.v4.new_code_cell(CLEAR))
+    short = SHORT.format(steps=max(int(1000 * share), 2)) if share < 1 else ""
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(CLEAR + short))
     manager = on or kernel()
     client = NotebookClient(notebook, km=manager, timeout=1200, record_timing=False)
     try:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+import scipy
 import torch
-from scipy.fft import idct
 from torch import Tensor
 
 
@@ -35,4 +35,4 @@ def cosine_basis(
     """
     if not 1 <= coefficients <= length:
         raise ValueError(f"a sequence of {length} steps has 1 to {length} coefficients, not {coefficients}")
-    return torch.from_numpy(idct(np.eye(coefficients, length), axis=1, norm="ortho")).to(device, dtype)
+    return torch.from_numpy(scipy.fft.idct(np.eye(coefficients, length), axis=1, norm="ortho")).to(device, dtype)

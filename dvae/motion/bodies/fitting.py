@@ -25,8 +25,8 @@ from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import torch
-from scipy.optimize import least_squares
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -247,7 +247,7 @@ class _Source(NamedTuple):
             found = self.lengths(_marks(average + changes @ torch.from_numpy(shape), self.own))
             return np.concatenate([(found - lengths).numpy() / WITHIN, shape])
 
-        return torch.from_numpy(least_squares(off, np.zeros(size), bounds=(-MOST, MOST)).x)
+        return torch.from_numpy(scipy.optimize.least_squares(off, np.zeros(size), bounds=(-MOST, MOST)).x)
 
     def steepness(self, seen: Iterable[Mapping[str, Tensor]], fps: float) -> Tensor:
         """Angle from ankles down to the toes of feet that stand flat; NaN where none does."""

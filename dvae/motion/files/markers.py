@@ -9,7 +9,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+import scipy
 
 from ... import files
 from .recording import MOST_TEXT, Recording, check_joints, check_size
@@ -115,6 +115,7 @@ def tree(places: np.ndarray) -> tuple[list[int], list[int]]:
     weights = spread + 1e-3 * mean + 1e-12  # of markers on one bone the nearest; none is 0, which would be no edge
     np.fill_diagonal(weights, 0)
     middle = int(mean.sum(1).argmin())
-    order, above = breadth_first_order(minimum_spanning_tree(weights), middle, directed=False)
+    graphs = scipy.sparse.csgraph
+    order, above = graphs.breadth_first_order(graphs.minimum_spanning_tree(weights), middle, directed=False)
     at = {int(marker): place for place, marker in enumerate(order)}
     return order.tolist(), [at.get(int(above[marker]), -1) for marker in order]

@@ -21,9 +21,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 import numpy as np
+import scipy
 import torch
-from scipy.interpolate import BSpline
-from scipy.sparse.linalg import splu
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -374,5 +373,6 @@ def _cubic(times: np.ndarray, at: np.ndarray) -> Tensor:
     """What takes values at F times to those at N others on a cubic through them, the not-a-knot spline: (N, F)."""
     degree = min(3, len(times) - 1)
     knots = np.concatenate([times[:1].repeat(degree + 1), times[2:-2], times[-1:].repeat(degree + 1)])
-    given, asked = (BSpline.design_matrix(each, knots, degree, extrapolate=True) for each in (times, at))
-    return torch.from_numpy(splu(given.T.tocsc()).solve(asked.T.toarray()).T)
+    splines = scipy.interpolate.BSpline
+    given, asked = (splines.design_matrix(each, knots, degree, extrapolate=True) for each in (times, at))
+    return torch.from_numpy(scipy.sparse.linalg.splu(given.T.tocsc()).solve(asked.T.toarray()).T)
