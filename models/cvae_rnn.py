@@ -50,13 +50,13 @@ class CVAERNN(LatentTrajectoryMethod):
     generative = "p(w) p(x_t | x_{<t}, y_{1:T}, w, s)"
     inference = "q(w | r_{1:T}, y_{1:T}, s)"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        skeleton: {**preset, "beta": 0.1 if skeleton else 0.001}
+        skeleton: {**preset, "beta": 0.1 if skeleton else 1e-4}
         for skeleton, preset in LatentTrajectoryMethod.presets.items()
     }
     """The weight of the KL is the paper's on a paper's skeleton, else the tuning split's (docs/results/tuning.md)."""
     trainings: ClassVar[Mapping[str, Training]] = {
         **LatentTrajectoryMethod.trainings,
-        "": Training(6000, 16, 1e-3, 0.5),
+        "": Training(12_000, 16, 1e-3, 0.5),
     }
 
     latent: Size | None = 256

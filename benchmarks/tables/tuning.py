@@ -66,7 +66,7 @@ class Section:
         """The method of a case, and its training."""
         options, told = parted({**self.options, **self.cases[case]})
         method = options.pop("method", self.method)
-        if self.judged and options.get("pose_prior") != 0:
+        if self.judged and options.get("pose_prior") != 0 and options.get("heading", True):  # as the judge has it
             options["pose_prior_run"] = str(prior)
         return dvae.method(method, **options), replace(self.training, **told)
 
@@ -127,6 +127,8 @@ SECTIONS = {
             "rate 1e-3, diversity 5 10": {"learning_rate": 1e-3, "diversity": (5.0, 10.0)},
             "6500 steps": {"steps": 6500},
             "alike from .01 m": {"pseudo_minimum": 0.01},
+            "10 x 1 draws": {"draws": (10, 1)},
+            "not turned": {"heading": False},
         },
         options={"diversity": (2.0, 4.0)},
         judged=True,
@@ -169,6 +171,7 @@ SECTIONS = {
             "0.0001": {"beta": 1e-4},
             "0.001, 6000 steps": {"beta": 1e-3, "steps": 6000},
             "0.001, rate 3e-3": {"beta": 1e-3, "learning_rate": 3e-3},
+            "0.0001, 12000 steps": {"beta": 1e-4, "steps": 12000},
         },
         protocol=PATHS,
     ),
@@ -191,6 +194,15 @@ SECTIONS = {
         | {
             f"srnn, 0.001, {steps} steps": {**BEFORE["srnn"], "method": "srnn", "learning_rate": 1e-3, "steps": steps}
             for steps in (3000, 16000)
+        },
+    ),
+    "best-of-many": Section(
+        "bom",
+        Training(steps=1000, decay=0.5, validate_every=500),
+        {
+            f"{name}, {rate:g}": {"method": name, "batch_size": batch, "learning_rate": rate}
+            for name, batch, rates in (("bom", 32, (1e-3, 3e-3, 1e-2)), ("bom-parts", 16, (3e-4, 1e-3, 3e-3)))
+            for rate in rates
         },
     ),
 }
@@ -306,9 +318,11 @@ def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: in
         for case in section.cases:
             if seeds := [seed for seed in section.seeds if store.lacks(case, seed)]:
                 method, training = section.of(case, prior)
-                sweep({folder(case): method}, own, runs / name, seeds, training, jobs)
-                for seed in seeds:
-                    store.add(case, seed, score(runs / name / f"{folder(case)}-seed{seed}", own, judged))
+                outcomes = sweep({folder(case): method}, own, runs / name, seeds, training, jobs)
+                for seed, outcome in zip(seeds, outcomes, strict=True):
+                    if outcome.status == "failed":
+                        raise RuntimeError(str(outcome))
+                    store.add(case, seed, score(outcome.path, own, judged))
 
 
 def main(
