@@ -481,7 +481,6 @@ def _likeliest_normal(
 
     Ranks 0 and L are tails: they do not say how far beyond all draws a truth lies.
     """
-
     edges, table = _rank_table(draws)
     scores = scipy.special.ndtri((np.arange(draws + 1) + 0.5) / (draws + 1))
 

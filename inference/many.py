@@ -295,10 +295,11 @@ def required(
         over = (common + sum(r / n for r, _, n in both)) / clips
         between = [(o + r / clips) / n for r, o, n in both]
         shared = sum(r / n for r, _, n in both) / clips
-        found = over * scipy.special.chdtri(clips - 1, _ranks()[0]) / (clips - 1)
+        of_clips, *others = _ranks()
+        found = over * scipy.special.chdtri(clips - 1, of_clips) / (clips - 1)
         of_seeds = [
             v * scipy.special.chdtri(n - 1, ranks) / (n - 1)
-            for v, (*_, n), ranks in zip(between, both, _ranks()[1:], strict=True)
+            for v, (*_, n), ranks in zip(between, both, others, strict=True)
         ]
         total = np.maximum(found + sum(of_seeds) - shared, np.maximum(found, sum(of_seeds)))
         uncertain = found**2 / (clips - 1) + sum(v**2 / (n - 1) for v, n in zip(of_seeds, numbers, strict=True))

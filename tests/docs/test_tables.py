@@ -566,6 +566,16 @@ def test_tuning(folder, page, monkeypatch):
             assert len(re.findall(rf"^\| {reference} \| \d\.\d+ \|", page.read_text(), re.MULTILINE)) == 2
         assert tuning.Store(folder / "tuning", "cvae").found.keys() == cases.keys()
         shutil.rmtree(folder / "tuned", ignore_errors=True)  # scored, which is enough
+    failing = {"without a prior": {"method": "gsps", "pose_prior_run": "nowhere"}}
+    monkeypatch.setitem(sections, "cvae", replace(sections["cvae"], cases=failing))
+    with pytest.raises(RuntimeError, match="without-a-prior-seed0 failed"):
+        tuning.main(folder / "tuned", folder / "people.npz", ("cvae",), stored=folder / "tuning")
+
+
+def test_gsps_has_the_prior_of_its_judge_where_it_sees_poses_as_the_judge_does(tmp_path):
+    cases = ("6500 steps", "not turned")
+    told = {case: tuning.SECTIONS["gsps"].of(case, tmp_path)[0].pose_prior_run for case in cases}
+    assert told == {"6500 steps": str(tmp_path), "not turned": ""}
 
 
 def test_irregular(tmp_path, page, monkeypatch):
