@@ -266,3 +266,10 @@ def test_arrays_that_are_no_motion_are_refused(name, value, message, tmp_path):
     np.savez(path, **arrays)
     with pytest.raises(ValueError, match=rf"a\.npz: .*{message}"):
         read_motion(path)
+
+
+def test_another_npz_in_a_folder_of_motion_is_named_as_what_it_is(tmp_path):
+    _, path = small("amass", tmp_path)
+    np.savez(path.parent / "z.npz", weights=np.zeros(3))
+    with pytest.raises(ValueError, match=r"z\.npz: it holds weights, expected AMASS's poses and trans"):
+        read_motion(path.parent)

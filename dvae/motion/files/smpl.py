@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from ... import files
+from ...npy import Refused
 from ..data import Clip, MotionSet
 from ..kinematics import inverse
 from ..matching import Kept, against_world, parts
@@ -81,9 +82,9 @@ def read_amass(path: str | Path) -> Recording:
     path = Path(path)
     with archive(path) as members:
         if not {"poses", "trans"} <= members.keys():
-            raise ValueError(
-                f"{path}: no file of AMASS, which has poses and trans; an npz of many clips is read by itself, "
-                "not in a folder"
+            raise Refused(
+                f"it holds {', '.join(sorted(members)[:6]) or 'nothing'}, expected AMASS's poses and trans; "
+                "an npz of many clips is read by itself, not in a folder"
             )
         wanted = ("poses", "trans", "offsets", "betas", *_FPS)
         found = {name: members[name].array() for name in wanted if name in members}
