@@ -12,18 +12,25 @@ list of predictors that GSPS's has, on Human3.6M).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
-from .pages import refuse_unknown, table, write
+from dvae.inference.result import canvas
+
+from .pages import DOCS, refuse_unknown, table, write
 from .ranking import (
     FUTURES,
     GROUPED,
     JOINTS,
+    LEVEL,
+    NEIGHBOURS,
     PARTED,
     PATHS,
     SCORES,
@@ -428,6 +435,32 @@ def more_joints(found: Found, paper: Paper) -> str:
     return table(["", "", *header], lines)
 
 
+PATHED = ("ADE", "FDE", "energy score")
+"""Scores that are drawn by the number of paths."""
+
+
+def drawn(found: Found, paper: Paper) -> Figure:
+    """Scores by how many paths are given, of the seeds that have all, with intervals over clips, and these seeds."""
+    figure = canvas(11, 3)
+    for panel, column in zip(figure.subplots(1, len(PATHED)), PATHED, strict=True):
+        for row in (NEIGHBOURS, *paper.rows):
+            own = {view.given: rows[row] for view, rows in found.items() if row in rows}
+            common = min((len(entry.seeds) for entry in own.values()), default=0)
+            seen = {given: replace(entry, seeds=entry.seeds[:common]).crossed(column) for given, entry in own.items()}
+            scores = {given: crossed.estimate() for given, crossed in seen.items() if crossed is not None}
+            means = [score.mean for score in scores.values()]
+            if row == NEIGHBOURS:
+                panel.axhline(means[0], color="0.5", lw=1, ls="--", label=row)
+            elif scores:
+                errors = ("sequences" if math.isnan(score.total) else "total" for score in scores.values())
+                ends = [score.interval(LEVEL, error) for score, error in zip(scores.values(), errors, strict=True)]
+                panel.errorbar([*scores], means, abs(np.transpose(ends) - means), marker="o", markersize=4, label=row)
+        panel.set_xlabel("paths given")
+        panel.set_title(f"{column} (m)", fontsize=9)
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside right center", fontsize=8, frameon=False)
+    return figure
+
+
 def captioned(caption: str, made: str) -> str:
     """A table below what it is of; nothing where it has no rows."""
     return f"*{caption}:*\n\n{made}" if made.count("\n") > 2 else ""
@@ -442,6 +475,7 @@ def main(
     samples: int = 50,
     stored: Path = SCORES,
     pages: Path | None = None,
+    pictures: Path = DOCS / "img",
 ) -> None:
     """Fit and score what is missing, and write the tables.
 
@@ -454,6 +488,7 @@ def main(
         samples: futures of a window.
         stored: the folder of scores and judges.
         pages: the folder of the pages; without one tables are printed.
+        pictures: the folder of the pictures, which are drawn with the pages.
     """
     refuse_unknown("paper", papers, PAPERS)
     refuse_unknown("row", rows, (row for name in papers for row in PAPERS[name].rows))
@@ -468,6 +503,10 @@ def main(
         tables.append(captioned("What each change does, paired", changes(found, paper)))
         if len(found) > 1:
             tables.append(captioned("What each further path does, paired", more_joints(found, paper)))
+            if pages is not None:
+                more = (view for each in paper.further for view in each.views if view == View(view.given))
+                seen = {view: entries(stored, paper.set, view, paper.rows) for view in more}
+                drawn(found | seen, paper).savefig(pictures / f"{name}.png", dpi=110)
         for each in paper.further:
             seen = {view: rows for view in each.views if (rows := entries(stored, paper.set, view, each.rows))}
             for row, view in each.apart.items():

@@ -19,6 +19,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 from torch import nn
 
 import dvae
@@ -27,6 +28,7 @@ from dvae.inference.checkpoints import Run
 from dvae.inference.estimates import Crossed, Estimate
 from dvae.inference.many import confidence_set
 from dvae.inference.metrics import average_pairwise_distance
+from dvae.inference.result import canvas
 from dvae.inference.scores import Measure
 from dvae.models import registry
 from dvae.motion.dataset import MotionData
@@ -34,7 +36,7 @@ from dvae.motion.parts import UNIONS, body_parts
 from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
-from .pages import refuse_unknown, same, table, write
+from .pages import DOCS, refuse_unknown, same, table, write
 
 SCORES = Path(__file__).parents[1] / "scores"
 
@@ -167,6 +169,8 @@ RANKED = "energy score"
 NEIGHBOURS = "nearest neighbours"
 ENOUGH = 3
 """Seeds that a row has which may be called the best: of fewer, what they spread tells next to nothing."""
+LEVEL = 0.9
+"""Of intervals, and of the set of those that may be the best."""
 
 
 @dataclass(frozen=True)
@@ -451,35 +455,54 @@ def trained(entry: Entry) -> tuple[str, str]:
     return (str(len(entry.seeds)), f"{statistics.fmean(entry.minutes):.1f}") if entry.minutes else ("–", "–")
 
 
+def ranked(found: Mapping[str, Entry]) -> dict[str, Crossed]:
+    """The energy score of all but the truth, the best first."""
+    scores = {name: entry.crossed(RANKED) for name, entry in found.items() if name != "real motion"}
+    known = {name: score for name, score in scores.items() if score is not None}  # all motion has it
+    return dict(sorted(known.items(), key=lambda item: item[1].mean))
+
+
 def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
     """Rows in order of the energy score, each with what it has more than the neighbours and than the next better.
 
     And below, the model confidence set.
     """
-
-    def score_of(name: str) -> Crossed:
-        crossed = found[name].crossed(RANKED)
-        assert crossed is not None  # of all motion
-        return crossed
-
-    order = sorted((name for name in found if name != "real motion"), key=lambda name: score_of(name).mean)
+    scores = ranked(found)
     header = ["", *TRAINED, f"{RANKED} minus neighbours'", "minus the one above", *columns]
     lines = []
-    for place, name in enumerate(order):
+    for name, above in zip(scores, [None, *scores], strict=False):
         own = found[name]
-        minus = [None if name == NEIGHBOURS else NEIGHBOURS, order[place - 1] if place else None]
-        behind = [None if other is None else score_of(name).estimate(score_of(other)) for other in minus]
+        minus = [None if name == NEIGHBOURS else NEIGHBOURS, above]
+        behind = [None if other is None else scores[name].estimate(scores[other]) for other in minus]
         means = [None if crossed is None else crossed.estimate() for crossed in map(own.crossed, columns)]
         lines.append([titled(name, own), *trained(own), *map(cell, [*behind, *means])])
-    scores = {name: score_of(name) for name in order}
     known = {name: score for name, score in scores.items() if score.count >= ENOUGH}
     if not any(found[name].minutes for name in known):
         return table(header, lines)
-    members = ", ".join(confidence_set(known).members)
-    return (
-        table(header, lines)
-        + f"\nMay be the best, at 90 % over clips and seeds, of rows with {ENOUGH} seeds or more: {members}.\n"
-    )
+    best = f"May be the best, at {100 * LEVEL:.0f} % over clips and seeds, of rows with {ENOUGH} seeds or more"
+    return f"{table(header, lines)}\n{best}: {', '.join(confidence_set(known, level=LEVEL).members)}.\n"
+
+
+def drawn(sets: Mapping[str, Mapping[str, Entry]]) -> Figure:
+    """How far above the neighbours' the energy scores of each set are; rows of all in the first one's order."""
+    ranks = {name: ranked(found) for name, found in sets.items()}
+    order = list(dict.fromkeys(row for scores in ranks.values() for row in scores if row != NEIGHBOURS))
+    figure = canvas(1.8 + 3.4 * len(sets), 0.8 + 0.22 * len(order))
+    panels = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
+    for panel, (name, scores) in zip(panels, ranks.items(), strict=True):
+        panel.axvline(0, color="0.6", lw=0.8)
+        for row in scores.keys() & order:
+            minus, height = scores[row].estimate(scores[NEIGHBOURS]), order.index(row)
+            for error, width in (("sequences", 4), ("total", 1)):
+                panel.plot(minus.interval(LEVEL, error), [height] * 2, color="C0", lw=width, solid_capstyle="butt")
+            face = "C0" if scores[row].count >= ENOUGH else "white"
+            panel.plot(minus.mean, height, "o", color="C0", markerfacecolor=face, markersize=5)
+        panel.set_title(name, fontsize=9)
+        panel.set_xlabel(f"{RANKED} minus neighbours' (m)", fontsize=8)
+        panel.tick_params(labelsize=8)
+    panels[0].set_yticks(range(len(order)), order)
+    panels[0].invert_yaxis()
+    return figure
 
 
 def main(
@@ -491,6 +514,7 @@ def main(
     samples: int = 50,
     scores: Path = SCORES,
     page: Path | None = None,
+    picture: Path = DOCS / "img" / "ranking.png",
 ) -> None:
     """Fit and score what is missing, and write the tables.
 
@@ -503,9 +527,11 @@ def main(
         samples: futures of a window.
         scores: the folder of scores and judges; in another than the project's own, all is fitted anew.
         page: whose tables; without one they are printed.
+        picture: of the sets that tell no paths, drawn with a page.
     """
     refuse_unknown("set", sets, SETS)
     refuse_unknown("method", methods, {**FUTURES, **PATHS})
+    futures: dict[str, Mapping[str, Entry]] = {}
     for name in sets:
         chosen = SETS[name]
         if data is not None:
@@ -516,8 +542,11 @@ def main(
             if found := entries(scores, name, view, chosen.methods):
                 heading = "" if view.given is None else f"With {view.given} paths given:\n\n"
                 tables.append(heading + ranking(found, [*COLUMNS, *(JUDGED if chosen.judges else ())]))
+                futures |= {} if view.given is not None else {name: found}
         if tables:
             write(page, *tables, name=name)
+    if page is not None and futures:
+        drawn(futures).savefig(picture, dpi=110)
 
 
 if __name__ == "__main__":

@@ -448,7 +448,8 @@ def test_ranking(folder, page, monkeypatch):
     monkeypatch.setattr(ranking, "ENOUGH", 2)
     page.write_text(page.read_text().replace("tables", "simulated"))
     runs, scores = folder / "ranked", folder / "scores"
-    options = {"scores": scores, "page": page, "samples": 2, "sets": ("simulated",)}
+    picture = folder / "ranking.png"
+    options = {"scores": scores, "page": page, "picture": picture, "samples": 2, "sets": ("simulated",)}
     ranking.main(runs, folder, seeds=(0,), **options)
     ranking.main(runs, folder, seeds=(0, 1), methods=("srnn",), **options)
     before = {file: file.stat().st_mtime_ns for file in scores.rglob("*.json.gz")}
@@ -518,7 +519,7 @@ def test_papers(folder, page, monkeypatch):
     monkeypatch.setattr(papers, "JOINTS", ("RFoot",))
     page.write_text(page.read_text().replace("tables", "rows"))
     for data in (folder, None):
-        where = {"stored": folder / "scores", "pages": page.parent}
+        where = {"stored": folder / "scores", "pages": page.parent, "pictures": page.parent}
         papers.main(folder / "papers", data, ("page",), samples=3, seeds=(0, 1), **where)
     page.write_text(page.read_text().replace("rows", "tables"))
     rows, compared, more, single = tables(page)
@@ -533,6 +534,12 @@ def test_papers(folder, page, monkeypatch):
     assert float(more[1][2].split()[0]) == pytest.approx(ades["trajevae", "1"] - ades["trajevae", "0"], abs=0.0016)
     assert [row[:2] for row in single[1:]] == [["trajevae", "1"]]
     assert single[1][4].startswith("0.000")  # one motion has no diversity
+    assert (page.parent / "page.png").stat().st_size > 0
+    found = {view: ranking.entries(folder / "scores", paper.set, view, paper.rows) for view in paper.views}
+    errors, *_ = papers.drawn(found, paper).axes
+    for row, line in zip(paper.rows, (line for line in errors.lines if line.get_marker() == "o"), strict=True):
+        assert [*line.get_xdata()] == [0, 1]
+        assert line.get_ydata() == pytest.approx([ades[row, count] for count in "01"], abs=0.0006)
 
 
 def test_tuning(folder, page, monkeypatch):
