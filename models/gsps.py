@@ -54,7 +54,7 @@ PRESETS = table(
     {
         "human36m": (10, 256, (10, 10), (8.0, 25.0), (100.0, 300.0), 0.1, 20, False),
         "humaneva": (8, 256, (10, 10), (5.0, 10.0), (15.0, 50.0), 0.01, 15, False),
-        "": (8, 128, (4, 4), (5.0, 10.0), (15.0, 50.0), 0.02, 10, True),
+        "": (8, 128, (4, 4), (5.0, 10.0), (15.0, 50.0), 0.01, 10, True),
     },
 )
 """Skeleton to options: the paper's; and for others, at 30 frames a second, 15 observed and 60 predicted frames."""

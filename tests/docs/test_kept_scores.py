@@ -52,6 +52,8 @@ def test_scores_are_of_the_presets(file):
     now = {name: value for name, value in method.config().items() if value is not None and not name.endswith("_run")}
     preset = method.preset(WALKER) if isinstance(method, PoseMethod) else {}
     for name, value in json.loads(json.dumps({**preset, **now})).items():
+        if name.startswith("pseudo_") and stored["method"]["multimodal"] == 0:
+            continue  # is read by that term alone
         assert stored["method"][name] == value, name
     now = {**vars(method.trainings[""]), **training}
     for name in ("steps", "batch_size", "learning_rate", "decay"):
