@@ -64,7 +64,7 @@ STEPS = {
     "cvae": 2300,
     "gmvae": 2300,
     "bom": 570,
-    "bom-parts": 470,
+    "bom-parts": 1450,
     "pose-knows": 1900,
     "mt-vae": 2300,
     "rhp": 2800,
