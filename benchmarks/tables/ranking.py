@@ -264,7 +264,7 @@ def fit(
     if method in ("gsps", "hit-dvae") and prior is not None and told.get("pose_prior") != 0:
         told["pose_prior_run"] = str(prior.absolute())
     if method in ("dlow", "dsf"):
-        told["cvae_run"] = str(fit(data, "cvae", {**FUTURES, **methods}, seed, runs, prior).absolute())
+        told["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior).absolute())
     (outcome,) = sweep({folder(row): dvae.method(method, **told)}, data, runs, (seed,), training, jobs=1)
     if outcome.status == "failed":
         raise RuntimeError(str(outcome))
@@ -331,11 +331,12 @@ def work(
         file = kept(stored / name, REFERENCES, view)
         if not (view.single or view.exchanged or view.parts == "held" or file.exists()):
             score(None, REFERENCES, view, file)
+    every = {**SETS[name].methods, **methods}  # what a second stage stands on has the set's options, chosen or not
     for seed in seeds:
         for row in methods:
             files = {view: kept(stored / name, f"{folder(row)}-seed{seed}", view) for view in views[row]}
             if missing := {view: file for view, file in files.items() if not file.exists()}:
-                path = fit(opened, row, methods, seed, runs / name, judged.get("prior"))
+                path = fit(opened, row, every, seed, runs / name, judged.get("prior"))
                 for view, file in missing.items():
                     score(path, row, view, file)
 

@@ -40,6 +40,7 @@ from benchmarks.tables import (
 )
 from dvae import Descent, Evaluation, Training, alternatives, method, motion
 from dvae.cli import main as command
+from dvae.inference.checkpoints import Run
 from dvae.motion.segments import dataset
 from dvae.runs.directory import fit_run
 from dvae.tables import Column, Columns, Panel, Series
@@ -495,6 +496,17 @@ def test_groups_are_of_the_first_word():
     )
     assert [clip.labels["group"] for clip in data.motion] == ["walk", "run"]
     assert [clip.labels["content"] for clip in data.motion] == list(contents)
+
+
+def test_a_second_stage_alone_stands_on_the_first_of_its_set(folder, tmp_path, monkeypatch):
+    """Where the first is not chosen, too."""
+    small = {"width": 4, "latent": 2, "batch_size": 4}
+    methods = {"cvae": {**small, "steps": 3}, "dlow": {"modes": 2, "steps": 2, "batch_size": 4}}
+    monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", methods)})
+    monkeypatch.setattr(ranking, "fitted_judges", lambda *arguments: {})
+    ranking.main(tmp_path, folder, ("simulated",), ("dlow",), (0,), 2, tmp_path / "scores")
+    assert Run(tmp_path / "simulated" / "cvae-seed0").config["training"]["steps"] == 3
+    assert not (tmp_path / "scores" / "simulated" / "cvae-seed0").exists()
 
 
 def test_papers(folder, page, monkeypatch):
