@@ -171,7 +171,7 @@ SECTIONS = {
             "0.0001": {"beta": 1e-4},
             "0.001, 6000 steps": {"beta": 1e-3, "steps": 6000},
             "0.001, rate 3e-3": {"beta": 1e-3, "learning_rate": 3e-3},
-            "0.0001, 12000 steps": {"beta": 1e-4, "steps": 12000},
+            **{f"{beta:g}, 12000 steps": {"beta": beta, "steps": 12000} for beta in (1e-4, 0.1)},
         },
         protocol=PATHS,
     ),
