@@ -528,11 +528,10 @@ def main(
         samples: futures of a window.
         scores: the folder of scores and judges; in another than the project's own, all is fitted anew.
         page: whose tables; without one they are printed.
-        picture: of the sets that tell no paths, drawn with a page.
+        picture: of all sets that tell no paths, drawn with a page.
     """
     refuse_unknown("set", sets, SETS)
     refuse_unknown("method", methods, {**FUTURES, **PATHS})
-    futures: dict[str, Mapping[str, Entry]] = {}
     for name in sets:
         chosen = SETS[name]
         if data is not None:
@@ -543,9 +542,13 @@ def main(
             if found := entries(scores, name, view, chosen.methods):
                 heading = "" if view.given is None else f"With {view.given} paths given:\n\n"
                 tables.append(heading + ranking(found, [*COLUMNS, *(JUDGED if chosen.judges else ())]))
-                futures |= {} if view.given is not None else {name: found}
         if tables:
             write(page, *tables, name=name)
+    futures = {
+        name: found
+        for name, chosen in SETS.items()
+        if View() in chosen.views and (found := entries(scores, name, View(), chosen.methods))
+    }
     if page is not None and futures:
         drawn(futures).savefig(picture, dpi=110)
 
