@@ -113,8 +113,9 @@ class Trainable:
         raise NotImplementedError
 
     def training(self, data: Any) -> Training:
-        """How the model is fitted to these data, where nothing else is said."""
-        return self.trainings[""]
+        """How the model is fitted to these data, by their skeleton if they have one, where nothing else is said."""
+        skeleton = getattr(Schema.of(data), "skeleton", None)
+        return self.trainings.get(skeleton.name if skeleton else "", self.trainings[""])
 
     @alone
     def fit(self, data: Any, **options: Any) -> Fit:

@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -36,6 +36,7 @@ from typing_extensions import override
 
 from ..data import bridged
 from ..inference.recipe import Recipe
+from ..inference.training import Training
 from ..laws import FAMILIES, ConditionalFlow, LawSpec, Product
 from ..laws.conditional_flow import ConditionalFlowLaw
 from ..laws.product import ProductLaw
@@ -70,6 +71,10 @@ class MoGlow(LikelihoodMethod):
     source = "Henter, Alexanderson and Beskow, 2020, arXiv 1905.06598"
     generative = "p(x_t | x_{<t})"
     inference = ""
+    trainings: ClassVar[Mapping[str, Training]] = {
+        "human36m": Training(80_000, 64, 1e-4),  # of the port in TrajeVAE's code
+        **LikelihoodMethod.trainings,
+    }
 
     latent: None = None
     emission: None = None

@@ -11,10 +11,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from ..data import bridged
-from ..inference.training import Training
 from ..motion import Skeleton
 from ..motion.protocols import Poses
-from ..schema import Schema
 from .method import Method
 
 
@@ -58,12 +56,6 @@ class PoseMethod(Method):
     def suited(self, data: Any) -> Self:
         """With the options that are left open chosen for the skeleton of these data."""
         return self.filled(self.preset(Poses.of(data, self.name, self.representation).skeleton))
-
-    @override
-    def training(self, data: Any) -> Training:
-        """Of poses of their skeleton."""
-        schema = Schema.of(data)
-        return self.trainings.get(schema.skeleton.name if isinstance(schema, Poses) else "", self.trainings[""])
 
     def poses(self, data: Any) -> Poses:
         """The schema of data, of poses without a root.

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from torch import nn
 
 import dvae
-from dvae import Evaluation, Training, motion
+from dvae import Evaluation, Training, files, motion
 from dvae.inference.checkpoints import Run
 from dvae.inference.estimates import Crossed, Estimate
 from dvae.inference.many import confidence_set
@@ -217,8 +217,8 @@ class Scored:
 
     def save(self, file: Path) -> None:
         """As compressed JSON, the same bytes for the same scores."""
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(gzip.compress(json.dumps(vars(self), separators=(",", ":")).encode(), mtime=0))
+        with files.written(file) as new:
+            new.write(gzip.compress(json.dumps(vars(self), separators=(",", ":")).encode(), mtime=0))
 
 
 def fitted_judges(data: MotionData, runs: Path, names: Sequence[str] = ("prior", "content")) -> dict[str, Path]:
@@ -228,8 +228,10 @@ def fitted_judges(data: MotionData, runs: Path, names: Sequence[str] = ("prior",
         clips = grouped(data) if options.get("label") == "group" else data
         (judge,) = sweep({name: registry.judges()[method](**options)}, clips, runs / "judges", (0,), training, jobs=1)
         config = judge.path / "config.json"  # is kept, and says nothing of this machine
-        text = config.read_text(encoding="utf-8").replace(json.dumps(data.path), json.dumps(Path(data.path).name))
-        config.write_text(text, encoding="utf-8")
+        text = config.read_text(encoding="utf-8")
+        if (placeless := text.replace(json.dumps(data.path), json.dumps(Path(data.path).name))) != text:
+            with files.written(config) as new:  # whole at any time, as other processes may read it
+                new.write(placeless.encode())
     return {name: runs / "judges" / f"{name}-seed0" for name in names}
 
 

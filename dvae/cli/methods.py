@@ -45,7 +45,7 @@ def show(
     """Show two equations: the joint distributions, the audit of the guide, and the graph; and how a method is fitted.
 
     Args:
-        method: name of a method, or give two equations instead.
+        method: name of a method, or of a judge, or give two equations instead.
         generative: the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)"; alone, with the guides that miss nothing.
         inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; "faithful" for one that misses nothing, "" of a model
             without latents.
@@ -57,6 +57,13 @@ def show(
     check_figure(out, "out")
     if method is not None and (generative or inference or summed):
         raise UsageError("give the name of a method or two equations, not both")
+    if method is not None and method in judges():
+        if out is not None:
+            raise UsageError(f"{method} is a judge of what methods make and has no graph; leave --out out")
+        judge = judges()[method]
+        said = [f"{method} has no equations: a judge of what methods make ({judge.source})", *_fitted(judge.trainings)]
+        OUT.print("\n".join(said), highlight=False, soft_wrap=True)
+        return
     if method is not None:
         with arguments():
             kind = registry.method(method)

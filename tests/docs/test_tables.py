@@ -487,6 +487,16 @@ def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
     assert (held["gsps"].means("APD upper") > 0).all()
 
 
+def test_judges_say_nothing_of_their_place_and_are_whole_while_others_use_them(folder, tmp_path, monkeypatch):
+    monkeypatch.setitem(ranking.JUDGES, "prior", ("pose-prior", {}, Training(2, 4, progress=False)))
+    data = motion.dataset.MotionData.open(folder / "people.npz", motion.PROTOCOLS["simulated"])
+    config = ranking.fitted_judges(data, tmp_path, ["prior"])["prior"] / "config.json"
+    before = config.stat()
+    assert Run(config.parent).config["data"]["path"] == "people.npz"
+    ranking.fitted_judges(data, tmp_path, ["prior"])
+    assert (config.stat().st_ino, config.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+
+
 def test_groups_are_of_the_first_word():
     people = motion.simulate(clips=2, frames=80, seed=1)
     contents = ("walk-turn-left", "run")

@@ -28,9 +28,14 @@ def posed(skeleton):
     return Poses.under(PROTOCOLS["h36m"], skeleton)
 
 
-@pytest.mark.parametrize("name", [name for name, kind in registry.methods().items() if issubclass(kind, PoseMethod)])
+KINDS = {**registry.methods(), **registry.judges()}
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, kind in KINDS.items() if issubclass(kind, PoseMethod) or len(kind.trainings) > 1]
+)
 def test_the_published_training_is_for_the_published_skeleton(people, name):
-    method = dvae.method(name)
+    method = KINDS[name]()
     paper, ours = method.training(posed(HUMAN36M)), method.training(people.schema)
     assert ours == method.trainings[""]
     assert paper == method.trainings.get("human36m", ours)
@@ -62,3 +67,7 @@ def test_show_says_how_a_method_is_fitted(capsys):
     said = capsys.readouterr().out
     assert "fitted to human36m in 39063 steps of 64, adam, learning rate 0.001, at the end 0" in said
     assert "fitted to other data in 2000 steps of 32" in said
+    assert main(["show", "pose-prior"]) == 0
+    assert "fitted to human36m in 1225 steps of 33, adam, learning rate 0.01" in capsys.readouterr().out
+    assert main(["show", "pose-prior", "--out", "graph.png"]) == 2
+    assert "leave --out out" in capsys.readouterr().err

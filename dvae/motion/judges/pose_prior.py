@@ -39,7 +39,7 @@ from ...laws import QRFlow, Shape
 from ...options import Layers, Range
 from ...turns import alone
 from ..protocols import Poses, Windows
-from ..skeleton import Skeleton, rotate_about_up
+from ..skeleton import HUMAN36M, HUMANEVA, Skeleton, rotate_about_up
 from ..views import Heading
 
 
@@ -60,7 +60,11 @@ class PosePrior(Trainable):
 
     name: ClassVar[str] = "pose-prior"
     source: ClassVar[str] = "Mao, Liu and Salzmann, 2021, arXiv 2108.08422"
-    trainings: ClassVar[Mapping[str, Training]] = {"": Training(1000, 32, 0.01, 0.8)}
+    trainings: ClassVar[Mapping[str, Training]] = {
+        HUMAN36M.name: Training(1225, 33, 0.01, 0.8, weight_decay=1e-3),  # 33 windows of 125 frames are 4,125 poses
+        HUMANEVA.name: Training(1225, 55, 0.01, 0.8, weight_decay=1e-3),
+        "": Training(1000, 32, 0.01, 0.8),
+    }
 
     layers: Layers = 3
     noise: Annotated[float, Range(0, 1, below=True)] = 0.002
