@@ -285,7 +285,7 @@ def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def folder(row: str) -> str:
     """What the runs of a row are called, before their seed."""
-    return row.replace(", ", "-").replace(" ", "-")
+    return row.replace(", ", "-").replace(",", "").replace(" ", "-")
 
 
 def work(

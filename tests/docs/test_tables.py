@@ -497,6 +497,15 @@ def test_judges_say_nothing_of_their_place_and_are_whole_while_others_use_them(f
     assert (config.stat().st_ino, config.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
 
+def test_every_row_has_a_folder_of_its_own():
+    """By a name that a sweep takes."""
+    sets = [each.methods for each in ranking.SETS.values()]
+    for rows in [*sets, *(each.rows for each in papers.PAPERS.values()), *(s.cases for s in tuning.SECTIONS.values())]:
+        folders = [ranking.folder(row) for row in rows]
+        assert len({*folders}) == len(rows)
+        assert all(re.fullmatch(r"[\w.=+-]+", name) for name in folders), folders
+
+
 def test_groups_are_of_the_first_word():
     people = motion.simulate(clips=2, frames=80, seed=1)
     contents = ("walk-turn-left", "run")
