@@ -42,11 +42,11 @@ PRESETS = table(
     "latent width hidden modes diversity diversity_scale heading",
     {
         "human36m": (*SHAPE, 50, 25.0, 100.0, False),
-        "humaneva": (*SHAPE, 50, 50.0, 20.0, True),
+        "humaneva": (*SHAPE, 50, 50.0, 20.0, False),
         "": (*SHAPE, 10, 50.0, 20.0, True),
     },
 )
-"""Skeleton to options: the paper's, but for the heading; and those for others."""
+"""Skeleton to options: the paper's; and those for others."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from .poses import table
 
 PRESETS = table(
     "latent width hidden modes diversity_scale heading",
-    {"human36m": (*SHAPE, 50, 100.0, False), "humaneva": (*SHAPE, 50, 20.0, True), "": (*SHAPE, 10, 20.0, True)},
+    {"human36m": (*SHAPE, 50, 100.0, False), "humaneva": (*SHAPE, 50, 20.0, False), "": (*SHAPE, 10, 20.0, True)},
 )
 """Skeleton to options: those of DLow."""
 

@@ -174,6 +174,7 @@ PAPERS = {
         printed(
             "ACC content,FID content,APD,ADE,FDE,MMADE,MMFDE,ADEm,FDEm,MMADEm,MMFDEm",
             """
+            HumanEva-I: real motion | .883 – – – – – – – – – –
             HumanEva-I: DLow | .527 3.472 4.853 .248 .262 .361 .337 .577 .717 .646 .753
             HumanEva-I: GSPS | .516 1.604 5.825 .233 .244 .343 .311 .686 .794 .735 .825
             HumanEva-I: HiT-DVAE | .726 .089 4.721 .282 .261 .335 .290 .579 .665 .610 .683
@@ -181,6 +182,7 @@ PAPERS = {
             HumanEva-I: no attention | .729 .264 3.921 .265 .243 .348 .295 .510 .604 .569 .650
             HumanEva-I: no w | .740 .306 4.244 .287 .263 .360 .303 .535 .662 .591 .689
             HumanEva-I: neither | .765 1.262 .023 .538 .621 .594 .660 .538 .622 .595 .662
+            Human3.6M: real motion | .855 – – – – – – – – – –
             Human3.6M: DLow | .659 1.412 11.741 .425 .518 .495 .531 .896 1.284 .948 1.289
             Human3.6M: GSPS | .650 2.030 14.757 .389 .496 .476 .525 1.013 1.372 1.065 1.381
             Human3.6M: HiT-DVAE | .700 1.708 8.942 .472 .505 .497 .514 .804 1.034 .812 1.028
@@ -298,7 +300,7 @@ PAPERS = {
         },
         (("APD", "energy score", *ERRORS[:4], "path error", "global ADE", *REAL[:4]),),
         [("6,000 steps", WHOLE), (WHOLE, TIME), (TIME, STANDARD), (FULL, "cvae-rnn")],
-        ("ADE", "APD"),
+        ("ADE", "FDE", "energy score", "APD"),
         printed(
             "APD,ADE,FDE,MMADE,MMFDE",
             """
@@ -399,6 +401,8 @@ def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[st
             told = [str(vars(view)[what]) if entry.minutes or what != "given" else ""] if what else []
             lines.append([titled(row, entry), *told, *trained(entry), *map(cell, means)])
     for row, cells in beside.items():
+        if all(cells.get(column, "–") == "–" for column in columns):
+            continue
         name, _, given = row.rpartition(", ") if what else (row, "", "")
         lines.append([f"*{name}*", *([given] if what else []), "", "", *(cells.get(column, "–") for column in columns)])
     return table(["", *([what] if what else []), *TRAINED, *columns], lines)

@@ -392,6 +392,10 @@ class Entry:
         rows = [each.rows[name] for each in self.seeds]
         return np.array([row[metric] for row in rows]) if all(metric in row for row in rows) else None
 
+    def by_seed(self, metric: str) -> np.ndarray:
+        """(S,), means over clips of a score that all have."""
+        return np.average(self.means(metric), 1, [*self.seeds[0].clips.values()])
+
     def crossed(self, metric: str, minus: Entry | None = None) -> Crossed | None:
         """A score, or what it is more than that of the same runs in another view of the same windows."""
         means, others = self.means(metric), 0.0 if minus is None else minus.means(metric)

@@ -10,10 +10,11 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import isnan, nan
+from math import isnan, nan, sqrt
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 
 import dvae
@@ -24,7 +25,7 @@ from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
 from .pages import refuse_unknown, table, write
-from .ranking import JOINTS, JUDGES, SCORES, fitted_judges, folder, judging, parted
+from .ranking import JOINTS, JUDGES, SCORES, SETS, entries, fitted_judges, folder, judging, parted
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
@@ -32,6 +33,8 @@ REFERENCES = ("zero velocity", "nearest neighbours")
 COLUMNS_OF_JUDGES = ("pose NLL", "ACC content")
 COLUMNS = ("ADE", "FDE", "ADEm", "APD", "energy score", "ACC content", "FID content", "pose NLL", "KL w", "KL z")
 """Scores that pages show, where there are."""
+SEEDS, TESTED = "seeds", ("bandai2-by-style", "bandai2-trajectories")
+"""The table of what another seed does, and the sets whose rows tell it."""
 PATH_COLUMNS = tuple(f"{score}, {count} given" for score in ("ADE", "APD", "energy score") for count in range(5))
 
 
@@ -301,6 +304,23 @@ def shown(scores: Sequence[Mapping[str, float]], name: str) -> str:
     return f"{sum(values) / len(values):.3f}" + (f" ({each})" if len(values) > 1 else "")
 
 
+def spread() -> str:
+    """What another seed does to the energy score of methods with the steps of their presets, by their test windows.
+
+    With paths to its mean over none to four. A difference of two runs has a standard deviation of sqrt(2) as much.
+    """
+    lines = []
+    for name in TESTED:
+        views = [entries(SCORES, name, view, SETS[name].methods) for view in SETS[name].views]
+        for row in SETS[name].methods:
+            seeds = [found[row].by_seed("energy score") for found in views if row in found]
+            means = np.mean(seeds, 0) if seeds else np.empty(0)
+            if len(means) > 1:
+                deviation = means.std(ddof=1)
+                lines.append([row, str(len(means)), f"{deviation:.3f}", f"{2 * sqrt(2) * deviation:.2f}"])
+    return table(["", "seeds", "standard deviation", "decided from"], lines)
+
+
 def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: int) -> None:
     """Fits and scores what is not there yet."""
     opened = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
@@ -328,7 +348,7 @@ def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: in
 def main(
     runs: tyro.conf.Positional[Path],
     data: Path | None = None,
-    sections: tuple[str, ...] = ("judges", *SECTIONS),
+    sections: tuple[str, ...] = ("judges", SEEDS, *SECTIONS),
     jobs: int = 1,
     stored: Path = SCORES / "tuning",
     page: Path | None = None,
@@ -343,10 +363,13 @@ def main(
         stored: the folder of scores.
         page: whose tables; without one they are printed.
     """
-    refuse_unknown("section", sections, ("judges", *SECTIONS))
+    refuse_unknown("section", sections, ("judges", SEEDS, *SECTIONS))
+    tried = [name for name in sections if name != SEEDS]
     if data is not None:
-        work(data, runs, stored, sections, jobs)
-    for name in sections:
+        work(data, runs, stored, tried, jobs)
+    if SEEDS in sections:
+        write(page, spread(), name=SEEDS)
+    for name in tried:
         columns = COLUMNS_OF_JUDGES if name == "judges" else SECTIONS[name].columns
         found = Store(stored, name).found
         cases = OF_JUDGES if name == "judges" else SECTIONS[name].cases

@@ -71,6 +71,21 @@ def test_what_was_tuned_stands_on_the_page(name):
         assert f"| {case} |" in page
 
 
+def test_what_another_seed_does_is_that_of_the_rows_on_test_windows():
+    page = (ranking.SCORES.parents[1] / "docs" / "results" / "tuning.md").read_text(encoding="utf-8")
+    assert tuning.spread() in page
+    told = {row: float(deviation) for row, _, deviation, _ in map(cells, tuning.spread().splitlines()[2:])}
+    rows = ranking.SETS["bandai2-by-style"].methods
+    for row, entry in ranking.entries(ranking.SCORES, "bandai2-by-style", ranking.View(), rows).items():
+        if row in rows:
+            error = entry.crossed("energy score").estimate().seeds
+            assert told[row] == pytest.approx(error * len(entry.seeds) ** 0.5, abs=6e-4)
+
+
+def cells(line):
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
 NUMBER = r"0?(\.\d+|\d+\.\d+) ± 0?(\.\d+) ± 0?(\.\d+)"
 
 

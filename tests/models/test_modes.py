@@ -284,6 +284,14 @@ def test_rows_of_one_past_are_seen_once_and_are_those_that_each_would_be(windows
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "skeleton", [dvae.motion.HUMAN36M, dvae.motion.HUMANEVA, dvae.motion.WALKER], ids=lambda s: s.name
+)
+def test_windows_are_turned_where_those_of_the_cvae_are(name, skeleton):
+    assert dvae.method(name).preset(skeleton)["heading"] == dvae.method("cvae").preset(skeleton)["heading"]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_a_run_has_the_decoder_of_the_cvae_and_does_without_its_run(people, cvae_run, tmp_path, name):
     own = shutil.copytree(cvae_run, tmp_path / "cvae")
     method = dvae.method(name, cvae_run=str(own), modes=3, sampler_width=8, sampler_hidden=(7, 6))
