@@ -314,10 +314,9 @@ def spread() -> str:
         views = [entries(SCORES, name, view, SETS[name].methods) for view in SETS[name].views]
         for row in SETS[name].methods:
             seeds = [found[row].by_seed("energy score") for found in views if row in found]
-            means = np.mean(seeds, 0) if seeds else np.empty(0)
-            if len(means) > 1:
-                deviation = means.std(ddof=1)
-                lines.append([row, str(len(means)), f"{deviation:.3f}", f"{2 * sqrt(2) * deviation:.2f}"])
+            if (count := min(map(len, seeds), default=0)) > 1:
+                deviation = np.mean([means[:count] for means in seeds], 0).std(ddof=1)
+                lines.append([row, str(count), f"{deviation:.3f}", f"{2 * sqrt(2) * deviation:.2f}"])
     return table(["", "seeds", "standard deviation", "decided from"], lines)
 
 
