@@ -27,6 +27,7 @@ from ..inference.training import Training
 from ..motion import Windows
 from ..networks import Input, Network, NetworkSpec
 from ..networks.base import once, perceptron, share_modules
+from ..networks.cells import GRU
 from ..options import Size
 from ..program.rollout import SelfFeeding
 from ..views import WHOLE
@@ -129,7 +130,7 @@ class Summary(nn.Module):
 
     def __init__(self, size: int, width: int):
         super().__init__()
-        self.network = nn.GRU(size, width, batch_first=True, bidirectional=True)
+        self.network = GRU(size, width, batch_first=True, bidirectional=True)
 
     def forward(self, first: Tensor, sequence: Tensor) -> Tensor:
         """The summary of s (B, D) and a sequence (B, T, D)."""

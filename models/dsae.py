@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 from typing_extensions import override
 
 from ..networks import Dense, Input, NetworkSpec, Recurrent
 from ..networks.base import Network
+from ..networks.cells import RNN
 from ..networks.recurrent import Memory
 from ..options import Size
 from ..relations import ALL
@@ -54,7 +55,7 @@ class LayeredNetwork(Network):
         recurrent = Recurrent(spec.width)
         self.past = Memory(recurrent, [(p, 0 if p.relation is None else -1) for p in inputs], +1)
         self.future = Memory(recurrent, [(p, 0) for p in inputs], -1)
-        self.top: Any = nn.RNN(2 * spec.width, spec.width, batch_first=True)
+        self.top: Any = RNN(2 * spec.width, spec.width, batch_first=True)
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:

@@ -30,6 +30,7 @@ from ..motion import HUMAN36M, HUMANEVA, Heading, Skeleton, energies
 from ..motion.protocols import Poses
 from ..networks import Input, Network
 from ..networks.base import once, perceptron, share_modules
+from ..networks.cells import GRU
 from ..networks.recurrent import gru_cell
 from ..options import Amount, Size
 from ..program.batch import AnyBatch
@@ -189,7 +190,7 @@ class FedBackNetwork(Network):
     ) -> None:
         super().__init__(inputs, True, (width, *hidden)[-1])
         self.share, (self.own, latent) = known, own or ("", 0)
-        self.cell: Any = nn.GRU(known + size, width, batch_first=True)
+        self.cell: Any = GRU(known + size, width, batch_first=True)
         self.behind = perceptron((width + latent, *hidden), "tanh")
 
     def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -239,7 +240,7 @@ class LastState(nn.Module):
     def __init__(self, size: int, width: int) -> None:
         super().__init__()
         self.size = size
-        self.network = nn.GRU(size, width, batch_first=True)
+        self.network = GRU(size, width, batch_first=True)
 
     def forward(self, poses: Tensor, lengths: Tensor | None = None) -> Tensor:
         """Of (B, T, D), or of (B, T D), frame after frame; of the first steps of each where there are lengths."""

@@ -44,6 +44,7 @@ from ..laws.kalman import LinearGaussianChain, update
 from ..laws.triangular import InverseCholesky, Triangular, refuse_half
 from ..networks import Dense, Input, Network, NetworkSpec
 from ..networks.base import presence, valid_steps
+from ..networks.cells import LSTM
 from ..networks.recurrent import lstm_cell
 from ..notation import Factorization
 from ..options import Range, Size
@@ -203,7 +204,7 @@ class KalmanNetwork(Network):
         super().__init__([parent], True, size + size**2)
         self.spec = spec
         self.first = nn.Parameter(torch.zeros(size))  # a_0
-        self.memory: Any = nn.LSTM(size, spec.width)
+        self.memory: Any = LSTM(size, spec.width)
         self.weights = nn.Linear(spec.width, count)
         self.A = nn.Parameter(torch.eye(latent).repeat(count, 1, 1))
         self.B = nn.Parameter(0.05 * torch.randn(count, latent, size))

@@ -39,6 +39,7 @@ from ..motion.protocols import Poses
 from ..motion.views import LENGTHS, Rotations
 from ..networks import Input, Network, NetworkSpec
 from ..networks.base import share_modules
+from ..networks.cells import GRU
 from ..networks.noise import AddProjected, Concatenate, MixAndMatch, Noise, Residual, half
 from ..networks.recurrent import gru_cell
 from ..notation import Factorization
@@ -281,7 +282,7 @@ class FutureDecoderNetwork(Network):
         self.velocity = spec.velocity
         self.past = LastState(size, spec.width)
         self.noise = None if spec.noise is None else spec.noise.decoder(spec.width, latent)
-        self.cell: Any = nn.GRU(size, spec.width, batch_first=True)
+        self.cell: Any = GRU(size, spec.width, batch_first=True)
         self.join = Residual(spec.width + latent, spec.width) if spec.noise is None else None
         self.out = nn.Linear(spec.width, size)
 

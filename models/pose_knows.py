@@ -14,11 +14,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from torch import Tensor, nn
+from torch import Tensor
 from typing_extensions import override
 
 from ..networks import Input, NetworkSpec
 from ..networks.base import AtOnce
+from ..networks.cells import GRU
 from ..options import Size
 from ..views import WHOLE
 from .cvae import SummaryDecoder
@@ -69,7 +70,7 @@ class FutureFilterNetwork(AtOnce):
         super().__init__(inputs, True, spec.width)
         size = next(parent.size for parent in inputs if parent.name == WHOLE)
         self.past = LastState(size, spec.width)
-        self.network = nn.GRU(size, spec.width, batch_first=True)
+        self.network = GRU(size, spec.width, batch_first=True)
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:

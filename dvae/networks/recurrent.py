@@ -14,10 +14,11 @@ from torch.nn import functional
 from typing_extensions import override
 
 from .base import Chain, Hoisted, Input, Join, Network, at, keep, once, over, part, perceptron, reverse, shift
+from .cells import GRU, LSTM
 from .extract import Extract, Extractors
 from .rows import Rows, select
 
-CELLS: dict[str, type[nn.GRU] | type[nn.LSTM]] = {"gru": nn.GRU, "lstm": nn.LSTM}
+CELLS: dict[str, type[GRU] | type[LSTM]] = {"gru": GRU, "lstm": LSTM}
 
 
 @dataclass(frozen=True)

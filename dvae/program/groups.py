@@ -46,9 +46,8 @@ class Groups:
         if index.dim() != 1 or index.is_floating_point():
             raise ValueError(f"{GROUP} is {index.dtype} {tuple(index.shape)}; expected whole numbers (B,)")
         _, place, count = torch.unique(index, return_inverse=True, return_counts=True)
-        rows = torch.arange(len(place) - 1, -1, -1, device=place.device)
-        first = torch.empty(len(count), dtype=torch.long, device=place.device)
-        first[place.flip(0)] = rows  # the first one is written last
+        rows = torch.arange(len(place), device=place.device)
+        first = rows.new_full((len(count),), len(place)).scatter_reduce(0, place, rows, "amin")
         return cls(place, first, count[place])
 
     def again(self, n: int) -> Groups:

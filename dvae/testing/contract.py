@@ -10,6 +10,7 @@ last, which trains it.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -32,7 +33,7 @@ from ..program.batch import AnyBatch, repeat
 from ..program.conditional import Conditional
 from ..program.model import DynamicalVAE
 from ..program.reference import reference
-from .device import move, on_device
+from .device import SameNoise, move, on_device
 
 
 class FactorizationContract:
@@ -226,11 +227,21 @@ class FactorizationContract:
             assert all(torch.equal(value, expected[name]) for name, value in run(other).items())
 
     def test_a_bound_stays_on_its_device(self) -> None:
-        """On a GPU that is only said to be one it is the processor's, and nothing is brought there anew."""
+        """On a GPU that is only said to be one, and on one that is, it is the processor's.
+
+        Nothing is brought there anew.
+        """
         model = self._model()
         data = self._data(model)
         torch.manual_seed(1)
         expected = SequenceELBO().terms(model, data).bound
+        if torch.cuda.is_available():
+            real = {name: value.to("cuda") for name, value in data.items()}
+            with SameNoise():
+                torch.manual_seed(1)
+                found = SequenceELBO().terms(copy.deepcopy(model).to("cuda"), real).bound
+                found.sum().backward()
+            self._close({"bound": found.detach().cpu()}, {"bound": expected})
         with on_device() as traffic:
             move(model)
             there = {name: value.to("cuda") for name, value in data.items()}

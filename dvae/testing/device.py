@@ -4,6 +4,8 @@ Torch's own fakes (`FakeTensorMode`) have no values, so that a program that look
 without CUDA has no gradients of them. Here a tensor of the device is one of the processor under another name: its
 operations run and give what they do there, one that mixes the two is refused as CUDA refuses it, and each copy between
 the two is listed, with each value that a program waits for.
+
+A real GPU draws other random numbers than the processor; under `SameNoise` it has the processor's, and gives the same.
 """
 
 from __future__ import annotations
@@ -218,6 +220,26 @@ def on_device() -> Iterator[Traffic]:
         traffic = stack.enter_context(Traffic())
         stack.enter_context(_Moves(traffic))
         yield traffic
+
+
+class SameNoise(TorchDispatchMode):
+    """Within it, random numbers of a GPU are drawn on the processor, by its seed, and brought there."""
+
+    @override
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        device = next((value.device for value in _tensors((*args, *kwargs.values()))), None)
+        device = torch.device(kwargs.get("device") or device or "cpu")
+        elsewhere = func.overloadpacket is aten._cudnn_rnn  # whose dropout has a state of its own
+        if torch.Tag.nondeterministic_seeded not in func.tags or device.type == "cpu" or elsewhere:
+            return func(*args, **kwargs)
+        if "device" in kwargs:
+            kwargs["device"] = torch.device("cpu")
+        own = [_mapped(value, Tensor, Tensor.cpu) for value in (*args, *kwargs.values())]
+        drawn = func(*own[: len(args)], **dict(zip(kwargs, own[len(args) :], strict=True)))
+        if func.overloadpacket.__name__.endswith("_"):
+            return args[0].copy_(drawn)
+        return _mapped(drawn, Tensor, lambda value: value.to(device))
 
 
 def move(module: nn.Module) -> nn.Module:

@@ -1,5 +1,6 @@
-"""Readiness for a GPU without one: steps and evaluations of every method on a device that is only said to be one."""
+"""Steps and evaluations of every method on a GPU, or, without one, on a device that is only said to be one."""
 
+import warnings
 from dataclasses import replace
 from typing import ClassVar
 
@@ -11,6 +12,7 @@ from torch.utils._pytree import tree_leaves
 
 import dvae
 from dvae import motion
+from dvae.inference.held import on_device_of
 from dvae.laws.chain import gaussian_chain
 from dvae.laws.kalman import LinearGaussianChain
 from dvae.models.motion_latent import MotionLatent
@@ -18,7 +20,7 @@ from dvae.models.registry import METHODS
 from dvae.models.trajectories import TrajectoryMethod
 from dvae.motion import bodies
 from dvae.motion.segments.embodied import Segments
-from dvae.testing.device import OnDevice, move, on_device
+from dvae.testing.device import OnDevice, SameNoise, move, on_device
 
 DENSE = {"latent": 4, "width": 8, "hidden": (8,)}
 SMALL = {
@@ -57,6 +59,9 @@ BROUGHT = {"mix-and-match": 1}
 """Tensors brought to the device in a step, beside the batch: the indices that all sequences share."""
 
 
+on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU is here")
+
+
 @pytest.fixture(scope="module")
 def people():
     return motion.simulate(clips=6, frames=60, seed=1)
@@ -90,9 +95,9 @@ def trained(request, people):
     return make
 
 
-def two_steps(model, recipe, before_the_second=lambda: None):
+def two_steps(model, recipe, before_the_second=lambda: None, accelerator="cpu"):
     """The terms of two steps of the recipe, the number of tensors of the batch, and what took them."""
-    options = {"steps": 4, "self_feeding": recipe.feeding, "accelerator": "cpu", "progress": False}
+    options = {"steps": 4, "self_feeding": recipe.feeding, "accelerator": accelerator, "progress": False}
     svi = dvae.SVI(model, stages=recipe.stages, **options)
     svi.init()
     batch = recipe.batches.sample(3, torch.Generator().manual_seed(1))
@@ -119,21 +124,65 @@ def test_a_method_stays_on_its_device_and_a_step_waits_for_it_as_often_as_is_sai
         places = [read.partition(":")[0] for read in traffic.reads]
         assert {place: places.count(place) for place in places} == STEP | BESIDE.get(name, {}), traffic.reads
         assert len(traffic.uploads) == tensors + BROUGHT.get(name, 0), traffic.uploads
-        svi.evaluate(train.sample(3, torch.Generator()))
-        if test is not None:
-            options = {"scores": motion.displacements, "samples": 2, "references": False, "progress": False}
-            dvae.evaluate(model, test, batch_size=500, bound_particles=2 * model.likelihood, **options)
-        for there, here in zip(found, expected, strict=True):
-            got = {key: value.cpu() for key, value in numbers(there).items()}
-            torch.testing.assert_close(got, numbers(here), rtol=1e-9, atol=1e-9)
+        judge(svi, train, test)
+        same(found, expected)
 
 
+def judge(svi, train, test):
+    """Validation, forecasts and scores."""
+    svi.evaluate(train.sample(3, torch.Generator()))
+    if test is not None:
+        options = {"scores": motion.displacements, "samples": 2, "references": False, "progress": False}
+        dvae.evaluate(svi.model, test, batch_size=500, bound_particles=2 * svi.model.likelihood, **options)
+
+
+def same(found, expected):
+    """The terms of steps there and here."""
+    for there, here in zip(found, expected, strict=True):
+        got = {key: value.cpu() for key, value in numbers(there).items()}
+        torch.testing.assert_close(got, numbers(here), rtol=1e-9, atol=1e-9)
+
+
+@on_gpu
 @pytest.mark.parametrize("name", METHODS)
-def test_terms_have_the_precision_of_the_model_under_autocast(name, trained):
+def test_a_gpu_does_what_the_processor_does(name, trained):
+    """In double precision, with the processor's noise."""
+    model, recipe, _, _ = trained(name)
+    expected, _, _ = two_steps(model.double(), recipe)
+    model, recipe, train, test = trained(name)
+    with SameNoise():
+        found, _, svi = two_steps(model.double(), recipe, accelerator="cuda")
+    judge(svi, train, test)
+    same(found, expected)
+
+
+@on_gpu
+@pytest.mark.parametrize("name", METHODS)
+def test_a_step_waits_for_a_gpu_as_often_as_for_the_stand_in(name, trained):
+    """CUDA itself tells when it is waited for, as it is with a tensor that is brought, but not with the batch."""
+    model, recipe, _, _ = trained(name)
+
+    def listen():
+        waited.clear()
+        torch.cuda.set_sync_debug_mode("warn")
+
+    with warnings.catch_warnings(record=True) as waited:
+        warnings.simplefilter("always")
+        try:
+            two_steps(model, recipe, listen, accelerator="cuda")
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    told = [f"{each.filename}:{each.lineno}" for each in waited if "synchronizing CUDA" in str(each.message)]
+    assert len(told) == sum((STEP | BESIDE.get(name, {})).values()) + BROUGHT.get(name, 0), told
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=on_gpu)])
+@pytest.mark.parametrize("name", METHODS)
+def test_terms_have_the_precision_of_the_model_under_autocast(name, device, trained):
     """A bound in mixed precision is off by no more than weights would have it be that have bfloat16's digits."""
     model, recipe, _, _ = trained(name)
-    model.train(name == "gsps").requires_grad_(False)  # which normalises over a batch
-    batch = recipe.batches.sample(3, torch.Generator().manual_seed(1))
+    model.train(name == "gsps").requires_grad_(False).to(device)  # which normalises over a batch
+    batch = on_device_of(model, recipe.batches.sample(3, torch.Generator().manual_seed(1)))
     drawing = {"draws": recipe.objective.draws} if getattr(recipe.objective, "draws", None) else {}
 
     def terms():
@@ -144,7 +193,7 @@ def test_terms_have_the_precision_of_the_model_under_autocast(name, trained):
         return float((found.bound - sum(found.energies.values())).double().sum())
 
     exact = value(terms())
-    with torch.autocast("cpu", torch.bfloat16):
+    with torch.autocast(device, torch.bfloat16):
         mixed = terms()
     assert {part.dtype for part in (mixed.bound, mixed.frames, *numbers(mixed).values())} == {torch.float32}
     weights, squares = [parameter.clone() for parameter in model.parameters()], []
@@ -250,6 +299,20 @@ class TestOnDevice:
             move(lstm)(x.to("cuda"))[0].square().sum().backward()
             assert not traffic.reads
             torch.testing.assert_close([p.grad.cpu() for p in lstm.parameters()], list(expected))
+
+    def test_the_same_noise_is_the_processors(self):
+        def noise(device):
+            torch.manual_seed(1)
+            made = torch.randn(3, device=device)
+            moved = torch.empty(3).to(device).uniform_()
+            return [made, moved, torch.bernoulli(moved), torch.randperm(4, device=device), torch.normal(made, moved)]
+
+        expected = noise("cpu")
+        with on_device(), SameNoise():
+            found = noise("cuda")
+            assert all(isinstance(value, OnDevice) for value in found)
+            found = [value.cpu() for value in found]
+        torch.testing.assert_close(found, expected, rtol=0, atol=0)
 
     def test_it_is_there_within_alone(self):
         with on_device():

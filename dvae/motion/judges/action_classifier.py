@@ -28,6 +28,7 @@ from torch import Tensor, nn
 from ...data import Batch
 from ...inference.recipe import Recipe, Trainable
 from ...inference.training import Stage, Training
+from ...networks.cells import GRU
 from ...options import Layers, Size
 from ...schema import SchemaError
 from ..protocols import Poses, Protocol, Windows
@@ -111,7 +112,7 @@ class ActionClassifierModel(nn.Module):
         super().__init__()
         self.label, self.classes = method.label, method.classes
         self.skeleton, self.size, self.protocol = skeleton, size, protocol
-        self.gru = nn.GRU(size, method.hidden, method.layers, batch_first=True)
+        self.gru = GRU(size, method.hidden, method.layers, batch_first=True)
         self.project = nn.Linear(method.hidden, method.features)
         self.logits = nn.Linear(method.features, len(method.classes))
 

@@ -52,6 +52,7 @@ from ...inference.result import Result, Table, progress_bar
 from ...inference.scores import clip_means
 from ...inference.trackers import Bar
 from ...inference.training import Stage
+from ...networks.cells import GRU
 from ...options import Size, nearest
 from ...schema import Schema
 from ...turns import alone
@@ -125,7 +126,7 @@ class RealOrMadeModel(nn.Module):
         self.view = Heading(skeleton, observed) if method.heading else None
         size, half, eighth = 3 * (skeleton.joints - 1), max(method.width // 2, 1), max(method.width // 8, 1)
         self.units = Units(size)
-        self.gru = nn.GRU(size, method.width, batch_first=True)
+        self.gru = GRU(size, method.width, batch_first=True)
         self.layers = nn.Sequential(
             *(nn.Linear(method.width, half), nn.ReLU(), nn.Linear(half, eighth), nn.ReLU(), nn.Linear(eighth, 1))
         )
