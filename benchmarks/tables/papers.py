@@ -35,6 +35,7 @@ from .ranking import (
     PATHS,
     SCORES,
     TRAINED,
+    Accelerator,
     Entry,
     View,
     cell,
@@ -478,6 +479,7 @@ def main(
     seeds: tuple[int, ...] = (0, 1, 2),
     samples: int = 50,
     stored: Path = SCORES,
+    accelerator: Accelerator = "auto",
     pages: Path | None = None,
     pictures: Path = DOCS / "img",
 ) -> None:
@@ -491,6 +493,7 @@ def main(
         seeds: of every row.
         samples: futures of a window.
         stored: the folder of scores and judges.
+        accelerator: on which to train and to forecast, as of `benchmarks.tables.ranking`.
         pages: the folder of the pages; without one tables are printed.
         pictures: the folder of the pictures, which are drawn with the pages.
     """
@@ -501,7 +504,7 @@ def main(
         if data is not None:
             fitted = {row: options for row, options in paper.rows.items() if not rows or row in rows}
             views = {row: paper.views_of(row) for row in fitted}
-            work(data, runs, stored, paper.set, fitted, views, seeds, samples)
+            work(data, runs, stored, paper.set, fitted, views, seeds, samples, accelerator)
         found = {view: entries(stored, paper.set, view, paper.rows) for view in paper.views}
         tables = [scores(found, columns, paper.printed) for columns in paper.columns]
         tables.append(captioned("What each change does, paired", changes(found, paper)))

@@ -39,6 +39,7 @@ from dvae.runs.sweep import sweep
 from .pages import DOCS, refuse_unknown, same, table, write
 
 SCORES = Path(__file__).parents[1] / "scores"
+Accelerator = Literal["auto", "cpu", "cuda"]
 
 FUTURES: dict[str, dict[str, Any]] = {
     "hit-dvae": {},
@@ -254,19 +255,25 @@ def judging(judged: Mapping[str, Path]) -> Any:
 
 
 def fit(
-    data: MotionData, row: str, methods: Mapping[str, Mapping[str, Any]], seed: int, runs: Path, prior: Path | None
+    data: MotionData,
+    row: str,
+    methods: Mapping[str, Mapping[str, Any]],
+    seed: int,
+    runs: Path,
+    prior: Path | None,
+    accelerator: str = "auto",
 ) -> Path:
     """The run directory of a method, fitted once; second stages stand on the first of the same seed.
 
     Raises:
         RuntimeError: the run failed.
     """
-    told, training = parted(methods[row])
+    told, training = parted({**methods[row], "accelerator": accelerator})
     method = told.pop("method", row)
     if method in ("gsps", "hit-dvae") and prior is not None and told.get("pose_prior") != 0:
         told["pose_prior_run"] = str(prior.absolute())
     if method in ("dlow", "dsf"):
-        told["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior).absolute())
+        told["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior, accelerator).absolute())
     (outcome,) = sweep({folder(row): dvae.method(method, **told)}, data, runs, (seed,), training, jobs=1)
     if outcome.status == "failed":
         raise RuntimeError(str(outcome))
@@ -297,6 +304,7 @@ def work(
     views: Mapping[str, Sequence[View]],
     seeds: Sequence[int],
     samples: int,
+    accelerator: Accelerator = "auto",
 ) -> None:
     """Fits and scores what is not there yet, seed by seed, so that every method has one before any has two.
 
@@ -309,6 +317,7 @@ def work(
         views: in which each is scored; the reference rows in all of them.
         seeds: of every method.
         samples: futures of a window.
+        accelerator: on which to train and to forecast.
     """
     opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[name])
     judged = fitted_judges(opened, stored / name, SETS[name].judges)
@@ -319,7 +328,8 @@ def work(
             data, by = grouped(opened), fitted_judges(opened, stored / name, view.judges.split("+"))
         elif view.observed:  # a pose prior reads windows turned at the last frame that its own protocol observes
             by = {judge: run for judge, run in judged.items() if judge != "prior"}
-        models = {} if path is None else {row: load(path).model}
+        device = "cuda" if accelerator == "cuda" else "cpu"
+        models = {} if path is None else {row: load(path).model.to(device)}
         known: dict[str, Any] = {"training_windows": view.windows(data, "train+validation")}
         options = {"references": False} if models else known
         windows, told = view.windows(data, "test"), view.evaluate(samples)
@@ -338,7 +348,7 @@ def work(
         for row in methods:
             files = {view: kept(stored / name, f"{folder(row)}-seed{seed}", view) for view in views[row]}
             if missing := {view: file for view, file in files.items() if not file.exists()}:
-                path = fit(opened, row, every, seed, runs / name, judged.get("prior"))
+                path = fit(opened, row, every, seed, runs / name, judged.get("prior"), accelerator)
                 for view, file in missing.items():
                     score(path, row, view, file)
 
@@ -458,8 +468,11 @@ TRAINED = ("seeds", "CPU minutes")
 
 
 def trained(entry: Entry) -> tuple[str, str]:
-    """How many seeds were trained, and how long each took."""
-    return (str(len(entry.seeds)), f"{statistics.fmean(entry.minutes):.1f}") if entry.minutes else ("–", "–")
+    """How many seeds were trained, and how long each took of those that were trained on a processor."""
+    if not entry.minutes:
+        return "–", "–"
+    here = [each.minutes for each in entry.seeds if each.config["training"]["accelerator"] != "cuda"]
+    return str(len(entry.seeds)), f"{statistics.fmean(here):.1f}" if here else "GPU"
 
 
 def ranked(found: Mapping[str, Entry]) -> dict[str, Crossed]:
@@ -520,6 +533,7 @@ def main(
     seeds: tuple[int, ...] = (0, 1, 2),
     samples: int = 50,
     scores: Path = SCORES,
+    accelerator: Accelerator = "auto",
     page: Path | None = None,
     picture: Path = DOCS / "img" / "ranking.png",
 ) -> None:
@@ -533,6 +547,7 @@ def main(
         seeds: of every method.
         samples: futures of a window.
         scores: the folder of scores and judges; in another than the project's own, all is fitted anew.
+        accelerator: on which to train and to forecast; minutes are told of runs that were not told to be on a GPU.
         page: whose tables; without one they are printed.
         picture: of all sets that tell no paths, drawn with a page.
     """
@@ -542,7 +557,7 @@ def main(
         chosen = SETS[name]
         if data is not None:
             named = {row: options for row, options in chosen.methods.items() if not methods or row in methods}
-            work(data, runs, scores, name, named, dict.fromkeys(named, chosen.views), seeds, samples)
+            work(data, runs, scores, name, named, dict.fromkeys(named, chosen.views), seeds, samples, accelerator)
         tables = []
         for view in chosen.views:
             if found := entries(scores, name, view, chosen.methods):

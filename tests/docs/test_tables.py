@@ -451,7 +451,7 @@ def test_ranking(folder, page, monkeypatch):
     runs, scores = folder / "ranked", folder / "scores"
     picture = folder / "ranking.png"
     options = {"scores": scores, "page": page, "picture": picture, "samples": 2, "sets": ("simulated",)}
-    ranking.main(runs, folder, seeds=(0,), **options)
+    ranking.main(runs, folder, seeds=(0,), accelerator="cpu", **options)
     ranking.main(runs, folder, seeds=(0, 1), methods=("srnn",), **options)
     before = {file: file.stat().st_mtime_ns for file in scores.rglob("*.json.gz")}
     assert len(before) == 4  # of three runs, and of the references
@@ -471,6 +471,16 @@ def test_ranking(folder, page, monkeypatch):
     assert energies == sorted(energies)
     for row, energy, before in zip(rows[2:], energies[1:], energies, strict=False):
         assert abs(float(row[4].split()[0]) - (energy - before)) < 0.0016  # of three rounded numbers
+
+
+def test_minutes_are_told_of_processors():
+    def told(**minutes):
+        runs = [ranking.Scored([], {}, {}, n, {"training": {"accelerator": where}}) for where, n in minutes.items()]
+        return ranking.trained(ranking.Entry(runs, [run.minutes for run in runs]))
+
+    assert told(auto=4.0, cuda=1.0) == ("2", "4.0")
+    assert told(auto=4.0, cpu=6.0) == ("2", "5.0")
+    assert told(cuda=1.0) == ("1", "GPU")
 
 
 def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
