@@ -1,8 +1,4 @@
-"""Writes the tables of docs/results/hit_dvae.md from evaluations.
-
-The page says how the runs were fitted and scored, each by `dvae evaluate RUN --out NAME.json` on the same windows; the
-full method's long forecasts are measured here.
-"""
+"""Writes the table of long forecasts of docs/results/hit_dvae.md, of a run fitted on poses."""
 
 from pathlib import Path
 
@@ -11,11 +7,7 @@ import tyro
 
 import dvae
 
-from .pages import DOCS, differences, joined, scores, table, write
-
-QUALITY = ("ACC content", "FID content", "FID style", "APD", "energy score", "pose NLL", "bone-length error", "ELBO")
-BEST = ("ADE", "FDE", "MMADE", "MMFDE")
-ERRORS = (*BEST, *(f"{name}m" for name in BEST))
+from .pages import DOCS, table, write
 
 
 @torch.no_grad()
@@ -63,24 +55,19 @@ def long_run(path: Path, count: int, seconds: float) -> str:
 
 def main(
     run: tyro.conf.Positional[Path],
-    files: tyro.conf.Positional[tuple[Path, ...]],
-    page: Path = DOCS / "results" / "hit_dvae.md",
+    page: Path | None = DOCS / "results" / "hit_dvae.md",
     count: int = 200,
     seconds: float = 10.0,
 ) -> None:
-    """Write the tables.
+    """Write the table.
 
     Args:
-        run: the directory of the full method's.
-        files: what `dvae evaluate RUN --out` wrote, of that run first.
-        page: where.
+        run: a run directory.
+        page: where; with None it is printed.
         count: windows from which forecasts run on.
         seconds: for so long.
     """
-    evaluation, first = joined(files)
-    compared = differences(evaluation, first, (*QUALITY[:4], *ERRORS))
-    forecasts = long_run(run, count, seconds)
-    write(page, scores(evaluation, QUALITY), scores(evaluation, ERRORS), compared, forecasts)
+    write(page, long_run(run, count, seconds), name="long forecasts")
 
 
 if __name__ == "__main__":

@@ -170,7 +170,11 @@ PAPERS = {
             **{row: FUTURES[row] for row in ("gsps", "dlow", "srnn")},
         },
         (("ACC content", "FID content", "APD", "energy score", *REAL), ERRORS),
-        [*((name, "1,200 steps") for name in WITHOUT), *((name, HIT) for name in ("gsps", "dlow", "srnn"))],
+        [
+            *((name, "1,200 steps") for name in WITHOUT),
+            ("no copies, no attention", "no copies"),
+            *((name, HIT) for name in ("1,200 steps", "neither", "gsps", "dlow", "srnn")),
+        ],
         ("ACC content", "FID content", "APD", "energy score", "ADE", "FDE", "MMADE", "ADEm"),
         printed(
             "ACC content,FID content,APD,ADE,FDE,MMADE,MMFDE,ADEm,FDEm,MMADEm,MMFDEm",

@@ -199,8 +199,10 @@ def test_bones(folder, page):
 
 def test_hit_dvae(folder, page):
     run = fitted(folder, "hit-dvae", "hit-dvae", "--pose-prior", "0")
-    hit_dvae.main(run, (evaluated(folder, "full", runs=[run]),), page, count=2, seconds=2.0)
-    *_, seconds = tables(page)
+    page.write_text(page.read_text().replace("tables", "long forecasts"))
+    hit_dvae.main(run, page, count=2, seconds=2.0)
+    page.write_text(page.read_text().replace("long forecasts", "tables"))
+    (seconds,) = tables(page)
     assert [row[0] for row in seconds[1:]] == ["1", "2"]
 
 
