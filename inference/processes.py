@@ -153,7 +153,8 @@ def _check(training: Training) -> None:
     there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     there["gpu"] = any(there.values())
     if not there.get(accelerator, True):
-        raise ValueError(f"accelerator is {accelerator!r}, and torch {torch.__version__} finds none here; leave it out")
+        found = f"torch {torch.__version__} finds none here"
+        raise ValueError(f"accelerator is {accelerator!r}, and {found}; 'auto' takes what there is")
     if devices > 1 and not by_torchrun() and sys.argv[0] in ("", "-", "-c"):
         raise ValueError(f"devices={devices} starts the program as often, and this one is in no file; write it to one")
 

@@ -175,7 +175,7 @@ PAPERS = {
             ("no copies, no attention", "no copies"),
             *((name, HIT) for name in ("1,200 steps", "neither", "gsps", "dlow", "srnn")),
         ],
-        ("ACC content", "FID content", "APD", "energy score", "ADE", "FDE", "MMADE", "ADEm"),
+        ("ACC content", "FID content", "APD", "APDE", "energy score", *ERRORS[:4], "ADEm", "limb jitter"),
         printed(
             "ACC content,FID content,APD,ADE,FDE,MMADE,MMFDE,ADEm,FDEm,MMADEm,MMFDEm",
             """
@@ -483,7 +483,7 @@ def main(
     seeds: tuple[int, ...] = (0, 1, 2),
     samples: int = 50,
     stored: Path = SCORES,
-    accelerator: Accelerator = "auto",
+    accelerator: Accelerator = "cpu",
     pages: Path | None = None,
     pictures: Path = DOCS / "img",
 ) -> None:

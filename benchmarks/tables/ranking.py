@@ -39,7 +39,7 @@ from dvae.runs.sweep import sweep
 from .pages import DOCS, refuse_unknown, same, table, write
 
 SCORES = Path(__file__).parents[1] / "scores"
-Accelerator = Literal["auto", "cpu", "cuda"]
+Accelerator = Literal["cpu", "cuda"]
 
 FUTURES: dict[str, dict[str, Any]] = {
     "hit-dvae": {},
@@ -261,7 +261,7 @@ def fit(
     seed: int,
     runs: Path,
     prior: Path | None,
-    accelerator: str = "auto",
+    accelerator: Accelerator = "cpu",
 ) -> Path:
     """The run directory of a method, fitted once; second stages stand on the first of the same seed.
 
@@ -304,7 +304,7 @@ def work(
     views: Mapping[str, Sequence[View]],
     seeds: Sequence[int],
     samples: int,
-    accelerator: Accelerator = "auto",
+    accelerator: Accelerator = "cpu",
 ) -> None:
     """Fits and scores what is not there yet, seed by seed, so that every method has one before any has two.
 
@@ -328,8 +328,7 @@ def work(
             data, by = grouped(opened), fitted_judges(opened, stored / name, view.judges.split("+"))
         elif view.observed:  # a pose prior reads windows turned at the last frame that its own protocol observes
             by = {judge: run for judge, run in judged.items() if judge != "prior"}
-        device = "cuda" if accelerator == "cuda" else "cpu"
-        models = {} if path is None else {row: load(path).model.to(device)}
+        models = {} if path is None else {row: load(path).model.to(accelerator)}
         known: dict[str, Any] = {"training_windows": view.windows(data, "train+validation")}
         options = {"references": False} if models else known
         windows, told = view.windows(data, "test"), view.evaluate(samples)
@@ -391,7 +390,7 @@ def kept(path: Path, name: str, view: View) -> Path:
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of a ranking: the scores of its seeds, and the minutes of processor time that each fit took."""
+    """A row of a ranking: the scores of its seeds, and the minutes that each fit took of a processor, a GPU's too."""
 
     seeds: Sequence[Scored]
     minutes: Sequence[float]
@@ -533,7 +532,7 @@ def main(
     seeds: tuple[int, ...] = (0, 1, 2),
     samples: int = 50,
     scores: Path = SCORES,
-    accelerator: Accelerator = "auto",
+    accelerator: Accelerator = "cpu",
     page: Path | None = None,
     picture: Path = DOCS / "img" / "ranking.png",
 ) -> None:
@@ -547,7 +546,7 @@ def main(
         seeds: of every method.
         samples: futures of a window.
         scores: the folder of scores and judges; in another than the project's own, all is fitted anew.
-        accelerator: on which to train and to forecast; minutes are told of runs that were not told to be on a GPU.
+        accelerator: on which to train and to forecast; runs on a GPU tell no minutes.
         page: whose tables; without one they are printed.
         picture: of all sets that tell no paths, drawn with a page.
     """

@@ -220,6 +220,7 @@ def resume(
     steps: int | None = None,
     learning_rate: float | None = None,
     compile: bool | None = None,
+    accelerator: Literal["auto", "cpu", "gpu", "cuda", "mps"] | None = None,
     tensorboard: bool = False,
 ) -> None:
     """Continue a run from its last checkpoint.
@@ -232,9 +233,10 @@ def resume(
         steps: optimiser steps in all, to make the run longer.
         learning_rate: step size of the optimiser from here on.
         compile: whether inner functions are compiled from here on, such as not where there is no compiler.
+        accelerator: where it goes on, such as on a processor after a GPU.
         tensorboard: write TensorBoard files to the run directory too.
     """
-    given = {"steps": steps, "learning_rate": learning_rate, "compile": compile}
+    given = {"steps": steps, "learning_rate": learning_rate, "compile": compile, "accelerator": accelerator}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     with arguments():
         Training(**options)

@@ -1,7 +1,7 @@
 """torch's recurrent networks, with a gradient in evaluation mode on a GPU too.
 
-cuDNN keeps what the gradient is made of in training alone, which without dropout, as here, means nothing else; latents
-are sampled, and control and completion descend, in evaluation.
+cuDNN keeps what the gradient is made of in training alone, and latents are sampled, and control and completion descend,
+in evaluation. The mode changes nothing else where there is no dropout, which is refused.
 """
 
 from __future__ import annotations
@@ -14,6 +14,13 @@ from typing_extensions import override
 
 
 class _Differentiable(nn.RNNBase):
+    """In training, for cuDNN, wherever gradients are recorded."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        if self.dropout:
+            raise ValueError(f"dropout is {self.dropout}; a recurrent network here has none, as evaluation would, too")
+
     @override
     def forward(self, *args: Any) -> Any:
         mode, self.training = self.training, torch.is_grad_enabled()
@@ -24,12 +31,12 @@ class _Differentiable(nn.RNNBase):
 
 
 class GRU(_Differentiable, nn.GRU):
-    """`torch.nn.GRU`, of no dropout."""
+    """`torch.nn.GRU`, without dropout."""
 
 
 class LSTM(_Differentiable, nn.LSTM):
-    """`torch.nn.LSTM`, of no dropout."""
+    """`torch.nn.LSTM`, without dropout."""
 
 
 class RNN(_Differentiable, nn.RNN):
-    """`torch.nn.RNN`, of no dropout."""
+    """`torch.nn.RNN`, without dropout."""

@@ -28,7 +28,7 @@ class Groups:
 
     Args:
         place: (B,), the group of every sequence, from 0.
-        first: (G,), a sequence of every group.
+        first: (G,), the first sequence of every group.
         count: (B,), how many sequences the group of each one has.
     """
 
@@ -47,6 +47,7 @@ class Groups:
             raise ValueError(f"{GROUP} is {index.dtype} {tuple(index.shape)}; expected whole numbers (B,)")
         _, place, count = torch.unique(index, return_inverse=True, return_counts=True)
         rows = torch.arange(len(place), device=place.device)
+        # by the least row: of several writes to one place a GPU leaves open which is the last
         first = rows.new_full((len(count),), len(place)).scatter_reduce(0, place, rows, "amin")
         return cls(place, first, count[place])
 

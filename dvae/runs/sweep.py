@@ -278,7 +278,8 @@ def _fit(run: _Run) -> tuple[Outcome, list[str]]:
         try:
             leased.check()
             if Run(run.path).exists:
-                ended = resume(run.path, run.source, callbacks=[leased], progress=False)
+                where = run.training.accelerator
+                ended = resume(run.path, run.source, callbacks=[leased], progress=False, accelerator=where)
             else:
                 training = replace(run.training, progress=False)
                 ended = fit_run(run.method, run.data, run.path, training, callbacks=[leased])
@@ -418,8 +419,9 @@ def _left(run: _Run) -> Fit:
 
 
 def _options(method: Trainable, schema: Schema, training: Training, fingerprint: str) -> dict[str, Any]:
-    """All that makes a run what it is, by what to call it. The method tells the self-feeding of the training."""
-    told = {name: value for name, value in vars(training).items() if name not in ("self_feeding", "progress")}
+    """All that makes a run what it is, wherever it is made. The method tells the self-feeding of the training."""
+    apart = ("self_feeding", "progress", "accelerator")
+    told = {name: value for name, value in vars(training).items() if name not in apart}
     return {**method.config(), **told, **dict(flat(schema.config(), "data's ")), "data's fingerprint": fingerprint}
 
 

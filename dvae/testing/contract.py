@@ -227,21 +227,11 @@ class FactorizationContract:
             assert all(torch.equal(value, expected[name]) for name, value in run(other).items())
 
     def test_a_bound_stays_on_its_device(self) -> None:
-        """On a GPU that is only said to be one, and on one that is, it is the processor's.
-
-        Nothing is brought there anew.
-        """
+        """On a GPU that is only said to be one it is the processor's, and nothing is brought there anew."""
         model = self._model()
         data = self._data(model)
         torch.manual_seed(1)
         expected = SequenceELBO().terms(model, data).bound
-        if torch.cuda.is_available():
-            real = {name: value.to("cuda") for name, value in data.items()}
-            with SameNoise():
-                torch.manual_seed(1)
-                found = SequenceELBO().terms(copy.deepcopy(model).to("cuda"), real).bound
-                found.sum().backward()
-            self._close({"bound": found.detach().cpu()}, {"bound": expected})
         with on_device() as traffic:
             move(model)
             there = {name: value.to("cuda") for name, value in data.items()}
@@ -256,6 +246,22 @@ class FactorizationContract:
             past = {name: v[:, :-1] if name in model.observed and v.dim() == 3 else v for name, v in there.items()}
             model.forecast(past, 1)
             self._close({"bound": bound.detach().cpu()}, {"bound": expected})
+
+    @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU is here")
+    def test_a_bound_on_a_gpu_is_the_processors(self) -> None:
+        """With the same noise, and so is its gradient."""
+        model = self._model()
+        data = self._data(model)
+        found: list[dict[str, Tensor]] = []
+        for each, device in ((model, "cpu"), (copy.deepcopy(model).to("cuda"), "cuda")):
+            there = {name: value.to(device) for name, value in data.items()}
+            with SameNoise():
+                torch.manual_seed(1)
+                bound = SequenceELBO().terms(each, there).bound.sum()
+                slopes = torch.autograd.grad(bound, list(each.parameters()), allow_unused=True, materialize_grads=True)
+            slope = torch.cat([each.flatten().cpu() for each in slopes])
+            found.append({"bound": bound.detach().cpu(), "its gradient": slope})
+        self._close(found[1], found[0])
 
     def test_the_audit_says_what_is_published(self) -> None:
         """The guide misses `missing` of the exact posterior's dependencies, and nothing else."""

@@ -223,15 +223,19 @@ def on_device() -> Iterator[Traffic]:
 
 
 class SameNoise(TorchDispatchMode):
-    """Within it, random numbers of a GPU are drawn on the processor, by its seed, and brought there."""
+    """Within it, random numbers of a GPU are drawn on the processor, by its seed, and brought there.
+
+    A generator of the GPU is refused, and what is drawn into `out=` is not brought.
+    """
 
     @override
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         device = next((value.device for value in _tensors((*args, *kwargs.values()))), None)
         device = torch.device(kwargs.get("device") or device or "cpu")
-        elsewhere = func.overloadpacket is aten._cudnn_rnn  # whose dropout has a state of its own
-        if torch.Tag.nondeterministic_seeded not in func.tags or device.type == "cpu" or elsewhere:
+        # cuDNN's networks and fused attention have the tag for their dropout, and no kernel here
+        here = torch._C._dispatch_has_computed_kernel_for_dispatch_key(func.name(), "CPU")
+        if torch.Tag.nondeterministic_seeded not in func.tags or device.type == "cpu" or not here:
             return func(*args, **kwargs)
         if "device" in kwargs:
             kwargs["device"] = torch.device("cpu")

@@ -200,7 +200,9 @@ def test_streams_are_of_one_process_of_one_seed():
 
 def test_what_cannot_be_started_is_told(monkeypatch):
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    with pytest.raises(ValueError, match=r"accelerator is 'mps', and torch \S+ finds none here; leave it out"):
+    with pytest.raises(
+        ValueError, match=r"accelerator is 'mps', and torch \S+ finds none here; 'auto' takes what there is"
+    ):
         processes.launched(Training(accelerator="mps"))
     monkeypatch.setattr("sys.argv", ["-c"])
     with pytest.raises(ValueError, match="devices=2 starts the program as often, and this one is in no file"):

@@ -124,19 +124,18 @@ def test_a_method_stays_on_its_device_and_a_step_waits_for_it_as_often_as_is_sai
         places = [read.partition(":")[0] for read in traffic.reads]
         assert {place: places.count(place) for place in places} == STEP | BESIDE.get(name, {}), traffic.reads
         assert len(traffic.uploads) == tensors + BROUGHT.get(name, 0), traffic.uploads
-        judge(svi, train, test)
-        same(found, expected)
+        validate_and_score(svi, train, test)
+        assert_same(found, expected)
 
 
-def judge(svi, train, test):
-    """Validation, forecasts and scores."""
+def validate_and_score(svi, train, test):
     svi.evaluate(train.sample(3, torch.Generator()))
     if test is not None:
         options = {"scores": motion.displacements, "samples": 2, "references": False, "progress": False}
         dvae.evaluate(svi.model, test, batch_size=500, bound_particles=2 * svi.model.likelihood, **options)
 
 
-def same(found, expected):
+def assert_same(found, expected):
     """The terms of steps there and here."""
     for there, here in zip(found, expected, strict=True):
         got = {key: value.cpu() for key, value in numbers(there).items()}
@@ -152,8 +151,8 @@ def test_a_gpu_does_what_the_processor_does(name, trained):
     model, recipe, train, test = trained(name)
     with SameNoise():
         found, _, svi = two_steps(model.double(), recipe, accelerator="cuda")
-    judge(svi, train, test)
-    same(found, expected)
+    validate_and_score(svi, train, test)
+    assert_same(found, expected)
 
 
 @on_gpu
