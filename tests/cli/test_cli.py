@@ -372,6 +372,16 @@ def test_a_longer_run_is_laid_out_anew(people, tmp_path):
     assert log(out)[-1]["learning_rate"] == pytest.approx(0.02 / 35)
 
 
+def test_a_run_of_a_gpu_goes_on_without_one(people, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    out = tmp_path / "run"
+    assert main(["fit", "vae", "--data", str(people), "--out", str(out), "--steps", "4", *SMALL]) == 0
+    config = out / "config.json"
+    config.write_text(config.read_text().replace('"accelerator": "auto"', '"accelerator": "cuda"'))
+    assert "'auto' takes what there is" in failure(capsys, "resume", str(out), "--steps", "5")
+    assert main(["resume", str(out), "--steps", "5", "--accelerator", "auto"]) == 0
+
+
 def test_tensorboard_files_lie_in_the_run(people, tmp_path):
     out = tmp_path / "run"
     assert main(["fit", "vae", "--data", str(people), "--out", str(out), "--steps", "4", *SMALL, "--tensorboard"]) == 0
