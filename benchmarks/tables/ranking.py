@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
+import torch
 import tyro
 from matplotlib.figure import Figure
 from torch import nn
@@ -319,6 +320,8 @@ def work(
         samples: futures of a window.
         accelerator: on which to train and to forecast.
     """
+    if accelerator == "cuda" and not torch.cuda.is_available():
+        sys.exit(f"torch {torch.__version__} finds no GPU; leave the accelerator out, or take a machine with one")
     opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[name])
     judged = fitted_judges(opened, stored / name, SETS[name].judges)
 

@@ -453,6 +453,9 @@ def test_ranking(folder, page, monkeypatch):
     runs, scores = folder / "ranked", folder / "scores"
     picture = folder / "ranking.png"
     options = {"scores": scores, "page": page, "picture": picture, "samples": 2, "sets": ("simulated",)}
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SystemExit, match="finds no GPU; leave the accelerator out"):
+        ranking.main(runs, folder, accelerator="cuda", **options)
     ranking.main(runs, folder, seeds=(0,), accelerator="cpu", **options)
     ranking.main(runs, folder, seeds=(0, 1), methods=("srnn",), **options)
     before = {file: file.stat().st_mtime_ns for file in scores.rglob("*.json.gz")}
