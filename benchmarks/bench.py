@@ -29,7 +29,7 @@ import tyro
 
 import dvae
 
-from .tables.pages import DOCS, refuse_unknown, table, write
+from .tables.pages import DOCS, refuse_unknown, require_gpu, table, write
 
 HERE = Path(__file__).parent
 HISTORY = HERE / "history.json"
@@ -232,9 +232,8 @@ def main(
         keep: whether they join the history, as those of this version, and its page.
     """
     refuse_unknown("benchmark", names, NAMES)
-    if device == "cuda" and not torch.cuda.is_available():
-        built = "" if torch.version.cuda else ", as it is built without CUDA"
-        sys.exit(f"torch {torch.__version__} finds no GPU{built}; leave the device out, or take a machine with one")
+    if device == "cuda":
+        require_gpu("device")
     if threads < 1:
         sys.exit(f"threads is {threads}, expected 1 or more")
     if not out.parent.is_dir():

@@ -9,6 +9,8 @@ from ..options import Amount, Count, Range, Share, check, nearest
 from .objectives import Evidence, Objective
 from .schedules import Piecewise, Schedule, clamp, levels, schedule, to_config
 
+Accelerator = Literal["auto", "cpu", "gpu", "cuda", "mps"]
+
 
 @dataclass(frozen=True)
 class Training:
@@ -62,7 +64,7 @@ class Training:
     patience: Count | None = None
     log_every: Count = 10
     seed: int = 0
-    accelerator: Literal["auto", "cpu", "gpu", "cuda", "mps"] = "auto"
+    accelerator: Accelerator = "auto"
     devices: Annotated[int, Range(1, 32)] = 1
     precision: Literal["32-true", "64-true", "bf16-mixed", "bf16-true"] = "32-true"
     compile: bool = False

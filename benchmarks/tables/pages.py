@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 import dvae
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -40,6 +42,13 @@ def refuse_unknown(what: str, names: Iterable[str], known: Iterable[str]) -> Non
     for name in names:
         if name not in known:
             sys.exit(f"unknown {what} {name!r}; known: {', '.join(known)}")
+
+
+def require_gpu(option: str) -> None:
+    """Ends the script where an option asks for a GPU and there is none."""
+    if not torch.cuda.is_available():
+        built = "" if torch.version.cuda else ", as it is built without CUDA"
+        sys.exit(f"torch {torch.__version__} finds no GPU{built}; leave the {option} out, or take a machine with one")
 
 
 def joined(files: Sequence[Path]) -> tuple[dvae.Evaluation, str]:

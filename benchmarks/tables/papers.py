@@ -400,10 +400,10 @@ def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[st
     what = "given" if views[0].given is not None else "observed" if views[0].observed else ""
     for row in dict.fromkeys(row for each in found.values() for row in each):
         seen = [view for view in views if row in found[view]]
-        for view in seen[:1] if what == "given" and not found[seen[0]][row].minutes else seen:
+        for view in seen[:1] if what == "given" and not found[seen[0]][row].fitted else seen:
             entry = found[view][row]
             means = [None if crossed is None else crossed.estimate() for crossed in map(entry.crossed, columns)]
-            told = [str(vars(view)[what]) if entry.minutes or what != "given" else ""] if what else []
+            told = [str(vars(view)[what]) if entry.fitted or what != "given" else ""] if what else []
             lines.append([titled(row, entry), *told, *trained(entry), *map(cell, means)])
     for row, cells in beside.items():
         if all(cells.get(column, "–") == "–" for column in columns):

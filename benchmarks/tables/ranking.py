@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
-import torch
 import tyro
 from matplotlib.figure import Figure
 from torch import nn
@@ -37,7 +36,7 @@ from dvae.motion.parts import UNIONS, body_parts
 from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
-from .pages import DOCS, refuse_unknown, same, table, write
+from .pages import DOCS, refuse_unknown, require_gpu, same, table, write
 
 SCORES = Path(__file__).parents[1] / "scores"
 Accelerator = Literal["cpu", "cuda"]
@@ -320,8 +319,8 @@ def work(
         samples: futures of a window.
         accelerator: on which to train and to forecast.
     """
-    if accelerator == "cuda" and not torch.cuda.is_available():
-        sys.exit(f"torch {torch.__version__} finds no GPU; leave the accelerator out, or take a machine with one")
+    if accelerator == "cuda":
+        require_gpu("accelerator")
     opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[name])
     judged = fitted_judges(opened, stored / name, SETS[name].judges)
 
@@ -393,10 +392,14 @@ def kept(path: Path, name: str, view: View) -> Path:
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of a ranking: the scores of its seeds, and the minutes that each fit took of a processor, a GPU's too."""
+    """A row of a ranking: the scores of its seeds."""
 
     seeds: Sequence[Scored]
-    minutes: Sequence[float]
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there were runs; a reference is not trained."""
+        return bool(self.seeds[0].config)
 
     def means(self, metric: str) -> np.ndarray | None:
         """(S, C), by seed and clip, where all have the score."""
@@ -416,8 +419,8 @@ class Entry:
         means, weights = means - others, np.array([*self.seeds[0].clips.values()])
         known = ~np.isnan(means).any(0)
         crossed = Crossed.of(means[:, known], weights[known])
-        # a reference is not trained: no seed of it differs from another
-        return crossed if self.minutes else replace(crossed, seeds=0.0, rest=0.0, count=sys.maxsize)
+        # no seed of a reference differs from another
+        return crossed if self.fitted else replace(crossed, seeds=0.0, rest=0.0, count=sys.maxsize)
 
 
 def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict[str, Entry]:
@@ -431,14 +434,14 @@ def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict
     if file.exists():
         references = Scored.load(file)
         basis = references.basis
-        found = {row: Entry([replace(references, rows={row: value})], []) for row, value in references.rows.items()}
+        found = {row: Entry([replace(references, rows={row: value})]) for row, value in references.rows.items()}
     for row in methods:
         files = sorted((stored / name).glob(str(kept(Path(), f"{folder(row)}-seed*", view))))
         if scored := [Scored.load(file) for file in files]:
             basis = basis or scored[0].basis
             if any(alike(each.basis) != alike(basis) for each in scored):
                 raise ValueError(f"scores of {row} in {stored / name} are of other windows, samples, seed or judges")
-            found[row] = Entry(scored, [each.minutes for each in scored])
+            found[row] = Entry(scored)
     return found
 
 
@@ -471,7 +474,7 @@ TRAINED = ("seeds", "CPU minutes")
 
 def trained(entry: Entry) -> tuple[str, str]:
     """How many seeds were trained, and how long each took of those that were trained on a processor."""
-    if not entry.minutes:
+    if not entry.fitted:
         return "–", "–"
     here = [each.minutes for each in entry.seeds if each.config["training"]["accelerator"] != "cuda"]
     return str(len(entry.seeds)), f"{statistics.fmean(here):.1f}" if here else "GPU"
@@ -499,7 +502,7 @@ def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
         means = [None if crossed is None else crossed.estimate() for crossed in map(own.crossed, columns)]
         lines.append([titled(name, own), *trained(own), *map(cell, [*behind, *means])])
     known = {name: score for name, score in scores.items() if score.count >= ENOUGH}
-    if not any(found[name].minutes for name in known):
+    if not any(found[name].fitted for name in known):
         return table(header, lines)
     best = f"May be the best, at {100 * LEVEL:.0f} % over clips and seeds, of rows with {ENOUGH} seeds or more"
     return f"{table(header, lines)}\n{best}: {', '.join(confidence_set(known, level=LEVEL).members)}.\n"

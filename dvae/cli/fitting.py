@@ -20,7 +20,7 @@ from ..inference.processes import restartable
 from ..inference.recipe import Trainable
 from ..inference.schedules import Schedule
 from ..inference.trackers import TensorBoard
-from ..inference.training import Training
+from ..inference.training import Accelerator, Training
 from ..models import registry
 from ..models.method import LatentMethod
 from ..models.registry import judges, methods
@@ -220,7 +220,7 @@ def resume(
     steps: int | None = None,
     learning_rate: float | None = None,
     compile: bool | None = None,
-    accelerator: Literal["auto", "cpu", "gpu", "cuda", "mps"] | None = None,
+    accelerator: Accelerator | None = None,
     tensorboard: bool = False,
 ) -> None:
     """Continue a run from its last checkpoint.
