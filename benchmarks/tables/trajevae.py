@@ -1,112 +1,81 @@
-"""Writes the tables of docs/results/trajevae.md from evaluations.
+"""Writes the table of exact paths of docs/results/trajevae.md, of a run: test windows from their own paths."""
 
-The page says how the runs were fitted, and scored together: `dvae evaluate RUN ... --joints ... --out FILE` for each
-number of given joints, for motion at the prior's mean as well, and from other windows' poses. A file is known by what
-it holds, whatever its name.
-"""
+from __future__ import annotations
 
-import sys
-from collections import defaultdict
+import time
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import torch
 import tyro
 
 import dvae
+from dvae.inference.estimates import Crossed
+from dvae.inference.held import clip_places
 
 from .pages import DOCS, table, write
+from .ranking import JOINTS
 
-METRICS = ("APD", "ADE", "FDE", "MMADE", "MMFDE", "path error", "global ADE", "bone-length error")
-SINGLE = ("ADE", "FDE", "path error", "global ADE")
-STEPS = (
-    ("+ learned prior", "in-time", "standard-prior"),
-    ("+ cosine transform", "whole-poses", "in-time"),
-    ("+ masked poses", "full", "whole-poses"),
-    ("over CVAE-RNN", "full", "cvae-rnn"),
-)
-"""What is compared: a change, and the runs with it and without it."""
-
-Counts = dict[int, dvae.Evaluation]
+METRICS = {
+    "path error, m": ".3f",
+    "within 1 cm": ".1%",
+    "bone-length error": ".1%",
+    "bones within 10 %": ".1%",
+    "corrected by, m": ".3f",
+}
 
 
-def read(files: Sequence[Path]) -> tuple[Counts, Counts, Counts]:
-    """Number of given joints to the evaluation: of draws, of means and from other windows' poses."""
-    groups: dict[str, Counts] = defaultdict(dict)
-    for file in files:
-        found = dvae.Evaluation.load(file)
-        kind = "exchanged" if found.data.get("exchanged") else "means" if found.options else "draws"
-        groups[kind][len(found.data.get("given", []))] = found
-    for kind, each in groups.items():
-        same = {
-            (kind == "exchanged" or str(e.clips), str((e.protocol, e.samples, e.seed, e.options)))
-            for e in each.values()
-        }
-        if len(same) > 1:
-            sys.exit(f"evaluations of {kind} differ in clips, protocol, samples, seed or options")
-    draws, means, exchanged = (dict(sorted(groups[kind].items())) for kind in ("draws", "means", "exchanged"))
-    return draws, means, exchanged
+def figures(made: Any, true: np.ndarray) -> dict[str, float]:
+    """Means over motions (S, T, J, 3), frames, and joints or bones, which should have these lengths."""
+    off, bones = np.stack([*made.errors.values()]), np.abs(made.skeleton.bone_lengths(made.positions) / true - 1)
+    moved = 0.0 if made.corrections is None else made.corrections.mean()
+    return dict(zip(METRICS, (off.mean(), (off < 0.01).mean(), bones.mean(), (bones < 0.1).mean(), moved), strict=True))
 
 
-def fitted(evaluation: dvae.Evaluation) -> list[str]:
-    """Names of the rows that are runs."""
-    return [name for name, row in evaluation.rows.items() if row.config]
-
-
-def scores(found: Counts, metrics: Sequence[str], references: bool = True) -> str:
-    """Runs and numbers of given joints down, metrics across; references, which know no paths, once."""
+def exact_paths(path: Path, joints: Sequence[str], count: int, samples: int) -> str:
+    """By the number of given joints, and whether motions are to be exact; ± one standard error over clips."""
+    run = dvae.load(path)
+    windows = run.data.windows("test")
+    chosen = torch.linspace(0, len(windows) - 1, count).long()
+    motions = windows.positions(windows.all()["x"])[chosen].numpy()
+    _, clips = np.unique(clip_places(windows.keys)[chosen].numpy(), return_inverse=True)
     rows = []
-    for name in {name: None for each in found.values() for name in each.rows}:
-        run = name in {n for each in found.values() for n in fitted(each)}
-        have = {count: each for count, each in found.items() if name in each.rows}
-        if run or references:
-            for count, each in list(have.items())[: None if run else 1]:
-                values = (str(each[name].get(metric, "–")) for metric in metrics)
-                rows.append([name, str(count) if run else "", *values])
-    return table(["", "given", *metrics], rows)
+    for number, exact in product(range(1, len(joints) + 1), (False, True)):
+        torch.manual_seed(0)
+        begun, found = time.perf_counter(), []
+        for motion in motions:
+            paths = {joint: motion[1:, windows.skeleton.find(joint)] for joint in joints[:number]}
+            made = run.model.complete(motion[0], paths, samples=samples, exact=exact)
+            found.append(figures(made, windows.skeleton.bone_lengths(motion[:1])))
+        spent = (time.perf_counter() - begun) / (count * samples)
+        cells = []
+        for name, unit in METRICS.items():
+            mean = Crossed.by_clip(np.array([[each[name] for each in found]]), np.ones(count), clips).estimate()
+            cells.append(f"{mean.mean:{unit}} ± {mean.sequences:{unit}}")
+        rows.append([", ".join(joints[:number]), "exact" if exact else "", *cells, f"{spent:.2f}"])
+    return table(["given", "", *METRICS, "seconds a motion"], rows)
 
 
-def more_joints(found: Counts, metrics: Sequence[str] = ("ADE", "APD")) -> str:
-    """What each further given joint changes, paired."""
-    counts = [(before, count) for before, count in zip(found, list(found)[1:], strict=False) if count == before + 1]
-    rows = []
-    for name in fitted(next(iter(found.values()))):
-        for metric in metrics:
-            cells = []
-            for before, count in counts:
-                more, fewer = found[count], found[before]
-                rows_of = {"more": more.rows[name], "fewer": fewer.rows[name]}
-                cells.append(str(dvae.Evaluation(**{**vars(more), "rows": rows_of}).difference(*rows_of, metric)))
-            rows.append([name, metric, *cells])
-    joints = [(set(found[c].data["given"]) - set(found[b].data["given"])).pop() for b, c in counts]
-    return table(["", "", *(f"{b} to {c}: {joint}" for (b, c), joint in zip(counts, joints, strict=True))], rows)
-
-
-def changes(found: Counts, metrics: Sequence[str] = ("ADE", "APD")) -> str:
-    """What each change does, paired, by the number of given joints."""
-    rows = [
-        [change, metric, *(str(each.difference(having, lacking, metric)) for each in found.values())]
-        for change, having, lacking in STEPS
-        for metric in metrics
-    ]
-    return table(["", "", *(f"{count} given" for count in found)], rows)
-
-
-def main(files: tyro.conf.Positional[tuple[Path, ...]], page: Path = DOCS / "results" / "trajevae.md") -> None:
-    """Write the tables.
+def main(
+    run: tyro.conf.Positional[Path],
+    page: Path | None = DOCS / "results" / "trajevae.md",
+    joints: tuple[str, ...] = JOINTS,
+    count: int = 40,
+    samples: int = 3,
+) -> None:
+    """Write the table.
 
     Args:
-        files: what `dvae evaluate --out` wrote.
-        page: where.
+        run: a run directory.
+        page: where; with None it is printed.
+        joints: whose paths are given, one more in each row.
+        count: windows, spread evenly over those of the test set.
+        samples: motions of each.
     """
-    draws, means, exchanged = read(files)
-    write(
-        page,
-        scores(draws, METRICS),
-        more_joints(draws),
-        changes(draws),
-        scores(means, SINGLE, references=False),
-        scores(exchanged, METRICS, references=False),
-    )
+    write(page, exact_paths(run, joints, count, samples), name="exact paths")
 
 
 if __name__ == "__main__":

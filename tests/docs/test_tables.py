@@ -412,23 +412,17 @@ def test_rotations(folder, page):
 
 
 def test_trajevae(folder, page):
-    paths = ("--protocol", "simulated-trajectories")
-    run = fitted(folder, "full", "trajevae", *paths)
-    runs = [run, fitted(folder, "cvae-rnn", "cvae-rnn", *paths)]
-    runs += [shutil.copytree(run, folder / name) for name in ("whole-poses", "in-time", "standard-prior")]
-    files = (
-        evaluated(folder, "1", "--joints", "RFoot", runs=runs),
-        evaluated(folder, "0", "--joints", runs=runs),
-        evaluated(folder, "mean-0", "--temperature", 0, runs=runs),
-        evaluated(folder, "exchanged-1", "--joints", "RFoot", "--exchange", 9.0, runs=runs),
-    )
-    trajevae.main(files, page)
-    draws, more, changes, means, exchanged = tables(page)
-    assert [row[1] for row in draws[1:] if row[0] == "full"] == ["0", "1"]
-    assert more[0][2:] == ["0 to 1: RFoot"]
-    assert {cell for row in changes[1:7] for cell in row[2:]} == {"0.000"}
-    assert {row[1] for row in means[1:]} == {"0"}
-    assert {row[1] for row in exchanged[1:]} == {"1"}
+    run = fitted(folder, "trajevae", "trajevae", "--protocol", "simulated-trajectories")
+    page.write_text(page.read_text().replace("tables", "exact paths"))
+    trajevae.main(run, page, joints=("RFoot", "LWrist"), count=2, samples=2)
+    page.write_text(page.read_text().replace("exact paths", "tables"))
+    ((header, *rows),) = tables(page)
+    assert [row[:2] for row in rows] == [[given, how] for given in ("RFoot", "RFoot, LWrist") for how in ("", "exact")]
+    number = lambda row, name: float(row[header.index(name)].split(" ± ")[0].rstrip("%"))  # noqa: E731
+    for free, exact in (rows[:2], rows[2:]):
+        assert number(free, "path error, m") > 0.01 > number(exact, "path error, m")
+        assert number(free, "within 1 cm") < number(exact, "within 1 cm") == 100
+        assert number(free, "corrected by, m") == 0 < number(exact, "corrected by, m")
 
 
 def test_occlusion(folder, page, monkeypatch):
