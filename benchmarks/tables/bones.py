@@ -5,6 +5,7 @@ its directory.
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import tyro
 import dvae
 from dvae import motion
 
-from .pages import DOCS, joined, scores, table, write
+from .pages import DOCS, same, table, write
 
 METRICS = ("bone-length error", "limb stretch", "limb jitter", "ADE", "FDE", "APD", "MMADE", "limb-angle error", "CMD")
 COMPARED = ("ADE", "FDE", "APD", "limb-angle error")
@@ -33,6 +34,18 @@ def evaluated(path: Path, every: int, samples: int) -> Path:
     return file
 
 
+def joined(files: Sequence[Path]) -> dvae.Evaluation:
+    """Evaluations of single runs on the same windows as one, named by their files, beside the first's references."""
+    found = {file.stem.replace("-", " "): dvae.Evaluation.load(file) for file in files}
+    first = next(iter(found.values()))
+    if any(same(each) != same(first) for each in found.values()):
+        sys.exit("these evaluations differ in windows, samples, seed, emission, multimodal threshold or judges")
+    rows = {name: row for name, row in first.rows.items() if not row.config}
+    for name, each in found.items():
+        (rows[name],) = (row for row in each.rows.values() if row.config)
+    return replace(first, rows=rows)
+
+
 def main(
     runs: tyro.conf.Positional[tuple[Path, ...]],
     page: Path = DOCS / "results" / "bones.md",
@@ -48,7 +61,7 @@ def main(
         samples: futures of each.
     """
     torch.set_num_threads(1)
-    evaluation, _ = joined([evaluated(path, every, samples) for path in runs])
+    evaluation = joined([evaluated(path, every, samples) for path in runs])
     names = [name for name, row in evaluation.rows.items() if row.config]
     bones = [bool(evaluation.rows[name].config["bones"]) for name in names]
     if not names or bones != [False, True] * (len(names) // 2):
@@ -62,7 +75,8 @@ def main(
         ]
         for theirs, ours in pairs
     ]
-    write(page, scores(evaluation, METRICS), table(["", *COMPARED, "ADE, relative"], rows))
+    scores = [[name, *(str(evaluation[name].get(metric, "–")) for metric in METRICS)] for name in evaluation.rows]
+    write(page, table(["", *METRICS], scores), table(["", *COMPARED, "ADE, relative"], rows))
 
 
 if __name__ == "__main__":

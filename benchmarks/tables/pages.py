@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -51,40 +50,7 @@ def require_gpu(option: str) -> None:
         sys.exit(f"torch {torch.__version__} finds no GPU{built}; leave the {option} out, or take a machine with one")
 
 
-def joined(files: Sequence[Path]) -> tuple[dvae.Evaluation, str]:
-    """Evaluations of single runs on the same windows as one, named by their files, beside the first's references.
-
-    And the name of the first run.
-    """
-    found = {file.stem.replace("-", " "): dvae.Evaluation.load(file) for file in files}
-    first = next(iter(found.values()))
-    if any(same(each) != same(first) for each in found.values()):
-        sys.exit("these evaluations differ in windows, samples, seed, emission, multimodal threshold or judges")
-    rows = {name: row for name, row in first.rows.items() if not row.config}
-    for name, each in found.items():
-        (rows[name],) = (row for row in each.rows.values() if row.config)
-    metrics = {name: metric for each in found.values() for name, metric in each.metrics.items()}
-    return replace(first, rows=rows, metrics=metrics), next(iter(found))
-
-
 def same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
     """What evaluations have in common whose scores stand in one table."""
     drawn = evaluation.samples, evaluation.seed, evaluation.emission, evaluation.bound_particles
     return evaluation.data, *drawn, evaluation.basis
-
-
-def scores(evaluation: dvae.Evaluation, metrics: Sequence[str]) -> str:
-    """Methods down, metrics across."""
-    rows = [[name, *(str(evaluation[name].get(metric, "–")) for metric in metrics)] for name in evaluation.rows]
-    return table(["", *metrics], rows)
-
-
-def differences(evaluation: dvae.Evaluation, first: str, metrics: Sequence[str]) -> str:
-    """What each other row of several samples has more than the first, paired."""
-
-    def cell(name: str, metric: str) -> str:
-        both = metric in evaluation[name] and metric in evaluation[first]
-        return str(evaluation.difference(name, first, metric)) if both else "–"
-
-    others = [name for name, row in evaluation.rows.items() if name != first and row.samples > 1]
-    return table([f"minus {first}", *metrics], [[name, *(cell(name, m) for m in metrics)] for name in others])

@@ -305,7 +305,7 @@ PAPERS = {
         },
         (("APD", "energy score", *ERRORS[:4], "path error", "global ADE", *REAL[:4]),),
         [("6,000 steps", WHOLE), (WHOLE, TIME), (TIME, STANDARD), (FULL, "cvae-rnn")],
-        ("ADE", "FDE", "energy score", "APD"),
+        ("ADE", "FDE", "MMFDE", "path error", "global ADE", "energy score", "APD"),
         printed(
             "APD,ADE,FDE,MMADE,MMFDE",
             """

@@ -1,4 +1,4 @@
-"""Writes the table of exact paths of docs/results/trajevae.md, of a run: test windows from their own paths."""
+"""Writes the table of exact paths of docs/results/trajevae.md: motions of a run along the paths of test windows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import time
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ import tyro
 import dvae
 from dvae.inference.estimates import Crossed
 from dvae.inference.held import clip_places
+from dvae.models.trajectories import Completion
 
 from .pages import DOCS, table, write
 from .ranking import JOINTS
@@ -26,36 +26,39 @@ METRICS = {
     "bones within 10 %": ".1%",
     "corrected by, m": ".3f",
 }
+"""What is told of motions, and how it is printed."""
 
 
-def figures(made: Any, true: np.ndarray) -> dict[str, float]:
-    """Means over motions (S, T, J, 3), frames, and joints or bones, which should have these lengths."""
+def figures(made: Completion, true: np.ndarray) -> tuple[float, ...]:
+    """Of motions whose bones should have these lengths: means over motions, frames, and joints or bones."""
     off, bones = np.stack([*made.errors.values()]), np.abs(made.skeleton.bone_lengths(made.positions) / true - 1)
-    moved = 0.0 if made.corrections is None else made.corrections.mean()
-    return dict(zip(METRICS, (off.mean(), (off < 0.01).mean(), bones.mean(), (bones < 0.1).mean(), moved), strict=True))
+    moved = np.nan if made.corrections is None else made.corrections.mean()
+    return off.mean(), (off < 0.01).mean(), bones.mean(), (bones < 0.1).mean(), moved
 
 
-def exact_paths(path: Path, joints: Sequence[str], count: int, samples: int) -> str:
+def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -> str:
     """By the number of given joints, and whether motions are to be exact; ± one standard error over clips."""
-    run = dvae.load(path)
+    run = dvae.load(folder)
     windows = run.data.windows("test")
-    chosen = torch.linspace(0, len(windows) - 1, count).long()
-    motions = windows.positions(windows.all()["x"])[chosen].numpy()
+    chosen = torch.linspace(0, len(windows) - 1, min(count, len(windows))).long()
+    motions = windows.positions(windows.all()["x"][chosen]).numpy()
     _, clips = np.unique(clip_places(windows.keys)[chosen].numpy(), return_inverse=True)
     rows = []
     for number, exact in product(range(1, len(joints) + 1), (False, True)):
         torch.manual_seed(0)
-        begun, found = time.perf_counter(), []
+        found = []
+        begun = time.perf_counter()
         for motion in motions:
             paths = {joint: motion[1:, windows.skeleton.find(joint)] for joint in joints[:number]}
             made = run.model.complete(motion[0], paths, samples=samples, exact=exact)
             found.append(figures(made, windows.skeleton.bone_lengths(motion[:1])))
-        spent = (time.perf_counter() - begun) / (count * samples)
-        cells = []
-        for name, unit in METRICS.items():
-            mean = Crossed.by_clip(np.array([[each[name] for each in found]]), np.ones(count), clips).estimate()
-            cells.append(f"{mean.mean:{unit}} ± {mean.sequences:{unit}}")
-        rows.append([", ".join(joints[:number]), "exact" if exact else "", *cells, f"{spent:.2f}"])
+        spent = (time.perf_counter() - begun) / (len(motions) * samples)
+        means = [Crossed.by_clip(each[None], np.ones(len(motions)), clips).estimate() for each in np.transpose(found)]
+        told = [
+            "–" if np.isnan(mean.mean) else f"{mean.mean:{form}} ± {mean.sequences:{form}}"
+            for mean, form in zip(means, METRICS.values(), strict=True)
+        ]
+        rows.append([", ".join(joints[:number]), "exact" if exact else "", *told, f"{spent:.2f}"])
     return table(["given", "", *METRICS, "seconds a motion"], rows)
 
 
@@ -75,6 +78,7 @@ def main(
         count: windows, spread evenly over those of the test set.
         samples: motions of each.
     """
+    torch.set_num_threads(1)
     write(page, exact_paths(run, joints, count, samples), name="exact paths")
 
 

@@ -19,10 +19,8 @@ from benchmarks.tables import (
     bounds,
     bracket,
     completion,
-    control,
     demo,
     family,
-    gsps,
     hit_dvae,
     house,
     irregular,
@@ -63,11 +61,6 @@ def folder(tmp_path_factory):
 def fitted(folder, name, method, *options):
     dvae("fit", method, "--data", folder / "people.npz", "--out", folder / name, *SMALL, *options)
     return folder / name
-
-
-def evaluated(folder, name, *options, runs):
-    dvae("evaluate", *runs, "--samples", 3, "--out", folder / f"{name}.json", *options)
-    return folder / f"{name}.json"
 
 
 @pytest.fixture(autouse=True)
@@ -161,28 +154,6 @@ def test_family(folder, page):
     forced, free = tables(page)
     assert {row[0] for row in forced[1:]} == {row[0] for row in free[1:]} == {"vae", "dkf"}
     assert forced[1][2] == "–"
-
-
-def test_gsps(folder, page):
-    run = fitted(folder, "gsps", "gsps", "--pose-prior", "0", "--draws", "2", "2")
-    again = shutil.copytree(run, folder / "the-same")
-    files = tuple(evaluated(folder, each.name, runs=[each]) for each in (run, again))
-    gsps.main(run, files, page, samples=2)
-    scores, differences, (_, free, held) = tables(page)
-    assert [row[0] for row in scores[1:]] == ["zero velocity", "nearest neighbours", "gsps", "the same"]
-    assert differences[2][:3] == ["the same", "0.000", "0.000"]
-    assert float(held[2]) == 0 < float(held[3]) < float(free[1])
-
-
-def test_control(folder, page):
-    small = ("--modes", 2, "--latent", 4, "--width", 8, "--sampler-width", 8, "--sampler-hidden", 8)
-    run = fitted(folder, "dsf", "dsf", *small)
-    control.main((run, run), page, samples=2, every=5)
-    ((header, first, again),) = tables(page)
-    assert header == ["", "APD", "APD lower", "APD upper"]
-    assert first == again
-    whole, *parts = (float(cell) for cell in first[1:])
-    assert 0 < max(parts) < whole < sum(parts)
 
 
 def test_bones(folder, page):
@@ -422,7 +393,9 @@ def test_trajevae(folder, page):
     for free, exact in (rows[:2], rows[2:]):
         assert number(free, "path error, m") > 0.01 > number(exact, "path error, m")
         assert number(free, "within 1 cm") < number(exact, "within 1 cm") == 100
-        assert number(free, "corrected by, m") == 0 < number(exact, "corrected by, m")
+        assert number(exact, "bone-length error") < number(free, "bone-length error")
+        assert free[header.index("corrected by, m")] == "–"
+        assert number(exact, "corrected by, m") > 0
 
 
 def test_occlusion(folder, page, monkeypatch):
