@@ -40,6 +40,8 @@ def joined(files: Sequence[Path]) -> dvae.Evaluation:
     first = next(iter(found.values()))
     if any(same(each) != same(first) for each in found.values()):
         sys.exit("these evaluations differ in windows, samples, seed, emission, multimodal threshold or judges")
+    if len(found) < len(files):
+        sys.exit("two of these runs have one name; a row has the name of its directory")
     rows = {name: row for name, row in first.rows.items() if not row.config}
     for name, each in found.items():
         (rows[name],) = (row for row in each.rows.values() if row.config)

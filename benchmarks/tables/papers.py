@@ -223,7 +223,7 @@ PAPERS = {
             **SHORT["gsps"],
             **{name: {**SHORT["gsps"]["3,000 steps"], **options} for name, options in TERMS.items()},
             **{row: FUTURES[row] for row in BASELINES},
-            LOWER: {"method": "dlow", "held": "lower"},
+            LOWER: {"method": "dlow", "held": ("lower",)},
         },
         (("APD", "energy score", *ERRORS[:4], *REAL),),
         [(name, "3,000 steps") for name in TERMS],

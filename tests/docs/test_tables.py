@@ -465,8 +465,11 @@ def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
     assert "nearest neighbours" in free
     assert held.keys() == {"gsps"}
     assert (held["gsps"].means("APD lower") == 0).all()
-    assert (free["gsps"].means("APD lower") > 0).all()
     assert (held["gsps"].means("APD upper") > 0).all()
+    whole, *parts = (free["gsps"].means(f"APD{part}") for part in ("", " lower", " upper"))
+    assert (np.minimum(*parts) > 0).all()
+    assert (np.maximum(*parts) < whole).all()
+    assert (whole < sum(parts)).all()
 
 
 def test_judges_say_nothing_of_their_place_and_are_whole_while_others_use_them(folder, tmp_path, monkeypatch):
@@ -486,6 +489,15 @@ def test_every_row_has_a_folder_of_its_own():
         folders = [ranking.folder(row) for row in rows]
         assert len({*folders}) == len(rows)
         assert all(re.fullmatch(r"[\w.=+-]+", name) for name in folders), folders
+
+
+def test_every_row_has_options_of_its_method():
+    sets = [each.methods for each in ranking.SETS.values()]
+    for rows in [*sets, *(each.rows for each in papers.PAPERS.values())]:
+        for row, options in rows.items():
+            told, training = ranking.parted(options)
+            made = method(told.pop("method", row), **told)
+            replace(made.trainings[""], **training)
 
 
 def test_groups_are_of_the_first_word():
