@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
 from itertools import product
@@ -14,7 +15,7 @@ import tyro
 import dvae
 from dvae.inference.estimates import Crossed
 from dvae.inference.held import clip_places
-from dvae.models.trajectories import Completion
+from dvae.models.trajectories import Completion, TrajectoryModel
 
 from .pages import DOCS, table, write
 from .ranking import JOINTS
@@ -39,6 +40,8 @@ def figures(made: Completion, true: np.ndarray) -> tuple[float, ...]:
 def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -> str:
     """By the number of given joints, and whether motions are to be exact; ± one standard error over clips."""
     run = dvae.load(folder)
+    if not isinstance(run.model, TrajectoryModel):
+        sys.exit(f"{folder} is a run of {run.method.name}, which follows no paths; give one of trajevae or cvae-rnn")
     windows = run.data.windows("test")
     chosen = torch.linspace(0, len(windows) - 1, min(count, len(windows))).long()
     motions = windows.positions(windows.all()["x"][chosen]).numpy()

@@ -389,13 +389,18 @@ def test_trajevae(folder, page):
     page.write_text(page.read_text().replace("exact paths", "tables"))
     ((header, *rows),) = tables(page)
     assert [row[:2] for row in rows] == [[given, how] for given in ("RFoot", "RFoot, LWrist") for how in ("", "exact")]
-    number = lambda row, name: float(row[header.index(name)].split(" ± ")[0].rstrip("%"))  # noqa: E731
+
+    def number(row, name):
+        return float(row[header.index(name)].split(" ± ")[0].rstrip("%"))
+
     for free, exact in (rows[:2], rows[2:]):
         assert number(free, "path error, m") > 0.01 > number(exact, "path error, m")
         assert number(free, "within 1 cm") < number(exact, "within 1 cm") == 100
         assert number(exact, "bone-length error") < number(free, "bone-length error")
         assert free[header.index("corrected by, m")] == "–"
         assert number(exact, "corrected by, m") > 0
+    with pytest.raises(SystemExit, match="a run of vae, which follows no paths"):
+        trajevae.main(fitted(folder, "pathless", "vae", "--warm-up", 1))
 
 
 def test_occlusion(folder, page, monkeypatch):
