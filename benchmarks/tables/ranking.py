@@ -132,18 +132,28 @@ class View:
 
 @dataclass(frozen=True)
 class Set:
-    """A protocol, the file of its clips below the folder of data, and what is fitted and scored."""
+    """The file of clips below the folder of data, and what is fitted and scored.
+
+    Args:
+        file: of the clips.
+        methods: by the rows that they are.
+        views: in which each is scored.
+        judges: of `JUDGES`.
+        like: the set whose protocol, judges and reference rows it has; its own where empty.
+    """
 
     file: str
     methods: Mapping[str, Mapping[str, Any]]
     views: tuple[View, ...] = (View(),)
     judges: tuple[str, ...] = ()
+    like: str = ""
 
 
 BANDAI, CMU = "bandai/bandai2.npz", "cmu/cmu8.npz"
 GIVEN = tuple(View(count) for count in range(5))
 SETS = {
     "bandai2-by-style": Set(BANDAI, FUTURES, judges=("prior", "content")),
+    "bandai2-by-style-alike": Set(BANDAI, ALIKE, judges=("prior", "content"), like="bandai2-by-style"),
     "bandai2-by-take": Set(BANDAI, ALIKE, judges=("prior", "content")),
     "cmu8": Set(CMU, ALIKE, judges=("prior", "content")),
     "bandai2-trajectories": Set(BANDAI, PATHS, GIVEN),
@@ -321,13 +331,14 @@ def work(
     """
     if accelerator == "cuda":
         require_gpu("accelerator")
-    opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[name])
-    judged = fitted_judges(opened, stored / name, SETS[name].judges)
+    own, like = stored / name, stored / (SETS[name].like or name)
+    opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[like.name])
+    judged = fitted_judges(opened, like, SETS[name].judges)
 
     def score(path: Path | None, row: str, view: View, file: Path) -> None:
         data, by = opened, judged
         if view.judges:
-            data, by = grouped(opened), fitted_judges(opened, stored / name, view.judges.split("+"))
+            data, by = grouped(opened), fitted_judges(opened, like, view.judges.split("+"))
         elif view.observed:  # a pose prior reads windows turned at the last frame that its own protocol observes
             by = {judge: run for judge, run in judged.items() if judge != "prior"}
         models = {} if path is None else {row: load(path).model.to(accelerator)}
@@ -341,13 +352,13 @@ def work(
         Scored.of(found, path).save(file)
 
     for view in dict.fromkeys(view for each in views.values() for view in each):
-        file = kept(stored / name, REFERENCES, view)
+        file = kept(like, REFERENCES, view)
         if not (view.single or view.exchanged or view.parts == "held" or file.exists()):
             score(None, REFERENCES, view, file)
     every = {**SETS[name].methods, **methods}  # what a second stage stands on has the set's options, chosen or not
     for seed in seeds:
         for row in methods:
-            files = {view: kept(stored / name, f"{folder(row)}-seed{seed}", view) for view in views[row]}
+            files = {view: kept(own, f"{folder(row)}-seed{seed}", view) for view in views[row]}
             if missing := {view: file for view, file in files.items() if not file.exists()}:
                 path = fit(opened, row, every, seed, runs / name, judged.get("prior"), accelerator)
                 for view, file in missing.items():
@@ -430,7 +441,7 @@ def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict
         ValueError: scores of other windows, samples, or judges.
     """
     found, basis = {}, None
-    file = kept(stored / name, REFERENCES, view)
+    file = kept(stored / (SETS[name].like or name), REFERENCES, view)
     if file.exists():
         references = Scored.load(file)
         basis = references.basis

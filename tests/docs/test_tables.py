@@ -527,6 +527,23 @@ def test_a_second_stage_alone_stands_on_the_first_of_its_set(folder, tmp_path, m
     assert not (tmp_path / "scores" / "simulated" / "cvae-seed0").exists()
 
 
+def test_a_set_like_another_has_its_judges_and_reference_rows(folder, tmp_path, capsys, monkeypatch):
+    """And its windows, but rows of its own."""
+    small = {"width": 4, "latent": 2, "warm_up": 1, "batch_size": 4}
+    first = ranking.Set("people.npz", {"srnn": {**small, "steps": 2}})
+    second = replace(first, methods={"srnn": {**small, "steps": 3}}, like="simulated")
+    judged = []
+    monkeypatch.setattr(ranking, "SETS", {"simulated": first, "longer": second})
+    monkeypatch.setattr(ranking, "fitted_judges", lambda data, path, names: judged.append(path.name) or {})
+    ranking.main(tmp_path, folder, seeds=(0,), samples=2, sets=("simulated", "longer"), scores=tmp_path / "scores")
+    assert judged == ["simulated", "simulated"]
+    assert not (tmp_path / "scores" / "longer" / ranking.REFERENCES).exists()
+    assert [Run(tmp_path / name / "srnn-seed0").config["training"]["steps"] for name in ranking.SETS] == [2, 3]
+    table = [line.split("|") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    once, again = (row[6:] for row in table if "nearest neighbours" in row[1])
+    assert once == again
+
+
 def test_papers(folder, page, monkeypatch):
     """Rows, in views that some have alone; what a change does is the difference of its rows, and printed cells stay."""
     small = {"latent": 2, "width": 4, "feedforward": 4, "steps": 2, "batch_size": 4}
