@@ -65,7 +65,7 @@ class Further:
         rows: of the paper's.
         columns: of that table; none for those of all its tables.
         printed: rows of the paper.
-        apart: rows that have a view of their own there.
+        apart: rows that have a view of their own there, and what they are called with it.
     """
 
     caption: str
@@ -73,11 +73,11 @@ class Further:
     rows: Sequence[str]
     columns: Sequence[str] = ()
     printed: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    apart: Mapping[str, View] = field(default_factory=dict)
+    apart: Mapping[str, tuple[str, View]] = field(default_factory=dict)
 
     def views_of(self, row: str) -> list[View]:
         """In which a row is scored for that table."""
-        return [*(self.views if row in self.rows else ()), *(view for name, view in self.apart.items() if name == row)]
+        return [*(self.views if row in self.rows else ()), *(view for name, view in self.apart.values() if name == row)]
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,10 @@ PAPERS = {
                     HumanEva-I: GSPS | 0 5.096
                     """,
                 ),
-                {LOWER: View(parts="free")},  # which has learned to hold it
+                {
+                    LOWER: (LOWER, View(parts="free")),  # it has learned to
+                    "dlow, 50 of 1,000": ("dlow", View(parts="nearest")),
+                },
             ),
         ),
     ),
@@ -520,9 +523,9 @@ def main(
                 drawn(found | seen, paper).savefig(pictures / f"{name}.png", dpi=110)
         for each in paper.further:
             seen = {view: rows for view in each.views if (rows := entries(stored, paper.set, view, each.rows))}
-            for row, view in each.apart.items():
-                own = {name: entry for name, entry in entries(stored, paper.set, view, [row]).items() if name == row}
-                seen |= {view: seen.get(view, {}) | own} if own else {}
+            for called, (row, view) in each.apart.items():
+                if own := entries(stored, paper.set, view, [row]).get(row):
+                    seen |= {view: seen.get(view, {}) | {called: own}}
             for columns in ([each.columns] if each.columns else paper.columns) if seen else []:
                 tables.append(captioned(each.caption, scores(seen, columns, each.printed)))
         write(None if pages is None else pages / f"{name.replace('-', '_')}.md", *filter(None, tables), name="rows")

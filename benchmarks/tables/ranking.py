@@ -14,6 +14,7 @@ import statistics
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -95,8 +96,8 @@ class View:
         truth: see `motion.Exchanged`.
         observed: frames, in place of the protocol's.
         judges: names with + between, in place of the set's.
-        parts: how diverse the parts of the body are, alone, in "free" futures, or in those that have the lower body's
-            draw "held", that of the first.
+        parts: how diverse the parts of the body are, alone, in "free" futures, in those that have the lower body's
+            draw "held", that of the first, or in those of many whose lower body is "nearest" the first one's.
     """
 
     given: int | None = None
@@ -106,7 +107,7 @@ class View:
     truth: Literal["path", "pose"] = "path"
     observed: int | None = None
     judges: str = ""
-    parts: Literal["", "free", "held"] = ""
+    parts: Literal["", "free", "held", "nearest"] = ""
 
     def windows(self, data: MotionData, split: str) -> Any:
         """Windows of a part of the data, and what is told of them."""
@@ -346,14 +347,15 @@ def work(
         options = {"references": False} if models else known
         windows, told = view.windows(data, "test"), view.evaluate(samples)
         if view.parts:
-            models = {name: Held(model) if view.parts == "held" else model for name, model in models.items()}
+            how = {"free": lambda model: model, "held": Held, "nearest": partial(Nearest, parts=places(windows))}
+            models = {name: how[view.parts](model) for name, model in models.items()}
         scores = diversities if view.parts else judging(by)
         found = dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **told)
         Scored.of(found, path).save(file)
 
     for view in dict.fromkeys(view for each in views.values() for view in each):
         file = kept(like, REFERENCES, view)
-        if not (view.single or view.exchanged or view.parts == "held" or file.exists()):
+        if not (view.single or view.exchanged or view.parts in ("held", "nearest") or file.exists()):
             score(None, REFERENCES, view, file)
     every = {**SETS[name].methods, **methods}  # what a second stage stands on has the set's options, chosen or not
     for seed in seeds:
@@ -365,8 +367,8 @@ def work(
                     score(path, row, view, file)
 
 
-class Held(nn.Module):
-    """A model whose futures share the first one's draw of the lower body."""
+class Wrapped(nn.Module):
+    """A model that forecasts in another way."""
 
     likelihood = False
 
@@ -374,10 +376,38 @@ class Held(nn.Module):
         super().__init__()
         self.model, self.generative, self.inference = model, model.generative, model.inference
 
+
+class Held(Wrapped):
+    """A model whose futures share the first one's draw of the lower body."""
+
     def forecast(self, past: Any, horizon: int, samples: int, **options: Any) -> Any:
         """Futures, of a model that has a latent of the lower body."""
         lower = self.model.forecast(past, horizon, 1, **options)["lower"][0]
         return self.model.forecast(past, horizon, samples, fix={"lower": lower}, **options)
+
+
+class Nearest(Wrapped):
+    """A model whose futures are those of twenty times as many whose lower body is nearest to the first one's.
+
+    As GSPS has DLow hold the lower body: the nearest 50 of 1,000.
+    """
+
+    def __init__(self, model: Any, parts: Mapping[str, Sequence[int]]) -> None:
+        super().__init__(model)
+        self.lower = parts["lower"]
+
+    def forecast(self, past: Any, horizon: int, samples: int, **options: Any) -> Any:
+        """Futures, by the squared distance over all frames."""
+        made = self.model.forecast(past, horizon, 20 * samples, **options)["x"]
+        lower = made[..., self.lower]
+        nearest = (lower - lower[0]).square().sum((2, 3)).topk(samples, 0, largest=False).indices
+        return {"x": made.take_along_dim(nearest[..., None, None], 0)}
+
+
+def places(windows: Any) -> dict[str, list[int]]:
+    """Coordinates of the parts of the body."""
+    parts = body_parts(windows.skeleton, tuple(UNIONS))
+    return {part: [3 * joint + axis for joint in joints for axis in range(3)] for part, joints in parts.items()}
 
 
 def diversities(windows: Any) -> list[Measure]:
@@ -386,11 +416,8 @@ def diversities(windows: Any) -> list[Measure]:
     def of(place: Any) -> Any:
         return lambda forecasts, *_: average_pairwise_distance(forecasts[..., place])
 
-    parts = body_parts(windows.skeleton, tuple(UNIONS))
-    places = {"APD": slice(None)} | {
-        f"APD {part}": [3 * joint + axis for joint in joints for axis in range(3)] for part, joints in parts.items()
-    }
-    return [Measure(name, of(place), "m", "higher") for name, place in places.items()]
+    scored = {"APD": slice(None)} | {f"APD {part}": place for part, place in places(windows).items()}
+    return [Measure(name, of(place), "m", "higher") for name, place in scored.items()]
 
 
 REFERENCES = "references"

@@ -15,12 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import tyro
 
 import dvae
 from dvae import Training, motion
 from dvae.models import registry
 from dvae.motion.dataset import MotionData
+from dvae.motion.energies import pose_prior_energy
 from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
@@ -30,7 +32,7 @@ from .ranking import JOINTS, JUDGES, SCORES, SETS, entries, fitted_judges, folde
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
 REFERENCES = ("zero velocity", "nearest neighbours")
-COLUMNS_OF_JUDGES = ("pose NLL", "ACC content")
+COLUMNS_OF_JUDGES = ("log density", "pose NLL", "ACC content")
 COLUMNS = ("ADE", "FDE", "ADEm", "APD", "energy score", "ACC content", "FID content", "pose NLL", "KL w", "KL z")
 """Scores that pages show, where there are."""
 SEEDS, TESTED = "seeds", ("bandai2-by-style", "bandai2-trajectories")
@@ -81,7 +83,7 @@ ABLATED: dict[str, dict[str, Any]] = {
     "in time": {"complement": False, "cosine": False},
     "standard prior": {"complement": False, "learned_prior": False},
 }
-"""TrajeVAE and its ablations; latents of all have 15 coefficients but those in time, which have 60 of a quarter."""
+"""TrajeVAE and its ablations; latents have 15 coefficients of 32 numbers; in time 60 of as many or, named, 8."""
 WEIGHED = [
     *[(name, beta) for name in ("full", "whole poses") for beta in (1e-4, 1e-3, 1e-2)],
     *[("in time", beta) for beta in (1e-4, 1e-3)],
@@ -213,7 +215,8 @@ SECTIONS = {
 
 
 STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
-"""Steps of judges, who are to know poses and contents of people whom they have not seen."""
+"""Of judges, who are to know poses and contents of people whom they have not seen."""
+SEEDS_OF = {"prior": (0, 1, 2), "content": (0,)}
 OF_JUDGES = [f"{judge} {steps} steps" for judge, tried in STEPS.items() for steps in tried]
 
 
@@ -244,17 +247,31 @@ class Store:
         return str(seed) not in self.found.get(case, {})
 
 
-def of_judges(data: MotionData, runs: Path, store: Store, judged: Mapping[str, Path]) -> None:
+def of_judges(data: MotionData, runs: Path, store: Store) -> None:
     """Fits judges for other numbers of steps, and scores real motion of the judging group by each."""
+    windows = seen(data)
     for name, tried in STEPS.items():
         method, options, training = JUDGES[name]
         for steps in tried:
             row, told = f"{name} {steps} steps", replace(training, steps=steps)
-            if store.lacks(row, 0):
-                sweep({folder(row): registry.judges()[method](**options)}, data, runs, (0,), told, jobs=1)
-                scores, real = judging({**judged, name: runs / f"{folder(row)}-seed0"}), ["zero velocity"]
-                found = dvae.evaluate({}, seen(data), scores=scores, samples=1, references=real, progress=False)
-                store.add(row, 0, {each: score.mean for each, score in found["real motion"].items()})
+            for seed in SEEDS_OF[name]:
+                if store.lacks(row, seed):
+                    sweep({folder(row): registry.judges()[method](**options)}, data, runs, (seed,), told, jobs=1)
+                    store.add(row, seed, of_judge(name, runs / f"{folder(row)}-seed{seed}", windows))
+
+
+def of_judge(name: str, run: Path, windows: motion.Windows) -> dict[str, float]:
+    """What a judge says of the predicted frames of real windows."""
+    if name == "prior":
+        prior, motions = load(run).model, windows.all()["x"]
+        poses = prior.facing(motions)[:, windows.protocol.observed :]
+        with torch.no_grad():
+            energy = pose_prior_energy(poses[None], prior, prior.skeleton).mean()
+            return {"log density": prior.log_prob(poses).mean().item(), "pose NLL": energy.item()}
+    found = dvae.evaluate(
+        {}, windows, scores=judging({name: run}), samples=1, references=["zero velocity"], progress=False
+    )
+    return {f"ACC {name}": found["real motion"][f"ACC {name}"].mean}
 
 
 def of_references(data: MotionData, store: Store, judged: Mapping[str, Path]) -> None:
@@ -323,13 +340,13 @@ def spread() -> str:
 def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: int) -> None:
     """Fits and scores what is not there yet."""
     opened = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
-    asked = [TUNING if name == "judges" else SECTIONS[name].protocol for name in sections]
+    asked = [SECTIONS[name].protocol for name in sections if name != "judges"]
     judged = fitted_judges(opened[TUNING.name], runs) if any(each.root == "drop" for each in asked) else {}
     prior = judged.get("prior", Path()).absolute()
     for name in sections:
         store = Store(stored, name)
         if name == "judges":
-            of_judges(opened[TUNING.name], runs / name, store, judged)
+            of_judges(opened[TUNING.name], runs / name, store)
             continue
         section = SECTIONS[name]
         own = opened[section.protocol.name]

@@ -460,6 +460,25 @@ def test_minutes_are_told_of_processors():
     assert told(cuda=1.0) == ("1", "GPU")
 
 
+def test_the_nearest_of_many_are_the_nearest():
+    """By the lower body, over all frames; the first is one of them."""
+    drawn = torch.randn(60, 2, 5, 4, generator=torch.Generator().manual_seed(0))
+
+    class Drawn(torch.nn.Module):
+        generative = inference = None
+
+        def forecast(self, past, horizon, samples, **options):
+            return {"x": drawn[:samples], "z": drawn}
+
+    found = ranking.Nearest(Drawn(), {"lower": [0, 3]}).forecast({}, 5, 3)["x"]
+    assert found.shape == (3, 2, 5, 4)
+    assert found[0].equal(drawn[0])
+    for sequence in range(2):
+        away = [(each[:, [0, 3]] - drawn[0, sequence][:, [0, 3]]).norm() for each in drawn[:, sequence]]
+        expected = [drawn[n, sequence] for n in np.argsort(away)[:3]]
+        assert all(map(torch.equal, found[:, sequence], expected))
+
+
 def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
     """Of the lower body, whose motion is then one and the same."""
     small = {"pose_prior": 0.0, "draws": (2, 2), "latent": 4, "width": 4, "steps": 2, "batch_size": 4}
