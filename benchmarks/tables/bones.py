@@ -15,7 +15,7 @@ import tyro
 import dvae
 from dvae import motion
 
-from .pages import DOCS, same, table, write
+from .pages import DOCS, loaded, same, table, write
 
 METRICS = ("bone-length error", "limb stretch", "limb jitter", "ADE", "FDE", "APD", "MMADE", "limb-angle error", "CMD")
 COMPARED = ("ADE", "FDE", "APD", "limb-angle error")
@@ -25,7 +25,7 @@ def evaluated(path: Path, every: int, samples: int) -> Path:
     """The file with the scores of a run, on each so many-th of its test windows."""
     file = path / f"{path.name}.json"
     if not file.exists():
-        run = dvae.load(path)
+        run = loaded(path)
         test = run.data.windows("test")
         some = test.with_protocol(replace(test.protocol, test_stride=every * test.protocol.test_stride))
         options = {"samples": samples, "batch_size": 64, "training_windows": run.data.windows("train+validation")}

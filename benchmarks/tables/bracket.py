@@ -14,7 +14,7 @@ import dvae
 from dvae.inference.bracket import told
 
 from .bounds import GUIDES, fitted
-from .pages import DOCS, code, table, write
+from .pages import DOCS, code, loaded, table, write
 
 SETTINGS: dict[str, Any] = {"particles": 32, "temperatures": 20, "chains": 4}
 
@@ -37,9 +37,9 @@ def bracketed(run: Path, kept: Path, count: int, fitting: int, reach: int) -> dv
     """Of some test windows of a run."""
     path = kept / f"{run.name}.json"
     if not path.is_file():
-        loaded = dvae.load(run)
-        windows = loaded.data.windows("test")
-        dvae.bracket(loaded.model, windows, **SETTINGS, count=count, fitting=fitting, reach=reach).save(path)
+        fitted = loaded(run)
+        windows = fitted.data.windows("test")
+        dvae.bracket(fitted.model, windows, **SETTINGS, count=count, fitting=fitting, reach=reach).save(path)
     return dvae.Bracket.load(path)
 
 

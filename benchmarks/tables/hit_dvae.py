@@ -5,15 +5,13 @@ from pathlib import Path
 import torch
 import tyro
 
-import dvae
-
-from .pages import DOCS, table, write
+from .pages import DOCS, loaded, table, write
 
 
 @torch.no_grad()
 def long_run(path: Path, count: int, seconds: float) -> str:
     """Bones and speed of forecasts that run on far past the horizon of training, second by second."""
-    run = dvae.load(path)
+    run = loaded(path)
     test = run.data.windows("test")
     x = test.all()["x"]
     x = x[torch.linspace(0, len(x) - 1, count).long()]

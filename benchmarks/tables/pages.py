@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
 import dvae
+from dvae.inference.checkpoints import CheckpointError
 
 DOCS = Path(__file__).parents[2] / "docs"
 BEGIN, END = "<!-- tables -->\n", "<!-- end of tables -->\n"
@@ -48,6 +50,14 @@ def require_gpu(option: str) -> None:
     if not torch.cuda.is_available():
         built = "" if torch.version.cuda else ", as it is built without CUDA"
         sys.exit(f"torch {torch.__version__} finds no GPU{built}; leave the {option} out, or take a machine with one")
+
+
+def loaded(run: Path) -> Any:
+    """A run that the script was given; ends it where there is none."""
+    try:
+        return dvae.load(run)
+    except CheckpointError as error:
+        sys.exit(str(error))
 
 
 def same(evaluation: dvae.Evaluation) -> tuple[object, ...]:

@@ -21,14 +21,13 @@ import tyro
 from torch import Tensor
 from torch.nn import functional
 
-import dvae
 from dvae.inference.checks import decode
 from dvae.inference.held import clip_places, on_device_of, reproducibly
 from dvae.inference.uncertainty import clustered_variance, linearised
 from dvae.motion import Windows
 from dvae.program.batch import rows
 
-from .pages import table, write
+from .pages import loaded, table, write
 
 DRAWS, PENALTY, CHUNK = 8, 1e-3, 128
 ONE_BODY = 0.01
@@ -171,7 +170,7 @@ def main(
     """
     told, swapped = [], []
     for path in runs:
-        run = dvae.load(path)
+        run = loaded(path)
         for split in splits:
             windows = run.data.windows(split)
             told += [[path.name, split, *line] for line in probes(run.model, windows, labels, seed)]

@@ -12,12 +12,11 @@ import numpy as np
 import torch
 import tyro
 
-import dvae
 from dvae.inference.estimates import Crossed
 from dvae.inference.held import clip_places
 from dvae.models.trajectories import Completion, TrajectoryModel
 
-from .pages import DOCS, table, write
+from .pages import DOCS, loaded, refuse_unknown, table, write
 from .ranking import JOINTS
 
 METRICS = {
@@ -39,10 +38,11 @@ def figures(made: Completion, true: np.ndarray) -> tuple[float, ...]:
 
 def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -> str:
     """By the number of given joints, and whether motions are to be exact; ± one standard error over clips."""
-    run = dvae.load(folder)
+    run = loaded(folder)
     if not isinstance(run.model, TrajectoryModel):
         sys.exit(f"{folder} is a run of {run.method.name}, which follows no paths; give one of trajevae or cvae-rnn")
     windows = run.data.windows("test")
+    refuse_unknown("joint", joints, windows.joints)
     chosen = torch.linspace(0, len(windows) - 1, min(count, len(windows))).long()
     motions = windows.positions(windows.all()["x"][chosen]).numpy()
     _, clips = np.unique(clip_places(windows.keys)[chosen].numpy(), return_inverse=True)

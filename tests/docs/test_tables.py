@@ -401,6 +401,10 @@ def test_trajevae(folder, page):
         assert number(exact, "corrected by, m") > 0
     with pytest.raises(SystemExit, match="a run of vae, which follows no paths"):
         trajevae.main(fitted(folder, "pathless", "vae", "--warm-up", 1))
+    with pytest.raises(SystemExit, match=r"unknown joint 'Tail'; known: .*LWrist"):
+        trajevae.main(run, joints=("Tail",))
+    with pytest.raises(SystemExit, match="nowhere is no run directory"):
+        trajevae.main(folder / "nowhere")
 
 
 def test_occlusion(folder, page, monkeypatch):
