@@ -37,9 +37,9 @@ def bracketed(run: Path, kept: Path, count: int, fitting: int, reach: int) -> dv
     """Of some test windows of a run."""
     path = kept / f"{run.name}.json"
     if not path.is_file():
-        fitted = loaded(run)
-        windows = fitted.data.windows("test")
-        dvae.bracket(fitted.model, windows, **SETTINGS, count=count, fitting=fitting, reach=reach).save(path)
+        trained = loaded(run)
+        windows = trained.data.windows("test")
+        dvae.bracket(trained.model, windows, **SETTINGS, count=count, fitting=fitting, reach=reach).save(path)
     return dvae.Bracket.load(path)
 
 

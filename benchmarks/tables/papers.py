@@ -65,7 +65,7 @@ class Further:
         rows: of the paper's.
         columns: of that table; none for those of all its tables.
         printed: rows of the paper.
-        apart: rows that have a view of their own there, and what they are called with it.
+        apart: by what they are called there, rows that have a view of their own, and the view.
     """
 
     caption: str
@@ -77,7 +77,7 @@ class Further:
 
     def views_of(self, row: str) -> list[View]:
         """In which a row is scored for that table."""
-        return [*(self.views if row in self.rows else ()), *(view for name, view in self.apart.values() if name == row)]
+        return [*(self.views if row in self.rows else ()), *(view for own, view in self.apart.values() if own == row)]
 
 
 @dataclass(frozen=True)
@@ -291,7 +291,7 @@ PAPERS = {
                     """,
                 ),
                 {
-                    LOWER: (LOWER, View(parts="free")),  # it has learned to
+                    LOWER: (LOWER, View(parts="free")),  # has learned to hold it
                     "dlow, 50 of 1,000": ("dlow", View(parts="nearest")),
                 },
             ),

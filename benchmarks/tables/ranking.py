@@ -140,7 +140,7 @@ class Set:
         methods: by the rows that they are.
         views: in which each is scored.
         judges: of `JUDGES`.
-        like: the set whose protocol, judges and reference rows it has; its own where empty.
+        like: the set whose protocol, fitted judges and reference rows it shares; its own where empty.
     """
 
     file: str
@@ -347,8 +347,8 @@ def work(
         options = {"references": False} if models else known
         windows, told = view.windows(data, "test"), view.evaluate(samples)
         if view.parts:
-            how = {"free": lambda model: model, "held": Held, "nearest": partial(Nearest, parts=places(windows))}
-            models = {name: how[view.parts](model) for name, model in models.items()}
+            ways: dict[str, Any] = {"held": Held, "nearest": partial(Nearest, lower=places(windows)["lower"])}
+            models = {name: ways.get(view.parts, lambda free: free)(model) for name, model in models.items()}
         scores = diversities if view.parts else judging(by)
         found = dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **told)
         Scored.of(found, path).save(file)
@@ -368,7 +368,7 @@ def work(
 
 
 class Wrapped(nn.Module):
-    """A model that forecasts in another way."""
+    """What forecasts by a model."""
 
     likelihood = False
 
@@ -387,18 +387,20 @@ class Held(Wrapped):
 
 
 class Nearest(Wrapped):
-    """A model whose futures are those of twenty times as many whose lower body is nearest to the first one's.
+    """A model whose futures are those of `MANY` times as many whose lower body is nearest to the first one's.
 
     As GSPS has DLow hold the lower body: the nearest 50 of 1,000.
     """
 
-    def __init__(self, model: Any, parts: Mapping[str, Sequence[int]]) -> None:
+    MANY = 20
+
+    def __init__(self, model: Any, lower: Sequence[int]) -> None:
         super().__init__(model)
-        self.lower = parts["lower"]
+        self.lower = lower
 
     def forecast(self, past: Any, horizon: int, samples: int, **options: Any) -> Any:
         """Futures, by the squared distance over all frames."""
-        made = self.model.forecast(past, horizon, 20 * samples, **options)["x"]
+        made = self.model.forecast(past, horizon, self.MANY * samples, **options)["x"]
         lower = made[..., self.lower]
         nearest = (lower - lower[0]).square().sum((2, 3)).topk(samples, 0, largest=False).indices
         return {"x": made.take_along_dim(nearest[..., None, None], 0)}

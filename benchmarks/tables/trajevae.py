@@ -16,7 +16,7 @@ from dvae.inference.estimates import Crossed
 from dvae.inference.held import clip_places
 from dvae.models.trajectories import Completion, TrajectoryModel
 
-from .pages import DOCS, loaded, refuse_unknown, table, write
+from .pages import DOCS, loaded, table, write
 from .ranking import JOINTS
 
 METRICS = {
@@ -42,7 +42,10 @@ def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -
     if not isinstance(run.model, TrajectoryModel):
         sys.exit(f"{folder} is a run of {run.method.name}, which follows no paths; give one of trajevae or cvae-rnn")
     windows = run.data.windows("test")
-    refuse_unknown("joint", joints, windows.joints)
+    try:
+        [windows.skeleton.find(joint) for joint in joints]
+    except ValueError as error:
+        sys.exit(str(error))
     chosen = torch.linspace(0, len(windows) - 1, min(count, len(windows))).long()
     motions = windows.positions(windows.all()["x"][chosen]).numpy()
     _, clips = np.unique(clip_places(windows.keys)[chosen].numpy(), return_inverse=True)

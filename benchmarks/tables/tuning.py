@@ -83,7 +83,7 @@ ABLATED: dict[str, dict[str, Any]] = {
     "in time": {"complement": False, "cosine": False},
     "standard prior": {"complement": False, "learned_prior": False},
 }
-"""TrajeVAE and its ablations; latents have 15 coefficients of 32 numbers; in time 60 of as many or, named, 8."""
+"""TrajeVAE and its ablations; latents are 15 coefficients of 32 numbers, in time 60 frames of 32 or, named, 8."""
 WEIGHED = [
     *[(name, beta) for name in ("full", "whole poses") for beta in (1e-4, 1e-3, 1e-2)],
     *[("in time", beta) for beta in (1e-4, 1e-3)],
@@ -215,7 +215,7 @@ SECTIONS = {
 
 
 STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
-"""Of judges, who are to know poses and contents of people whom they have not seen."""
+"""Of judges, which are to know poses and contents of people whom they have not seen."""
 SEEDS_OF = {"prior": (0, 1, 2), "content": (0,)}
 OF_JUDGES = [f"{judge} {steps} steps" for judge, tried in STEPS.items() for steps in tried]
 
@@ -256,8 +256,11 @@ def of_judges(data: MotionData, runs: Path, store: Store) -> None:
             row, told = f"{name} {steps} steps", replace(training, steps=steps)
             for seed in SEEDS_OF[name]:
                 if store.lacks(row, seed):
-                    sweep({folder(row): registry.judges()[method](**options)}, data, runs, (seed,), told, jobs=1)
-                    store.add(row, seed, of_judge(name, runs / f"{folder(row)}-seed{seed}", windows))
+                    judge = registry.judges()[method](**options)
+                    (outcome,) = sweep({folder(row): judge}, data, runs, (seed,), told, jobs=1)
+                    if outcome.status == "failed":
+                        raise RuntimeError(str(outcome))
+                    store.add(row, seed, of_judge(name, outcome.path, windows))
 
 
 def of_judge(name: str, run: Path, windows: motion.Windows) -> dict[str, float]:

@@ -40,7 +40,7 @@ from dvae import Descent, Evaluation, Training, alternatives, method, motion
 from dvae.cli import main as command
 from dvae.inference.checkpoints import Run
 from dvae.motion.segments import dataset
-from dvae.runs.directory import fit_run
+from dvae.runs.directory import fit_run, load
 from dvae.tables import Column, Columns, Panel, Series
 
 SMALL = ["--steps", "2", "--batch-size", "4", "--validate-every", "2"]
@@ -401,7 +401,7 @@ def test_trajevae(folder, page):
         assert number(exact, "corrected by, m") > 0
     with pytest.raises(SystemExit, match="a run of vae, which follows no paths"):
         trajevae.main(fitted(folder, "pathless", "vae", "--warm-up", 1))
-    with pytest.raises(SystemExit, match=r"unknown joint 'Tail'; known: .*LWrist"):
+    with pytest.raises(SystemExit, match=r"no joint 'Tail'.*LWrist"):
         trajevae.main(run, joints=("Tail",))
     with pytest.raises(SystemExit, match="nowhere is no run directory"):
         trajevae.main(folder / "nowhere")
@@ -474,7 +474,7 @@ def test_the_nearest_of_many_are_the_nearest():
         def forecast(self, past, horizon, samples, **options):
             return {"x": drawn[:samples], "z": drawn}
 
-    found = ranking.Nearest(Drawn(), {"lower": [0, 3]}).forecast({}, 5, 3)["x"]
+    found = ranking.Nearest(Drawn(), [0, 3]).forecast({}, 5, 3)["x"]
     assert found.shape == (3, 2, 5, 4)
     assert found[0].equal(drawn[0])
     for sequence in range(2):
@@ -487,15 +487,17 @@ def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
     """Of the lower body, whose motion is then one and the same."""
     small = {"pose_prior": 0.0, "draws": (2, 2), "latent": 4, "width": 4, "steps": 2, "batch_size": 4}
     monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", {})})
-    views = [ranking.View(parts=parts) for parts in ("free", "held")]
+    views = [ranking.View(parts=parts) for parts in ("free", "held", "nearest")]
     ranking.work(folder, folder / "parts", folder / "parts", "simulated", {"gsps": small}, {"gsps": views}, (0,), 3)
-    free, held = (ranking.entries(folder / "parts", "simulated", view, ["gsps"]) for view in views)
+    free, held, nearest = (ranking.entries(folder / "parts", "simulated", view, ["gsps"]) for view in views)
     assert "nearest neighbours" in free
-    assert held.keys() == {"gsps"}
+    assert held.keys() == nearest.keys() == {"gsps"}
     assert (held["gsps"].means("APD lower") == 0).all()
     assert (held["gsps"].means("APD upper") > 0).all()
     whole, *parts = (free["gsps"].means(f"APD{part}") for part in ("", " lower", " upper"))
     assert (np.minimum(*parts) > 0).all()
+    assert (nearest["gsps"].means("APD lower") > 0).all()
+    assert (nearest["gsps"].means("APD lower") < parts[0]).all()
     assert (np.maximum(*parts) < whole).all()
     assert (whole < sum(parts)).all()
 
@@ -647,6 +649,33 @@ def test_tuning(folder, page, monkeypatch):
     monkeypatch.setitem(sections, "cvae", replace(sections["cvae"], cases=failing))
     with pytest.raises(RuntimeError, match="without-a-prior-seed0 failed"):
         tuning.main(folder / "tuned", folder / "people.npz", ("cvae",), stored=folder / "tuning")
+
+
+def test_pose_priors_are_tuned_by_their_density(folder, tmp_path, page, monkeypatch):
+    """Which has the determinant that the score of futures leaves out."""
+    protocol = motion.PROTOCOLS["simulated"]
+    for name, value in {
+        "TUNING": protocol,
+        "SECTIONS": {"none": tuning.Section("cvae", Training(), {}, protocol=protocol)},
+        "STEPS": {"prior": (1, 30)},
+        "OF_JUDGES": ["prior 1 steps", "prior 30 steps"],
+        "SEEDS_OF": {"prior": (0, 1)},
+        "JUDGES": {"prior": ("pose-prior", {}, Training(2, 4, learning_rate=0.01, progress=False))},
+    }.items():
+        monkeypatch.setattr(tuning, name, value)
+    page.write_text(page.read_text().replace("tables", "judges"))
+    tuning.main(tmp_path, folder / "people.npz", ("judges",), stored=tmp_path / "scores", page=page)
+    page.write_text(page.read_text().replace("judges", "tables"))
+    (rows,) = tables(page)
+    assert [row[-1] for row in rows[1:]] == ["–", "–"]
+    found = tuning.Store(tmp_path / "scores", "judges").found
+    assert all(seeds.keys() == {"0", "1"} for seeds in found.values())
+    prior = load(tmp_path / "judges" / "prior-30-steps-seed1").model
+    told = found["prior 30 steps"]["1"]
+    windows = tuning.seen(motion.dataset.MotionData.open(folder / "people.npz", protocol)).all()["x"]
+    density = prior.log_prob(prior.facing(windows)[:, protocol.observed :]).mean().item()
+    assert told["log density"] == pytest.approx(density, abs=1e-3)
+    assert abs(told["pose NLL"] + density) > 1
 
 
 def test_gsps_has_the_prior_of_its_judge_where_it_sees_poses_as_the_judge_does(tmp_path):
