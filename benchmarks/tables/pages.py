@@ -33,8 +33,13 @@ def write(page: Path | None, *tables: str, name: str = "tables") -> None:
         print(*tables, sep="\n")
         return
     begin, end = (mark.replace("tables", name) for mark in (BEGIN, END))
-    before, rest = page.read_text(encoding="utf-8").split(begin)
-    page.write_text(before + begin + "\n" + "\n".join(tables) + "\n" + end + rest.split(end)[1], encoding="utf-8")
+    if not page.is_file():
+        sys.exit(f"no page {page}; without one, tables are printed")
+    before, opened, rest = page.read_text(encoding="utf-8").partition(begin)
+    _, closed, after = rest.partition(end)
+    if not (opened and closed):
+        sys.exit(f"no marks for the table in {page}; it stands between lines {begin.strip()} and {end.strip()}")
+    page.write_text(before + begin + "\n" + "\n".join(tables) + "\n" + end + after, encoding="utf-8")
 
 
 def refuse_unknown(what: str, names: Iterable[str], known: Iterable[str]) -> None:

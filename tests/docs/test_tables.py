@@ -454,6 +454,17 @@ def test_ranking(folder, page, monkeypatch):
         assert abs(float(row[4].split()[0]) - (energy - before)) < 0.0016  # of three rounded numbers
 
 
+@pytest.mark.parametrize("text", ["", "{begin}", "{end}{begin}"])
+def test_a_page_without_both_marks_is_left_as_it_is(tmp_path, text):
+    page = tmp_path / "page.md"
+    with pytest.raises(SystemExit, match=r"no page .*page\.md"):
+        pages.write(page, "a table")
+    page.write_text(text.format(begin=pages.BEGIN, end=pages.END))
+    with pytest.raises(SystemExit, match=r"no marks .*<!-- tables --> and <!-- end of tables -->"):
+        pages.write(page, "a table")
+    assert page.read_text() == text.format(begin=pages.BEGIN, end=pages.END)
+
+
 def test_minutes_are_told_of_processors():
     def told(**minutes):
         runs = [ranking.Scored([], {}, {}, n, {"training": {"accelerator": where}}) for where, n in minutes.items()]
@@ -560,7 +571,9 @@ def test_a_set_like_another_has_its_judges_and_reference_rows(folder, tmp_path, 
     judged = []
     monkeypatch.setattr(ranking, "SETS", {"simulated": first, "longer": second})
     monkeypatch.setattr(ranking, "fitted_judges", lambda data, path, names: judged.append(path.name) or {})
-    ranking.main(tmp_path, folder, seeds=(0,), samples=2, sets=("simulated", "longer"), scores=tmp_path / "scores")
+    for name in ranking.SETS:
+        assert ranking.rows_of(tmp_path / "scores", "longer", ranking.View()) == {}  # reference rows alone are no table
+        ranking.main(tmp_path, folder, seeds=(0,), samples=2, sets=(name,), scores=tmp_path / "scores")
     assert judged == ["simulated", "simulated"]
     assert not (tmp_path / "scores" / "longer" / ranking.REFERENCES).exists()
     assert [Run(tmp_path / name / "srnn-seed0").config["training"]["steps"] for name in ranking.SETS] == [2, 3]
