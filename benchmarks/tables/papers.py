@@ -365,7 +365,7 @@ PAPERS = {
             Further(
                 "One motion, at the mean of the prior",
                 tuple(View(count, single=True) for count in range(5)),
-                (FULL, "6,000 steps", WHOLE, TIME, STANDARD, "cvae-rnn"),
+                (FULL, "6,000 steps", WHOLE, TIME, STANDARD),
                 printed=printed(
                     "ADE,FDE",
                     """
@@ -382,7 +382,7 @@ PAPERS = {
                 Further(
                     caption,
                     tuple(View(count, exchanged=0.01, **how) for count in range(1, 5)),
-                    (FULL, "cvae-rnn"),
+                    (FULL,),
                     printed={} if how else ANOTHERS,
                 )
                 for caption, how in EXCHANGES.items()
