@@ -1,4 +1,4 @@
-"""Prints what the static latent of runs knows, and what moves with it: linear probes, interpolations and swaps of w.
+"""Tables of what the static latent of runs knows, and what moves with it: linear probes, interpolations, swaps of w.
 
 A probe is fitted to the windows of every other clip of each class, and judged on the windows of the others: multinomial
 logistic regression to a label, and ridge regression to the lengths of bones, where people differ in these. Beside the
@@ -27,7 +27,7 @@ from dvae.inference.uncertainty import clustered_variance, linearised
 from dvae.motion import Windows
 from dvae.program.batch import rows
 
-from .pages import loaded, table, write
+from .pages import DOCS, loaded, table, write
 
 DRAWS, PENALTY, CHUNK = 8, 1e-3, 128
 ONE_BODY = 0.01
@@ -152,17 +152,17 @@ def swaps(model: Any, windows: Windows, label: str, count: int, seed: int) -> li
 
 def main(
     runs: tyro.conf.Positional[tuple[Path, ...]],
-    page: Path | None = None,
+    page: Path | None = DOCS / "results" / "hit_dvae.md",
     labels: tuple[str, ...] = ("style", "content"),
     splits: tuple[str, ...] = ("train", "test"),
     count: int = 200,
     seed: int = 0,
 ) -> None:
-    """Print the tables.
+    """Write the tables.
 
     Args:
         runs: their directories.
-        page: where to write them, between marks.
+        page: where; with None they are printed.
         labels: what probes are to tell.
         splits: on whose windows; a probe is fitted on each anew.
         count: windows that are decoded with a latent of another.
@@ -179,7 +179,7 @@ def main(
     read = table(["", "windows", "probe of", *labels, "bone lengths, R²"], told)
     moved = ["mean pose moved, mm", "motion about it moved, mm", "mean pose from theirs, mm"]
     header = ["", "latent", "share of another's", *moved]
-    write(page, read, table(header, swapped))
+    write(page, read, table(header, swapped), name="w")
 
 
 if __name__ == "__main__":

@@ -179,7 +179,9 @@ def test_hit_dvae(folder, page):
 
 def test_static(folder, page):
     run = fitted(folder, "with-w", "hit-dvae", "--pose-prior", "0", "--width", "8")
+    page.write_text(page.read_text().replace("tables", "w"))
     static.main((run,), page, labels=("activity",), splits=("train",), count=5)
+    page.write_text(page.read_text().replace("w -->", "tables -->"))
     told, moved = tables(page)
     assert [row[2] for row in told[1:]] == ["w", "z", "mean and spread of poses"]
     assert [row[1:3] for row in moved[1:]] == [*(["w", f"{share:g}"] for share in static.SHARES), ["z", "1"]]
