@@ -618,7 +618,7 @@ def main(
         tables = []
         for view in chosen.views:
             if rows := rows_of(scores, name, view):
-                heading = "" if view.given is None else f"With {view.given} paths given:\n\n"
+                heading = "" if view.given is None else f"With {view.given} path{'s' * (view.given != 1)} given:\n\n"
                 tables.append(heading + ranking(rows, [*COLUMNS, *(JUDGED if chosen.judges else ())]))
         if tables:
             write(page, *tables, name=name)
