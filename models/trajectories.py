@@ -470,7 +470,7 @@ class TrajectoryModel(DynamicalVAE):
         share = np.mean(np.abs(lengths - true) < 0.1 * true)
         if share < 0.95:
             warnings.warn(
-                f"only {share:.0%} of the bones are within 10 % of their length; the paths may be out of reach for "
+                f"only {share:.1%} of the bones are within 10 % of their length; the paths may be out of reach for "
                 "this body, or the model too little fitted",
                 stacklevel=3,
             )

@@ -589,8 +589,9 @@ def test_a_recurrent_decoder_is_bent_through_its_loop(windows):
     torch.manual_seed(0)
     method = small("cvae-rnn", latent=16, width=16)
     model, walk = method.build(windows), Straight(windows)
-    options = {"steps": 60, "batch_size": 16, "learning_rate": 5e-3, "progress": False, "accelerator": "cpu"}
-    method.train(windows, steps=options.pop("steps")).fit(model, **options)
+    # After 60 steps .948 to .950 of the bones keep their length, by the instruction set: the warning's threshold.
+    options = {"batch_size": 16, "learning_rate": 5e-3, "progress": False, "accelerator": "cpu"}
+    method.train(windows, steps=240).fit(model, **options)
     done = []
     for options in ({}, {"exact": True}, {"exact": True, "steps": 1}):
         torch.manual_seed(0)
