@@ -26,7 +26,7 @@ Bie et al., 2022, arXiv 2204.01565. There is no public code. Ours where the pape
 * With best-of-many, the density of x has one scale per coordinate, fitted to the errors and no more: its gradient does
   not reach the poses. The paper's unit variance is emission="unit".
 * Off the paper's data z costs .03 a nat and not .5, under which it falls silent in short runs: motions then lose their
-  rhythm (docs/results/hit_dvae.md).
+  rhythm. A nat of w costs .03 and not 7.5, under which it carries nothing (docs/results/hit_dvae.md).
 * The observed frames are never replaced in training, as they will not be in a forecast, unless `feed_observed`. Means
   that are fed back carry no gradient, unless `feeding_gradient`; `feeding_passes` feeds them in parallel.
 * A model may see windows turned so that the last observed pose faces one way, which it does on small sets.

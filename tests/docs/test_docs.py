@@ -2,11 +2,13 @@
 
 import pkgutil
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
 import dvae  # noqa: F401  its settings are Pyro's from here on, and not from an example's first line
+from dvae.cli import main as command
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -52,6 +54,21 @@ def test_what_a_page_names_is_there(page):
             pkgutil.resolve_name(name)
         except (AttributeError, ImportError):
             pytest.fail(f"{page.name} speaks of {name}")
+
+
+PUBLISHED = re.findall(
+    r"^    dvae (fit .+)$",
+    (ROOT / "docs" / "methods.md").read_text(encoding="utf-8").partition("## The papers' own runs")[2],
+    re.MULTILINE,
+)
+
+
+@pytest.mark.parametrize("line", PUBLISHED)
+def test_a_published_run_lacks_its_data_alone(line, tmp_path, monkeypatch, capsys):
+    """Every option of it is known."""
+    monkeypatch.chdir(tmp_path)
+    assert command(shlex.split(line)) == 1
+    assert re.search(r"^error: \w+\.npz: no such file$", capsys.readouterr().err, re.MULTILINE)
 
 
 def test_every_page_is_on_the_site():
