@@ -30,6 +30,7 @@ from benchmarks.tables import (
     overview,
     pages,
     papers,
+    priors,
     ranking,
     rotations,
     static,
@@ -407,6 +408,43 @@ def test_trajevae(folder, page):
         trajevae.main(run, joints=("Tail",))
     with pytest.raises(SystemExit, match="nowhere is no run directory"):
         trajevae.main(folder / "nowhere")
+
+
+def test_priors(folder, page, monkeypatch):
+    monkeypatch.setattr(priors, "JOINTS", ("RFoot", "LWrist"))
+    monkeypatch.setattr(priors, "SAMPLES", 4)
+    small = ["--protocol", "simulated-trajectories", "--width", "8", "--latent", "4"]
+    runs = [
+        fitted(folder, name, "trajevae", *small, *options)
+        for name, options in {"learned": (), "standard": ("--no-learned-prior", "--no-cosine")}.items()
+    ]
+    page.write_text(page.read_text().replace("tables", "priors"))
+    priors.main(tuple(runs), page, counts=(0, 2))
+    page.write_text(page.read_text().replace("priors", "tables"))
+    ((header, *rows),) = tables(page)
+    assert [row[:2] for row in rows] == [[run.name, count] for run in runs for count in "02"]
+
+    def column(name):
+        return [row[header.index(name)] for row in rows]
+
+    assert column("prior means")[2:] == ["0.00"] * 2
+    assert column("prior")[2:] == ["1.00"] * 2
+    assert all(a < b for a, b in zip(column("APD, prior × 0.5"), column("APD, prior × 2"), strict=True))
+    assert column("APD, fitted") != column("APD, prior × 1")
+    with pytest.raises(SystemExit, match="a run of vae; give one of trajevae"):
+        priors.main((fitted(folder, "without-paths", "vae", "--warm-up", 1),))
+
+
+def test_a_fitted_prior_has_the_moments_of_the_posteriors_together():
+    torch.manual_seed(0)
+    mean, deviation = torch.randn(5, 3, 2), torch.rand(5, 3, 2)
+    loc, scale = priors.fitted((mean, deviation))({}, 7, 4)
+    assert loc.shape == scale.shape == (7, 4, 2)
+    assert not loc[:, 3].any()
+    assert (scale[:, 3] == 1).all()
+    draws = (mean + deviation * torch.randn(20_000, 5, 3, 2)).flatten(0, 1)
+    torch.testing.assert_close(loc[0, :3], draws.mean(0), atol=0.03, rtol=0)
+    torch.testing.assert_close(scale[0, :3], draws.std(0), atol=0.03, rtol=0)
 
 
 def test_occlusion(folder, page, monkeypatch):
