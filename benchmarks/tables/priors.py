@@ -1,15 +1,15 @@
-"""Writes the table of TrajeVAE's priors of docs/results/trajevae.md: how they fit the posteriors, and other scales.
+"""Writes the table of TrajeVAE's priors of docs/results/trajevae.md: how they fit the posteriors, and other laws.
 
-A prior covers the posteriors where z, drawn from that of a window, is as far from the prior's mean as a draw of the
-prior is: one, in units of the prior's deviation, root mean square. Below it the prior is too wide, above it too narrow.
-What that does is told by the same decoder with other priors: the model's own with its deviations multiplied, and a
-normal law of the mean and the variance, for each number of z, of the posteriors of all training windows.
+z, drawn from a window's posterior, is as far from the prior's mean as a draw of the prior where the prior is as wide as
+the posteriors ask: one, in units of the prior's deviation, root mean square. Below it the prior is too wide, above it
+too narrow. What that does is told by the same decoder with other laws of z: the prior with its deviations multiplied,
+and with the mean, the deviation, or both, of the posteriors of all training windows together, number by number.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -17,35 +17,41 @@ from unittest.mock import patch
 import torch
 import tyro
 from torch import Tensor
-from torch.nn import functional
 
-import dvae
 from dvae import motion
 from dvae.models.trajectories import FIRST, GIVEN
 from dvae.program.batch import CHUNK, rows
 
 from .pages import DOCS, loaded, table, write
 from .ranking import JOINTS
-from .tuning import SAMPLES, seen
+from .tuning import evaluated, seen
 
-SCALES = (0.5, 1.0, 2.0)
-"""Of the prior's deviations."""
 SCORES = ("APD", "energy score")
+LAWS: dict[str, tuple[float, tuple[str, ...]]] = {
+    "prior": (1.0, ()),
+    "prior × 2": (2.0, ()),
+    "common mean": (1.0, ("mean",)),
+    "common deviation": (1.0, ("deviation",)),
+    "common both": (1.0, ("mean", "deviation")),
+}
+"""By their columns: what the prior's deviations are multiplied by, and what is the posteriors' together."""
+BETWEEN = (0.05, 0.95)
+"""Quantiles over the numbers of z."""
 Law = tuple[Tensor, Tensor]
 
 
 @torch.no_grad()
-def laws(model: Any, windows: Any) -> tuple[Law, Law]:
-    """Means and deviations of z, (N, T, D), by the guide and by the prior; of the coefficients that are read."""
-    found: list[list[Tensor]] = []
+def law(model: Any, factor: Any, windows: Any) -> Law:
+    """Means and deviations of z, (N, T, D), by the guide or the prior; of the coefficients that are read."""
+    found: list[Law] = []
     batch = windows.all()
     for start in range(0, len(batch["x"]), CHUNK):
         data = model.read(rows(batch, slice(start, start + CHUNK)))
-        size, length = len(data[FIRST]), data[GIVEN].shape[1]
-        each = [*model.encoder["z"](data, size, length), *model.generator["z"](data, size, length)]
-        found.append([values[:, : model.method.components or None] for values in each])
-    mean, deviation, prior_mean, prior_deviation = (torch.cat(values) for values in zip(*found, strict=True))
-    return (mean, deviation), (prior_mean, prior_deviation)
+        mean, deviation = factor(data, len(data[FIRST]), data[GIVEN].shape[1])
+        steps = slice(model.method.components or None)
+        found.append((mean[:, steps], deviation[:, steps]))
+    means, deviations = map(torch.cat, zip(*found, strict=True))
+    return means, deviations
 
 
 def rms(values: Tensor) -> float:
@@ -53,28 +59,30 @@ def rms(values: Tensor) -> float:
     return float(values.square().mean().sqrt())
 
 
-def fitted(posterior: Law) -> Callable[..., Law]:
-    """A prior that is the same for all windows: what the posteriors of some are together, each number by itself."""
+def together(posterior: Law) -> Law:
+    """Mean and deviation of draws of the posteriors of all windows, (T, D)."""
     mean, deviation = posterior
-    center, spread = mean.mean(0), (mean.var(0, correction=0) + deviation.square().mean(0)).sqrt()
-
-    def prior(parents: Mapping[str, Tensor], batch: int, length: int, *unread: Any) -> Law:
-        later = (0, 0, 0, length - len(center))  # coefficients that nothing reads are N(0, 1)
-        loc, scale = functional.pad(center, later), functional.pad(spread, later, value=1.0)
-        return loc.expand(batch, -1, -1), scale.expand(batch, -1, -1)
-
-    return prior
+    return mean.mean(0), (mean.var(0, correction=0) + deviation.square().mean(0)).sqrt()
 
 
-def scored(model: Any, windows: Any, scale: float) -> list[float]:
-    """Of draws of the prior with its deviations multiplied."""
+def with_common(prior: Callable[..., Law], common: Law, what: tuple[str, ...]) -> Callable[..., Law]:
+    """A prior with what is said to be common to all windows."""
+    mean, deviation = common
 
-    def scores(windows: Any) -> Any:
-        return [each for each in motion.scores(windows) if each.name in SCORES]
+    def changed(*arguments: Any, **options: Any) -> Law:
+        loc, scale = (values.clone() for values in prior(*arguments, **options))
+        if "mean" in what:
+            loc[:, : len(mean)] = mean
+        if "deviation" in what:
+            scale[:, : len(mean)] = deviation
+        return loc, scale
 
-    told = {"references": False, "progress": False, "options": {"temperature": scale}}
-    found = dvae.evaluate(model, windows, scores=scores, samples=SAMPLES, **told)["model"]
-    return [found[name].mean for name in SCORES]
+    return changed
+
+
+def few(windows: Any) -> Any:
+    """The scores that the table shows."""
+    return [each for each in motion.scores(windows) if each.name in SCORES]
 
 
 def lines(path: Path, counts: tuple[int, ...]) -> Iterator[list[str]]:
@@ -83,17 +91,21 @@ def lines(path: Path, counts: tuple[int, ...]) -> Iterator[list[str]]:
     if run.method.name != "trajevae":
         sys.exit(f"{path} is a run of {run.method.name}; give one of trajevae")
     model, judged, trained = run.model.eval(), seen(run.data), run.data.windows("train")
+    guide, prior = model.encoder["z"], model.generator["z"]
     for count in counts:
         windows = judged.given(JOINTS[:count])
-        (mean, deviation), (prior_mean, prior_deviation) = laws(model, windows)
+        (mean, deviation), (prior_mean, prior_deviation) = (law(model, each, windows) for each in (guide, prior))
         off = torch.hypot(mean - prior_mean, deviation) / prior_deviation
+        low, high = off.square().mean(0).sqrt().quantile(torch.tensor(BETWEEN)).tolist()
         widths = [rms(mean - mean.mean(0)), rms(deviation), rms(prior_mean - prior_mean.mean(0)), rms(prior_deviation)]
-        cells = [scored(model, windows, scale) for scale in SCALES]
-        posterior, _ = laws(model, trained.given(JOINTS[:count]))
-        with patch.object(model.generator["z"], "forward", fitted(posterior)):
-            cells.append(scored(model, windows, 1.0))
-        told = [f"{value:.2f}" for value in (*widths, rms(off))]
-        yield [path.name, str(count), *told, *(f"{each:.2f}" for values in zip(*cells, strict=True) for each in values)]
+        common = together(law(model, guide, trained.given(JOINTS[:count])))
+        cells = []
+        for scale, what in LAWS.values():
+            with patch.object(prior, "forward", with_common(prior.forward, common, what)):
+                found = evaluated(model, windows, few, options={"temperature": scale})
+            cells.append([f"{found[name]:.2f}" for name in SCORES])
+        told = [*(f"{value:.2f}" for value in widths), f"{rms(off):.2f} ({low:.2f}, {high:.2f})"]
+        yield [path.name, str(count), *told, *(each for values in zip(*cells, strict=True) for each in values)]
 
 
 def main(
@@ -109,8 +121,7 @@ def main(
         counts: of joints whose paths are given.
     """
     widths = ["posterior means", "posterior", "prior means", "prior", "z in units of the prior"]
-    ways = [*(f"prior × {scale:g}" for scale in SCALES), "fitted"]
-    header = ["", "given", *widths, *(f"{score}, {way}" for score in SCORES for way in ways)]
+    header = ["", "given", *widths, *(f"{score}, {name}" for score in SCORES for name in LAWS)]
     write(page, table(header, [line for run in runs for line in lines(run, counts)]), name="priors")
 
 

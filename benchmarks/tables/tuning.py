@@ -311,9 +311,9 @@ def score(path: Path, data: MotionData, judged: Mapping[str, Path]) -> dict[str,
     return found
 
 
-def evaluated(model: Any, windows: Any, scores: Any) -> dict[str, float]:
-    """Means of scores over windows."""
-    found = dvae.evaluate(model, windows, scores=scores, samples=SAMPLES, references=False, progress=False)
+def evaluated(model: Any, windows: Any, scores: Any, **told: Any) -> dict[str, float]:
+    """Means of scores over windows; the last arguments are of `dvae.evaluate`."""
+    found = dvae.evaluate(model, windows, scores=scores, samples=SAMPLES, references=False, progress=False, **told)
     return {name: each.mean for name, each in found["model"].items()}
 
 

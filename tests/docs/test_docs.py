@@ -63,6 +63,10 @@ PUBLISHED = re.findall(
 )
 
 
+def test_the_methods_of_the_papers_have_published_runs():
+    assert {"gsps", "hit-dvae", "trajevae", "dlow"} <= {line.split()[1] for line in PUBLISHED}
+
+
 @pytest.mark.parametrize("line", PUBLISHED)
 def test_a_published_run_lacks_its_data_alone(line, tmp_path, monkeypatch, capsys):
     """Every option of it is known."""

@@ -412,7 +412,7 @@ def test_trajevae(folder, page):
 
 def test_priors(folder, page, monkeypatch):
     monkeypatch.setattr(priors, "JOINTS", ("RFoot", "LWrist"))
-    monkeypatch.setattr(priors, "SAMPLES", 4)
+    monkeypatch.setattr(tuning, "SAMPLES", 4)
     small = ["--protocol", "simulated-trajectories", "--width", "8", "--latent", "4"]
     runs = [
         fitted(folder, name, "trajevae", *small, *options)
@@ -429,22 +429,37 @@ def test_priors(folder, page, monkeypatch):
 
     assert column("prior means")[2:] == ["0.00"] * 2
     assert column("prior")[2:] == ["1.00"] * 2
-    assert all(a < b for a, b in zip(column("APD, prior × 0.5"), column("APD, prior × 2"), strict=True))
-    assert column("APD, fitted") != column("APD, prior × 1")
+    for run, off, posterior in zip(runs, column("z in units of the prior")[::2], column("posterior")[::2], strict=True):
+        loaded = load(run)
+        data = loaded.model.read(tuning.seen(loaded.data).given(()).all())
+        read = slice(loaded.model.method.components or None)
+        (mean, deviation), (loc, scale) = (
+            [values[:, read].detach() for values in factor["z"](data, len(data["s"]), data["y"].shape[1])]
+            for factor in (loaded.model.encoder, loaded.model.generator)
+        )
+        assert float(posterior) == pytest.approx(float((deviation**2).mean()) ** 0.5, abs=0.006)
+        second = ((mean - loc) ** 2 + deviation**2) / scale**2  # moment of a draw, in units of the prior
+        assert float(off.split()[0]) == pytest.approx(float(second.mean()) ** 0.5, abs=0.006)
+    assert all(a < b for a, b in zip(column("APD, prior"), column("APD, prior × 2"), strict=True))
+    assert len({*column("APD, common both")}) > 1
+    assert column("energy score, common both") != column("energy score, prior")
     with pytest.raises(SystemExit, match="a run of vae; give one of trajevae"):
         priors.main((fitted(folder, "without-paths", "vae", "--warm-up", 1),))
 
 
-def test_a_fitted_prior_has_the_moments_of_the_posteriors_together():
+def test_what_a_prior_has_in_common_are_the_moments_of_the_posteriors_together():
     torch.manual_seed(0)
     mean, deviation = torch.randn(5, 3, 2), torch.rand(5, 3, 2)
-    loc, scale = priors.fitted((mean, deviation))({}, 7, 4)
-    assert loc.shape == scale.shape == (7, 4, 2)
-    assert not loc[:, 3].any()
-    assert (scale[:, 3] == 1).all()
+    common = priors.together((mean, deviation))
     draws = (mean + deviation * torch.randn(20_000, 5, 3, 2)).flatten(0, 1)
-    torch.testing.assert_close(loc[0, :3], draws.mean(0), atol=0.03, rtol=0)
-    torch.testing.assert_close(scale[0, :3], draws.std(0), atol=0.03, rtol=0)
+    for found, of in zip(common, (draws.mean(0), draws.std(0)), strict=True):
+        torch.testing.assert_close(found, of, atol=0.03, rtol=0)
+    own = torch.randn(7, 4, 2), torch.rand(7, 4, 2)  # of which the last step is not read
+    for what in ((), ("mean",), ("deviation",), ("mean", "deviation")):
+        made = priors.with_common(lambda: own, common, what)()
+        for name, values, before, after in zip(("mean", "deviation"), made, own, common, strict=True):
+            assert (values[:, :3] == (after if name in what else before[:, :3])).all()
+            assert (values[:, 3] == before[:, 3]).all()
 
 
 def test_occlusion(folder, page, monkeypatch):
