@@ -134,9 +134,9 @@ def test_a_file_that_is_no_motion_is_refused_in_a_sentence(capsys, tmp_path, peo
     hostile, text, metres = tmp_path / "hostile.npz", tmp_path / "text.npz", tmp_path / "far" / "metres.npz"
     np.savez(hostile, positions_3d=np.array(Hostile(), dtype=object))
     text.write_text("not a zip archive")
-    shutil.copy(people.with_name("skeleton.json"), tmp_path)
+    shutil.copy(people.with_name("people.npz.skeleton.json"), tmp_path / "skeleton.json")
     metres.parent.mkdir()
-    shutil.copy(people.with_name("skeleton.json"), metres.parent)
+    shutil.copy(people.with_name("people.npz.skeleton.json"), metres.parent / "skeleton.json")
     np.savez(metres, **{"train/a": 1000 * np.load(people)["train/person_0000"]})
     assert "no such file" in failure(capsys, "data", "info", str(tmp_path / "nowhere.npz"))
     assert "system" in failure(capsys, "data", "info", str(hostile))
@@ -497,7 +497,7 @@ def test_a_config_of_wrong_types_is_refused_in_a_sentence(capsys, run, keys, val
 
 def test_changed_or_moved_data_are_noticed(capsys, people, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in ("people.npz", "skeleton.json", "labels.csv"):
+    for name in ("people.npz", "people.npz.skeleton.json", "people.npz.labels.csv"):
         shutil.copy(people.with_name(name), tmp_path)
     assert main(["fit", "vae", "--data", "people.npz", "--out", "run", "--steps", "5", *SMALL]) == 0
     assert json.loads(Path("run/config.json").read_text())["data"]["path"] == "people.npz"

@@ -935,7 +935,7 @@ def test_demo(tmp_path):
     demo.main(tmp_path / "demo", share=0.002, samples=2, clips=10)
     rows = Evaluation.load(tmp_path / "demo" / "evaluation.json").rows
     assert rows.keys() == {"zero velocity", "nearest neighbours", *demo.STEPS}
-    data = {"labels.csv", "people.npz", "skeleton.json"}
+    data = {"people.npz", "people.npz.labels.csv", "people.npz.skeleton.json"}
     names = {"evaluation.json", "futures.png", "report.html", "runs", *data}
     assert {file.name for file in (tmp_path / "demo").iterdir()} == names
     page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")

@@ -512,7 +512,7 @@ def read_mutated(example, directory):
     path = directory / "mutated.npz"
     if base == "plain":
         save(path, MotionSet([Clip("train", "walk", clips(1)[0])], WALKER))
-        (directory / "skeleton.json").unlink()
+        (directory / "mutated.npz.skeleton.json").unlink()
         if header is not None:
             npz(
                 path, [("train/walk.npy", mutate_bytes(npy(clips(1)[0].tobytes(), header), member))], compression=method

@@ -107,7 +107,7 @@ BROKEN = {
 @pytest.mark.parametrize("what", BROKEN)
 def test_what_is_no_skeleton_is_told_in_a_sentence_that_names_the_file(tmp_path, what):
     changes, message = BROKEN[what]
-    path = tmp_path / "skeleton.json"
+    path = tmp_path / "a.npz.skeleton.json"
     if isinstance(changes, dict) and not what.startswith("no "):
         changes = (
             {**VALID, **changes} if "joint" in what or "lengths" in what else {**VALID, "bone_lengths_m": [], **changes}

@@ -355,7 +355,7 @@ class TestPlain:
     def test_links_are_replaced_and_not_followed(self, tmp_path):
         victim = tmp_path / "mine.txt"
         victim.write_text("mine")
-        links = [tmp_path / name for name in ("a.npz", "skeleton.json", "labels.csv")]
+        links = [tmp_path / name for name in ("a.npz", "a.npz.skeleton.json", "a.npz.labels.csv")]
         for link in links:
             link.symlink_to(victim)
         save(links[0], simulate(5, 20))
@@ -363,7 +363,7 @@ class TestPlain:
         assert not any(link.is_symlink() for link in links)
         assert read_motion(links[0]).fingerprint() == simulate(5, 20).fingerprint()
 
-    @pytest.mark.parametrize("name", ["a.npz", "skeleton.json", "labels.csv"])
+    @pytest.mark.parametrize("name", ["a.npz", "a.npz.skeleton.json", "a.npz.labels.csv"])
     def test_a_full_disk_leaves_the_older_file_and_is_named(self, name, tmp_path, monkeypatch):
         save(tmp_path / "a.npz", simulate(5, 20))
         old = (tmp_path / name).read_bytes()
@@ -418,7 +418,7 @@ class TestPlain:
 
     def test_without_a_skeleton_the_error_says_what_to_write(self, tmp_path):
         np.savez(tmp_path / "a.npz", walk=people()[0].positions)
-        with pytest.raises(ValueError, match=r'skeleton\.json beside it \(\{"joint_names"'):
+        with pytest.raises(ValueError, match=r'skeleton\.json into its folder \(\{"joint_names"'):
             read_motion(tmp_path / "a.npz")
 
     def test_labels_are_found_by_split_and_clip(self, tmp_path):

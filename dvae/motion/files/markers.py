@@ -5,7 +5,9 @@ Known readers, in C and C++, end the whole process over a damaged file; what is 
 
 from __future__ import annotations
 
+import itertools
 import struct
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,8 @@ MOST_DISTANCES = 2**23
 
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
 _BLOCK, _MOST_BLOCKS = 512, 255  # bytes of a block, and how many hold the parameters, said in one byte
+_OUTPUTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "REACTIONS", "SCALARS")
+"""Parameters of the group POINT that list points which are no places but what a model of the body computed."""
 _ORDERS = {84: "<", 86: ">"}  # Intel's and MIPS' bytes; DEC's numbers (85) are of the eighties
 
 
@@ -26,7 +30,10 @@ def read_c3d(path: str | Path) -> Recording:
     """Read the labelled markers of a C3D file, and the tree that holds them best together.
 
     Markers have no skeleton. Here one hangs from another where their distance hardly changes: the minimum spanning tree
-    over the spread of all distances, from the marker in the middle. A marker that is not seen is NaN.
+    over the spread of all distances, from the marker in the middle. A marker that is not seen is NaN: its residual is
+    negative, or its place and its residual are exactly zero. Of points without a name and of those that the file lists
+    as angles, forces, moments, powers, reactions or scalars, none is a marker. The notes of the recording list what is
+    left out or renamed.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -59,16 +66,45 @@ def read_c3d(path: str | Path) -> Recording:
     numbers = np.frombuffer(content, kind, frames * row, _BLOCK * (start - 1)).reshape(frames, row)
     values = numbers[:, : 4 * markers].reshape(frames, markers, 4).astype(np.float64)
     places: np.ndarray = values[..., :3] * (1 if scale < 0 else scale)
-    hidden = (values[..., 3] < 0) | ~(np.abs(places) < 1e9).all(-1)
-    places[hidden] = np.nan
-    names = parameters.get("LABELS", [])[:markers]
-    seen = np.asarray(np.isfinite(places).all(2)).max(0)
-    kept = [n for n, name in enumerate(names) if name and name[0] != "*" and name not in names[:n] and seen[n]]
+    zero = (values == 0).all(-1)
+    places[(values[..., 3] < 0) | zero | ~(np.abs(places) < 1e9).all(-1)] = np.nan
+    names = _numbered(parameters, "LABELS")[:markers]
+    groups = {
+        *_OUTPUTS,
+        *(name.upper() for name in _numbered(parameters, "TYPE_GROUPS") if "MARKER" not in name.upper()),
+    }
+    outputs = {name for group in groups if not group.endswith("_UNITS") for name in _numbered(parameters, group)}
+    named = [n for n, name in enumerate(names) if name and name[0] != "*"]
+    seen = np.asarray(np.isfinite(places).all(2)).any(0)
+    kept = [n for n in named if names[n] not in outputs and seen[n]]
     if not kept:
         raise ValueError(f"{path}: it has no markers with names that are seen")
+    left_out = {
+        "computed by a model of the body": [names[n] for n in named if names[n] in outputs],
+        "never seen": [names[n] for n in named if names[n] not in outputs and not seen[n]],
+        "without a name": [f"point {n + 1}" for n in sorted({*range(markers)} - {*named}) if seen[n]],
+    }
+    notes = [f"{len(points)} points {why} are left out ({_some(points)})" for why, points in left_out.items() if points]
+    if (count := int(zero[:, kept].sum())) > 0:
+        notes.append(f"{count:,} places that are exactly 0, 0, 0 with residual 0 are read as not seen")
+    for n in kept:
+        if (name := names[n]) in names[:n]:
+            names[n] = next(new for again in itertools.count(2) if (new := f"{name}_{again}") not in names)
+            notes.append(f"another marker {name} is read as {names[n]}")
     order_of, parents = tree(places[:, kept])
     chosen = [kept[place] for place in order_of]
-    return Recording([names[n] for n in chosen], parents, places[:, chosen], fps=fps, metres=METRES[unit])
+    found = [names[n] for n in chosen]
+    return Recording(found, parents, places[:, chosen], fps=fps, metres=METRES[unit], notes=notes)
+
+
+def _numbered(parameters: dict[str, list[str]], name: str) -> list[str]:
+    """Texts of a parameter that goes on in others, as it has 255 entries at most: LABELS, LABELS2, LABELS3."""
+    parts = itertools.takewhile(parameters.__contains__, (f"{name}{n if n > 1 else ''}" for n in itertools.count(1)))
+    return [text for part in parts for text in parameters[part]]
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:6]) + ", …" * (len(names) > 6)
 
 
 def _parameters(content: bytes) -> tuple[dict[str, list[str]], str]:
@@ -87,7 +123,7 @@ def _parameters(content: bytes) -> tuple[dict[str, list[str]], str]:
             point = -group if name == "POINT" else point
         elif struct.unpack_from("b", content, here + 2)[0] == -1:  # text
             sizes = list(content[here + 4 : here + 4 + content[here + 3]])
-            width, count = ([*sizes, 1, 1])[:2]
+            width, count = ([*sizes, 1])[0], prod(sizes[1:])
             begin = here + 4 + len(sizes)
             text = content[begin : begin + width * count].decode("latin1")
             texts = [text[n * width : (n + 1) * width].strip(" \0") for n in range(count)]

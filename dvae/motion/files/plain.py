@@ -28,8 +28,10 @@ from .settled import doubt
 TURNS = ".rotations"
 """At the end of a member's name: the rotations of the clip."""
 
+SKELETON, LABELS = "skeleton.json", "labels.csv"
+
 WHICH = (
-    "which skeleton? Put a skeleton.json beside it "
+    "which skeleton? Put a skeleton.json into its folder "
     '({"joint_names": [...], "parents": [-1, 0, ...], "joints_left": [...], "joints_right": [...], '
     '"up_axis": "y", "fps": 30}) or pass skeleton=, such as dvae.motion.HUMAN36M'
 )
@@ -62,12 +64,12 @@ def read_archive(
     """
     found = _read_clips(path)
     if skeleton is None:
-        skeleton, kept = _skeleton_of(path, found)
+        skeleton, kept = _skeleton_of(path, found, joints)
         joints = kept if joints is None else joints
     skeleton = replace(skeleton, up=up or skeleton.up, fps=fps or skeleton.fps)
-    known = read_labels(path.with_name("labels.csv"), labels)
+    file = Path(labels) if labels else companion(path, LABELS)
+    known = read_labels(file, labels)
     if known and not any((split, name) in known or (None, name) in known for split, name, _, _ in found):
-        file = Path(labels) if labels else path.with_name("labels.csv")
         raise ValueError(f"{file}: no row names a clip of {path} by (split, clip)")
     found.reverse()
 
@@ -96,10 +98,11 @@ def read_archive(
 
 
 def save(path: str | Path, motion: MotionSet) -> None:
-    """Write a plain npz, and beside it skeleton.json and (where there are labels) labels.csv, for `read_motion`.
+    """Write a plain npz with its skeleton and labels, for `read_motion`.
 
-    Each takes the place of an older file, or of a link, once it is whole. Rotations are members of their own, "split/
-    clip.rotations".
+    The skeleton of people.npz is in people.npz.skeleton.json, and its labels, if any, are in people.npz.labels.csv, so
+    that several archives fit into one folder. Each takes the place of an older file, or of a link, once it is whole.
+    Rotations are members of their own, "split/clip.rotations".
 
     Raises:
         OSError: one cannot be written; the error names it.
@@ -135,21 +138,52 @@ def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], S
 
     with files.written(path) as file:
         write_arrays(file, members())
-    skeleton().to_json(path.with_name("skeleton.json"))
-    write_labels(path.with_name("labels.csv"), labelled)
+    skeleton().to_json(own_companion(path, SKELETON))
+    own = own_companion(path, LABELS)
+    if not write_labels(own, labelled, always=path.with_name(LABELS).is_file()):  # the folder's are not of these clips
+        own.unlink(missing_ok=True)
 
 
-def write_labels(path: Path, clips: Iterable[Clip]) -> None:
-    """Write what is known of clips, if anything is, as `read_labels` reads it."""
+def own_companion(path: Path, name: str) -> Path:
+    """Return the path of a file that belongs to one motion file only, such as people.npz.skeleton.json."""
+    return path.with_name(f"{path.name}.{name}")
+
+
+def companion(path: Path, name: str) -> Path:
+    """Return the path of the skeleton or labels of a motion file: its own if there is one, or else the folder's."""
+    own = own_companion(path, name)
+    return own if own.is_file() else path.with_name(name)
+
+
+def write_labels(path: Path, clips: Iterable[Clip], older: Path | None = None, always: bool = False) -> bool:
+    """Write the labels of clips as `read_labels` reads them, and return whether there was anything to write.
+
+    Args:
+        path: the file.
+        clips: clips with their labels.
+        older: an earlier file, whose rows of other clips are kept.
+        always: write the names of clips without labels too.
+
+    Raises:
+        ValueError: a row of the earlier file does not name the split of its clip.
+    """
     rows = [{**clip.labels, "split": clip.split, "clip": clip.name} for clip in clips]
+    if not always and not any(row.keys() - {"split", "clip"} for row in rows):
+        return False
+    if older is not None:
+        new = {key for row in rows for key in ((row["split"], row["clip"]), (None, row["clip"]))}
+        kept = {key: row for key, row in read_labels(older, None).items() if key not in new}
+        if any(split is None for split, _ in kept):
+            raise ValueError(f"{older}: other clips have labels in it, by name alone; add a column named split")
+        rows = [*kept.values(), *rows]
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    if len(columns) > 2:
-        table = io.StringIO(newline="")
-        writer = csv.DictWriter(table, ["split", "clip", *(c for c in columns if c not in ("split", "clip"))])
-        writer.writeheader()
-        writer.writerows(rows)
-        with files.written(path) as file:
-            file.write(table.getvalue().encode())
+    table = io.StringIO(newline="")
+    writer = csv.DictWriter(table, ["split", "clip", *(c for c in columns if c not in ("split", "clip"))])
+    writer.writeheader()
+    writer.writerows(rows)
+    with files.written(path) as file:
+        file.write(table.getvalue().encode())
+    return True
 
 
 def check_key(key: tuple[str, str], path: Path | None = None) -> None:
@@ -160,13 +194,21 @@ def check_key(key: tuple[str, str], path: Path | None = None) -> None:
         )
 
 
-def _skeleton_of(path: Path, clips: Sequence[_Read]) -> tuple[Skeleton, tuple[int, ...] | None]:
+def _skeleton_of(
+    path: Path, clips: Sequence[_Read], joints: Sequence[int] | None
+) -> tuple[Skeleton, tuple[int, ...] | None]:
     """The skeleton beside a file or of a known archive, and which of the file's joints make it up."""
-    beside = path.with_name("skeleton.json")
-    if beside.is_file():
-        return Skeleton.from_json(beside), None
-    splits = {split for split, *_ in clips}
     counts = {positions.shape[1] for _, _, positions, _ in clips if positions.ndim == 3}
+    file = companion(path, SKELETON)
+    if file.is_file():
+        skeleton = Skeleton.from_json(file)
+        if joints is None and counts and skeleton.joints not in counts:
+            raise ValueError(
+                f"{path} has {max(counts)} joints and {file} has {skeleton.joints}, so they do not belong together; "
+                f"put the archive's own skeleton into {own_companion(path, SKELETON).name}, or pass skeleton="
+            )
+        return skeleton, None
+    splits = {split for split, *_ in clips}
     for subjects, joints, skeleton, kept in _ARCHIVES:
         if splits and splits <= subjects and joints in counts:
             return skeleton, kept
@@ -299,7 +341,7 @@ def _read_columns(path: Path, numbers: int = MOST_NUMBERS, *most: int) -> dict[s
 
 
 def read_table(path: Path) -> Recording:
-    """Read a clip from a csv file of columns as in `read_paths`, with its skeleton.json beside it.
+    """Read a clip from a csv file of columns as in `read_paths`, with its skeleton.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -307,12 +349,12 @@ def read_table(path: Path) -> Recording:
     """
     columns = _read_columns(path, 3 * MOST_PLACES, MOST_TEXT)
     check_joints(path, len(columns))
-    if not (beside := path.with_name("skeleton.json")).is_file():
+    if not (file := companion(path, SKELETON)).is_file():
         raise ValueError(f"{path}: {WHICH}")
-    skeleton = Skeleton.from_json(beside)
+    skeleton = Skeleton.from_json(file)
     if set(columns) != set(skeleton.names):
         differing = ", ".join(sorted(set(columns) ^ set(skeleton.names)))
-        raise ValueError(f"{path}: {beside} and the columns do not have the same joints: {differing[:600]}")
+        raise ValueError(f"{path}: {file} and the columns do not have the same joints: {differing[:600]}")
     positions = np.stack([columns[name] for name in skeleton.names], 1)
     return Recording(
         skeleton.names, skeleton.parents, positions, fps=skeleton.fps, metres=1.0, up=skeleton.up, skeleton=skeleton

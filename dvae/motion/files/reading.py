@@ -17,7 +17,7 @@ from .amc import read_amc, read_expmap
 from .archive import LARGEST
 from .bvh import read_bvh
 from .markers import read_c3d
-from .plain import check_key, read_archive, read_labels, read_table
+from .plain import LABELS, check_key, companion, read_archive, read_labels, read_table
 from .recording import Recording
 from .settled import World, doubt, settle, turned, understand
 from .smpl import is_amass, read_amass
@@ -79,24 +79,26 @@ def read_motion(
     | `.amc` | with its `.asf` beside it |
     | `.txt` | exponential maps as in the CMU benchmark |
     | `.c3d` | markers |
-    | `.csv` | one clip in metres, columns such as LWrist_x, LWrist_y, LWrist_z; `skeleton.json` beside it |
+    | `.csv` | one clip in metres, columns such as LWrist_x, LWrist_y, LWrist_z; with a skeleton |
     | `.npz` | AMASS: one clip, members `poses`, `trans`, `mocap_framerate` |
     | `.npz` | VideoPose3D's archive: the member `positions_3d` |
-    | `.npz` | any other: an array (F, J, 3) in metres for each clip under "split/clip"; `skeleton.json` beside it |
+    | `.npz` | any other: an array (F, J, 3) in metres for each clip under "split/clip"; with a skeleton |
 
     A folder is read to its last subfolder, without following links: a clip's name is its file's, its split the
-    subfolder, or "all". A key of an npz without a slash belongs to the split "all", too. `labels.csv` (one row per
-    clip with the columns split, clip and whatever is known) beside the file, or in the folder, is read too.
-    VideoPose3D's archives of Human3.6M and HumanEva-I have no skeleton.json; they are known by their subjects and
-    joints.
+    subfolder, or "all". A key of an npz without a slash belongs to the split "all", too.
+
+    The skeleton of people.npz is read from people.npz.skeleton.json, or else from skeleton.json in the same folder.
+    Labels are read from people.npz.labels.csv, or else from labels.csv, which has one row per clip with the columns
+    split, clip and whatever is known. VideoPose3D's archives of Human3.6M and HumanEva-I need no skeleton file; they
+    are known by their subjects and joints.
 
     Units and axes are as the file says, or found: a person has a person's size, and their head is above their feet.
     `MotionSet.said` has what was found.
 
     Args:
         path: the file or folder.
-        skeleton: overrides the file's, or skeleton.json.
-        labels: a csv file, instead of labels.csv.
+        skeleton: overrides that of the file or next to it.
+        labels: a csv file, instead of the one next to the file.
         skip_bad: leave out clips with NaN, wrong joints or units instead of raising; they are listed in
             `skipped`.
         joints: those to keep, by place or name; or by name with a new one. Each hangs from its nearest ancestor that is
@@ -165,7 +167,7 @@ def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
         suffix = path.suffix.lower()
         if suffix not in READERS or (suffix == ".npz" and not is_amass(path)):
             return []
-        return _known([File("all", path.stem, path)], path.with_name("labels.csv"), labels)
+        return _known([File("all", path.stem, path)], companion(path, LABELS), labels)
     kinds: dict[str, list[File]] = {suffix: [] for suffix in READERS}
     count = 0
     for folder, inner, names in os.walk(path, followlinks=False):
@@ -174,7 +176,8 @@ def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
         for name in sorted(names):
             file = Path(folder, name)
             suffix = file.suffix.lower()
-            if suffix in kinds and not name.startswith(".") and name != "labels.csv" and not file.is_symlink():
+            labelling = name == LABELS or name.endswith(f".npz.{LABELS}")
+            if suffix in kinds and not name.startswith(".") and not labelling and not file.is_symlink():
                 kinds[suffix].append(File("all" if split == "." else split, file.stem, file))
                 count += 1
                 if count > MOST_FILES:
@@ -186,7 +189,7 @@ def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
         raise ValueError(f"{path}: it has {counts} files; put each kind into a folder of its own")
     if not there:
         raise FileNotFoundError(f"{path}: no file in it is one of {', '.join(READERS)}")
-    return _known(there[next(iter(there))], path / "labels.csv", labels)
+    return _known(there[next(iter(there))], path / LABELS, labels)
 
 
 def _known(files: list[File], beside: Path, labels: str | Path | None) -> list[File]:
@@ -276,7 +279,7 @@ class FileReader:
             clip, own = clip.resampled(fps / self.resampled), replace(own, fps=float(self.resampled))
         if reason := defect(clip, own, self.missing):
             raise ValueError(reason)
-        notes = [BENDS] if settled.rotations is not None and clip.rotations is None else []
+        notes = [*recording.notes, *([BENDS] if settled.rotations is not None and clip.rotations is None else [])]
         notes += [lying] if (lying := doubt(settled.names, settled.positions, self.world.up)) else []
         return clip, own, notes
 

@@ -43,6 +43,7 @@ class Recording:
         up: the axis that is, where the file says.
         skeleton: of these joints, where it stands beside the file.
         labels: what the file says about it.
+        notes: what of the file was left out or renamed, in a sentence each.
     """
 
     names: Sequence[str]
@@ -56,6 +57,7 @@ class Recording:
     up: str | None = None
     skeleton: Skeleton | None = None
     labels: Mapping[str, str] = field(default_factory=dict)
+    notes: Sequence[str] = ()
 
     @classmethod
     def turned(

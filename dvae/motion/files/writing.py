@@ -17,7 +17,7 @@ from ...inference.result import progress_bar
 from ..data import Clip, MotionSet
 from ..skeleton import Skeleton, brief
 from .bvh import write_bvh
-from .plain import save, save_clips, write_labels, write_table
+from .plain import LABELS, SKELETON, own_companion, save, save_clips, write_labels, write_table
 from .reading import Collected, File, FileReader, find_files, read_motion, sampled, upwards
 from .recording import Recording
 from .settled import understand
@@ -79,7 +79,7 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
         for clip in motion:
             write_clip(_place(stage, clip, format), replace(motion, clips=[clip]), format)
         if not path.suffix:
-            write_labels(stage / "labels.csv", motion)
+            write_labels(stage / LABELS, motion, path / LABELS)
     return [_place(path, clip, format) for clip in motion]
 
 
@@ -101,7 +101,7 @@ def write_clip(path: Path, motion: MotionSet, format: str) -> None:
     clip, skeleton = motion.clips[0], motion.skeleton
     if format == "csv":
         write_table(path, skeleton.names, clip.positions)
-        skeleton.to_json(path.with_name("skeleton.json"))
+        skeleton.to_json(own_companion(path, SKELETON))
         return
     if np.isnan(clip.positions).any():
         raise ValueError(
@@ -202,7 +202,9 @@ def convert(
                 if reason:
                     skipped.append(reason)
                     if not isinstance(result, str) and format != "npz":
-                        _place(stage, result[0], format).unlink()
+                        place = _place(stage, result[0], format)
+                        place.unlink()
+                        own_companion(place, SKELETON).unlink(missing_ok=True)
                 else:
                     yield result[0]
         if len(skipped) == len(files):
@@ -214,7 +216,7 @@ def convert(
         with _staged(out) as stage:
             known = list(clips(stage))
             if not out.suffix:
-                write_labels(stage / "labels.csv", known)
+                write_labels(stage / LABELS, known, out / LABELS)
     left = f"; {len(skipped)} skipped, the first: {skipped[0]}" if skipped else ""
     return f"{len(files) - len(skipped)} clips; read as {collected.said(world)}{left}"
 

@@ -43,6 +43,58 @@ def test_markers_that_were_not_seen_are_gaps(tmp_path):
     np.testing.assert_allclose(found.clips[0].positions, expected, atol=1e-6)
 
 
+def standing(frames, *more):
+    """Four markers of a standing person, and further points (x, y, z) that move with them: (F, M, 4) in mm."""
+    rest = np.array([[0, 0, 1700.0], [0, 0, 900], [100, 0, 10], [-100, 0, 10], *more])
+    places = rest + np.random.default_rng(0).normal(0, 5, (frames, len(rest), 3))
+    return np.concatenate([places, np.ones((frames, len(rest), 1))], 2)
+
+
+def test_points_that_a_model_of_the_body_computed_are_no_joints(tmp_path):
+    names = ["HEAD", "HIP", "LFT", "RFT"]
+    lists = {"ANGLES": ["LKneeAngle"], "ANGLES2": ["RKneeAngle"], "POWERS": ["LKneePower"], "EXTRA": ["Spare"]}
+    outputs = [name for texts in lists.values() for name in texts]
+    places = standing(7, *[(30, 5, 0)] * len(outputs))
+    write_c3d(tmp_path / "a.c3d", names + outputs, places, **lists, TYPE_GROUPS=["ANGLES", "EXTRA", "EXTRA_UNITS"])
+    read = read_motion(tmp_path / "a.c3d")
+    assert sorted(read.skeleton.names) == names
+    assert (
+        "4 points computed by a model of the body are left out (LKneeAngle, RKneeAngle, LKneePower, Spare)" in read.said
+    )
+
+
+def test_names_past_255_are_read(tmp_path):
+    names = [f"M{n}" for n in range(600)]
+    write_c3d(tmp_path / "a.c3d", names, standing(2, *[(n, 0, 1000) for n in range(596)]))
+    assert sorted(read_c3d(tmp_path / "a.c3d").names) == sorted(names)
+
+
+def test_points_that_are_left_out_or_renamed_are_named(tmp_path):
+    names = ["HEAD", "HIP", "LFT", "LFT", "LFT_2", "GONE", "*8"]
+    places = standing(7, (0, 50, 1000), (0, 0, 0), (50, 50, 1000), (0, 90, 900))
+    places[:, 5] = 0
+    write_c3d(tmp_path / "a.c3d", names, places)
+    read = read_c3d(tmp_path / "a.c3d")
+    assert sorted(read.names) == ["HEAD", "HIP", "LFT", "LFT_2", "LFT_3"]
+    np.testing.assert_allclose(read.positions[:, read.names.index("LFT_3")], places[:, 3, :3], rtol=1e-6)
+    assert read.notes == [
+        "1 points never seen are left out (GONE)",
+        "2 points without a name are left out (point 7, point 8)",
+        "another marker LFT is read as LFT_3",
+    ]
+
+
+def test_exact_zeros_without_a_residual_are_gaps(tmp_path):
+    places = standing(7)
+    places[2:5, 0] = 0
+    places[3, 1, :3] = 0  # measured there, as its residual says
+    write_c3d(tmp_path / "a.c3d", ["HEAD", "HIP", "LFT", "RFT"], places)
+    read = read_c3d(tmp_path / "a.c3d")
+    assert np.isnan(read.positions).any(2).sum(0)[read.names.index("HEAD")] == 3
+    assert np.isfinite(read.positions[:, read.names.index("HIP")]).all()
+    assert read.notes == ["3 places that are exactly 0, 0, 0 with residual 0 are read as not seen"]
+
+
 def test_markers_hang_from_those_that_move_with_them():
     random = np.random.default_rng(0)
     bodies = [random.normal(0, 0.3, (1, 4, 3)) for _ in range(2)]  # two rigid bodies that go their own ways

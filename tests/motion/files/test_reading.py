@@ -423,12 +423,12 @@ def test_other_data_are_put_onto_the_skeleton_of_a_run(representation, tmp_path)
 def test_a_table_has_the_joints_of_its_skeleton(people, tmp_path):
     write_motion(tmp_path / "a.csv", MotionSet(people.clips[:1], people.skeleton))
     assert read_motion(tmp_path / "a.csv").skeleton.left == WALKER.left
-    fields = json.loads((tmp_path / "skeleton.json").read_text())
+    fields = json.loads((tmp_path / "a.csv.skeleton.json").read_text())
     fields["joint_names"][3] = "RPaw"
-    (tmp_path / "skeleton.json").write_text(json.dumps(fields))
+    (tmp_path / "a.csv.skeleton.json").write_text(json.dumps(fields))
     with pytest.raises(ValueError, match=r"a\.csv: .* do not have the same joints: RFoot, RPaw"):
         read_motion(tmp_path / "a.csv")
-    (tmp_path / "skeleton.json").unlink()
+    (tmp_path / "a.csv.skeleton.json").unlink()
     with pytest.raises(ValueError, match=r"a\.csv: which skeleton"):
         read_motion(tmp_path / "a.csv")
 

@@ -7,7 +7,18 @@ import numpy as np
 import pytest
 
 from dvae.cli import main
-from dvae.motion import HUMAN36M, WALKER, Clip, Forecasts, MotionSet, read_motion, save, simulate, write_motion
+from dvae.motion import (
+    HUMAN36M,
+    WALKER,
+    Clip,
+    Forecasts,
+    MotionSet,
+    Skeleton,
+    read_motion,
+    save,
+    simulate,
+    write_motion,
+)
 from dvae.motion.files.plain import read_arrays
 from dvae.motion.files.smpl import JOINTS
 
@@ -140,6 +151,45 @@ def test_labels_go_with_the_clips(format, three, tmp_path):
         assert read["train", "person_0001"].labels["mood"] == "wild"
 
 
+@pytest.mark.parametrize("older", [False, True], ids=["own files", "files of the folder"])
+def test_archives_of_one_folder_keep_their_skeletons_and_labels(older, three, tmp_path):
+    people = MotionSet([replace(clip, labels={"mood": "glad"}) for clip in three], WALKER)
+    save(tmp_path / "a.npz", people)
+    if older:  # as earlier versions wrote them
+        for name in ("skeleton.json", "labels.csv"):
+            (tmp_path / f"a.npz.{name}").rename(tmp_path / name)
+    told = ["--out", str(tmp_path / "b.npz"), "--onto", "human36m", "--fps", "15"]
+    assert main(["data", "convert", str(tmp_path / "a.npz"), *told]) == 0
+    save(tmp_path / "c.npz", MotionSet([replace(three.clips[0], labels={})], replace(WALKER, fps=60.0)))
+    skeletons = {name: read_motion(tmp_path / f"{name}.npz").skeleton for name in "abc"}
+    assert [(skeleton.joints, skeleton.fps) for skeleton in skeletons.values()] == [(17, 30), (17, 15), (17, 60)]
+    assert skeletons["a"] == WALKER
+    assert [skeleton.up for skeleton in skeletons.values()] == ["y", "z", "y"]
+    moods = [read_motion(tmp_path / f"{name}.npz").clips[0].labels.get("mood") for name in "abc"]
+    assert moods == ["glad", "glad", None]
+    save(tmp_path / "a.npz", MotionSet([replace(clip, labels={}) for clip in three], WALKER))
+    assert read_motion(tmp_path / "a.npz").clips[0].labels.get("mood") is None
+
+
+def test_an_archive_with_the_skeleton_of_another_is_refused(three, tmp_path):
+    save(tmp_path / "a.npz", three)
+    arm = Skeleton(("shoulder", "elbow"), (-1, 0))
+    arm.to_json(tmp_path / "skeleton.json")
+    assert read_motion(tmp_path / "a.npz").skeleton == WALKER
+    (tmp_path / "a.npz.skeleton.json").unlink()
+    with pytest.raises(ValueError, match=r"a\.npz has 17 joints and .*skeleton\.json has 2"):
+        read_motion(tmp_path / "a.npz")
+
+
+def test_labels_of_other_clips_in_a_folder_are_kept(three, tmp_path):
+    for clip, mood in zip(three, ("sad", "glad", ""), strict=True):
+        write_motion(tmp_path / "all", MotionSet([replace(clip, labels={"mood": mood})], WALKER), "csv")
+    assert [clip.labels["mood"] for clip in read_motion(tmp_path / "all").clips] == ["", "sad", "glad"]
+    (tmp_path / "all" / "labels.csv").write_text("clip,mood\nperson_0001,wild\n")
+    with pytest.raises(ValueError, match=r"labels\.csv: other clips .* column named split"):
+        write_motion(tmp_path / "all", MotionSet([replace(three.clips[0], labels={"mood": "sad"})], WALKER), "csv")
+
+
 def test_what_is_refused_leaves_nothing_and_what_is_skipped_no_file(recordings, three, tmp_path, capsys):
     shutil.copytree(recordings, tmp_path / "in")
     stranger = tmp_path / "in" / "train" / "stranger.bvh"
@@ -155,10 +205,11 @@ def test_what_is_refused_leaves_nothing_and_what_is_skipped_no_file(recordings, 
     assert written == [
         "labels.csv",
         "test/person_0002.csv",
-        "test/skeleton.json",
+        "test/person_0002.csv.skeleton.json",
         "train/person_0000.csv",
+        "train/person_0000.csv.skeleton.json",
         "train/person_0001.csv",
-        "train/skeleton.json",
+        "train/person_0001.csv.skeleton.json",
     ]
     away = replace(three.clips[0], name="../b")
     with pytest.raises(ValueError, match="leads out of the folder"):
