@@ -64,10 +64,11 @@ def by_the_letter(samples, truths):
     pairs = [(t, i, j) for t in range(frames) for i in range(size) for j in range(i)]
     truth = truths[0]
     numbers = [abs(samples[j] - samples[k]).mean() for j in range(count) for k in range(j)]
-    variogram = [
-        (abs(truth[t, i] - truth[t, j]) ** 0.5 - np.mean(abs(samples[:, t, i] - samples[:, t, j]) ** 0.5)) ** 2
-        for t, i, j in pairs
-    ]
+    variogram = []
+    for t, i, j in pairs:
+        values = abs(samples[:, t, i] - samples[:, t, j]) ** 0.5
+        error = np.var(values, ddof=1) / count if count > 1 else 0.0
+        variogram.append((abs(truth[t, i] - truth[t, j]) ** 0.5 - values.mean()) ** 2 - error)
     return {
         average_pairwise_distance: np.mean(apart) if apart else 0.0,
         average_displacement_error: min(ade[0]),
@@ -241,6 +242,16 @@ def test_crps_of_normal_draws_is_the_closed_form_at_every_number_of_them(count):
     normal = torch.distributions.Normal(0.0, 1.0)
     exact = scale * (z * (2 * normal.cdf(z) - 1) + 2 * normal.log_prob(z).exp() - 1 / math.sqrt(math.pi))
     assert abs(found.mean() - exact.mean()) < 4 * found.std() / math.sqrt(repeats)
+
+
+def test_variogram_score_has_the_same_expectation_at_every_number_of_samples():
+    """The difference of two standard normals is N(0, 2), so that E v^2 = E |d| and E v = E |d|^(1/2) are known."""
+    truth = torch.tensor([[0.3, 1.6]], dtype=torch.float64)
+    mean = 2**0.25 * 2**0.25 * math.gamma(0.75) / math.sqrt(math.pi)
+    exact = (math.sqrt(1.3) - mean) ** 2
+    for count in (2, 5, 40):
+        found = variogram_score(draw(20_000, count, 1, 2), truth.expand(20_000, 1, 2))
+        assert abs(found.mean() - exact) < 4 * found.std() / math.sqrt(len(found)), count
 
 
 @pytest.mark.parametrize("count", [1, 3])
