@@ -7,15 +7,21 @@ d_k = b'_k - b_k are K independent numbers with mean
 
     E d_k = mean over sequences of (new bound - old bound),
 
-so that t = mean(d) sqrt(K) / sd(d) follows Student's t with K - 1 degrees of freedom when nothing has changed (d_k, a
-mean over sequences, is nearly normal). Failing where t is below the alpha quantile fails with probability alpha at
-most, whatever draw k before and draw k after have to do with each other: equal seeds may couple them (an unchanged
-model gives d = 0), decouple them (another network takes its random numbers in another order) or oppose them (a latent
+so that t = mean(d) sqrt(K) / sd(d) follows Student's t with K - 1 degrees of freedom when nothing has changed and d_k,
+a mean over sequences, is normal. Failing where t is below the alpha quantile then fails with probability alpha,
+whatever draw k before and draw k after have to do with each other: equal seeds may couple them (an unchanged model
+gives d = 0), decouple them (another network takes its random numbers in another order) or oppose them (a latent
 changed its sign). Standard errors added in squares would be right in the second case only. Had all draws one stream of
 random numbers, one number more would couple draw k to draw k - 1, and the d_k to each other.
 
+Where d is skewed upwards, K draws often miss its tail, and t is low too often: for instance where a sampled KL, whose
+draws have a long lower tail, becomes analytic. t is then compared with that of K log-normal draws as well. Their
+log-scale is the least one at which a sample skewness as low as that of d has probability .05, and at most 1.5. So the
+assumption is that d is not more skewed than such log-normal draws. Simulated rates of false alarms at alpha = .001 are
+at most .003 from 20 draws on, where Student's t alone has .12.
+
 A fall of delta nats is found with probability 1 - beta where delta = (t_{1-alpha} + t_{1-beta}) sd(d) / sqrt(K): four
-times the draws halve it.
+times the draws halve it. 20 draws hardly show whether d is skewed: delta is twice as large there.
 """
 
 from __future__ import annotations
@@ -27,6 +33,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cache
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -142,7 +149,7 @@ class Change:
     @property
     def p_worse(self) -> float:
         """Probability of so low a difference when the bound has not fallen."""
-        return self._p(self.difference)
+        return self._p(1)
 
     @property
     def worse(self) -> bool:
@@ -152,12 +159,18 @@ class Change:
     @property
     def better(self) -> bool:
         """Whether the bound rose significantly."""
-        return self._p(-self.difference) < self.alpha
+        return self._p(-1) < self.alpha
 
-    def _p(self, difference: float) -> float:
+    def _p(self, sign: int) -> float:
         slack = ROUNDING * float(np.abs(self.old.bound).mean())
-        t = (difference + slack) / max(self.error, 1e-100)  # an exact bound has no error
-        return float(stats.t.cdf(t, len(self.new.draws) - 1))
+        t = (sign * self.difference + slack) / max(self.error, 1e-100)  # an exact bound has no error
+        p = float(stats.t.cdf(t, len(self.new.draws) - 1))
+        _, skewness = _studentized(sign * (self.new.draws - self.old.draws))
+        if p >= self.alpha or skewness <= 0:
+            return p
+        least, reference = _skewed(len(self.new.draws))
+        scale = min(int(np.searchsorted(least, skewness)), len(least) - 1)
+        return max(p, float(np.searchsorted(reference[scale], t, side="right")) / reference.shape[1])
 
     def __str__(self) -> str:
         lines = [
@@ -246,7 +259,7 @@ class ElboRegression:
             _write(path, new.dumps())
             quantiles = stats.t.ppf([1 - alpha, 0.9], particles - 1)
             loss = quantiles.sum() * math.sqrt(2) * new.mean_error
-            power = f"a loss of {loss:.2g} would be found with probability 0.9"
+            power = f"a loss of {loss:.2g} would be found with probability {'below ' * (particles < 100)}0.9"
             self.note(f"new, to be committed: {_shown(path)}: {new}; {power}")
         elif self.update:
             if new.dumps() != path.read_text(encoding="utf-8"):
@@ -384,6 +397,22 @@ def _other_data(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
         if bad := np.flatnonzero((np.abs(difference) > SAME_DATA * np.array(now["rms"])).any(0)).tolist():
             return f"{name} differs in sequence {_listed(bad)}"
     return ""
+
+
+def _studentized(draws: Floats) -> tuple[Floats, Floats]:
+    """The t statistic and the skewness of draws (..., K)."""
+    mean = draws.mean(-1, keepdims=True)
+    variance = np.maximum(((draws - mean) ** 2).mean(-1), 1e-200)
+    return mean[..., 0] * np.sqrt((draws.shape[-1] - 1) / variance), ((draws - mean) ** 3).mean(-1) / variance**1.5
+
+
+@cache
+def _skewed(count: int, sets: int = 10_000) -> tuple[Floats, Floats]:
+    """Skewness (S,) that .05 of the sets of log-normal draws are below, and sorted t statistics (S, sets), by scale."""
+    noise = np.random.default_rng(0).normal(size=(sets, count))
+    scales = np.linspace(0.1, 1.5, 8)
+    t, skewness = zip(*(_studentized(np.exp(s * noise) - math.exp(s**2 / 2)) for s in scales), strict=True)
+    return np.quantile(skewness, 0.05, axis=1), np.sort(t, axis=1)
 
 
 def _standard_error(draws: Floats) -> float:

@@ -71,8 +71,32 @@ def test_the_rate_of_false_alarms_is_alpha(exact):
     pairs = zip(repeated(model, x, n, 30, seed=1), repeated(model, x, n, 30, seed=2), strict=True)
     found = [Change(old, new, alpha) for old, new in pairs]
     spread = 4 * math.sqrt(alpha * (1 - alpha) / n)
-    assert abs(np.mean([change.worse for change in found]) - alpha) < spread
-    assert abs(np.mean([change.better for change in found]) - alpha) < spread
+    assert np.mean([change.worse for change in found]) < alpha + spread
+    assert np.mean([change.better for change in found]) < alpha + spread
+
+
+@pytest.mark.parametrize("particles", [20, 100])
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda random, size: random.normal(size=size),
+        lambda random, size: random.standard_t(3, size=size),
+        lambda random, size: random.chisquare(1, size=size) - 1,
+        lambda random, size: np.exp(random.normal(size=size)) - math.exp(0.5),
+        lambda random, size: np.exp(1.5 * random.normal(size=size)) - math.exp(1.125),
+    ],
+    ids=["normal", "t", "chi-squared", "log-normal", "wide log-normal"],
+)
+def test_false_alarms_are_rare_where_skewed_draws_become_exact(draw, particles):
+    """Of one sequence, as where a sampled KL becomes analytic: old draws miss a long lower tail, or upper one."""
+    n, alpha = 1000, 0.01
+    old = draw(np.random.default_rng(0), (n, particles))
+    exact = Record(np.zeros(1), np.zeros(1), np.zeros(particles), {})
+    for sign in (-1, 1):
+        records = [Record(row[:1], row[:1], row, {}) for row in sign * old]
+        for name in ("worse", "better"):
+            alarms = [getattr(Change(record, exact, alpha), name) for record in records]
+            assert np.mean(alarms) < 2 * alpha + 4 * math.sqrt(alpha / n)
 
 
 @pytest.mark.parametrize("particles", [4, 100])
@@ -89,7 +113,7 @@ def test_false_alarms_are_as_rare_however_draws_are_coupled_and_sequences_spread
         Change(Record.of(level + scale * a, {}), Record.of(level + scale * b, {}), alpha).worse
         for a, b in zip(first, second, strict=True)
     ]
-    assert abs(np.mean(alarms) - alpha) < 4 * math.sqrt(alpha * (1 - alpha) / n)
+    assert np.mean(alarms) < alpha + 4 * math.sqrt(alpha * (1 - alpha) / n)
 
 
 class Poor:
@@ -129,7 +153,7 @@ def test_false_alarms_are_as_rare_when_a_change_takes_other_random_numbers(chang
     pairs = zip(Poor().records(n, 30, seed=1), Poor(**change).records(n, 30, seed=1), strict=True)
     found = [Change(old, new, alpha) for old, new in pairs]
     for alarms in ([change.worse for change in found], [change.better for change in found]):
-        assert abs(np.mean(alarms) - alpha) < 4 * math.sqrt(alpha * (1 - alpha) / n)
+        assert np.mean(alarms) < alpha + 4 * math.sqrt(alpha * (1 - alpha) / n)
 
 
 def test_one_random_number_more_uncouples_one_draw_only():
@@ -139,19 +163,14 @@ def test_one_random_number_more_uncouples_one_draw_only():
     for before, after in zip(old, same, strict=True):
         np.testing.assert_array_equal(after.draws[1:], before.draws[1:])
         assert after.draws[0] != before.draws[0]
-    # Differences are the fall, but for the first, which has the error e besides: t = particles * fall / |e| + sign(e).
-    scaled = particles * (40 * mean - mean**2) / (math.sqrt(2) * 40 * 0.3 / math.sqrt(4))
-    quantile = stats.t.ppf(1 - alpha, particles - 1)
-    power = stats.norm.cdf(-scaled / (quantile + 1)) + stats.norm.cdf(-scaled / (quantile - 1)) - 1
-    rate = np.mean([Change(a, b, alpha).worse for a, b in zip(old, poor, strict=True)])
-    assert abs(rate - power) < 4 * math.sqrt(power * (1 - power) / n)
-    assert power > 0.8
+    # With all draws uncoupled the fall would be half of the error of the difference, and be found in .13 of the cases.
+    assert np.mean([Change(a, b, alpha).worse for a, b in zip(old, poor, strict=True)]) > 0.6
 
 
 def test_the_note_tells_the_fall_that_is_found_nine_times_in_ten(tmp_path, exact):
-    """By simulation of the t-test, for draws that have nothing in common."""
+    """By simulation of the test, for draws that have nothing in common."""
     model, x, _ = exact
-    notes, particles, n = [], 5, 4000
+    notes, particles, n = [], 100, 1000
     regression(tmp_path, notes).check(model.model, model.guide, x, particles=particles, alpha=0.05)
     fall = float(re.search(r"a loss of (\S+) would be found with probability 0.9", notes[0])[1])
     scale = Record.loads((tmp_path / "test_it.json").read_text()).mean_error * math.sqrt(particles)
