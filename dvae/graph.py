@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import networkx as nx
 
 from .drawing import Edge, Node, draw_dag
-from .inversion import Order, Unrolled, faithful, guide, markov_boundary, orders, spelled
+from .inversion import MarkovBoundaries, Order, Unrolled, faithful, guide, orders, spelled
 from .notation import Factor, Factorization, Parent, check_pair
 from .relations import Relation
 
@@ -253,11 +253,12 @@ def audit(
     model.add_nodes_from(given)
     read.add_nodes_from(given)
     inner = {node for name in latents for node in view.inner(name)}
+    boundaries = MarkovBoundaries(model)
     needs, uses = {}, {}
     for node in view.drawn(inference.blocks):
         if node in inner:
-            needs[node] = markov_boundary(model, node, given)
-            uses[node] = markov_boundary(model, node, set(read.predecessors(node)))
+            needs[node] = boundaries.of(node, given)
+            uses[node] = boundaries.of(node, set(read.predecessors(node)))
         given.add(node)
     lacks = {node: boundary - set(read.predecessors(node)) for node, boundary in needs.items()}
 

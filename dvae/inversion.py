@@ -29,36 +29,60 @@ Order = tuple[Block, ...]
 """Blocks of latents as they are drawn, each at all of its steps before the next one."""
 
 
-def markov_boundary(dag: nx.DiGraph, node: Node, given: AbstractSet[Node]) -> set[Node]:
-    """The smallest part of `given` that makes `node` independent of the rest of `given`.
-
-    u is in it exactly when node and u are not d-separated by the others. What is not given is integrated out.
+class MarkovBoundaries:
+    """The Markov boundaries of the nodes of a graph, whose sets of nodes are the bits of integers here.
 
     Args:
         dag: directed acyclic graph, edges from parent to child.
-        node: a node that is not in given.
-        given: nodes whose values are known.
     """
-    kept = {node, *given}
-    frontier = [node, *given]
-    while frontier:
-        above = [parent for parent in dag.pred[frontier.pop()] if parent not in kept]
-        kept.update(above)
-        frontier.extend(above)
-    # In the moral graph of these a child and its parents, a family, are neighbours; given nodes stop a path.
-    boundary: set[Node] = set()
-    walked, families = {node}, set()
-    frontier = [node]
-    while frontier:
-        current = frontier.pop()
-        for child in (current, *dag.successors(current)):
-            if child in kept and child not in families:
-                families.add(child)
-                family = {child, *dag.predecessors(child)}
-                boundary |= family & given
-                frontier.extend(family - given - walked)
-                walked |= family - given
-    return boundary
+
+    def __init__(self, dag: nx.DiGraph):
+        self.nodes: list[Node] = list(dag)
+        self.bits = {node: 1 << place for place, node in enumerate(self.nodes)}
+        self.parents = [self._joined(dag.pred[node]) for node in self.nodes]
+        self.children = [self._joined(dag.succ[node]) for node in self.nodes]
+
+    def of(self, node: Node, given: AbstractSet[Node]) -> set[Node]:
+        """Return the smallest part of `given` that makes `node` independent of the rest of `given`.
+
+        u is in it exactly when node and u are not d-separated by the others. What is not given is integrated out.
+
+        Args:
+            node: a node that is not in given.
+            given: nodes whose values are known.
+        """
+        start, known = self.bits[node], self._joined(given)
+        kept = frontier = start | known
+        while frontier:
+            above = 0
+            for place in _places(frontier):
+                above |= self.parents[place]
+            frontier = above & ~kept
+            kept |= frontier
+        # In the moral graph of these a child and its parents, a family, are neighbours; given nodes stop a path.
+        boundary, families, walked, frontier = 0, 0, start, start
+        while frontier:
+            reached = frontier
+            for place in _places(frontier):
+                reached |= self.children[place]
+            families |= (new := reached & kept & ~families)
+            found = new
+            for place in _places(new):
+                found |= self.parents[place]
+            boundary |= found & known
+            frontier = found & ~known & ~walked
+            walked |= frontier
+        return {self.nodes[place] for place in _places(boundary)}
+
+    def _joined(self, nodes: Iterable[Node]) -> int:
+        return sum(self.bits[node] for node in nodes)
+
+
+def _places(bits: int) -> Iterator[int]:
+    while bits:
+        lowest = bits & -bits
+        yield lowest.bit_length() - 1
+        bits ^= lowest
 
 
 @dataclass(frozen=True)
@@ -165,13 +189,13 @@ def faithful(
     reach = sum({relation.lag for relation in relations}) * max(1, len(latents))
     names = (*latents, *data, *generative.context)
     view = Unrolled({name: generative.local(name) for name in names}, width=4 * reach + 3, margin=2 * reach + 2)
-    dag = generative.dag(view.length)
+    boundaries = MarkovBoundaries(generative.dag(view.length))
     given = {node for name in (*data, *generative.context) for node in view.nodes(name)}
     inner = {node for name in latents for node in view.inner(name)}
     needs = {}
     for node in view.drawn(order):
         if node in inner:
-            needs[node] = markov_boundary(dag, node, given)
+            needs[node] = boundaries.of(node, given)
         given.add(node)
 
     def factor(child: str) -> Factor:

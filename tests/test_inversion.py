@@ -14,7 +14,7 @@ import dvae
 import dvae.inversion
 from benchmarks.tables.audits import FAMILY
 from dvae.graph import analytic_kl
-from dvae.inversion import faithful, guide, markov_boundary, orders, spelled
+from dvae.inversion import MarkovBoundaries, faithful, guide, orders, spelled
 from dvae.notation import Block, Factorization
 from dvae.relations import Relation
 from dvae.testing.strategies import factorizations
@@ -28,9 +28,9 @@ TWO_LAYERS = "p(u_t | u_{t-1}) p(z_t | z_{t-1}, u_t) p(x_t | z_t)"
 @given(factorizations())
 def test_markov_boundary_is_d_separation(pair):
     dag = Factorization.parse(pair[0]).dag(3)
-    known = {node for node in dag if node[0] == "x"}
+    known, boundaries = {node for node in dag if node[0] == "x"}, MarkovBoundaries(dag)
     for node in sorted(set(dag) - known, key=str):
-        boundary = markov_boundary(dag, node, known)
+        boundary = boundaries.of(node, known)
         assert boundary == {u for u in known if not nx.is_d_separator(dag, {node}, {u}, known - {u})}
         assert nx.is_d_separator(dag, {node}, known - boundary, boundary) or boundary == known
         known = known | {node}
