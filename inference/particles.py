@@ -237,7 +237,7 @@ class Filter:
             return Stepwise(conditional, select([p.unbind(1) for p in everywhere], rows), [])
         state = conditional.start(given, size, self.known.length, lengths)
         reads = [*live, conditional.factor.child] if conditional.law.residual else live
-        return Stepwise(conditional, conditional.network.select(state, rows), reads)  # type: ignore[union-attr]
+        return Stepwise(conditional, conditional.select(state, rows), reads)
 
     def _given(
         self, conditional: Conditional, shared: Mapping[str, Tensor]
@@ -281,8 +281,7 @@ class Stepwise:
 
     def select(self, rows: Tensor) -> Stepwise:
         """For these of its particles."""
-        network = self.conditional.network if self.reads else None
-        moved = select(self.state, rows) if network is None else network.select(self.state, rows)
+        moved = self.conditional.select(self.state, rows) if self.reads else select(self.state, rows)
         return Stepwise(self.conditional, moved, self.reads)
 
 

@@ -28,7 +28,7 @@ from ..networks.base import (
     shift,
     valid_steps,
 )
-from ..networks.rows import Rows
+from ..networks.rows import Rows, select
 from ..notation import Factor
 from ..units import Units
 from .groups import Groups
@@ -298,6 +298,15 @@ class Conditional(nn.Module):
             return state, drawn
         found = {n: follow(rows, drawn[n], self.units[n], state.lengths) for n, rows in state.kept.items()}
         return state.network, {**drawn, **found}
+
+    def select(self, state: Any, rows: Tensor) -> Any:
+        """The state with these rows (N,) of its batch (see `rows.select`)."""
+        if self.network is None:
+            return select(state, rows)
+        if not isinstance(state, Standardised):
+            return self.network.select(state, rows)
+        kept, lengths = select([state.kept, state.lengths], rows)
+        return Standardised(self.network.select(state.network, rows), kept, lengths)
 
     @staticmethod
     def _advanced(state: Any, inner: Any) -> Any:

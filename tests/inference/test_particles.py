@@ -9,7 +9,7 @@ from pyro import poutine
 
 from dvae import DynamicalVAE, Oracle, SequenceELBO, importance_bound, laws, particle_bound, twin
 from dvae.inference.particles import Filter, ancestors, effective_size
-from dvae.networks import Attention, Dense, Input, Linear, Recurrent
+from dvae.networks import Attention, Dense, Input, Linear, LinearSDE, LinearSDEGuide, Recurrent, WithNoise
 from dvae.networks.rows import Rows, select
 from dvae.notation import Factorization
 from dvae.program.batch import repeat
@@ -254,6 +254,8 @@ def test_it_is_the_textbooks_filter(pair, kind, extra):
     model = build(pair, kind)
     batch = data(model, **BATCHES[extra]())
     for below in (0.6, 1.0):
+        if below == 1.0:
+            model.standardise("z").double().fit(2 + 3 * torch.randn(9, 2, dtype=torch.float64))
         pyro.set_rng_seed(3)
         bound, count = textbook(model, batch, 4, below)
         pyro.set_rng_seed(3)
@@ -261,6 +263,34 @@ def test_it_is_the_textbooks_filter(pair, kind, extra):
         torch.testing.assert_close(out.bound, bound, rtol=0, atol=1e-9)
         assert torch.equal(out.resamplings, count)
     assert count.sum() > 3
+
+
+GIVEN = {
+    "with noise": ("q(z_t | z_{t-1}, x_t)", {"p(x)": WithNoise("s", Dense((4,)))}, {"p(x)": laws.KnownNoise()}),
+    "irregular times": (
+        "q(z_t | z_{t-1}, x_t, d_t)",
+        {"p(z)": LinearSDE(), "q(z)": LinearSDEGuide()},
+        {"p(z)": laws.Triangular(), "q(z)": laws.Triangular()},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", GIVEN)
+def test_units_of_mean_zero_and_scale_one_change_no_bound(case):
+    guide, networks, distributions = GIVEN[case]
+    sizes = {"z": 2, "x": 3, "d": 1, "s": 3}
+    noisy = case == "with noise"
+    pair = ("p(z_t | z_{t-1}) p(x_t | z_t, s_t)" if noisy else "p(z_t | z_{t-1}, d_t) p(x_t | z_t)", guide)
+    sizes.pop("d" if noisy else "s")
+    model = DynamicalVAE(*pair, sizes, {"default": Dense((4,)), **networks}, distributions).double()
+    batch = {name: torch.rand(2, T, sizes[name], dtype=torch.float64) + 0.1 for name in ("x", *model.context)}
+    bounds = []
+    for standardised in (False, True):
+        if standardised:
+            model.standardise("z").double()
+        pyro.set_rng_seed(2)
+        bounds.append(particle_bound(model, batch, 4, resample_below=1.0).bound)
+    torch.testing.assert_close(*bounds)
 
 
 @torch.no_grad()
