@@ -11,6 +11,7 @@ Where these can be counted, evidence and posterior moments are known still; boun
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,14 +19,18 @@ from typing import Any
 import numpy as np
 import scipy
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from .inversion import FAITHFUL, guide
 from .laws.families import FixedNormal, FixedNormalLaw, Gaussian
 from .laws.family import Family
+from .networks.base import indicator, valid_steps
 from .networks.linear import Linear, LinearNetwork
 from .notation import Factor, Factorization
+from .program.conditional import Conditional, like
+from .program.groups import GROUP
 from .program.model import DynamicalVAE
+from .program.rollout import Rollout
 from .program.summed import Discrete
 from .turns import alone
 from .views import LOG_DET, volume
@@ -70,9 +75,18 @@ def twin(
         return DynamicalVAE(generative, inference, sizes, Linear(steps, scale), laws, observed=observed).double()
 
 
+def _is_partial(run: Rollout) -> bool:
+    """Whether entries may be missing or padding."""
+    return run.lengths is not None or bool(run.observed)
+
+
 @dataclass(frozen=True)
 class _System:
-    """v = W v + U d + b + diag(s) e for stacked variables v, stacked data d and standard normal e."""
+    """v = W v + U d + b + diag(s) e for stacked variables v, stacked data d and standard normal e.
+
+    Each has one row for each sequence, or a single row where all sequences are complete. Padding is N(0, 1), which
+    nothing reads.
+    """
 
     weights: Tensor
     data_weights: Tensor
@@ -83,12 +97,16 @@ class _System:
 class Oracle:
     """Exact quantities of a linear-Gaussian model and its guide.
 
+    Missing entries, lengths and units are those of the program: the model reads its own mean at a missing entry, and
+    nothing reads padding.
+
     Args:
-        model: a `twin`, or any `DynamicalVAE` of Linear networks with fixed scales and without projections.
+        model: a `twin`, or any `DynamicalVAE` of Linear networks with fixed scales.
         steps: T.
 
     Raises:
-        ValueError: a model that is not linear-Gaussian, given the states of what is summed out, or has context.
+        ValueError: a model that is not linear-Gaussian, given the states of what is summed out, or has context; a batch
+            of another length, without all data, or with groups.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
@@ -110,43 +128,77 @@ class Oracle:
     def _size(self, name: str) -> int:
         return self.model.sizes[name] * (self.steps if self.model.generative.local(name) else 1)
 
-    def _system(self, conditionals: Mapping[str, Any], names: tuple[str, ...], data: tuple[str, ...]) -> _System:
-        def block(child: str, parent: str) -> Tensor:
-            network = conditionals[child].network
-            if network is None or parent not in network.weights:
-                return torch.zeros(self._size(child), self._size(parent), dtype=torch.float64)
-            weight: Tensor = network.weight(parent, self.steps)
-            return weight.transpose(1, 2).reshape(self._size(child), self._size(parent))
+    def _run(self, x: Tensor | Mapping[str, Tensor]) -> Rollout:
+        """The model's run over a batch, with its values, lengths and observed entries."""
+        run = self.model._rollout(self.model.generative, self.model.generator, x, None, 1)
+        if missing := [name for name in self.model.observed if name not in run.values]:
+            raise ValueError(f"the batch has no {', '.join(missing)}; the oracle needs a value of every data variable")
+        if run.length != self.steps:
+            raise ValueError(f"the batch has {run.length} steps, but this oracle is Oracle(model, {self.steps})")
+        if run.groups is not None:
+            raise ValueError(
+                f"sequences of a group share {', '.join(self.model.grouped)}, and the oracle knows sequences one by "
+                f"one; leave {GROUP!r} out of the batch"
+            )
+        if self.model.sums is not None:
+            self.model.sums.require_data(run.hidden)
+        return run
 
-        def stack(parents: tuple[str, ...]) -> Tensor:
-            rows = [torch.cat([block(c, p) for p in parents], dim=1) for c in names] if parents else []
-            return torch.cat(rows) if rows else torch.zeros(sum(map(self._size, names)), 0, dtype=torch.float64)
+    def _stack(self, values: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
+        return torch.cat([values[name].flatten(1) for name in names], dim=1)
 
-        biases, scales = [], []
+    def _counted(self, names: tuple[str, ...], run: Rollout | None, observed: bool = True) -> Tensor:
+        """(R, N) 1 at entries that are not padding, nor missing where `observed`; R is 1 where all are there."""
+        if run is None or not _is_partial(run):
+            return torch.ones(1, sum(map(self._size, names)), dtype=torch.float64)
+        parts = []
+        for name in names:
+            shape = (run.batch, *((self.steps,) if self.model.generative.local(name) else ()), self.model.sizes[name])
+            part = run.observed[name] if observed and name in run.observed else torch.ones(shape, dtype=torch.bool)
+            if run.lengths is not None and len(shape) == 3:
+                part = part & valid_steps(run.lengths, self.steps)[..., None]
+            parts.append(part.flatten(1))
+        return torch.cat(parts, dim=1).double()
+
+    def _system(
+        self, conditionals: Mapping[str, Any], names: tuple[str, ...], data: tuple[str, ...], run: Rollout | None = None
+    ) -> _System:
+        """The affine functions that the conditionals are, from their locations at 0 and at every unit vector."""
+        columns = (*names, *data)
+        there, real = (self._counted(each, run, observed=False) for each in (columns, names))
+        rows, count = there.shape
+        probes = torch.cat([there.new_zeros(rows, 1, count), torch.diag_embed(there)], dim=1).flatten(0, 1)
+        parts = probes.to(like(self.model)).split([self._size(name) for name in columns], dim=1)
+        values = {
+            name: part.unflatten(1, (self.steps, -1)) if self.model.generative.local(name) else part
+            for name, part in zip(columns, parts, strict=True)
+        }
+        lengths = None if run is None or run.lengths is None else run.lengths.repeat_interleave(count + 1)
+        observed = {} if run is None else run.observed
+        values |= {indicator(name): seen.repeat_interleave(count + 1, 0) for name, seen in observed.items()}
+        located, scales = [], []
         for name in names:
             conditional = conditionals[name]
-            law = conditional.law
-            linear = (
-                isinstance(conditional.network, LinearNetwork)
-                and isinstance(law, FixedNormalLaw)
-                and isinstance(law.out, nn.Identity)
-                and not law.residual
+            self._require_linear(conditional)
+            location, scale = conditional(values, len(probes), self.steps, lengths)
+            located.append(location.flatten(1).unflatten(0, (rows, -1)).double())
+            scales.append(scale.flatten(1).unflatten(0, (rows, -1))[:, 0].double())
+        location = torch.cat(located, dim=2) * real[:, None]
+        weights = (location[:, 1:] - location[:, :1]).mT
+        own = len(real.t())
+        scale = torch.where(real > 0, torch.cat(scales, dim=1), 1.0)
+        return _System(weights[..., :own], weights[..., own:], location[:, 0], scale)
+
+    def _require_linear(self, conditional: Conditional) -> None:
+        units = self.model.units
+        linear = isinstance(conditional.network, LinearNetwork) and isinstance(conditional.law, FixedNormalLaw)
+        if not linear and not (conditional.network is None and isinstance(conditional.law, Gaussian)):
+            raise ValueError(
+                f"{conditional.factor} is not linear-Gaussian: the oracle needs networks.Linear with laws.FixedNormal, "
+                "as dvae.oracle.twin builds, or without parents a normal"
             )
-            if not linear and not (conditional.network is None and isinstance(law, Gaussian)):
-                raise ValueError(
-                    f"{conditional.factor} is not linear-Gaussian: the oracle needs networks.Linear with "
-                    "laws.FixedNormal(project=False), as dvae.oracle.twin builds, or without parents a normal"
-                )
-            zeros = {
-                parent: torch.zeros(1, self._size(parent), dtype=torch.float64).unflatten(
-                    1, (self.steps, -1) if self.model.generative.local(parent) else (-1,)
-                )
-                for parent in conditional.parents
-            }
-            location, scale = conditional(zeros, 1, self.steps)
-            biases.append(location.flatten())
-            scales.append(scale.flatten())
-        return _System(stack(names), stack(data), torch.cat(biases), torch.cat(scales))
+        if read := [name for name in conditional.parents if name in units and units[name].logarithms]:
+            raise ValueError(f"{conditional.factor} reads logarithms of {', '.join(read)}, and is not linear in them")
 
     def _joint(self) -> tuple[Tensor, Tensor]:
         """Mean and precision of (latents, data) under the model, both stacked variable by variable.
@@ -159,21 +211,30 @@ class Oracle:
                 f"with {', '.join(self.model.summed)} summed out the posterior is a mixture of normals, from which the "
                 "divergence of a normal guide is not known exactly; evidence and posterior moments are"
             )
-        _, means, precision = self._mixture()
-        return means[0], precision
+        _, means, precision = self._mixture(None)
+        return means[0, 0], precision[0]
 
-    def _mixture(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Of every course that the states may take: log probability (C,) and mean (C, N), and the precision of all."""
-        model = self.model
-        system = self._system(model.generator, (*model.latents, *model.observed), model.summed)
-        rest = torch.eye(len(system.bias), dtype=torch.float64) - system.weights
-        white = rest / system.scale[:, None]
-        moved, logs = system.bias[None], torch.zeros(1, dtype=torch.float64)
+    def _mixture(self, run: Rollout | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Log probability (C,) and mean (R, C, N) of each course of the states, and the precision (R, N, N) of all.
+
+        A missing entry is its mean, a function of its parents, so that what remains of it is N(0, 1) by itself.
+        """
+        model, names = self.model, (*self.model.latents, *self.model.observed)
+        system = self._system(model.generator, names, model.summed, run)
+        identity = torch.eye(system.bias.shape[1], dtype=torch.float64)
+        rest = identity - system.weights
+        missing = self._counted(names, run, observed=False) - self._counted(names, run)
+        kept = 1 - missing
+        # without missing entries: those are replaced in all that reads them
+        own = torch.linalg.solve(identity - missing[..., None] * system.weights, rest, left=False)
+        white = (kept / system.scale)[..., None] * own * kept[:, None] + torch.diag_embed(missing)
+        moved, logs = system.bias[:, None], torch.zeros(1, dtype=torch.float64)
         if model.sums is not None:
             states = model.sums.courses(self.steps)
             logs = sum((self._log_probability(name, states) for name in model.summed), logs)
-            moved = moved + self._stack(states, model.summed) @ system.data_weights.t()
-        return logs, torch.linalg.solve(rest, moved.t()).t(), white.t() @ white
+            moved = moved + self._stack(states, model.summed) @ system.data_weights.mT
+        means = torch.linalg.solve(rest, moved.mT).mT * kept[:, None]
+        return logs, means, white.mT @ white
 
     def _log_probability(self, name: str, states: Mapping[str, Tensor]) -> Tensor:
         """(C,), of courses of a variable that is summed out given those of the others."""
@@ -182,67 +243,78 @@ class Oracle:
         logs: Tensor = (law.logits * value).flatten(1).sum(1)
         return logs
 
-    def _guide(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Gain on the data, offset, and a root R of the covariance R R' of q(latents | data)."""
-        system = self._system(self.model.encoder, self.model.latents, self.model.observed)
-        rest = torch.eye(len(system.bias), dtype=torch.float64) - system.weights
-        right = torch.cat([system.data_weights, system.bias[:, None], torch.diag(system.scale)], dim=1)
+    def _guide(self, run: Rollout | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Gain on the data, offset, and a root R of the covariance R R' of q(latents | data), for each row."""
+        system = self._system(self.model.encoder, self.model.latents, self.model.observed, run)
+        rest = torch.eye(system.bias.shape[1], dtype=torch.float64) - system.weights
+        right = torch.cat([system.data_weights, system.bias[..., None], torch.diag_embed(system.scale)], dim=-1)
         solved = torch.linalg.solve(rest, right)
-        data = system.data_weights.shape[1]
-        return solved[:, :data], solved[:, data], solved[:, data + 1 :]
-
-    def _stack(self, values: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
-        return torch.cat([values[name].flatten(1) for name in names], dim=1)
+        data = system.data_weights.shape[-1]
+        return solved[..., :data], solved[..., data], solved[..., data + 1 :]
 
     def evidence(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
-        """log p(x), (B,), of data (B, T, D)."""
+        """log p(x), (B,), of data (B, T, D), or of their observed entries."""
         seen = self.model.read(x)
-        evidence: Tensor = self._weighed(self._stack(seen, self.model.observed)).logsumexp(1)
+        run = self._run(seen)
+        evidence: Tensor = self._weighed(run, *self._mixture(run)).logsumexp(1)
         return evidence + volume(seen) if LOG_DET in seen else evidence
 
-    def _weighed(self, data: Tensor) -> Tensor:
-        """(B, C): log joint of data (B, N) and each course that the states may take."""
-        logs, means, precision = self._mixture()
-        start = means.shape[1] - data.shape[1]
-        covariance = torch.linalg.inv(precision)[start:, start:]
-        law = torch.distributions.MultivariateNormal(means[:, start:], covariance)
-        weighed: Tensor = logs + law.log_prob(data[:, None])
+    def _weighed(self, run: Rollout, logs: Tensor, means: Tensor, precision: Tensor) -> Tensor:
+        """(B, C): log joint of the data and each course that the states may take."""
+        counted = self._counted(self.model.observed, run)
+        data = self._stack(run.values, self.model.observed) * counted
+        start = means.shape[-1] - data.shape[1]
+        covariance = torch.linalg.inv(precision)[:, None, start:, start:]
+        law = torch.distributions.MultivariateNormal(means[..., start:], covariance)
+        # entries that do not count are 0, of N(0, 1) by themselves
+        weighed: Tensor = logs + law.log_prob(data[:, None]) + (1 - counted).sum(1, True) * math.log(2 * math.pi) / 2
         return weighed
 
     def posterior(self, x: Tensor | Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Mean (B, N) and covariance (N, N) of the latents, stacked in the guide's order, given data (B, T, D).
+        """Mean (B, N) and covariance of the latents, stacked in the guide's order, given data (B, T, D); 0 at padding.
 
-        With discrete latents summed out the posterior is a mixture, and the covariance each sequence's own, (B, N, N).
+        The covariance is (N, N), or each sequence's own, (B, N, N), of a batch with "mask" or "lengths" and of a model
+        with discrete latents summed out, whose posterior is a mixture.
         """
-        data = self._stack(self.model.read(x), self.model.observed)
-        _, means, precision = self._mixture()
-        n = means.shape[1] - data.shape[1]
-        within = torch.linalg.inv(precision[:n, :n])
-        gain = -within @ precision[:n, n:]
-        found = means[:, :n] + (data[:, None] - means[:, n:]) @ gain.t()  # (B, C, N)
+        run = self._run(x)
+        logs, means, precision = self._mixture(run)
+        found, within = self._given_states(run, means, precision)
+        real = self._counted(self.model.latents, run)
+        within = within * real[:, None] * real[..., None]
         if not self.model.summed:
-            return found[:, 0], within
-        weights = self._weighed(data).softmax(1)
+            return found[:, 0], within if _is_partial(run) else within[0]
+        weights = self._weighed(run, logs, means, precision).softmax(1)
         mean = torch.einsum("bc,bci->bi", weights, found)
         away = found - mean[:, None]
         return mean, within + torch.einsum("bc,bci,bcj->bij", weights, away, away)
 
+    def _given_states(self, run: Rollout, means: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean (B, C, N) and covariance (R, N, N) of the latents given the data and each course of the states."""
+        data = self._stack(run.values, self.model.observed) * self._counted(self.model.observed, run)
+        n = means.shape[-1] - data.shape[1]
+        within = torch.linalg.inv(precision[:, :n, :n])
+        gain = -within @ precision[:, :n, n:]
+        return means[..., :n] + (data[:, None] - means[..., n:]) @ gain.mT, within
+
     def bound(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
         """The exact evidence lower bound of the model's guide, (B,): no draws are taken."""
+        evidence = self.evidence(x)
         if not self.model.latents:
-            return self.evidence(x)
-        gain, offset, root = self._guide()
-        mean, _ = self.posterior(x)
-        data = self._stack(self.model.read(x), self.model.observed)
-        n = len(mean.t())
-        precision = self._joint()[1][:n, :n]
-        difference = data @ gain.t() + offset - mean
-        distance = torch.einsum("bi,ij,bj->b", difference, precision, difference)
-        return self.evidence(x) - self._divergence(distance, precision, root)
+            return evidence
+        self._joint()  # which a mixture has not
+        run = self._run(x)
+        _, means, precision = self._mixture(run)
+        gain, offset, root = self._guide(run)
+        mean = self._given_states(run, means, precision)[0][:, 0]
+        data = self._stack(run.values, self.model.observed)
+        precision = precision[:, : mean.shape[1], : mean.shape[1]]
+        difference = (gain @ data[..., None])[..., 0] + offset - mean
+        distance = (difference * (precision @ difference[..., None])[..., 0]).sum(1)
+        return evidence - self._divergence(distance, precision, root)
 
     def gap(self) -> Tensor:
-        """The expected evidence minus bound, in nats a sequence, over data drawn from the model."""
-        gain, offset, root = self._guide()
+        """The expected evidence minus bound, in nats a sequence, over complete data drawn from the model."""
+        gain, offset, root = (part[0] for part in self._guide())
         mean, precision = self._joint()
         n = len(offset)
         within, across = precision[:n, :n], precision[:n, n:]
@@ -256,9 +328,9 @@ class Oracle:
     @staticmethod
     def _divergence(distance: Tensor, precision: Tensor, root: Tensor) -> Tensor:
         """Of N(m, root root') from N(n, precision^-1), with the distance of m and n under the precision."""
-        spread = (root.t() @ precision * root.t()).sum()
+        spread = (root.mT @ precision * root.mT).sum((-2, -1))
         log_volume = torch.linalg.slogdet(precision)[1] + 2 * torch.linalg.slogdet(root)[1]
-        divergence: Tensor = 0.5 * (spread + distance - len(root) - log_volume)
+        divergence: Tensor = 0.5 * (spread + distance - root.shape[-1] - log_volume)
         return divergence
 
     def fit_guide(self, iterations: int = 2000) -> float:
@@ -383,7 +455,7 @@ def _lost(oracle: Oracle, less: Factorization) -> float:
     n = sum(map(oracle._size, model.latents))
     with torch.no_grad():
         system = oracle._system(model.generator, names, ())
-    weights, scale = system.weights.numpy(), system.scale.numpy()
+    weights, scale = system.weights[0].numpy(), system.scale[0].numpy()
     unit = np.where(np.arange(len(scale)) < n, scale, 1.0)
     root = (np.eye(len(scale)) - weights) / scale[:, None] * unit
     covariance = np.linalg.inv(root.T @ root)[n:, n:]

@@ -400,7 +400,7 @@ def reference_posterior(
 ) -> ReferencePosterior:
     """The posterior of the latents of some sequences beside what a guide says of it: a yardstick for the guide.
 
-    Of a linear-Gaussian model without missing entries the posterior is exact, and of any other it is drawn by NUTS,
+    Of a linear-Gaussian model the posterior is exact, and of any other it is drawn by NUTS,
     which takes long: see docs/criticism.md for the cost. It says for itself whether it has converged.
 
     Args:
@@ -466,17 +466,16 @@ def reference_posterior(
 
 
 def _exact(model: DynamicalVAE, data: Mapping[str, Any], inferred: Inferred) -> LatentMoments | None:
-    """Of a linear-Gaussian model, all of whose data were observed."""
-    if {"lengths", "mask"} & data.keys():  # of which the oracle knows nothing
-        return None
+    """Of a linear-Gaussian model; NaN at padding."""
     try:
         mean, covariance = Oracle(model, max(steps for steps, _ in inferred.shapes.values())).posterior(data)
     except ValueError:  # the networks or laws are others, or there is context
         return None
-    covariance = covariance if covariance.dim() == 2 else covariance[0]  # each sequence's own, with states summed out
+    mean, covariance = mean[0, inferred.there], covariance.reshape(len(mean.t()), -1)[inferred.there][:, inferred.there]
     deviation = covariance.diagonal().sqrt()
-    correlation = covariance / torch.outer(deviation, deviation)
-    told = (mean[0], deviation, correlation, torch.zeros_like(deviation), torch.zeros_like(deviation))
+    correlation = inferred.whole(inferred.whole(covariance / torch.outer(deviation, deviation)).T)
+    mean, deviation, none = map(inferred.whole, (mean, deviation, torch.zeros_like(deviation)))
+    told = (mean, deviation, correlation, none, none)
     return LatentMoments(*(each.detach().double().cpu().numpy() for each in told))
 
 

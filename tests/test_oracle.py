@@ -7,17 +7,18 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
-from dense import masked
+from dense import library_bound, masked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyro.infer import Trace_ELBO
 from torch.distributions.transforms import ReshapeTransform
 
 from dvae import DynamicalVAE, Oracle, SequenceELBO, audit, model_arrow_prices, model_price, price, twin
-from dvae.laws import FixedNormal, Mixture
+from dvae.laws import FixedNormal, Mixture, StandardNormal
 from dvae.networks import Linear
 from dvae.notation import Factorization
 from dvae.testing.strategies import factorizations
+from dvae.units import Coordinate
 
 T = 4
 DKF = "p(z_t | z_{t-1}) p(x_t | z_t)"
@@ -107,23 +108,50 @@ def test_evidence_and_posterior_are_the_kalman_filters_and_smoothers():
         np.testing.assert_allclose([blocks[t, :, t] for t in range(T)], covs, atol=1e-9)
 
 
+def partly_observed(model, x):
+    """The data with missing entries and lengths, of a model with units for all variables."""
+    for name, size in model.sizes.items():
+        model.standardise(name).double().fit(1 + 2 * torch.randn(50, size, dtype=torch.float64))
+    mask = torch.rand_like(x) < 0.6
+    return {"x": x, "mask": mask, "lengths": torch.tensor([T, T - 1, 1, T])}
+
+
+@pytest.mark.parametrize("partial", [False, True])
 @pytest.mark.parametrize("pair", PAIRS)
-def test_log_joint_is_evidence_plus_log_posterior(pair):
+def test_log_joint_is_evidence_plus_log_posterior(pair, partial):
     model = build(pair, size=2)
     x = data(model, 4)
-    latents = {name: value.detach() for name, value in model.guide(x).items()}
+    batch = partly_observed(model, x) if partial else x
+    latents = {name: value.detach() for name, value in model.guide(batch).items()}
     oracle = Oracle(model, T)
-    mean, covariance = oracle.posterior(x)
-    log_posterior = dist.MultivariateNormal(mean, covariance).log_prob(oracle._stack(latents, model.latents))
-    joint = sum(model.log_joint(x, latents).values())
-    torch.testing.assert_close(joint, (oracle.evidence(x) + log_posterior).detach(), rtol=0, atol=1e-8)
+    means, covariances = (part.detach() for part in oracle.posterior(batch))
+    values, log_posterior = oracle._stack(latents, model.latents), []
+    for mean, covariance, value in zip(means, covariances.expand(4, -1, -1), values, strict=True):
+        there = covariance.diagonal() > 0
+        assert (value[~there] == 0).all()
+        posterior = dist.MultivariateNormal(mean[there], covariance[there][:, there])
+        log_posterior.append(posterior.log_prob(value[there]))
+    joint = sum(model.log_joint(batch, latents).values())
+    torch.testing.assert_close(joint, oracle.evidence(batch).detach() + torch.stack(log_posterior), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("indicators", [(), ("x",)])
+@pytest.mark.parametrize("pair", ["dkf, backward", "two layers", "statics"])
+def test_the_bound_of_partly_observed_data_is_the_mean_of_the_programs(pair, indicators):
+    distributions = {"default": FixedNormal(0.7, learned=True, project=False)}
+    distributions |= {f"p({name})": StandardNormal() for name in ("w", "v") if f"p({name})" in PAIRS[pair][0]}
+    sizes = dict.fromkeys(Factorization.parse(PAIRS[pair][0]).variables, 1)
+    model = DynamicalVAE(*PAIRS[pair], sizes, Linear(T), distributions, indicators=indicators).double()
+    batch = partly_observed(model, torch.randn(4, T, 1, dtype=torch.float64))
+    expected = library_bound(model, batch["x"], lengths=batch["lengths"], seen=batch["mask"])
+    torch.testing.assert_close(Oracle(model, T).bound(batch), expected, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("pair", ["dkf, backward", "two layers", "statics"])
 def test_the_guides_moments_are_those_of_its_draws(pair):
     model = build(pair)
     x = data(model, 1)
-    gain, offset, root = Oracle(model, T)._guide()
+    gain, offset, root = (part[0] for part in Oracle(model, T)._guide())
     n = 20_000
     latents = model.guide(x.expand(n, -1, -1))
     draws = torch.cat([latents[name].flatten(1) for name in model.latents], 1).detach()
@@ -402,3 +430,9 @@ def test_models_that_the_oracle_does_not_know():
         Oracle(twin(*driven, {"z": 1, "x": 1, "c": 1}, T), T)
     with pytest.raises(ValueError, match=r"p\(w\) is not linear-Gaussian: .* or without parents a normal"):
         Oracle(with_prior(Mixture()), T).gap()
+    model = build("dkf")
+    with pytest.raises(ValueError, match=r"the batch has 3 steps, but this oracle is Oracle\(model, 4\)"):
+        Oracle(model, T).evidence(torch.zeros(2, 3, 1))
+    model.standardise("z", [Coordinate(floor=0.1)])
+    with pytest.raises(ValueError, match=r"q\(z_t .* reads logarithms of z"):
+        Oracle(model, T).gap()

@@ -14,7 +14,7 @@ comes before it with the states summed out, log p(x_t | v_{<=t}, x_{<t}), so tha
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -147,6 +147,20 @@ class Sums:
         """L."""
         return max((window.high for window in self.windows.values()), default=0)
 
+    def require_data(self, replaced: Collection[str]) -> None:
+        """Refuses a model that reads some of these data, whose entries are replaced by its own means or noise.
+
+        Raises:
+            ValueError: the replacements depend on the states.
+        """
+        read = {parent.name for factor in self.generative.factors for parent in factor.parents}
+        if fed := sorted(read.intersection(replaced)):
+            raise ValueError(
+                f"{', '.join(self.sizes)} cannot be summed out where the model reads its own means, or noise, in place "
+                f"of {', '.join(fed)}, as of missing entries and in scheduled sampling: these depend on the states; "
+                "fill the entries in, or let no factor read them"
+            )
+
     def _window(self, factor: Factor) -> Window:
         statics, chain, lags = [], [], [0]
         for parent in factor.parents:
@@ -249,13 +263,7 @@ class Summation:
 
     def __init__(self, sums: Sums, rollout: Any):
         self.sums, self.rollout, self.values = sums, rollout, dict(rollout.values)
-        read = {parent.name for factor in sums.generative.factors for parent in factor.parents}
-        if fed := sorted((rollout.hidden.keys() | rollout.noisy) & read):
-            raise ValueError(
-                f"{', '.join(sums.sizes)} cannot be summed out where the model reads its own means, or noise, in place "
-                f"of {', '.join(fed)}, as of missing entries and in self-feeding: these depend on the states; fill the "
-                "entries in, or let no factor read them"
-            )
+        sums.require_data(rollout.hidden.keys() | rollout.noisy)
         logs = {name: self._logs(name, window) for name, window in sums.windows.items()}
         self._static = {name: value for name, value in logs.items() if not sums.generative.local(name)}
         self._local = {name: value for name, value in logs.items() if sums.generative.local(name)}

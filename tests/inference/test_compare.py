@@ -348,7 +348,7 @@ def test_what_is_unknown_is_not_a_number_and_shown_as_a_dash():
 def law(model):
     """Gain, covariance of q(latents | x), and covariance of x, of a linear-Gaussian model."""
     oracle = Oracle(model, T)
-    gain, _, root = oracle._guide()
+    gain, _, root = (part[0] for part in oracle._guide())
     covariance = torch.linalg.inv(oracle._joint()[1])[len(gain) :, len(gain) :]
     return gain.detach(), (root @ root.t()).detach(), covariance.detach()
 

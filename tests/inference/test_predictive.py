@@ -50,7 +50,7 @@ def law(model, x):
     covariance = torch.linalg.inv(precision)
     gain = torch.linalg.solve(covariance[known][:, known], covariance[known][:, future]).T
     rest = covariance[future][:, future] - gain @ covariance[known][:, future]
-    weights, offset, root = (value.detach() for value in past._guide())
+    weights, offset, root = (value[0].detach() for value in past._guide())
     seen = x[:, :SEEN].flatten(1)
     latents = seen @ weights.T + offset
     read = gain[:, : latents.shape[1]] @ root
