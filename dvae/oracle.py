@@ -105,8 +105,8 @@ class Oracle:
         steps: T.
 
     Raises:
-        ValueError: a model that is not linear-Gaussian, given the states of what is summed out, or has context; a batch
-            of another length, without all data, or with groups.
+        ValueError: a model that is not linear-Gaussian, given the states of what is summed out, or has context or
+            energies; a batch of another length, without all data, or with groups.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
@@ -117,6 +117,8 @@ class Oracle:
     def __init__(self, model: DynamicalVAE, steps: int):
         if model.context:
             raise ValueError(f"the oracle knows no law of the context {', '.join(model.context)}")
+        if type(model).penalties is not DynamicalVAE.penalties:
+            raise ValueError(f"{type(model).__name__} adds energies to the log joint, which is not normal then")
         self.model, self.steps = model, steps
         for name in model.summed:
             if other := [parent for parent in model.generator[name].parents if parent not in model.summed]:
