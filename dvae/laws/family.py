@@ -13,7 +13,7 @@ linear layer makes of features: a rate is an exponential of it, a matrix of scal
 | angle | radians from -pi to pi | von Mises |
 | positive, log-normal | positive numbers, and such over orders of magnitude | Gamma, LogNormal |
 | power | squared magnitudes of a spectrum | Exponential |
-| share | between 0 and 1 | Beta |
+| share | above 0 and below 1 | Beta |
 | binary | 0 or 1 | Bernoulli |
 | category | one of D classes, in D coordinates of which one is 1 | OneHotCategorical |
 | count, overdispersed | whole numbers from 0, and such that vary more than Poisson's | Poisson, negative binomial |
@@ -37,7 +37,8 @@ import pyro.distributions as dist
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
-from torch.distributions import Distribution, biject_to, transform_to
+from torch import distributions as plain
+from torch.distributions import Distribution, biject_to, constraints, transform_to
 from typing_extensions import override
 
 from ..constants import constant
@@ -92,6 +93,49 @@ UNITS: Mapping[str, Mapping[str, Moved]] = {
 }
 """How parameters move with the unit of the variable, by distribution. Rates of counts become those of counts whose mean
 is a multiple; what has a scale alone heeds no mean."""
+
+
+class Inside(constraints.Constraint):
+    """The unit interval or the simplex without its edges.
+
+    Args:
+        closed: the constraint with its edges.
+    """
+
+    def __init__(self, closed: Any):
+        self.closed, self.event_dim = closed, closed.event_dim
+
+    def check(self, value: Tensor) -> Tensor:
+        """Whether values are inside."""
+        inside = self.closed.check(value)
+        return inside & (value > 0).all(-1) if self.event_dim else inside & (value > 0) & (value < 1)
+
+    def __repr__(self) -> str:
+        return f"Inside({self.closed})"
+
+
+class VonMises(dist.VonMises):  # type: ignore[misc]
+    """A von Mises distribution at any concentration; torch's has gradients between 3e-6 and 4e4 alone in float32."""
+
+    @override
+    def log_prob(self, value: Tensor) -> Tensor:
+        concentration, apart = self.concentration.double(), value.double() - self.loc.double()
+        kernel = -2 * concentration * (apart / 2).sin().square()  # cos - 1, whose terms cancel
+        return (kernel - (2 * math.pi * torch.special.i0e(concentration)).log()).to(value.dtype)
+
+    @override
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        """Draws; rejection sampling never ends at concentrations near 1e16."""
+        narrow = dist.VonMises(self.loc, self.concentration.clamp(max=1e12), validate_args=False)
+        return narrow.sample(torch.Size(sample_shape))  # type: ignore[no-any-return]
+
+
+OPEN: Mapping[type[Distribution], Any] = {
+    plain.Gamma: constraints.positive,
+    **dict.fromkeys((plain.Beta, plain.Kumaraswamy, plain.RelaxedBernoulli), Inside(constraints.unit_interval)),
+    **dict.fromkeys((plain.Dirichlet, plain.RelaxedOneHotCategorical), Inside(constraints.simplex)),
+}
+"""Supports of distributions that torch declares closed, although the density on their edge is 0 or infinite."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +196,7 @@ class FamilyLaw(Law):
 
     def __init__(self, spec: Family, shape: Shape):
         super().__init__(spec.residual)
-        self.kind: Any = spec.kind
+        self.kind: Any = VonMises if spec.kind is dist.VonMises else spec.kind
         self.given: dict[str, Any] = dict(spec.given)
         self.floors = {"scale": spec.min_scale, "cov_diag": spec.min_scale**2}
         if "validate_args" in inspect.signature(self.kind.__init__).parameters:
@@ -202,7 +246,11 @@ class FamilyLaw(Law):
         if parameters:  # numbers, which torch would bring to the device each time
             numbers = {name: value for name, value in given.items() if isinstance(value, float)}
             given = given | {name: constant(value, parameters[0]) for name, value in numbers.items()}
-        return self.kind(**shaped, **given)  # type: ignore[no-any-return]
+        made = self.kind(**shaped, **given)
+        for kind, support in OPEN.items():
+            if isinstance(made, kind):
+                made.support = support
+        return made  # type: ignore[no-any-return]
 
     @override
     def mean(self, parameters: Parameters) -> Tensor:

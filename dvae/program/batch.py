@@ -213,7 +213,7 @@ class Reader:
                 raise ValueError(
                     f"{name} holds {values[name][tuple(place)].item():g} (sequence {place[0]}, coordinate {place[-1]}),"
                     f" and by {law.factor}, {law.family}, values are {_meaning(law.support)}; give {name} another law,"
-                    " or hide such entries by the 'mask' of the batch"
+                    " move such entries inside, or hide them by the 'mask' of the batch"
                 )
 
     def _outside(self, name: str, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> Tensor | None:
@@ -271,6 +271,8 @@ def _meaning(support: Any) -> str:
         "IntegerGreaterThan(lower_bound=0)": "whole numbers from 0",
         "GreaterThan(lower_bound=0.0)": "above 0",
         "GreaterThanEq(lower_bound=0.0)": "at least 0",
+        "Inside(Interval(lower_bound=0.0, upper_bound=1.0))": "above 0 and below 1",
+        "Inside(Simplex())": "above 0 and sum to 1",
         "Interval(lower_bound=0.0, upper_bound=1.0)": "from 0 to 1",
     }.get(str(support), str(support))
 

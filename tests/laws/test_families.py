@@ -9,7 +9,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
-from scipy import integrate, stats
+from scipy import integrate, special, stats
 
 import dvae
 from dvae import laws
@@ -195,6 +195,26 @@ def test_densities_are_those_of_scipy(name):
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6 if name == "angle" else 1e-10)
 
 
+def test_angles_have_densities_and_gradients_at_every_concentration_of_single_precision():
+    law, logs = Family("VonMises", project=False).build(Shape(1, 2)), torch.linspace(-80.0, 80.0, 33)
+    features = torch.stack([torch.full_like(logs, 0.25), logs], -1).requires_grad_()
+    concentration = logs.exp().double().numpy()
+    value = (0.25 + torch.exp(-logs / 2).clamp(max=2.0))[:, None]
+    apart = (value.double() - 0.25).numpy()[:, 0]
+    kernel = -2 * np.sin(apart / 2) ** 2
+    density = law.distribution(law(features)).log_prob(value)[:, 0]
+    expected = concentration * kernel - np.log(2 * np.pi * special.i0e(concentration))
+    np.testing.assert_allclose(density.detach().numpy(), expected, rtol=1e-5, atol=1e-5)
+    (gradient,) = torch.autograd.grad(density.sum(), features)
+    np.testing.assert_allclose(gradient[:, 0].numpy(), concentration * np.sin(apart), rtol=1e-5)
+    moderate = logs < 25  # further up even scipy's 1 - I_1 / I_0 is 0
+    slope = concentration * (kernel + 1 - special.i1e(concentration) / special.i0e(concentration))
+    np.testing.assert_allclose(gradient[moderate, 1].numpy(), slope[moderate], rtol=1e-3, atol=1e-5)
+    assert gradient.isfinite().all()
+    draws = law.draw(law(features), law.noise((33, 1), features))
+    assert draws.isfinite().all()
+
+
 def test_without_a_layer_features_are_parameters_and_a_location_comes_first():
     law = Family("Laplace", project=False).build(Shape(3, 6)).double()
     features, value = torch.randn(2, 6, dtype=torch.float64), torch.randn(2, 3, dtype=torch.float64)
@@ -339,9 +359,13 @@ def test_whole_numbers_may_come_as_such():
             r"x holds 0.5 .sequence 1, coordinate 0., and by p\(x_t .*\), Poisson, values are whole numbers from 0",
         ),
         (Family("Bernoulli"), 2.0, "values are 0 or 1"),
-        (Family("Gamma"), -1.0, "values are at least 0"),
+        (Family("Exponential"), -1.0, "values are at least 0"),
         (Family("LogNormal"), 0.0, "values are above 0"),
-        (Family("Beta"), 1.5, "values are from 0 to 1"),
+        *((Family(name), 0.0, "values are above 0; give x another law, move") for name in ("Gamma", "Chi2")),
+        *((Family("Beta"), value, "values are above 0 and below 1") for value in (0.0, 1.0, 1.5, 1 - 1e-9)),
+        (Family("Kumaraswamy"), 0.0, "values are above 0 and below 1"),
+        (Family("Dirichlet"), 0.0, "values are above 0 and sum to 1"),
+        (laws.Product((((0,), Family("Beta")), ((1,), laws.Normal()))), 0.0, "of 0: above 0 and below 1"),
         (Family("OneHotCategorical"), 1.0, "values are 1 at one coordinate and 0 at the others"),
         (
             laws.Product((((0,), Family("Poisson")), ((1,), laws.Normal()))),
