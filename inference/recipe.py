@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -136,6 +137,8 @@ class Trainable:
             ValueError: see `Recipe.fit`, or data without windows of these parts.
         """
         train = data.windows("train")
+        if too_short := getattr(train, "too_short", ""):
+            warnings.warn(f"training leaves out {too_short}", stacklevel=2)
         names = Training.__dataclass_fields__.keys() & options
         training = replace(self.training(data.schema), **{name: options.pop(name) for name in names})
         method = self.suited(train)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields, make_dataclass
@@ -104,6 +105,7 @@ class DataOptions:
         id: of a table: columns that tell sequences apart.
         time: of a table: column of dates or numbers.
         group: of a table: column that is the same within a sequence.
+        zone: of a table: time zone of its dates, such as Europe/Berlin.
         observed: of a table: steps that a forecast is given.
         horizon: of a table: steps to forecast.
         stride: of a table: steps from one test window to the next.
@@ -129,6 +131,7 @@ class DataOptions:
     id: tuple[str, ...] = ()
     time: str | None = None
     group: str | None = None
+    zone: str | None = None
     observed: int | None = None
     horizon: int | None = None
     stride: int | None = None
@@ -166,6 +169,7 @@ class DataOptions:
         if isinstance(opened, PanelData):
             for said in opened.parts().values():
                 ERROR.print(said)
+            warnings.filterwarnings("ignore", "training leaves out")  # which the lines above list
         return opened
 
 
@@ -173,7 +177,7 @@ OF_KINDS = {
     "motion": ("protocol", "representation", "missing", "skip_bad"),
     "segments": ("cut", "scaling", "warped", "bodies", "skip_bad"),
     "panel": (
-        *("columns", "covariates", "past", "attributes", "id", "time", "group"),
+        *("columns", "covariates", "past", "attributes", "id", "time", "group", "zone"),
         *("observed", "horizon", "stride", "split", "validation", "test", "season"),
     ),
 }

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 
 from .encoding import PanelSchema
 from .panel import Panel, Series
-from .windows import PanelWindows
+from .windows import NAMED, PanelWindows
 
 
 def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> PanelWindows:
@@ -22,31 +23,44 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
         horizon: steps of the future; by default those of the schema.
 
     Raises:
-        ValueError: whole sequences; sequences shorter than what is observed; or covariates that the future lacks,
-            saying which, and of which sequence.
+        ValueError: whole sequences; or no sequence that is long enough and has the covariates of its future.
+
+    Warns:
+        UserWarning: some sequences have no window, saying which and why.
     """
     observed, steps = schema.cut.observed, horizon or schema.cut.horizon
     if observed is None or steps is None:
         raise ValueError("whole sequences have no horizon; fit with observed and horizon steps to forecast")
     known = schema.columns.of("known")
-    found = []  # with all of the past, of which covariates may have their last value
+    calendar = panel.calendar
+    if calendar.kind == schema.calendar.kind and calendar.step is None:  # too few or short sequences to show one
+        calendar = replace(calendar, step=schema.calendar.step)
+    found, without = [], []  # with all of the past, of which covariates may have their last value
     for one in panel:
         present = panel.present(one)
         if present < observed:
-            raise ValueError(
+            without.append(
                 f"sequence {one.name!r} has {present} steps up to its last target, and {observed} are to be observed"
             )
+            continue
         future = one.values[present : present + steps]
         missing = [c.name for c in known if np.isnan(future[:, schema.places[c.name]]).any() or len(future) < steps]
         if missing:
-            raise ValueError(
+            without.append(
                 f"a forecast of {steps} steps needs {', '.join(missing)}, known in the future too, and sequence "
                 f"{one.name!r} has {len(future)} rows after its last target at row {present - 1}; append rows with "
                 f"{'these' if len(missing) > 1 else 'it'} to the table, their targets empty"
             )
+            continue
         if len(future) < steps:
             future = np.concatenate([future, np.full((steps - len(future), future.shape[1]), np.nan)])
         values = np.concatenate([one.values[:present], future])
-        found.append(Series(one.name, values, one.moments(0, len(values)), one.group))
+        found.append(Series(one.name, values, one.moments(0, len(values), calendar), one.group))
+    if not found:
+        raise ValueError(without[0])
+    if without:
+        more = f"; and {len(without) - NAMED} more" if len(without) > NAMED else ""
+        names = "; ".join(without[:NAMED])
+        warnings.warn(f"{len(without)} of {len(panel)} sequences have no forecast: {names}{more}", stacklevel=3)
     cut = replace(schema.cut, horizon=steps, split="sequence")
-    return PanelWindows(replace(panel, series=found), replace(schema, cut=cut), "last")
+    return PanelWindows(replace(panel, series=found, calendar=calendar), replace(schema, cut=cut), "last")

@@ -2,6 +2,7 @@
 
 id = ["station"]                      # tell sequences apart
 time = "date"
+zone = "Europe/Berlin"                # of the times, where they do not name it
 group = "region"                      # of sequences, for panels
 split = "part"                        # train, validation or test, where the data say it
 
@@ -16,7 +17,8 @@ unit = "°C"
 [columns.weather]
 role = "past"                         # one that ends with the present
 family = "category"
-classes = ["clear", "rain"]
+classes = ["clear", "rain", "else"]
+other = "else"                        # the class of every other value
 
 [columns.height]
 role = "static"                       # one value for each sequence
@@ -28,12 +30,13 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from reprlib import repr as brief
 from typing import Any, Literal, Self
 
 from ..laws.family import FAMILIES
 from ..options import check, nearest, tuples
+from .calendar import check_zone
 
 Role = Literal["target", "known", "past", "static"]
 WHOLE_STEPS = ("correlated",)
@@ -55,9 +58,10 @@ class Column:
         family: of the values, one of `dvae.laws.FAMILIES`; of covariates "category" or "real".
         unit: in which the values are, for tables and pictures.
         classes: of a category, in the order of its coordinates.
+        other: one of the classes, which stands for every value that is none of them; "" refuses such values.
 
     Raises:
-        ValueError: a family that is none, or a category without classes.
+        ValueError: a family that is none, a category without classes, or `other` that is none of these.
     """
 
     name: str
@@ -65,6 +69,7 @@ class Column:
     family: str = "real"
     unit: str = ""
     classes: tuple[str, ...] = ()
+    other: str = field(default="", repr=False)  # fingerprints of panels hash the rest
 
     def __post_init__(self) -> None:
         check(self)
@@ -84,6 +89,11 @@ class Column:
                 f"column {self.name!r} has {len(self.classes)} classes, {brief(self.classes)}; they are 2 to {MOST}, "
                 "all different"
             )
+        if self.other and self.other not in self.classes:
+            raise ValueError(
+                f"column {self.name!r} has other = {self.other!r}{nearest(self.other, self.classes)}, which is none of "
+                f"its classes, {brief(self.classes)}; add it to them"
+            )
 
     @property
     def coordinates(self) -> list[str]:
@@ -101,9 +111,10 @@ class Columns:
         time: name of the column that orders them, dates or numbers; rows as they stand, where there is none.
         group: name of a column that is the same within each sequence, for panels.
         split: name of a column that says "train", "validation" or "test".
+        zone: time zone of the times, such as "Europe/Berlin", whose clocks show the dates without an offset from UTC.
 
     Raises:
-        ValueError: two columns of one name, or no target.
+        ValueError: two columns of one name, no target, or a zone that is none or of no time.
     """
 
     columns: tuple[Column, ...]
@@ -111,6 +122,7 @@ class Columns:
     time: str | None = None
     group: str | None = None
     split: str | None = None
+    zone: str | None = field(default=None, repr=False)  # fingerprints of panels hash the times
 
     def __post_init__(self) -> None:
         names = [*self.names, *self.id, *(each for each in (self.time, self.split) if each is not None)]
@@ -122,6 +134,10 @@ class Columns:
             raise ValueError(f"no column is a target; given are {', '.join(self.names[:20]) or 'none'}")
         if twice := [name for name, count in Counter(names).items() if count > 1]:
             raise ValueError(f"column {twice[0]!r} has two parts to play; every column has one")
+        if self.zone is not None:
+            check_zone(self.zone)
+            if self.time is None:
+                raise ValueError(f"zone is {self.zone!r}, and no column is the time; name it")
 
     def of(self, *roles: Role) -> list[Column]:
         """The columns that play one of these roles."""
@@ -154,7 +170,7 @@ class Columns:
         """
         own = self._known(name)
         if told.get("family", "category") != "category":
-            told = {"classes": (), **told}
+            told = {"classes": (), "other": "", **told}
         return replace(self, columns=tuple(replace(each, **told) if each == own else each for each in self.columns))
 
     def without(self, *names: str) -> Self:
@@ -175,9 +191,11 @@ class Columns:
     def config(self) -> dict[str, Any]:
         """It in JSON's types; `from_config` reads it."""
         found: dict[str, Any] = {"id": list(self.id), "time": self.time, "group": self.group, "split": self.split}
+        found |= {"zone": self.zone} if self.zone else {}  # fingerprints of windows hash what is here
         columns = {}
         for column in self.columns:
-            own = {field.name: getattr(column, field.name) for field in fields(Column) if field.name != "name"}
+            own = {entry.name: getattr(column, entry.name) for entry in fields(Column) if entry.name != "name"}
+            own |= {"other": column.other} if own.pop("other") else {}
             columns[column.name] = {**own, "classes": list(column.classes)}
         return {**found, "columns": columns}
 
@@ -192,26 +210,31 @@ class Columns:
         columns = rest.pop("columns", {})
         if not isinstance(columns, Mapping):
             raise ValueError(f"columns is {brief(columns)}; expected a table for each column, such as [columns.riders]")
-        _refuse_others(rest, (field.name for field in fields(cls)), "the schema")
+        _refuse_others(rest, (entry.name for entry in fields(cls)), "the schema")
         found = []
         for name, told in columns.items():
             if not isinstance(told, Mapping):
                 raise ValueError(f"column {name!r} is {brief(told)}; expected a table, [columns.{name}]")
-            _refuse_others(told, (field.name for field in fields(Column)[1:]), f"column {name!r}")
+            _refuse_others(told, (entry.name for entry in fields(Column)[1:]), f"column {name!r}")
             found.append(Column(name, **tuples(told)))
         own = rest.pop("id", ())
         own = [own] if isinstance(own, str) else own
         if not isinstance(own, list | tuple) or not all(isinstance(each, str) for each in own):
             raise ValueError(f"id is {brief(own)}; expected names of columns")
-        for name in ("time", "group", "split"):
+        for name in ("time", "group", "split", "zone"):
             if not isinstance(rest.get(name), str | None):
-                raise ValueError(f"{name} is {brief(rest[name])}; expected the name of a column")
+                expected = "a time zone" if name == "zone" else "the name of a column"
+                raise ValueError(f"{name} is {brief(rest[name])}; expected {expected}")
         return cls(tuple(found), tuple(own), **rest)
 
     def to_toml(self) -> str:
         """The schema as a file to be edited."""
         lines = [f"id = [{', '.join(map(_quoted, self.id))}]"] if self.id else []
-        lines += [f"{name} = {_quoted(value)}" for name in ("time", "group", "split") if (value := getattr(self, name))]
+        lines += [
+            f"{name} = {_quoted(value)}"
+            for name in ("time", "zone", "group", "split")
+            if (value := getattr(self, name))
+        ]
         for column in self.columns:
             bare = re.fullmatch(r"[A-Za-z0-9_-]+", column.name)
             lines += ["", f"[columns.{column.name if bare else _quoted(column.name)}]"]
@@ -219,6 +242,7 @@ class Columns:
             lines += [f'family = "{column.family}"']
             lines += [f"unit = {_quoted(column.unit)}"] if column.unit else []
             lines += [f"classes = [{', '.join(map(_quoted, column.classes))}]"] if column.classes else []
+            lines += [f"other = {_quoted(column.other)}"] if column.other else []
         return "\n".join(lines).strip() + "\n"
 
     @classmethod

@@ -29,6 +29,7 @@ from ..options import Amount, Positive, Range, tuples
 from ..schema import Schema
 from ..units import Coordinate
 from ..views import Offered, View
+from .calendar import NUMBERS, Calendar
 from .columns import WHOLE_STEPS, Column, Columns
 from .panel import COUNTS, Panel, Series
 from .protocol import Cut
@@ -56,6 +57,7 @@ class PanelSchema(Schema):
         logarithms: of those that are read as such, the least that is, and their mean and deviation.
         lacking: names of columns that have an indicator: those that lack entries in training, or end with the present.
         step: median time from one step to the next; 0 where steps are evenly spaced.
+        calendar: what times are, and the step by which forecasts continue them.
     """
 
     kind: ClassVar[str] = "panel"
@@ -69,6 +71,7 @@ class PanelSchema(Schema):
     logarithms: Mapping[str, tuple[Positive, Annotated[float, Range()], Positive]] = field(default_factory=dict)
     lacking: tuple[str, ...] = ()
     step: Amount = 0.0
+    calendar: Calendar = NUMBERS
 
     def __post_init__(self) -> None:
         found = {"x": len(self.coordinates)}
@@ -125,7 +128,7 @@ class PanelSchema(Schema):
         middle = float(np.median(gaps)) if len(gaps) else 0.0
         step = middle if len(gaps) and (gaps.max() > EVEN * middle or middle > EVEN * gaps.min()) else 0.0
         units: dict[str, Any] = {"means": means, "scales": scales, "logarithms": logarithms}
-        return cls(columns=panel.columns, cut=cut, **units, lacking=tuple(lacking), step=step)
+        return cls(columns=panel.columns, cut=cut, **units, lacking=tuple(lacking), step=step, calendar=panel.calendar)
 
     @property
     def protocol(self) -> Cut:
@@ -281,7 +284,7 @@ class PanelSchema(Schema):
     def config(self) -> dict[str, Any]:
         """The schema in JSON's types."""
         own: dict[str, Any] = {name: dict(getattr(self, name)) for name in ("means", "scales", "logarithms")}
-        own |= {"lacking": list(self.lacking), "step": self.step}
+        own |= {"lacking": list(self.lacking), "step": self.step, "calendar": asdict(self.calendar)}
         return {"columns": self.columns.config(), "cut": asdict(self.cut), **own}
 
     @classmethod
@@ -291,6 +294,7 @@ class PanelSchema(Schema):
         own = tuples(config)
         own |= {"columns": Columns.from_config(config["columns"]), "cut": Cut(**config["cut"])}
         own["logarithms"] = tuples(config["logarithms"])
+        own["calendar"] = Calendar(**config.get("calendar", {}))  # older runs keep none
         return cls(**own)
 
 

@@ -14,6 +14,7 @@ from .. import files
 from ..inference.result import canvas
 from ..inference.scores import reaching
 from ..options import nearest
+from .calendar import NUMBERS, Calendar
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,8 +37,8 @@ class PanelForecasts:
         truth: (N, H, D) that happened, NaN where nobody knows.
         columns: coordinate to its unit; of a category, its shares are forecast, in a coordinate for each class.
         keys: (sequence, first step of the future) of each window.
-        times: (N, O + H) of the steps, as in the table; None for steps.
-        dates: whether times are seconds since 1970.
+        times: (N, O + H) of the steps, see `Calendar`; None for steps.
+        calendar: what the times are.
     """
 
     draws: np.ndarray
@@ -46,7 +47,7 @@ class PanelForecasts:
     columns: Mapping[str, str]
     keys: Sequence[tuple[str, int]]
     times: np.ndarray | None = None
-    dates: bool = False
+    calendar: Calendar = NUMBERS
 
     def table(self) -> Any:
         """A pandas frame with a row for each window, step and coordinate: mean, quantiles, and what happened.
@@ -59,7 +60,7 @@ class PanelForecasts:
         window, step, place = (index.ravel() for index in np.indices((count, horizon, size)))
         found = _rows(self.keys, window, step)
         if self.times is not None:
-            found["time"] = _shown(self.times[:, -horizon:].reshape(-1).repeat(size), self.dates)
+            found["time"] = self.calendar.shown(self.times[:, -horizon:].reshape(-1).repeat(size))
         found["ahead"] = step + 1
         found |= _columns(self.columns, place) | _quantiles(self.draws.reshape(len(self.draws), -1))
         return pd.DataFrame({**found, "truth": self.truth.ravel()})
@@ -113,7 +114,9 @@ class PanelForecasts:
         """Draws one coordinate of a window on axes of one's own, as `plot` does on its panels."""
         place = list(self.columns).index(column)
         observed, horizon = self.past.shape[1], self.draws.shape[2]
-        steps: Any = np.arange(observed + horizon) if self.times is None else _shown(self.times[window], self.dates)
+        steps: Any = np.arange(observed + horizon) if self.times is None else self.times[window]
+        if dated := self.times is not None and self.calendar.kind == "dates":
+            steps = self.calendar.shown(steps)
         before, after, draws = steps[:observed], steps[observed:], self.draws[:, window, :, place]
         if np.isin(self.draws[..., place], (0, 1)).all():  # no fan, but how many
             axis.plot(after, draws.mean(0), "C0", linewidth=1.2)
@@ -128,11 +131,13 @@ class PanelForecasts:
             axis.plot(after, np.median(draws, 0), "C0", linewidth=1.2, label="median")
         axis.plot(before, self.past[window, :, place], color="0.3", linewidth=1, marker=".", markersize=3)
         axis.plot(after, self.truth[window, :, place], "k.", markersize=4, label="truth")
-        if self.dates:
+        if dated:
             from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
-            axis.xaxis.set_major_locator(locator := AutoDateLocator(maxticks=6))
-            axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+            axis.xaxis.set_major_locator(locator := AutoDateLocator(tz=steps.tz, maxticks=6))
+            axis.xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=steps.tz))
+        elif self.calendar.kind == "durations":
+            axis.set_xlabel("seconds", fontsize=8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +149,8 @@ class PanelImputed:
         lacking: (N, T, D), True where a coordinate is missing.
         columns: coordinate to its unit.
         keys: (sequence, first step) of each.
-        times: (N, T) of the steps, as in the table; None for steps.
-        dates: whether times are seconds since 1970.
+        times: (N, T) of the steps, see `Calendar`; None for steps.
+        calendar: what the times are.
     """
 
     draws: np.ndarray
@@ -153,7 +158,7 @@ class PanelImputed:
     columns: Mapping[str, str]
     keys: Sequence[tuple[str, int]]
     times: np.ndarray | None = None
-    dates: bool = False
+    calendar: Calendar = NUMBERS
 
     def table(self) -> Any:
         """A pandas frame with a row for each missing entry: mean, and quantiles that so many draws have (`needed`)."""
@@ -162,7 +167,7 @@ class PanelImputed:
         window, step, place = np.nonzero(self.lacking)
         found = _rows(self.keys, window, step)
         if self.times is not None:
-            found["time"] = _shown(self.times[window, step], self.dates)
+            found["time"] = self.calendar.shown(self.times[window, step])
         return pd.DataFrame(found | _columns(self.columns, place) | _quantiles(self.draws[:, window, step, place]))
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -177,12 +182,6 @@ class PanelImputed:
 def needed(quantile: float) -> int:
     """The fewest draws of which some lie beyond a quantile: 39 for that of 2.5 %, 1 for the median."""
     return 1 if quantile == 0.5 else reaching(abs(1 - 2 * quantile))
-
-
-def _shown(times: np.ndarray, dates: bool) -> Any:
-    import pandas as pd
-
-    return pd.to_datetime(times, unit="s") if dates else times
 
 
 def _rows(keys: Sequence[tuple[str, int]], window: np.ndarray, step: np.ndarray) -> dict[str, Any]:
@@ -226,7 +225,7 @@ def _save(found: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **
     with files.written(path) as file:
         if suffix == ".csv":
             table = found.table()
-            if "time" in table and not found.dates:
+            if "time" in table and found.calendar.kind == "numbers":
                 table["time"] = table["time"].map("{:.15g}".format)
             table.to_csv(file, index=False, float_format="%.9g")
         elif suffix == ".parquet":

@@ -26,13 +26,17 @@ import torch
 from ..blocks import hash_values, ranges, row_blocks
 from ..npy import is_mapped
 from ..options import nearest
+from .calendar import NUMBERS, Calendar
 from .columns import Column, Columns
-from .parsing import is_number, numeric, tabular, texts, times
+from .parsing import is_duration, is_number, numeric, tabular, texts, times
 from .proposing import LARGEST, TIMES, Told, is_date
 
 SPLITS = ("train", "validation", "test")
 COUNTS = ("count", "overdispersed", "sparse", "sparse-overdispersed")
 """Families of whole numbers."""
+RECORDING, MINGLED = 4, 5
+"""Rows that stand in order on average, and changes between such parts for each step back in time, from which these are
+recordings whose times overlap; fewer are rows in disorder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +47,7 @@ class Series:
         name: that tells it from the others.
         values: (T, C) of the columns, float64, or any real numbers that are mapped; a category as the index of its
             class; NaN where missing.
-        times: (T,) of the steps, increasing, dates in seconds since 1970; None for steps 0, 1, …
+        times: (T,) of the steps, increasing, see `Calendar`; None for steps 0, 1, …
         group: that it belongs to.
         split: "train", "validation" or "test", where the data say it.
     """
@@ -57,13 +61,12 @@ class Series:
     def __len__(self) -> int:
         return len(self.values)
 
-    def moments(self, start: int, steps: int) -> np.ndarray | None:
-        """Times (steps,) from a step on; behind the end as far apart as the median of them all."""
+    def moments(self, start: int, steps: int, calendar: Calendar) -> np.ndarray | None:
+        """Times (steps,) from a step on; after the end they continue by the calendar, see `Calendar.after`."""
         if self.times is None:
             return None
         own = self.times[start : start + steps]
-        apart = np.median(np.diff(self.times)) if len(self) > 1 else 1.0
-        return np.concatenate([own, self.times[-1] + apart * np.arange(1, steps - len(own) + 1)])
+        return np.concatenate([own, calendar.after(self.times, steps - len(own))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +77,7 @@ class Panel:
         series: the sequences.
         columns: what their columns are.
         name: for titles.
-        dates: whether times are dates, in seconds since 1970.
+        calendar: what their times are.
         complete: names of mapped sequences, in which nothing can change, that lack no value of a target; found.
 
     Raises:
@@ -85,7 +88,7 @@ class Panel:
     series: Sequence[Series]
     columns: Columns
     name: str = "panel"
-    dates: bool = False
+    calendar: Calendar = NUMBERS
     complete: frozenset[str] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -227,8 +230,8 @@ class Panel:
                 data, columns = _of_grid(data, columns)
             frame = tabular(data)
             columns = columns.of(frame) if isinstance(columns, Told) else columns
-            series = list(_of_frame(frame, columns))
-            return cls(series, columns, name, columns.time is not None and not is_number(frame[columns.time]))
+            series, calendar = _of_frame(frame, columns)
+            return cls(series, columns, name, calendar)
         arrays = [data] if hasattr(data, "ndim") and data.ndim == 2 else data
         if not isinstance(arrays, np.ndarray | torch.Tensor | list | tuple):
             raise TypeError(
@@ -253,14 +256,15 @@ class Panel:
         """A table of a pandas frame with one row for each step and one column for each sequence of one variable.
 
         Args:
-            data: whose index is the time, where it is of numbers or dates.
+            data: whose index is the time, where it is of numbers, dates or durations.
             column: what all of them hold; a real target named "value", if not given.
             name: for titles.
         """
-        index, when = data.index.to_series(), None
-        if is_number(index) or is_date(index):
-            when = times(index)
-            data, when = data.iloc[np.argsort(when, kind="stable")], np.sort(when)
+        index, when, calendar = data.index.to_series(name="index"), None, Calendar()
+        if is_number(index) or is_date(index) or is_duration(index):
+            when, calendar = times(index)
+            order = _ordered(when, np.arange(len(when)), f"the table {name}", calendar, "index")
+            data, when = data.iloc[order], when[order]
         own = column or Column("value")
         series = []
         for each, held in data.items():
@@ -269,7 +273,7 @@ class Panel:
             if len(known):
                 part = slice(known[0], known[-1] + 1)
                 series.append(Series(str(each), values[part, None], None if when is None else when[part]))
-        return cls(series, Columns((own,)), name, when is not None and not is_number(index))
+        return cls(series, Columns((own,)), name, calendar.stepping(one.times for one in series))
 
 
 def plain_columns(columns: Columns | Told | Sequence[str] | None, size: int) -> Columns:
@@ -318,14 +322,14 @@ def _of_grid(data: Any, columns: Columns | Told) -> tuple[Any, Columns | Told]:
     data = data if hasattr(data, "data_vars") else data.to_dataset(name=data.name or "x")
     frame, dims = data.to_dataframe().reset_index(), [str(name) for name in data.dims]
     if isinstance(columns, Told) and dims:
-        dated = [name for name in dims if frame[name].dtype.kind == "M" or TIMES.search(name.lower())]
+        dated = [name for name in dims if frame[name].dtype.kind in "mM" or TIMES.search(name.lower())]
         time = columns.time or (dated or dims)[-1]
         columns = replace(columns, time=time, id=columns.id or tuple(name for name in dims if name != time))
     return frame, columns
 
 
-def _of_frame(frame: Any, columns: Columns) -> Iterator[Series]:
-    """The sequences of a frame in the long form."""
+def _of_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
+    """The sequences of a frame in the long form, and what their times are."""
     if lacking := [name for name in columns.needed if name not in frame.columns]:
         known = [str(name) for name in frame.columns]
         raise ValueError(
@@ -335,7 +339,6 @@ def _of_frame(frame: Any, columns: Columns) -> Iterator[Series]:
     if not len(frame):
         raise ValueError("the table has no rows")
     values = np.stack([numeric(frame[column.name], column) for column in columns.columns], 1)
-    when = None if columns.time is None else times(frame[columns.time])
     told = {name: own for name in ("group", "split") if (own := getattr(columns, name))}
     labels = {name: texts(frame[own]).fillna("").to_numpy() for name, own in told.items()}
     rows, names = [np.arange(len(frame))], ["0"]
@@ -344,14 +347,12 @@ def _of_frame(frame: Any, columns: Columns) -> Iterator[Series]:
         rows = [np.sort(places) for places in found.values()]
         firsts = frame.iloc[[places[0] for places in rows]]
         names = ["/".join(key) for key in zip(*(texts(firsts[own]).fillna("") for own in columns.id), strict=True)]
+    when, calendar, found = None, Calendar(), []
+    if columns.time is not None:
+        when, calendar = times(frame[columns.time], columns.zone, rows)
     for name, places in zip(names, rows, strict=True):
         if when is not None:
-            places = places[np.argsort(when[places], kind="stable")]
-            if (twice := np.diff(when[places]) == 0).any():
-                moment = frame[columns.time].iloc[places[np.argmax(twice)]]
-                raise ValueError(
-                    f"sequence {name!r} has two rows at {columns.time} {moment}; name the id columns that part them"
-                )
+            places = _ordered(when, places, f"sequence {name!r}", calendar, columns.time)
         own = {}
         for what, all_labels in labels.items():
             if len(said := set(all_labels[places])) > 1:
@@ -361,4 +362,34 @@ def _of_frame(frame: Any, columns: Columns) -> Iterator[Series]:
             own[what] = said.pop()
         if own.get("split") and own["split"] not in SPLITS:
             raise ValueError(f"sequence {name!r} is of split {own['split']!r}; expected one of {', '.join(SPLITS)}")
-        yield Series(name, values[places], None if when is None else when[places], **own)
+        found.append(Series(name, values[places], None if when is None else when[places], **own))
+    return found, calendar.stepping(one.times for one in found)
+
+
+def _ordered(when: np.ndarray, rows: np.ndarray, who: str, calendar: Calendar, column: str | None) -> np.ndarray:
+    """Rows of a sequence in the order of their times.
+
+    Raises:
+        ValueError: two rows of one time, or recordings whose times overlap, one after the other.
+    """
+    if (np.diff(when[rows]) > 0).all():
+        return rows
+    order = np.argsort(when[rows], kind="stable")
+    found = rows[order]
+    advice = "name the id columns that tell sequences apart"
+    if calendar.kind == "dates" and calendar.zone is None:
+        advice += ', or, if clocks were set back, their zone, such as zone = "Europe/Berlin"'
+    if calendar.kind == "durations":
+        advice += ", or write the date before clocks that begin again each day"
+    if (twice := np.diff(when[found]) == 0).any():
+        first, second = found[np.argmax(twice) :][:2]
+        raise ValueError(f"{who} has two rows at {column} {calendar.text(when[first])}, {first} and {second}; {advice}")
+    part = np.concatenate([[0], np.cumsum(np.diff(when[rows]) < 0)])  # of rows that stand in order
+    if len(rows) >= RECORDING * (part[-1] + 1) and (np.diff(part[order]) != 0).sum() > MINGLED * part[-1]:
+        last, row = rows[np.argmax(part) - 1 :][:2]
+        raise ValueError(
+            f"{who} goes back from {column} {calendar.text(when[last])} in row {last} to {calendar.text(when[row])} in "
+            f"row {row}, and the rows before and after overlap in time; {advice}, or, if it is one sequence, sort its "
+            f"rows by {column}"
+        )
+    return found

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from reprlib import repr as brief
 from typing import Any
 
 import numpy as np
 
 from ..options import nearest
+from .calendar import Calendar, seconds
 from .columns import Column
 
 LONGEST = 64
@@ -34,10 +36,13 @@ WRITTEN = [
     )
 ]
 """How dates are written that are not as in ISO 8601, each column in one of these ways."""
+_OFFSET = re.compile(r"[T :]\d\d[\d:.]*\s?(z|utc|gmt|[-+]\d[\d:]{1,4})$", re.IGNORECASE | re.ASCII)
+"""The offset from UTC at the end of a date."""
+_DURATION = re.compile(r"[-+]?(?:\d{1,6} days?,? ?)?[-+]?\d{1,6}:\d\d:\d\d(?:\.\d{1,9})?|[-+]?\d{1,6} days?", re.ASCII)
 
 
 class Undecided(ValueError):
-    """Dates whose day and month cannot be told apart."""
+    """Dates that can be read in several ways, such as with the day or the month first."""
 
 
 def is_number(column: Any) -> bool:
@@ -60,7 +65,7 @@ def tabular(data: Any) -> Any:
     columns, levels = [*frame.columns], []
     for place in range(frame.index.nlevels):
         level = frame.index.get_level_values(place)
-        dated = isinstance(level, pd.DatetimeIndex | pd.PeriodIndex)
+        dated = isinstance(level, pd.DatetimeIndex | pd.PeriodIndex | pd.TimedeltaIndex)
         if level.name is not None or dated or not (frame.index.nlevels == 1 or is_number(level)):
             unnamed = "time" if dated and "time" not in columns else f"level_{place}"
             name = unnamed if level.name is None else str(level.name)
@@ -87,25 +92,51 @@ def texts(column: Any) -> Any:
 
 
 def dates(column: Any) -> Any:
-    """Dates, in UTC: of ISO 8601, with a month in English, or in digits of which some tell the day from the month.
+    """Dates, in their time zone if they have one.
+
+    They are written as in ISO 8601, with a month in English, or in digits of which some tell the day from the month.
+    Dates with several offsets from UTC are in UTC.
 
     Raises:
-        Undecided: day, month and year in digits, and nothing that tells which is which.
+        Undecided: day, month and year in digits, and nothing that tells which is which, or an offset from UTC for some.
         TypeError, ValueError: a column that holds something else, or dates that are written in several ways.
     """
     import pandas as pd
 
     if isinstance(column.dtype, pd.PeriodDtype):
-        column = column.dt.to_timestamp()
+        return column.dt.to_timestamp()
+    if pd.api.types.is_datetime64_any_dtype(column):
+        return column
+    codes, held = pd.factorize(column)  # sequences share their dates
     try:
-        return pd.to_datetime(column, utc=True, format="ISO8601")
+        said = pd.Series(held, dtype=object)
+        when = pd.to_datetime(said, utc=True, format="ISO8601")
     except (TypeError, ValueError):
-        codes, said = pd.factorize(column.astype(str).str.strip().where(column.notna()))  # sequences share their dates
-        said = pd.Series(said, dtype=object)
-        when = pd.to_datetime(_as_iso(said), utc=True, format="ISO8601", errors="coerce")
+        codes, held = pd.factorize(column.astype(str).str.strip().where(column.notna()))
+        said = _as_iso(pd.Series(held, dtype=object))
+        when = pd.to_datetime(said, utc=True, format="ISO8601", errors="coerce")
         if (wrong := when.isna()).any():
-            raise _unread(said[wrong]) from None
-        return when.reindex(codes).set_axis(column.index)
+            raise _unread(pd.Series(held)[wrong]) from None
+    offsets = said.astype(str).str.extract(_OFFSET)[0].str.upper().replace({"UTC": "Z", "GMT": "Z"})
+    known = offsets.dropna().unique()
+    if len(known) and (naive := offsets.isna()).any():
+        raise Undecided(
+            f"dates of which some, such as {brief(str(held[naive.argmax()]))}, have no offset from UTC, and others do; "
+            "write it for all, or for none"
+        )
+    if not len(known):
+        when = when.dt.tz_localize(None)
+    elif len(known) == 1 and known[0] != "Z":
+        when = when.dt.tz_convert(pd.Timestamp(said[0]).tz)
+    return when.reindex(codes).set_axis(column.index)
+
+
+def is_duration(column: Any) -> bool:
+    """Whether a column holds durations, or texts of them such as "1 days 02:00:00" or "02:00:00"."""
+    known = column.dropna()
+    return column.dtype.kind == "m" or bool(
+        len(known) and not is_number(column) and known.astype(str).str.strip().str.fullmatch(_DURATION).all()
+    )
 
 
 def _as_iso(said: Any) -> Any:
@@ -151,15 +182,28 @@ def _order(parts: Any, example: str) -> dict[str, str]:
     return {"first": "day", "second": "month"} if first else {"first": "month", "second": "day"}
 
 
-def times(column: Any) -> np.ndarray:
-    """Seconds since 1970 of dates, or the numbers that they are.
+def times(
+    column: Any, zone: str | None = None, sequences: Iterable[np.ndarray] | None = None
+) -> tuple[np.ndarray, Calendar]:
+    """Times (N,) of rows, and what they are: seconds of dates since 1970 or of durations, or the numbers that they are.
+
+    Args:
+        column: numbers, dates or durations.
+        zone: time zone of dates; those without an offset from UTC are what its clocks show.
+        sequences: rows of each sequence, whose order tells the first of two equal hours from the second; by default
+            all rows are one.
 
     Raises:
-        ValueError: neither, or rows without.
+        ValueError: something else, or rows without.
     """
+    import pandas as pd
+
     if is_number(column):
-        found = column.to_numpy(np.float64, na_value=np.nan)
+        found, calendar = column.to_numpy(np.float64, na_value=np.nan), Calendar()
         known = np.isfinite(found)
+    elif is_duration(column):
+        spans = pd.to_timedelta(column if column.dtype.kind == "m" else column.astype(str).where(column.notna()))
+        found, known, calendar = seconds(pd.TimedeltaIndex(spans)), spans.notna().to_numpy(), Calendar("durations")
     else:
         try:
             when = dates(column)
@@ -167,13 +211,48 @@ def times(column: Any) -> np.ndarray:
             raise ValueError(f"column {column.name!r} holds {error}") from error
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"the times of column {column.name!r} are neither numbers nor dates: {str(error)[:200]}"
+                f"the times of column {column.name!r} are neither numbers, dates nor durations: {str(error)[:200]}"
             ) from error
         known = when.notna().to_numpy()
-        found = when.to_numpy("datetime64[us]").astype("int64") / 1e6
+        moments = pd.DatetimeIndex(when)
+        if zone is not None:
+            moments = moments.tz_convert(zone) if moments.tz else _localized(moments, zone, sequences, column)
+        found = seconds(moments)
+        calendar = Calendar("dates", None if moments.tz is None else str(moments.tz))
+    if zone is not None and calendar.kind != "dates":
+        raise ValueError(f"zone is {zone!r}, and column {column.name!r} holds {calendar.kind}; leave the zone out")
     if not known.all():
         raise ValueError(f"row {int(np.argmin(known))} of column {column.name!r} has no time")
-    return np.asarray(found)
+    return np.asarray(found), calendar
+
+
+def _localized(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, column: Any) -> Any:
+    """Dates as moments in the zone whose clocks show them.
+
+    Raises:
+        ValueError: an hour that the clocks skip, or show twice where its sequence does not.
+    """
+    shown_twice = local.tz_localize(zone, ambiguous="NaT", nonexistent="shift_forward").isna() & local.notna()
+    moments = local.tz_localize(zone, ambiguous=np.ones(len(local), bool), nonexistent="NaT")
+    if (skipped := moments.isna() & local.notna()).any():
+        row = int(skipped.argmax())
+        raise ValueError(
+            f"row {row} of column {column.name!r} is {local[row]}, which the clocks of {zone} skip; write its offset "
+            "from UTC, or leave the zone out"
+        )
+    moments = moments.to_series().reset_index(drop=True)
+    for rows in [np.arange(len(local))] if sequences is None else sequences:
+        if shown_twice[rows].any():
+            try:
+                moments.iloc[rows] = local[rows].tz_localize(zone, ambiguous="infer")
+            except ValueError:
+                row = rows[shown_twice[rows].argmax()]
+                raise ValueError(
+                    f"row {row} of column {column.name!r} is {local[row]}, an hour that the clocks of {zone} show "
+                    "twice, and its sequence does not have it twice in order; write its offset from UTC, as in "
+                    f"{moments.iloc[row].isoformat()}, or leave the zone out"
+                ) from None
+    return type(local)(moments)
 
 
 def numeric(column: Any, told: Column) -> np.ndarray:
@@ -188,11 +267,13 @@ def numeric(column: Any, told: Column) -> np.ndarray:
         places = {each: place for place, each in enumerate(told.classes)}
         said = texts(column)
         unknown = said.notna() & ~said.isin(list(places))
-        if unknown.any():
+        if told.other:
+            said = said.mask(unknown, told.other)
+        elif unknown.any():
             value = said[unknown].iloc[0]
             raise ValueError(
                 f"column {told.name!r} has {brief(value)}{nearest(value, places)}, which is none of its classes: "
-                f"{', '.join(told.classes[:10])}"
+                f"{', '.join(told.classes[:10])}; a class can stand for all others: other = {told.classes[-1]!r}"
             )
         return said.map(places).to_numpy(np.float64)  # type: ignore[no-any-return]
     advice = "leave it out, or give it the family 'category'"

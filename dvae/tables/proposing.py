@@ -13,7 +13,7 @@ import numpy as np
 
 from ..options import nearest
 from .columns import Column, Columns, Role
-from .parsing import Undecided, dates, is_number, tabular, texts
+from .parsing import Undecided, dates, is_duration, is_number, tabular, texts
 
 CLASSES = 20
 """Most different texts of a category; more are an id, or a text."""
@@ -39,6 +39,7 @@ class Told:
         id: columns that tell sequences apart.
         time: column of dates or numbers.
         group: column that is the same within a sequence.
+        zone: time zone of dates, such as "Europe/Berlin".
     """
 
     columns: tuple[str, ...] = ()
@@ -48,6 +49,7 @@ class Told:
     id: tuple[str, ...] = ()
     time: str | None = None
     group: str | None = None
+    zone: str | None = None
 
     def of(self, frame: Any) -> Columns:
         """The columns of a frame, with what is not told as it is proposed.
@@ -70,8 +72,8 @@ class Told:
             if name not in known:
                 raise ValueError(f"no column {name!r}{nearest(name, known)}; there are {', '.join(known[:20])}")
         found, undecided = _proposed(frame, self.time, self.id, roles)
-        layout: dict[str, Any] = {"id": found.id, "time": found.time, "group": self.group}
-        aside = {*layout["id"], *filter(None, (layout["time"], self.group))}
+        layout: dict[str, Any] = {"id": found.id, "time": found.time, "group": self.group, "zone": self.zone}
+        aside = {*layout["id"], *filter(None, (found.time, self.group))}
         own = {column.name: column for column in found.columns if column.name not in aside}
         names = list(roles) if self.columns else [*(name for name in own if name not in roles), *roles]
         columns = []
@@ -123,6 +125,8 @@ def _proposed(
     undecided: dict[str, str] = {}
     if time is None:
         time = next((name for name in free if _is_time(name, frame[name], undecided)), None)
+    if time is None and not undecided:
+        time = next((name for name in free if is_duration(frame[name])), None)
     if time is None:
         time = next((name for name in free if TIMES.search(name.lower()) and is_number(frame[name])), None)
     free = [name for name in free if name not in (time, *undecided)]
@@ -219,7 +223,7 @@ def is_date(values: Any) -> bool:
     """Whether a column holds dates, or texts of them.
 
     Raises:
-        Undecided: dates whose day and month cannot be told apart.
+        Undecided: dates that can be read in several ways.
     """
     import pandas as pd
 

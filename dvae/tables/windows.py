@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from copy import copy
 from functools import cached_property
+from itertools import islice
 from typing import Any, Self
 
 import numpy as np
@@ -18,6 +19,7 @@ from ..data import Sequences, columns_of, gapped, past_of
 from ..inference.held import on_device_of, reproducibly
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
+from .calendar import Calendar
 from .encoding import COVARIATES, GAPS, STATICS, PanelSchema, whole
 from .forecasts import PanelForecasts, PanelImputed
 from .panel import Panel
@@ -27,6 +29,8 @@ GROUPED = 8
 """Windows of a group in a batch for training."""
 AT_ONCE = 64
 """Windows that are forecast or filled at once."""
+NAMED = 10
+"""Sequences without a window that are named."""
 
 
 class PanelWindows:
@@ -50,7 +54,9 @@ class PanelWindows:
             self._ranges.sort(key=lambda each: panel.series[each[0]].group)
         shortest = schema.cut.length or 1
         cut_from = schema.cut.spans(panel, split)
-        self.skipped = [panel.series[place].name for place, low, high in cut_from if high - low < shortest]
+        self.skipped = {
+            panel.series[place].name: max(high - low, 0) for place, low, high in cut_from if high - low < shortest
+        }
         steps = [panel.present(one) for one in panel]
         none = (
             f"{panel.name} has no {split} window of {schema.cut.name}; up to their last targets its {len(panel)} "
@@ -94,13 +100,18 @@ class PanelWindows:
     @property
     def left_out(self) -> str:
         """What is not among the listed windows, in words; empty where all is."""
-        parts = []
-        if self.skipped:
-            names = ", ".join(self.skipped[:3]) + ("…" if len(self.skipped) > 3 else "")
-            parts.append(f"{len(self.skipped)} sequences, which have fewer than {self.length} steps there ({names})")
+        parts = [self.too_short] if self.skipped else []
         if self.untold:
             parts.append(f"{self.untold} windows, in whose past or future no target was observed")
         return " and ".join(parts)
+
+    @property
+    def too_short(self) -> str:
+        """Sequences that are too short for a window there, with their steps, in words; empty where none is."""
+        named = [f"{name}: {steps}" for name, steps in islice(self.skipped.items(), NAMED)]
+        more = f" and {len(self.skipped) - NAMED} more" if len(self.skipped) > NAMED else ""
+        said = f"{len(self.skipped)} sequences, which have fewer than {self.length} steps there"
+        return f"{said} ({', '.join(named)}{more})" if named else ""
 
     @property
     def untold(self) -> int:
@@ -154,7 +165,8 @@ class PanelWindows:
     @property
     def fingerprint(self) -> str:
         """SHA-256 of the data, how they are cut, and which part these windows are."""
-        digest = hashlib.sha256(f"{self.panel.fingerprint()}({self.schema.config()!r}, {self.split!r}, ".encode())
+        schema = {name: own for name, own in self.schema.config().items() if name != "calendar"}  # which changes no x
+        digest = hashlib.sha256(f"{self.panel.fingerprint()}({schema!r}, {self.split!r}, ".encode())
         hash_list(digest, self._keys())
         digest.update(b")")
         return digest.hexdigest()
@@ -257,16 +269,17 @@ class PanelWindows:
         keys = [(name, start) for _, name, start in self.keys]
         return PanelImputed(np.concatenate(parts, 1), lacking, columns_of(self), keys, *self.times(steps))
 
-    def times(self, steps: int) -> tuple[np.ndarray | None, bool]:
-        """Times (N, steps) from the start of the listed windows, and whether they are dates; None where rows have none.
+    def times(self, steps: int) -> tuple[np.ndarray | None, Calendar]:
+        """Times (N, steps) from the start of the listed windows, and what they are; None where rows have none.
 
-        Behind the end of a sequence they go on as `Series.moments` says.
+        After the end of a sequence they continue as `Series.moments` says.
         """
+        calendar = self.panel.calendar
         places, starts = map(Tensor.tolist, self._windows)
         listed = [self.panel.series[self._ranges[place][0]] for place in places]
-        found = [one.moments(start, steps) for one, start in zip(listed, starts, strict=True)]
+        found = [one.moments(start, steps, calendar) for one, start in zip(listed, starts, strict=True)]
         known = [own for own in found if own is not None]
-        return (np.stack(known), self.panel.dates) if len(known) == len(found) else (None, False)
+        return (np.stack(known), calendar) if len(known) == len(found) else (None, calendar)
 
     @property
     def _stride(self) -> int:

@@ -85,15 +85,20 @@ def test_a_future_that_lacks_them_says_which_and_of_which_sequence(future):
         ahead(panel, PanelSchema.under(panel, CUT))
     panel = table(PLANNED, 3)
     panel.series[2].values[-1, 3] = NAN
-    with pytest.raises(ValueError, match=r"needs holiday, known .* sequence 's2' has 3 rows .* append rows with it"):
-        ahead(panel, PanelSchema.under(panel, CUT))
+    with pytest.warns(UserWarning, match=r"1 of 4 .* needs holiday, known .* 's2' has 3 rows .* append rows with it"):
+        windows = ahead(panel, PanelSchema.under(panel, CUT))
+    assert [name for _, name, _ in windows.keys] == ["s0", "s1", "s3"]
 
 
-def test_what_cannot_be_forecast_is_refused():
+def test_what_cannot_be_forecast_is_said_and_the_rest_is_forecast():
     panel = table(PLAIN)
     with pytest.raises(ValueError, match="whole sequences have no horizon"):
         ahead(panel, PanelSchema.under(panel, Cut()))
     schema = PanelSchema.under(panel, CUT)
     panel.series[1].values[3:, 0] = NAN
-    with pytest.raises(ValueError, match="sequence 's1' has 3 steps up to its last target, and 4 are to be observed"):
-        ahead(panel, schema)
+    said = "sequence 's1' has 3 steps up to its last target, and 4 are to be observed"
+    with pytest.warns(UserWarning, match=f"1 of 4 sequences have no forecast: {said}"):
+        windows = ahead(panel, schema)
+    assert [name for _, name, _ in windows.keys] == ["s0", "s2", "s3"]
+    with pytest.raises(ValueError, match=said):
+        ahead(panel.only(["s1"]), schema)

@@ -38,7 +38,7 @@ def column(draw, name, role):
     families = list(FAMILIES) if role == "target" else ["real", "category"]
     family = draw(st.sampled_from(families))
     classes = draw(st.lists(NAMES, min_size=2, max_size=4, unique=True)) if family == "category" else ()
-    return Column(name, role, family, draw(NAMES), tuple(classes))
+    return Column(name, role, family, draw(NAMES), tuple(classes), draw(st.sampled_from(["", *classes])))
 
 
 @st.composite
@@ -46,6 +46,7 @@ def schemas(draw):
     names = iter(draw(st.lists(NAMES.filter(bool), min_size=7, max_size=9, unique=True)))
     told = {"id": (next(names), next(names))[: draw(st.integers(0, 2))]}
     told |= {name: draw(st.none() | st.just(next(names))) for name in ("time", "group", "split")}
+    told |= {"zone": draw(st.sampled_from([None, "Europe/Berlin", "+02:00"]))} if told["time"] else {}
     roles = ["target", *draw(st.lists(st.sampled_from(["target", "known", "past", "static"]), max_size=3))]
     return Columns(tuple(draw(column(name, role)) for name, role in zip(names, roles, strict=False)), **told)
 
@@ -100,6 +101,13 @@ def test_columns_are_real_targets_where_nothing_is_said():
         ("time = 5\n[columns.a]", "time is 5; expected the name of a column"),
         ("time = 'a'\n[columns.a]", "column 'a' has two parts to play"),
         ("time = ''\n[columns.a]", "a column has no name"),
+        ("time = 'a'\nzone = 3\n[columns.b]", "zone is 3; expected a time zone"),
+        ("time = 'a'\nzone = 'Berlin'\n[columns.b]", "zone is 'Berlin'; expected a name such as 'Europe/Berlin'"),
+        ("zone = 'UTC'\n[columns.b]", "zone is 'UTC', and no column is the time"),
+        (
+            "[columns.a]\nfamily = 'category'\nclasses = ['rain', 'sun']\nother = 'rian'",
+            r"other = 'rian' \(did you mean 'rain'\?\), which is none of its classes",
+        ),
         ("columns = 3", "columns is 3; expected a table for each column"),
         ("[columns]\na = 3", "column 'a' is 3; expected a table"),
         ("cut = 3", "cut is a table"),

@@ -91,7 +91,7 @@ def test_dates_in_an_index_are_times(days, name):
     told = Told(columns=("x",))
     panel = Panel.of(frame[["x"]], told)
     assert panel.columns.time == (name or "time")
-    assert panel.dates
+    assert panel.calendar.kind == "dates"
     np.testing.assert_array_equal(panel.series[0].values[:, 0], [1, 2, 3, 4])
     np.testing.assert_array_equal(np.diff(panel.series[0].times) / 86400, [1, 3, 1])
     assert Panel.of(frame, told).series[0].times.tolist() == panel.series[0].times.tolist()
@@ -195,6 +195,14 @@ def test_classes_are_texts_and_whole_numbers_are_written_alike_whether_some_are_
         of(["rian"], "category", ("rain", "sun"))
 
 
+def test_a_class_that_is_named_stands_for_all_others():
+    frame = pd.DataFrame({"y": ["rain", "hail", None, "sun"]})
+    told = Columns((Column("y", family="category", classes=("rain", "else", "sun"), other="else"),))
+    np.testing.assert_array_equal(Panel.of(frame, told).series[0].values[:, 0], [0, 1, np.nan, 2])
+    with pytest.raises(ValueError, match="classes: rain, sun; a class can stand for all others: other = 'sun'"):
+        Panel.of(frame, Columns((Column("y", family="category", classes=("rain", "sun")),)))
+
+
 @pytest.mark.parametrize(
     ("column", "said"),
     [
@@ -266,7 +274,7 @@ def test_dates_with_time_zones_are_moments(column):
     frame = pd.DataFrame({"t": column, "y": [1.0, 2.0, 3.0]})
     panel = Panel.of(frame)
     assert panel.columns.time == "t"
-    assert panel.dates
+    assert panel.calendar.kind == "dates"
     np.testing.assert_array_equal(np.diff(panel.series[0].times) / 3600, [24, 23])  # summer time
     assert panel.series[0].times[0] == 1585350000
 
@@ -325,20 +333,31 @@ def test_dates_before_1970_are_times_too():
 @pytest.mark.parametrize(
     ("column", "said"),
     [
-        ([0, 1, 1], "sequence '0' has two rows at t 1; name the id columns"),
-        (["2020", "2021", "2021"], "sequence '0' has two rows at t 2021"),
+        ([0, 1, 1], "sequence '0' has two rows at t 1, 1 and 2; name the id columns that tell sequences apart$"),
+        (
+            ["2020", "2021", "2021"],
+            "two rows at t 2021-01-01 00:00:00, 1 and 2; .* if clocks were set back, their zone",
+        ),
+        (["1:00:00", "2:00:00", "2:00:00"], "two rows at t 0 days 02:00:00, .*, or write the date before clocks"),
+        (
+            ["2020-01-01T01:00+01:00", "2020-01-02", "2020-01-03"],
+            "'2020-01-02', have no offset from UTC, and others do",
+        ),
         ([0, None, 1], "row 1 of column 't' has no time"),
         (["2020", None, "2021"], "row 1 of column 't' has no time"),
-        (["a", "b", "c"], "times of column 't' are neither numbers nor dates"),
-        (["1/2/2020", "13/2/2020", "2/13/2020"], "neither .* nor dates: some begin with the day and others with the m"),
-        (["13/1/2020", "n.a.", "15/1/2020"], "neither numbers nor dates: 'n.a.' among them; write dates as 2024-12-31"),
-        (["30/1/2020", "30/2/2020", "30/3/2020"], "neither numbers nor dates: '30/2/2020' among them"),
+        (["a", "b", "c"], "times of column 't' are neither numbers, dates nor durations"),
+        (
+            ["1/2/2020", "13/2/2020", "2/13/2020"],
+            "nor durations: some begin with the day and others with the m",
+        ),
+        (["13/1/2020", "n.a.", "15/1/2020"], "nor durations: 'n.a.' among them; write dates as 2024-12-31"),
+        (["30/1/2020", "30/2/2020", "30/3/2020"], "nor durations: '30/2/2020' among them"),
         (
             ["1/2/2020", "2/2/2020", "12/2/2020"],
             "column 't' holds dates such as '1/2/2020', .* as 2024-12-31",
         ),
         (["1.2.20", "2.2.20", "13.2.20"], "column 't' holds dates such as '1.2.20'"),
-        (["12:30", "12:40", "12:50"], "neither numbers nor dates: '12:30' among them"),
+        (["12:30", "12:40", "12:50"], "nor durations: '12:30' among them"),
     ],
 )
 def test_rows_without_a_time_of_their_own_are_refused(column, said):

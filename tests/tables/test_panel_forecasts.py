@@ -12,6 +12,7 @@ from dvae.inference.checkpoints import CheckpointError
 from dvae.models.registry import methods
 from dvae.runs import directory as runs
 from dvae.tables import Column, Columns, Panel
+from dvae.tables.calendar import NUMBERS, Calendar
 from dvae.tables.dataset import PanelData
 from dvae.tables.forecasts import QUANTILES, PanelForecasts, PanelImputed, needed
 from dvae.tables.protocol import Cut
@@ -166,13 +167,16 @@ def test_a_run_is_fitted_loaded_resumed_and_refused_where_it_was_tampered_with(d
         runs.load(out).data.windows("test")
 
 
-def forecasts(times=None, dates=False, samples=50):
+BERLIN = Calendar("dates", "Europe/Berlin")
+
+
+def forecasts(times=None, calendar=NUMBERS, samples=50):
     rng = np.random.default_rng(0)
     draws = rng.normal(1e6, 1, size=(samples, 2, 3, 2)).astype(np.float32)
     draws[..., 1] = rng.integers(0, 2, draws.shape[:-1])
     past, truth = rng.normal(size=(2, 4, 2)), rng.normal(size=(2, 3, 2))
     truth[0, 1, 0] = past[1, 2, 0] = NAN
-    return PanelForecasts(draws, past, truth, {"y": "m", "open": ""}, [("a", 4), ("b", 9)], times, dates)
+    return PanelForecasts(draws, past, truth, {"y": "m", "open": ""}, [("a", 4), ("b", 9)], times, calendar)
 
 
 def test_the_table_has_a_row_for_each_window_step_and_column():
@@ -232,11 +236,22 @@ def test_times_that_are_numbers_keep_all_their_digits(tmp_path, times):
     np.testing.assert_array_equal(table["time"], times[:, 4:].reshape(-1).repeat(2))
 
 
-def test_dates_are_dates(tmp_path):
-    days = pd.date_range("2024-02-25", periods=7).astype("datetime64[s]").astype("int64").to_numpy(float)
-    forecasts(np.stack([days, days]), True).save(tmp_path / "a.csv")
-    table = pd.read_csv(tmp_path / "a.csv")
-    assert [*dict.fromkeys(table["time"])] == ["2024-02-29", "2024-03-01", "2024-03-02"]
+@pytest.mark.parametrize(
+    ("calendar", "start", "step", "written"),
+    [
+        (Calendar("dates"), 1708819200, 86400, ["2024-02-29", "2024-03-01", "2024-03-02"]),
+        (BERLIN, 1711828800, 3600, [f"2024-03-31 0{h}:00:00+0{zone}:00" for h, zone in ((1, 1), (3, 2), (4, 2))]),
+        (Calendar("durations"), 3600, 0.25, [f"0 days 01:00:01.{n}0000" for n in ("00", "25", "50")]),
+    ],
+)  # fmt: skip
+def test_dates_and_durations_are_written_in_their_zone(tmp_path, calendar, start, step, written):
+    found = forecasts(np.stack([start + step * np.arange(7.0)] * 2), calendar)
+    found.save(tmp_path / "a.csv")
+    assert [*dict.fromkeys(pd.read_csv(tmp_path / "a.csv")["time"])] == written
+    figure = found.plot()
+    figure.canvas.draw()
+    labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
+    assert calendar.zone is None or "04:00" in labels
 
 
 def test_npz_holds_the_draws(tmp_path):

@@ -1,0 +1,164 @@
+"""Calendar: what the times of a table are, how they are written, and which times follow them.
+
+Times are float64: numbers as they are, or seconds. A day, a week, a business day or a month is not a fixed number of
+seconds, so that dates at such steps are continued on the calendar, in their own time zone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from reprlib import repr as brief
+from typing import Any, Literal, Self
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from ..options import check
+
+MONTH = 30.4369
+"""Mean days of a month."""
+SERIES = 50
+"""Sequences from which the calendar step of a panel is inferred."""
+_OFFSET = re.compile(r"(?:UTC)?[-+]\d\d:\d\d", re.ASCII)
+_DAYS = ("MON", "TUE", "WED", "THU", "FRI", "SAT", "SUN")
+_STEP = re.compile(rf"[1-9]\d{{0,3}}(?:D|B|MS|ME|BMS|BME|WOM-[1-4](?:{'|'.join(_DAYS)}))", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Calendar:
+    """What the times of a panel are.
+
+    Args:
+        kind: "numbers", "dates" (times are seconds since 1970, in UTC) or "durations" (times are seconds).
+        zone: time zone of the dates, such as "Europe/Berlin" or "UTC+02:00"; None for dates without one.
+        step: calendar step as a pandas alias, such as "1MS" or "1B"; None for steps of equal duration.
+
+    Raises:
+        ValueError: unknown zone or step, or a zone or step of times that are not dates.
+    """
+
+    kind: Literal["numbers", "dates", "durations"] = "numbers"
+    zone: str | None = None
+    step: str | None = None
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.zone is not None:
+            check_zone(self.zone)
+        if self.step is not None and not _STEP.fullmatch(self.step):
+            raise ValueError(f"step is {brief(self.step)}; expected a calendar step such as '1MS', '1B' or '7D'")
+        if self.kind != "dates" and (self.zone or self.step):
+            raise ValueError(f"zone is {self.zone!r} and step {self.step!r}, but times are {self.kind}, not dates")
+
+    def stepping(self, times: Iterable[np.ndarray | None]) -> Self:
+        """Return the calendar with the most common calendar step of sequences of times."""
+        if self.kind != "dates":
+            return self
+        some = [own for own in times if own is not None and len(own) > 2]
+        steps = Counter(_step(self._local(own)) for own in some[:: len(some) // SERIES + 1])
+        return replace(self, step=steps.most_common(1)[0][0] if steps else None)
+
+    def shown(self, times: np.ndarray) -> Any:
+        """Times (N,) as pandas has them: dates in their zone, durations, or the numbers."""
+        import pandas as pd
+
+        if self.kind == "numbers":
+            return times
+        whole = np.rint(times * 1e6).astype(np.int64)
+        if self.kind == "durations":
+            return pd.TimedeltaIndex(whole.astype("timedelta64[us]"))
+        dates = pd.DatetimeIndex(whole.astype("datetime64[us]"))
+        return dates if self.zone is None else dates.tz_localize("UTC").tz_convert(self.zone)
+
+    def text(self, time: float) -> str:
+        """A time as `shown` has it, as text."""
+        return f"{time:.15g}" if self.kind == "numbers" else str(self.shown(np.array([time]))[0])
+
+    def after(self, times: np.ndarray, count: int) -> np.ndarray:
+        """Return the `count` times that follow.
+
+        They follow the calendar step of the times or, where these are too few to show one, that of the panel. Without
+        a calendar step they are as far apart as the median of the times.
+        """
+        if self.kind == "dates" and count:
+            local = self._local(times)
+            own = _step(local)
+            steps = (self.step, own) if own in (None, "1D") else (own, self.step)  # business days are days too
+            for step in filter(None, steps):
+                if (following := _following(local, step, count)) is not None:
+                    return self._seconds(following)
+        apart = np.median(np.diff(times)) if len(times) > 1 else 1.0
+        return np.asarray(times[-1] + apart * np.arange(1, count + 1))
+
+    def _local(self, times: np.ndarray) -> Any:
+        """Dates as the clocks of their zone show them."""
+        dates = self.shown(times)
+        return dates if self.zone is None else dates.tz_localize(None)
+
+    def _seconds(self, local: Any) -> np.ndarray:
+        """Seconds since 1970 of dates as the clocks of their zone show them."""
+        if self.zone is not None:  # an hour that the clocks skip begins when they have skipped it
+            local = local.tz_localize(self.zone, ambiguous=np.ones(len(local), bool), nonexistent="shift_forward")
+        return seconds(local)
+
+
+NUMBERS = Calendar()
+"""Times that are numbers."""
+
+
+def seconds(dates: Any) -> np.ndarray:
+    """Seconds since 1970 of a pandas index of dates, or seconds of durations."""
+    return np.asarray(dates.as_unit("us").asi8 / 1e6)
+
+
+def check_zone(zone: str) -> None:
+    """Refuse what is no time zone.
+
+    Raises:
+        ValueError: no offset such as "+02:00", and no name of the IANA database.
+    """
+    try:
+        if not _OFFSET.fullmatch(zone):
+            ZoneInfo(zone)
+    except (KeyError, ValueError, OSError):
+        raise ValueError(
+            f"zone is {brief(zone)}; expected a name such as 'Europe/Berlin', 'UTC', or an offset such as '+02:00'"
+        ) from None
+
+
+def _step(local: Any) -> str | None:
+    """Calendar step of increasing dates; None where they have none, or are too few to show one."""
+    if len(local) < 3 or (local - local.normalize()).nunique() > 1:
+        return None
+    days = float(np.median(np.diff(seconds(local)))) / 86400
+    count, first = round(days / MONTH), local[0]
+    if days > 27:
+        candidates = [f"{count}{end}" for end in ("ME", "BME", "MS", "BMS")]
+        candidates.append(f"{count}WOM-{min((first.day + 6) // 7, 4)}{_DAYS[first.weekday()]}")
+    else:
+        candidates = ["1B"] if days == 1 and (np.diff(local.day_of_week) < 0).any() else []
+    candidates.append(f"{round(days)}D")
+    valid = (step for step in candidates if _STEP.fullmatch(step))
+    return next((step for step in valid if _following(local, step, 1) is not None), None)
+
+
+def _following(local: Any, step: str, count: int) -> Any:
+    """The `count` dates that follow by a calendar step; None where most dates do not follow each other by it."""
+    import pandas as pd
+
+    days = None
+    if step.endswith("MS") and "B" not in step:  # months from any day: the 15th, or the 30th and the end of February
+        days = local.day.max()
+        if (local.day != np.minimum(days, local.days_in_month)).any():
+            return None
+        local = local - pd.to_timedelta(local.day - 1, unit="D")
+    places = pd.date_range(local[0], local[-1], freq=step).get_indexer(local)
+    if places[0] != 0 or (places < 0).any() or (len(local) > 1 and np.median(np.diff(places)) != 1):
+        return None
+    following = pd.date_range(local[-1], periods=count + 1, freq=step)[1:]
+    return (
+        following if days is None else following + pd.to_timedelta(np.minimum(days, following.days_in_month) - 1, "D")
+    )

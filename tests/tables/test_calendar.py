@@ -1,0 +1,166 @@
+"""Times continue by the calendar step and in the time zone of the table, whatever holds them."""
+
+import numpy as np
+import pytest
+
+from dvae.tables import Cut, Panel, PanelData, Series, Told
+from dvae.tables.ahead import ahead
+from dvae.tables.calendar import Calendar, seconds
+from dvae.tables.columns import Column, Columns
+from dvae.tables.encoding import PanelSchema
+
+pd = pytest.importorskip("pandas")
+
+ZONES = [None, "Europe/Berlin", "America/New_York", "UTC+02:00"]
+
+STEPS = ["MS", "ME", "QS", "QE", "YS-JUL", "YE", "BMS", "BME", "WOM-3FRI", "W-SUN", "2W-WED", "B", "D", "h", "15min"]
+
+
+def frame_of(index, **columns):
+    values = np.random.default_rng(0).normal(size=len(index))
+    return pd.DataFrame({"time": index, "y": values, **columns})
+
+
+def future(frame, steps=8, **told):
+    """The times after the end of a table."""
+    data = PanelData.of(frame, Told(("y",), time="time", **told), Cut(2, 1, split="time"))
+    windows = data.ahead(steps)
+    times, calendar = windows.times(2 + steps)
+    return calendar.shown(times[0, 2:])
+
+
+@pytest.mark.parametrize("zone", ZONES)
+@pytest.mark.parametrize("step", STEPS)
+def test_times_continue_by_the_calendar(step, zone):
+    """Over both changes of clocks, from the frame and from what it is as a CSV."""
+    index = pd.date_range("2023-08-01 00:00", periods=40, freq=step, tz=zone)
+    assert future(frame_of(index[:-8])).equals(index[-8:].as_unit("us"))
+    written = index.astype(str)
+    assert future(frame_of(written[:-8]), zone=zone).equals(index[-8:].as_unit("us"))
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (pd.period_range("2023-01", periods=12, freq="M"), "2024-01-01"),
+        (pd.date_range("2023-01-01", periods=12, freq="MS") + pd.Timedelta("14D 12h"), "2024-01-15 12:00"),
+        (["2023-01-30", "2023-02-28", "2023-03-30", "2023-04-30", "2023-05-30"], "2023-06-30"),
+        (["2023-01-30", "2023-02-28", "2023-04-30", "2023-05-30", "2023-07-30", "2023-08-30"], "2023-09-30"),
+        ([*pd.date_range("2023-01-01", periods=12, freq="MS").delete([3, 7])], "2024-01-01"),
+        ([*pd.bdate_range("2023-01-02", "2023-01-27").delete([5, 11])], "2023-01-30"),
+        (["2023-01-02", "2023-01-05", "2023-01-07", "2023-01-10", "2023-01-16"], "2023-01-19"),
+    ],
+    ids=["periods", "15th", "30th", "30th with a gap", "months with gaps", "holidays", "irregular"],
+)  # fmt: skip
+def test_steps_are_found_from_any_day_and_with_missing_rows(given, expected):
+    assert future(frame_of(given))[0] == pd.Timestamp(expected)
+
+
+def test_a_short_sequence_continues_as_the_others_or_as_the_training_data():
+    days = [pd.bdate_range("2024-01-01", periods=count) for count in (12, 12, 5, 1)]
+    series = [Series(f"s{n}", np.zeros((len(own), 1)), seconds(own)) for n, own in enumerate(days)]
+    panel = Panel(series, Columns((Column("y"),)), calendar=Calendar("dates").stepping(one.times for one in series))
+    schema = PanelSchema.under(panel, Cut(1, 1, split="time"))
+    for some in (panel, Panel(series[2:], panel.columns, calendar=Calendar("dates"))):
+        windows = ahead(some, schema, 2)
+        times, calendar = windows.times(3)
+        following = calendar.shown(times[-2:, 1:].ravel())
+        assert [str(day.date()) for day in following] == ["2024-01-08", "2024-01-09", "2024-01-02", "2024-01-03"]
+
+
+BERLIN = pd.date_range("2024-10-26", periods=60, freq="h", tz="Europe/Berlin")
+
+
+@pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
+def test_an_hour_that_clocks_show_twice_is_two_hours(order):
+    local = BERLIN.tz_localize(None)
+    two = frame_of([*BERLIN.astype(str)[order]] * 2, s=np.repeat(["a", "b"], 60))
+    told = {"id": ("s",), "time": "time"}
+    panel = Panel.of(two, Told(("y",), **told))
+    naive = Panel.of(two.assign(time=[*local[order]] * 2), Told(("y",), zone="Europe/Berlin", **told))
+    for one, other in zip(panel, naive, strict=True):
+        np.testing.assert_array_equal(one.times, seconds(BERLIN))
+        np.testing.assert_array_equal(other.times, one.times)
+    assert (panel.calendar.zone, naive.calendar.zone) == ("UTC", "Europe/Berlin")  # offsets that change name no zone
+
+
+@pytest.mark.parametrize(
+    ("local", "zone", "said"),
+    [
+        (BERLIN.tz_localize(None), None, "two rows at time 2024-10-27 02:00:00, 26 and 27; .* clocks were set back"),
+        (BERLIN.tz_localize(None).delete(26), "Europe/Berlin", r"row 26 of column 'time' is 2024-10-27 02:00:00, .* "
+            r"clocks of Europe/Berlin show twice, .* as in 2024-10-27T02:00:00\+02:00, or leave the zone out"),
+        (pd.date_range("2024-03-31", periods=9, freq="h"), "Europe/Berlin", "row 2 .* 02:00:00, .* clocks .* skip"),
+        (pd.timedelta_range("0h", periods=9, freq="h"), "Europe/Berlin", "holds durations; leave the zone out"),
+        (range(9), "Europe/Berlin", "holds numbers; leave the zone out"),
+        (range(9), "Europe/Berln", "zone is 'Europe/Berln'; expected a name such as"),
+    ],
+)  # fmt: skip
+def test_what_a_zone_does_not_settle_is_named(local, zone, said):
+    with pytest.raises(ValueError, match=said):
+        future(frame_of(local), zone=zone)
+
+
+SPANS = pd.timedelta_range("0h", periods=30, freq="90min")
+
+
+@pytest.mark.parametrize(
+    "spans", [SPANS, SPANS.astype(str), [f"{n * 3 // 2:02d}:{n % 2 * 30:02d}:00" for n in range(30)]]
+)
+def test_durations_are_times(spans, tmp_path):
+    following = future(frame_of(spans))
+    assert following.equals((SPANS[-1] + SPANS[1:9]).as_unit("us"))
+    for panel in (Panel.of(frame_of(spans)), Panel.of(frame_of(spans).set_index("time"))):
+        assert panel.columns.time == "time"
+        np.testing.assert_array_equal(panel.series[0].times, SPANS.total_seconds())
+    wide = Panel.wide(frame_of(spans).set_index("time"))
+    np.testing.assert_array_equal(wide.series[0].times, SPANS.total_seconds())
+
+
+def test_recordings_whose_clocks_overlap_are_not_mingled():
+    clock = np.concatenate([np.arange(20.0), 0.5 + np.arange(20)])
+    said = (
+        r"sequence '0' goes back from time 19 in row 19 to 0\.5 in row 20, and the rows before and after overlap in "
+        "time; name the id columns that tell sequences apart, or, if it is one sequence, sort its rows by time"
+    )
+    with pytest.raises(ValueError, match=said):
+        Panel.of(frame_of(clock))
+    with pytest.raises(ValueError, match="goes back from index 19"):
+        Panel.wide(frame_of(clock).set_index("time"))
+    assert len(Panel.of(frame_of(clock, s=np.repeat(["a", "b"], 20)), Told(id=("s",)))) == 2
+    assert len(Panel.of(frame_of(clock).sort_values("time"))) == 1
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        np.arange(40)[::-1],
+        np.random.default_rng(0).permutation(40),
+        np.roll(np.arange(40), 13),
+        np.r_[0:9, 12:40, 9:12],
+        np.r_[0:9, 10, 9, 11:30, 31, 30, 32:40],
+    ],
+    ids=["reversed", "shuffled", "in two files", "late", "swapped"],
+)
+def test_rows_in_disorder_are_put_in_order(order):
+    panel = Panel.of(frame_of(np.arange(40.0)).iloc[order])
+    np.testing.assert_array_equal(panel.series[0].times, np.arange(40))
+
+
+def test_a_calendar_is_kept_with_a_run_and_checked():
+    data = PanelData.of(
+        frame_of(pd.date_range("2020", periods=40, freq="MS", tz="Europe/Berlin")), cut=Cut(4, 3, split="time")
+    )
+    assert PanelSchema.from_config(data.schema.config()) == data.schema
+    assert data.schema.calendar == Calendar("dates", "Europe/Berlin", "1MS")
+    for zone, step in (
+        ("../../etc/passwd", "1D"),
+        ("Europe", "1D"),
+        ("dateutil//etc/x", "1D"),
+        ("UTC", "99999D"),
+        ("UTC", "x"),
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            PanelSchema.from_config({**data.schema.config(), "calendar": {"kind": "dates", "zone": zone, "step": step}})
+    without = {name: own for name, own in data.schema.config().items() if name != "calendar"}
+    assert PanelSchema.from_config(without).calendar == Calendar()
