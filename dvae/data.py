@@ -342,6 +342,47 @@ def leaves(batch: Batch) -> dict[str, Tensor]:
     return flat
 
 
+def refuse_table(data: Any) -> None:
+    """Raise a TypeError for a table, such as a pandas `DataFrame`: the roles of its columns are unknown."""
+    for kind in type(data).__mro__:
+        if (library := kind.__module__.partition(".")[0]) in ("pandas", "polars", "xarray"):
+            raise TypeError(
+                f"got {library}.{kind.__name__}, expected numbers (N, T, D) or windows; give "
+                "`dvae.tables.PanelData.of(frame, dvae.tables.Told(id=('unit',), time='date'))`, where `id` names the "
+                "columns that identify a sequence, and `time` the column that orders its steps"
+            )
+
+
+def is_divided(data: Any) -> bool:
+    """Whether data have parts for training, validation and test, such as `dvae.tables.PanelData`."""
+    return callable(getattr(type(data), "windows", None))  # not of an instance: some windows keep others by that name
+
+
+def take_split(data: Any, split: str) -> Any:
+    """Return the windows of one split where data are divided, and any other data unchanged.
+
+    Raises:
+        TypeError: data are a table.
+    """
+    refuse_table(data)
+    return data.windows(split) if is_divided(data) else data
+
+
+def held_out_windows(data: Any) -> HeldOutWindows:
+    """Return windows to evaluate on; of divided data those of the test split.
+
+    Raises:
+        TypeError: data do not say which steps are observed.
+    """
+    windows = take_split(data, "test")
+    if not isinstance(windows, HeldOutWindows):
+        raise TypeError(
+            f"expected windows with observed steps and a future, got {type(windows).__name__}; of an array x (N, T, D) "
+            "they are `dvae.ArrayWindows(x, observed=...)`"
+        )
+    return windows
+
+
 def sequences(data: Any) -> Sequences:
     """Return data as `Sequences`.
 
@@ -351,6 +392,7 @@ def sequences(data: Any) -> Sequences:
     Raises:
         TypeError, ValueError: when it is none of these.
     """
+    refuse_table(data)
     if isinstance(data, Sequences):
         return data
     if isinstance(data, Mapping):
@@ -370,13 +412,31 @@ def sequences(data: Any) -> Sequences:
     )
 
 
+def as_source(data: Any) -> Source:
+    """Return training data that draw batches: as they are, or those of `sequences`."""
+    refuse_table(data)
+    return data if isinstance(data, Source) else sequences(data)
+
+
 def in_batches(data: Any) -> InBatches:
-    """Return data that can be gone through: as they are, or those of `sequences`."""
+    """Return validation data that can be gone through: as they are, or those of `sequences`."""
+    data = take_split(data, "validation")
     return data if isinstance(data, InBatches) else sequences(data)
 
 
 def tensor_of(values: Any) -> Tensor:
-    """Return a tensor on an array's own memory, or on the mapped file, to which nobody may write then."""
+    """Return a tensor on an array's own memory, or on the mapped file, to which nobody may write then.
+
+    Raises:
+        ValueError: a tensor on the meta device.
+    """
+    if isinstance(values, Tensor):
+        if values.is_meta:
+            raise ValueError(
+                f"got a tensor {tuple(values.shape)} on the meta device, which has no values; give one on a CPU or GPU"
+            )
+        # autograd refuses inference tensors
+        return values.clone() if values.is_inference() and not torch.is_inference_mode_enabled() else values
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The given NumPy array is not writable")
         return torch.as_tensor(values)

@@ -150,6 +150,15 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
+def kind_of(value: Any) -> str:
+    """Return "the class Recurrent" or "a Recurrent", for messages.
+
+    >>> kind_of(int), kind_of(3)
+    ('the class int', 'a int')
+    """
+    return f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
+
+
 def _problem_of_entries(name: str, value: Any, hints: tuple[Any, ...]) -> Exception | None:
     if not isinstance(value, tuple | list):
         return TypeError(f"{name} is {reprlib.repr(value)}; it must be a tuple")

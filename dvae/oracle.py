@@ -335,6 +335,7 @@ class Oracle:
         divergence: Tensor = 0.5 * (spread + distance - root.shape[-1] - log_volume)
         return divergence
 
+    @torch.inference_mode(False)
     def fit_guide(self, iterations: int = 2000) -> float:
         """Fits the guide to the model's exact gap by L-BFGS and returns what is left of it, in nats a sequence."""
         if not self.model.latents:

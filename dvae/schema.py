@@ -6,6 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
+import numpy as np
+from torch import Tensor
+
+from .data import ArrayWindows, Sequences, refuse_table, sequences
 from .laws.base import LawSpec
 from .options import Frames, Size, check
 from .units import Coordinate
@@ -90,12 +94,21 @@ class Schema:
         """The schema of data.
 
         Args:
-            data: a schema, windows that have one, or sizes by name.
+            data: a schema, windows that have one, x (N, T, D), a batch, or sizes by name.
             who: needs to know this kind of schema.
 
         Raises:
+            TypeError: a table, whose columns need roles.
             SchemaError: nothing of which this kind of schema is known.
         """
+        refuse_table(data)
+        arrays = Tensor | np.ndarray
+        if isinstance(data, arrays | Sequences | ArrayWindows) or (
+            isinstance(data, Mapping) and any(isinstance(value, arrays) for value in data.values())
+        ):
+            batch = sequences(data).batch
+            sizes = {name: value.shape[-1] for name, value in batch.items() if name != "mask" and np.ndim(value) > 1}
+            data = Schema(sizes, None if "lengths" in batch else batch["x"].shape[1])
         found = Schema(dict(data)) if isinstance(data, Mapping) else getattr(data, "schema", data)
         if not isinstance(found, cls):
             known = found.kind if isinstance(found, Schema) else type(data).__name__

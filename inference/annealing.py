@@ -72,6 +72,7 @@ class AnnealedBound:
 
 
 @alone
+@torch.inference_mode(False)
 def annealed_bound(
     model: DynamicalVAE,
     batch: AnyBatch,

@@ -30,7 +30,7 @@ from rich.console import Group
 from torch import Tensor
 from typing_extensions import override
 
-from ..data import HeldOutWindows, Listed, called, clusters, each, sequences
+from ..data import HeldOutWindows, Listed, called, clusters, each, sequences, take_split
 from ..program.batch import AnyBatch, repeat
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
@@ -254,6 +254,7 @@ def _reach(estimate: Estimate) -> float:
 
 
 @alone
+@torch.inference_mode(False)
 def bracket(
     model: DynamicalVAE,
     data: HeldOutWindows | Listed | Tensor | np.ndarray | Mapping[str, Any],
@@ -307,6 +308,7 @@ def bracket(
         )
     require_likelihood(model)
     require_latents(model)
+    data = take_split(data, "test")
     whole, notes = sequences(data).batch, []
     if GROUP in whole and model.grouped:
         raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")

@@ -80,6 +80,8 @@ class Run:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
+        if not isinstance(path, str | os.PathLike):
+            raise TypeError(f"a run is a folder that fit wrote; expected its path, got {path!r}")
         self.path = Path(path)
 
     def __repr__(self) -> str:

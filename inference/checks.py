@@ -353,12 +353,13 @@ def predictive_checks(
             "expected a model, at least 19 samples, for tail areas below .05 to be no more than a tenth, and a "
             f"batch_size of at least 1; got {len(models)}, {samples} and {batch_size}"
         )
+    held = hold(windows)
+    windows = held.windows
     statistics = usual(windows) if statistics is None else statistics
     if not statistics:
         raise ValueError("there is no statistic to check")
     for each in models.values():
         require_likelihood(each)
-    held = hold(windows)
     truth = gapped(held.batch)
     _, frame = called(windows.description)
     firsts = {"forecast": held.observed - min(_SEAM, held.observed), "posterior": 0}

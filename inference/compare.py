@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, HeldOutWindows, Listed, called, clusters, each, leaves, sequences
+from ..data import Batch, HeldOutWindows, Listed, called, clusters, each, leaves, sequences, take_split
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from ..turns import alone
@@ -114,6 +114,7 @@ def compare(
             "particles, estimates and batch_size are at least 1, filter_particles, contrasts and samples at least 0, "
             f"not {particles}, {estimates}, {batch_size}, {filter_particles}, {contrasts} and {samples}"
         )
+    data = take_split(data, "test")
     windows = data if isinstance(data, HeldOutWindows) else None
     whole = windows is not None and windows.protocol.observed is None
     samples = 0 if windows is None or whole else samples

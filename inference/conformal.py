@@ -285,7 +285,8 @@ def conformal(
         >>> {region: factor.shape for region, factor in tubes.factors.items()}
         {'number': (4, 2), 'frame': (4, 1), 'future': (1, 1)}
     """
-    held, (clip, _) = hold(windows), called(windows.description)
+    held = hold(windows)
+    windows, (clip, _) = held.windows, called(held.windows.description)
     keys = clusters(windows) if groups is None else [("", group, 0) for group in groups]
     if len(keys) != len(held.keys):
         raise ValueError(f"{len(held.keys)} windows need as many groups, not {len(keys)}")

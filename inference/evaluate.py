@@ -60,7 +60,8 @@ def evaluate(
 
     Args:
         model: a model (`Forecasting`), or `{name: model}`.
-        windows: `ArrayWindows`, windows of `dvae.motion`, or any `HeldOutWindows`.
+        windows: `ArrayWindows`, windows of `dvae.motion`, or any `HeldOutWindows`; of data with parts, such as
+            `dvae.tables.PanelData`, those of the test split.
         scores: of the forecasts, as a function of the windows: `proper` scoring rules, `calibrated` with coverage and
             PIT beside them, or `dvae.motion.scores`, with judges as `functools.partial(dvae.motion.scores,
             pose_prior=..., classifiers=...)`.
@@ -73,7 +74,8 @@ def evaluate(
         bound_particles: particles of the importance-weighted bound and its k-hat; 0 leaves both out.
         log_score_particles: particles of the log score, see `predictive_bound`; 0 leaves it out.
         references: whether to add the reference rows, each where it can be had; or names of some, see `References`.
-        training_windows: what "mean", "climatology" and "nearest neighbours" know; without it these are left out.
+        training_windows: what "mean", "climatology" and "nearest neighbours" know, such as x (N, T, D); without it
+            these are left out.
         season: the period of "seasonal", in frames; by default what the windows' description says.
         configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
         options: further arguments of the models' `forecast`, such as {"temperature": 0} for motion at the mean of
@@ -84,7 +86,7 @@ def evaluate(
         The evaluation; print it, or take its `table`, `plot` and `to_json`.
 
     Raises:
-        TypeError: what is no model that forecasts.
+        TypeError: what is no model that forecasts, or data that do not say which steps are observed.
         ValueError: windows that are ragged or leave nothing to predict; a forecast of the wrong shape; a model with the
             name of a reference row; a reference row that is asked for and cannot be had; fewer than one sample; two
             scores of one name.
@@ -99,6 +101,7 @@ def evaluate(
     models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
     _check(models, samples, batch_size, bound_particles, log_score_particles)
     held = hold(windows)
+    windows = held.windows
     measures = _measures(scores, windows)
     if draw_emission is None and any(measure.of_draws for measure in measures):
         draw_emission = True

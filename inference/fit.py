@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from ..data import Fingerprinted, InBatches, Source, in_batches, sequences
+from ..data import Fingerprinted, InBatches, Source, as_source, in_batches, is_divided, take_split
 from ..turns import alone
 from . import processes
 from .checkpoints import CONFIG, CheckpointError, Run
@@ -144,6 +144,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 @alone
+@torch.inference_mode(False)  # which enables gradients too
 def fit(
     model: nn.Module,
     train: Any,
@@ -166,8 +167,8 @@ def fit(
 
     Args:
         model: a `DynamicalVAE`, or any module that `SequenceELBO` takes.
-        train: x as a tensor (N, T, D), a batch of N sequences, or an object with `sample(batch_size,
-            generator)`.
+        train: x as a tensor (N, T, D), a batch of N sequences, an object with `sample(batch_size, generator)`, or
+            data with parts, such as `dvae.tables.PanelData`, whose validation windows are used too.
         validation: x as a tensor, a batch, or an object whose `all()` returns a batch, or whose `batches(size)` are
             some sequences after the others.
         objective: what to minimise; `Evidence()` by default.
@@ -189,6 +190,7 @@ def fit(
         Interrupted: after Ctrl-C or SIGTERM; the step is complete, the checkpoint written.
         CheckpointError: when `out` holds a run and `resume` is False, or a run that cannot be resumed, such as one
             fitted on training data with another `fingerprint`.
+        TypeError: a model or data of another kind, such as a table, whose columns need roles.
         LostProcess: another one of several processes has ended, or does not answer; the last checkpoint stays.
 
     Example:
@@ -202,7 +204,10 @@ def fit(
     """
     svi = SVI(model, objective, stages, **options)
     training = svi.training
-    source = train if isinstance(train, Source) else sequences(train)
+    if validation is None and is_divided(train):
+        validation = train
+    train = take_split(train, "train")
+    source = as_source(train)
     held_out = None if validation is None else in_batches(validation)
     if training.patience is not None and held_out is None:
         raise ValueError("patience counts validations; give validation data, or leave patience out")

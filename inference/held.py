@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..data import Batch, HeldOutWindows, called, clusters, each, gapped, mask_of, past_of
+from ..data import Batch, HeldOutWindows, called, clusters, each, gapped, held_out_windows, mask_of, past_of
 from ..program.batch import rows
 from ..program.conditional import evaluating
 
@@ -88,12 +88,14 @@ class Held:
         return {"seen": {"past": past.double().mean().item(), "future": future.double().mean().item()}}
 
 
-def hold(windows: HeldOutWindows) -> Held:
-    """Windows prepared.
+def hold(data: Any) -> Held:
+    """Prepare windows; of data with parts, those of the test split.
 
     Raises:
+        TypeError: data that do not say which steps are observed.
         ValueError: whole sequences; windows that are ragged, or leave nothing to observe or to predict.
     """
+    windows = held_out_windows(data)
     batch = windows.all()
     observed = windows.protocol.observed
     if observed is None:

@@ -195,6 +195,7 @@ def _alone(parameters: Parameters) -> Parameters:
 
 
 @alone
+@torch.inference_mode(False)
 def local_guide(
     model: DynamicalVAE,
     batch: AnyBatch,

@@ -157,6 +157,7 @@ class Posterior:
 
 
 @alone
+@torch.inference_mode(False)
 def posterior(
     program: _Program,
     batch: Mapping[str, Any],

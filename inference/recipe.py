@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import nn
 
-from ..data import Source
+from ..data import Source, as_source, is_divided, take_split
 from ..options import check
 from ..schema import Schema, SchemaError
 from ..turns import alone
@@ -119,14 +119,17 @@ class Trainable:
         return self.trainings.get(skeleton.name if skeleton else "", self.trainings[""])
 
     @alone
-    def fit(self, data: Any, **options: Any) -> Fit:
+    @torch.inference_mode(False)
+    def fit(self, data: Any, validation: Any = None, **options: Any) -> Fit:
         """Builds the model for data and fits it to them: in one call, in memory.
 
         `dvae.runs.directory.fit_run` keeps a run that can be loaded and resumed.
 
         Args:
             data: with a `schema`, and `windows` to train and to validate on, such as `dvae.tables.PanelData` or
-                `dvae.motion.MotionData`.
+                `dvae.motion.MotionData`; or training windows; or x as a tensor or array (N, T, D), or a batch, whose
+                values are fitted in their own unit.
+            validation: windows, x or a batch to validate on; of data with parts their own, where it is None.
             **options: of `Recipe.fit`; those of `Training` that are not given are the method's own (`training`). Its
                 seed is that of the initial weights too.
 
@@ -134,18 +137,22 @@ class Trainable:
             The fit; its `model` has the best weights.
 
         Raises:
+            TypeError: a table, whose columns need roles, or data of another kind.
             ValueError: see `Recipe.fit`, or data without windows of these parts.
         """
-        train = data.windows("train")
+        if validation is None and is_divided(data):
+            validation = data
+        train = as_source(take_split(data, "train"))
+        schema = Schema.of(data if is_divided(data) else train)
         if too_short := getattr(train, "too_short", ""):
             warnings.warn(f"training leaves out {too_short}", stacklevel=2)
         names = Training.__dataclass_fields__.keys() & options
-        training = replace(self.training(data.schema), **{name: options.pop(name) for name in names})
+        training = replace(self.training(schema), **{name: options.pop(name) for name in names})
         method = self.suited(train)
-        recipe = method.train(train, data.windows("validation"), training.steps)
+        recipe = method.train(train, take_split(validation, "validation"), training.steps)
         with torch.random.fork_rng():
             torch.manual_seed(training.seed)
-            return recipe.fit(method.build(data.schema), **vars(training), **options)
+            return recipe.fit(method.build(schema), **vars(training), **options)
 
     def check(self) -> None:
         """Refuses options that do not fit together, before any data are read.

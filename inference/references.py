@@ -7,7 +7,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ..data import Batch, HeldOutWindows, bridged, gapped, mask_of, mean_of_known
+from ..data import Batch, HeldOutWindows, bridged, gapped, mask_of, mean_of_known, sequences, take_split
 from ..options import nearest
 from .held import Held
 
@@ -275,8 +275,7 @@ class References:
         return 1, again
 
     def _mean(self) -> tuple[int, Forecaster]:
-        assert self.training is not None
-        mean = mean_of_known(gapped(self.training.all()), (0, 1))
+        mean = mean_of_known(gapped(self._known), (0, 1))
         return 1, lambda part: mean.expand(1, len(self.held.x[part]), self._horizon, -1)
 
     def _climatology(self) -> tuple[int, Forecaster]:
@@ -307,9 +306,12 @@ class References:
         return past["x"], self._horizon, mask_of(past)
 
     @cached_property
+    def _known(self) -> Batch:
+        return sequences(take_split(self.training, "train")).batch
+
+    @cached_property
     def _training(self) -> tuple[Tensor, Tensor | None]:
         """As much of training windows as those to forecast have, and its mask."""
-        assert self.training is not None
-        listed, frames = self.training.all(), self.held.x.shape[1]
+        listed, frames = self._known, self.held.x.shape[1]
         mask = mask_of(listed)
         return listed["x"][:, :frames], None if mask is None else mask[:, :frames]

@@ -132,6 +132,7 @@ class SteinDiscrepancy(Result):
 
 
 @alone
+@torch.inference_mode(False)
 def stein_discrepancy(
     model: DynamicalVAE,
     batch: AnyBatch,

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from ..compiled import compiling, require_compiler
-from ..data import Batch, InBatches, each, in_batches
+from ..data import Batch, InBatches, each, in_batches, refuse_table, tensor_of
+from ..options import kind_of
 from ..program.protocols import Program
 from ..turns import alone
 from . import processes
@@ -93,11 +94,19 @@ class SVI:
     def __init__(
         self, model: nn.Module, objective: Objective | None = None, stages: Sequence[Stage] = (), **options: Any
     ) -> None:
+        if not isinstance(model, nn.Module):
+            raise TypeError(
+                f"the model is {kind_of(model)}; expected a module such as a DynamicalVAE, or `method.build(data)`"
+            )
         self.model = model
         self.training, self.plan = lay_out(options, objective, stages)
         trained = {name: parameter for name, parameter in model.named_parameters() if parameter.requires_grad}
         if not trained:
             raise ValueError(f"{type(model).__name__} has no parameters that require gradients: nothing to fit")
+        for name, tensor in model.state_dict(keep_vars=True).items():
+            if tensor.is_meta or tensor.is_inference():
+                where = "on the meta device" if tensor.is_meta else "in `torch.inference_mode()`"
+                raise ValueError(f"{name} was made {where} and cannot be fitted; build the model outside of it")
         for stage in self.plan:
             if missing := [start for start in stage.frozen if not any(name.startswith(start) for name in trained)]:
                 raise ValueError(f"no parameter's name starts with {', '.join(missing)}; they are {', '.join(trained)}")
@@ -132,6 +141,7 @@ class SVI:
         return self._begun[first]
 
     @alone
+    @torch.inference_mode(False)
     def init(self) -> State:
         """Begin at step 0, with a new optimiser and the random numbers of the seed; the weights stay as they are."""
         training = self.training
@@ -154,6 +164,7 @@ class SVI:
         return self._state
 
     @alone
+    @torch.inference_mode(False)
     def step(self, batch: Batch | Tensor) -> Terms:
         """Take one optimiser step, in training mode, and return the terms of the bound before it.
 
@@ -332,8 +343,9 @@ class SVI:
     ) -> Terms:
         """Terms of a batch that the objective needs, on the device and in the precision of the model."""
         dtype = self.parameters[0].dtype
-        named = {"x": batch} if isinstance(batch, Tensor) else batch
-        placed = each(named, lambda v: v.to(dtype) if v.is_floating_point() else v)
+        refuse_table(batch)
+        named = {"x": batch} if not isinstance(batch, Mapping) else batch
+        placed = each(each(named, tensor_of), lambda v: v.to(dtype) if v.is_floating_point() else v)
         program: dict[str, Any] = {"self_feeding": feeding} if feeding else {}
         program |= {} if curriculum is None else {"curriculum": curriculum}
         if isinstance(objective, Asking) and objective.draws:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal
 
-from ..options import Amount, Count, Range, Share, check, nearest
+from ..options import Amount, Count, Range, Share, check, kind_of, nearest
 from .objectives import Evidence, Objective
 from .schedules import Piecewise, Schedule, clamp, levels, schedule, to_config
 
@@ -120,6 +120,8 @@ class Stage:
     frozen: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if isinstance(self.objective, type):
+            raise TypeError(f"the objective is {kind_of(self.objective)}; expected an instance such as dvae.Evidence()")
         if self.steps < 1:
             raise ValueError(f"a stage has {self.steps} steps; it needs at least 1")
         for value in () if self.curriculum is None else levels(self.curriculum):

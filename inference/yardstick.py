@@ -385,6 +385,7 @@ def _read(kind: Any, said: Mapping[str, Any], shape: tuple[int, int]) -> Any:
 
 
 @alone
+@torch.inference_mode(False)
 def reference_posterior(
     model: DynamicalVAE,
     batch: AnyBatch,

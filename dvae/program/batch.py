@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..data import BESIDE, Batch
+from ..data import BESIDE, Batch, refuse_table, tensor_of
 from ..laws.product import ProductSupport
 from ..networks.base import again, once, valid_steps
 from ..notation import Factorization
@@ -61,12 +61,14 @@ class Reader:
             means: name to what stands for missing entries of a variable, where that is not 0.
 
         Raises:
-            ValueError: names that the model does not have, or a mask of nothing.
+            TypeError: a table.
+            ValueError: names that the model does not have, a mask of nothing, or tensors on the meta device.
         """
         if batch is None:
             return {}
         names = tuple(dict.fromkeys((*self.view.names, *self.sizes)))
         whole = WHOLE if self.view.parts else self.observed[0]
+        refuse_table(batch)
         if not isinstance(batch, Mapping):
             if len(self.observed) > 1 and not self.view.parts:
                 raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
@@ -254,7 +256,7 @@ def _tensors(value: Any, dtype: torch.dtype, names: Collection[str]) -> Any:
         if isinstance(each, Mapping):
             found[name] = _tensors(each, dtype, names if name == BESIDE else ())
             continue
-        tensor = torch.as_tensor(each)
+        tensor = tensor_of(each)
         found[name] = tensor.to(dtype) if tensor.is_floating_point() or name in names else tensor
     return found
 

@@ -141,10 +141,8 @@ class Conditional(nn.Module):
             ValueError: a distribution of another shape.
         """
         rows = (1, 1) if self.factor.local else (1,)
-        own = list(self.law.parameters())
-        with torch.random.fork_rng(devices=[]), torch.set_grad_enabled(not any(p.is_inference() for p in own)):
-            read = torch.randn(*rows, features)
-            read.requires_grad_(torch.is_grad_enabled())
+        with torch.random.fork_rng(devices=[]):
+            read = torch.randn(*rows, features, requires_grad=True)
             previous = torch.randn(*rows, self.size) if self.law.residual else None
             parameters = self.law(read, previous)
             law = self.law.distribution(parameters)

@@ -13,7 +13,7 @@ from contextlib import nullcontext
 from functools import partial
 from itertools import accumulate
 from operator import mul
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import pyro
 import pyro.distributions as dist
@@ -29,6 +29,7 @@ from ..laws.subset import Subset
 from ..networks import NetworkSpec, Recurrent
 from ..networks.base import once
 from ..notation import Factor, Factorization, check_pair
+from ..options import Range, kind_of, problem
 from ..relations import MaskFunction
 from ..turns import alone
 from ..units import Coordinate, Units
@@ -70,7 +71,9 @@ class DynamicalVAE(nn.Module):
             with units.
 
     Raises:
-        ValueError: equations that cannot be read or do not fit together; sizes missing or unknown.
+        TypeError: a size that is no whole number, or a class in place of a view.
+        ValueError: equations that cannot be read or do not fit together; sizes missing, unknown or out of range; a
+            class in place of a network or law.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})", {"z": 2, "x": 3})
@@ -86,6 +89,7 @@ class DynamicalVAE(nn.Module):
     """What there is one log-likelihood of."""
 
     @alone
+    @torch.inference_mode(False)  # so that the parameters can be trained, wherever the model is built
     def __init__(
         self,
         generative: str | Factorization,
@@ -105,18 +109,18 @@ class DynamicalVAE(nn.Module):
         self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
         self.generative = Factorization.parse(generative, masks)
         self.feeding: SelfFeeding | InputNoise = SelfFeeding(0.0)
+        if not isinstance(view, View | None):
+            raise TypeError(f"the view is {kind_of(view)}; expected an instance such as dvae.views.View()")
         self.view = view or View()
         observed = tuple(self.view.parts or observed)
-        self.sizes = dict(sizes)
+        self.sizes = _checked_sizes(sizes)
         self.summed = tuple(n for n, size in self.sizes.items() if isinstance(size, Discrete) and n not in observed)
         self.inference = guide(self.generative, inference, observed, masks, self.summed)
         self.latents, self.observed, self.context = check_pair(
             self.generative, self.inference, observed, sizes, self.summed
         )
         self.sums = Sums(self.generative, {name: self.sizes[name] for name in self.summed}) if self.summed else None
-        for name, size in self.sizes.items():
-            if size < 1:
-                raise ValueError(f"the size of {name} is {size}; sizes are positive")
+        for name in self.sizes:
             if hasattr(nn.ModuleDict, name):
                 raise ValueError(f"a variable cannot be named {name!r}, which is an attribute of torch's modules")
         self.networks = _by_factor(network, Recurrent(), "network")
@@ -218,6 +222,7 @@ class DynamicalVAE(nn.Module):
                     f"{self.generator[name].factor} is {self.generator[name].family}; leave it to be that of categories"
                 )
 
+    @torch.inference_mode(False)
     def standardise(self, name: str, coordinates: Sequence[Coordinate] = ()) -> Units:
         """Has networks read a variable without unit, by a mean and a scale that `fit` of the result takes.
 
@@ -560,6 +565,11 @@ class DynamicalVAE(nn.Module):
         Raises:
             ValueError: names that the model does not have, a mask of nothing, or data that the view cannot show.
         """
+        if like(self).is_meta:
+            raise ValueError(
+                "the model's parameters are on the meta device and have no values; build the model outside of "
+                "`torch.device('meta')`, or call `to_empty(device='cpu')` and load weights"
+            )
         means = {name: units.filling for name, units in self.units.items()}
         # by guide and model both, but for what they share
         data = dict(once(self, [batch], lambda: self.reader.read(batch, like(self).dtype, means)))
@@ -605,9 +615,19 @@ def _note(factorization: Factorization, rollout: Rollout) -> Any:
     return {"program": factorization, "run": rollout}
 
 
+def _checked_sizes(sizes: Mapping[str, int]) -> dict[str, int]:
+    if not isinstance(sizes, Mapping):
+        raise TypeError(f'sizes is {sizes!r}; expected the size of every variable by name, such as {{"z": 2, "x": 3}}')
+    for name, size in sizes.items():
+        if error := problem(f"the size of {name}", size, Annotated[int, Range(1, 2**20)]):
+            raise error
+    return dict(sizes)
+
+
 def _by_factor(given: Any, default: Any, what: str) -> dict[str, Any]:
     table = dict(given) if isinstance(given, Mapping) else {} if given is None else {"default": given}
     for key, spec in table.items():
-        if not hasattr(spec, "build"):
-            raise ValueError(f"the {what} of {key!r} is {spec!r}; expected a description such as {default!r}")
+        if isinstance(spec, type) or not hasattr(spec, "build"):
+            said = kind_of(spec) if isinstance(spec, type) else repr(spec)
+            raise ValueError(f"the {what} of {key!r} is {said}; expected a description such as {default!r}")
     return {"default": default, **table}

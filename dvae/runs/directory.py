@@ -219,8 +219,9 @@ def read_config(path: str | os.PathLike[str], data: str | os.PathLike[str] | Non
     Raises:
         CheckpointError: no run, or a damaged one.
     """
+    run = Run(path)
     with reading_config(path):
-        config = upgraded(Run(path).config, Path(path), data)
+        config = upgraded(run.config, run.path, data)
         schema, source, training = dict(config["schema"]), dict(config["data"]), config["training"]
         kind, described = source.pop("kind"), schema.pop("kind")
         if described != DATA[kind].described:

@@ -179,6 +179,15 @@ def test_validating_changes_neither_training_nor_the_callers_random_state(tmp_pa
     assert same(*(load_file(tmp_path / name / "last.safetensors") for name in ("with", "without")))
 
 
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_fit_takes_gradients_wherever_it_is_called(mode):
+    model = build()
+    with mode():
+        inside = run(model, train=walks(24), validation=walks(7, seed=1), steps=3)
+        assert not torch.is_grad_enabled()
+    assert inside.best_bound == run(steps=3, validation=HELD_OUT).best_bound
+
+
 def test_the_seed_decides_everything():
     first, second, third = build(), build(), build()
     for model, seed in ((first, 1), (second, 1), (third, 2)):
@@ -563,6 +572,18 @@ def test_options_that_do_not_exist_or_make_sense_are_refused():
 def test_a_model_without_parameters_is_refused():
     with pytest.raises(ValueError, match="no parameters that require gradients"):
         run(build().requires_grad_(False))
+
+
+def test_what_is_no_model_or_cannot_be_trained_is_refused():
+    for wrong, said in ((DynamicalVAE, "the class DynamicalVAE"), (Dense(), "a Dense")):
+        with pytest.raises(TypeError, match=f"the model is {said}; expected a module"):
+            run(wrong)
+    with pytest.raises(TypeError, match=r"the objective is the class Evidence; .* such as dvae.Evidence\(\)"):
+        run(objective=Evidence)
+    with torch.inference_mode():
+        model = torch.nn.Linear(2, 3)
+    with pytest.raises(ValueError, match=r"weight was made in `torch.inference_mode\(\)` and cannot be fitted"):
+        run(model)
 
 
 # Checkpoints --------------------

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pyro import poutine
 from pyro.infer import Predictive, Trace_ELBO
 
-from dvae import DynamicalVAE, laws
+from dvae import DynamicalVAE, laws, views
 from dvae.inference.bounds import SequenceELBO
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.program.batch import Reader, in_chunks, rows
@@ -641,7 +641,16 @@ X = torch.zeros(B, T, 3, dtype=torch.float64)
     [
         ({"sizes": {"z": 2}}, "sizes missing for x; needed are z, x"),
         ({"sizes": {"z": 2, "x": 3, "y": 1}}, "sizes given for y; the equations have z, x"),
-        ({"sizes": {"z": 0, "x": 3}}, "the size of z is 0; sizes are positive"),
+        ({"sizes": {"z": 0, "x": 3}}, "the size of z is 0; it must be at least 1"),
+        ({"sizes": {"z": 10**9, "x": 3}}, "the size of z is 1000000000; it must be at least 1 and at most 1048576"),
+        ({"sizes": {"z": "2", "x": 3}}, "the size of z is '2'; it must be a whole number"),
+        ({"sizes": {"z": 2, "x": 3.0}}, "the size of x is 3.0; it must be a whole number"),
+        ({"sizes": {"z": 2, "x": None}}, "the size of x is None; it must be a whole number"),
+        ({"sizes": 3}, "sizes is 3; expected the size of every variable by name"),
+        ({"network": Dense}, "the network of 'default' is the class Dense; expected a description such as Recurrent"),
+        ({"network": {"p(z)": Dense}}, r"the network of 'p\(z\)' is the class Dense; expected a description"),
+        ({"laws": laws.StudentT}, "the law of 'default' is the class StudentT; expected a description such as Normal"),
+        ({"view": views.View}, r"the view is the class View; expected an instance such as dvae.views.View\(\)"),
         (
             {"network": {"p(y)": Dense()}},
             r"no factor 'p\(y\)'; keys are p\(x\), p\(z\), q\(z\), 'p', 'q' and 'default'",
@@ -665,7 +674,7 @@ X = torch.zeros(B, T, 3, dtype=torch.float64)
 )
 def test_models_that_cannot_be(change, message):
     base = {"generative": PAIRS["dkf"][0], "inference": PAIRS["dkf"][1], "sizes": {"z": 2, "x": 3}}
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         DynamicalVAE(**{**base, **change})
 
 
