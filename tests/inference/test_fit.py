@@ -657,7 +657,7 @@ def test_a_state_of_wrong_types_is_refused(finished, change, message):
 
 def test_a_run_knows_how_long_it_took_over_all_its_parts(finished):
     before = json.loads((finished / "state.json").read_text())
-    assert 0 < before["processor_seconds"] < 600
+    assert before["processor_seconds"] > 0
     took = run(out=finished, steps=before["step"] + 5, resume=True).processor_seconds
     assert took > before["processor_seconds"]
     assert json.loads((finished / "state.json").read_text())["processor_seconds"] == took

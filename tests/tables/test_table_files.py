@@ -4,7 +4,6 @@ import io
 import os
 import resource
 import sys
-import time
 import zipfile
 from pathlib import Path
 
@@ -155,10 +154,10 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("which", HOSTILE)
-def test_hostile_files_are_refused_in_a_sentence_in_no_time_and_little_room(tmp_path, which):
+def test_hostile_files_are_refused_in_a_sentence_and_in_little_memory(tmp_path, which):
     name, content, said = HOSTILE[which]
     path = put(tmp_path / name, content)
-    size, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     if said is None:
         assert not len(read_frame(path))
     else:
@@ -166,7 +165,6 @@ def test_hostile_files_are_refused_in_a_sentence_in_no_time_and_little_room(tmp_
             read_frame(path)
         assert str(path) in str(error.value)
         assert len(str(error.value)) < 500
-    assert time.process_time() - start < 5
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - size
     assert grown * (1 if sys.platform == "darwin" else 1024) < 600e6
 
