@@ -1,4 +1,4 @@
-"""Calendar: what the times of a table are, how they are written, and which times follow them.
+"""Calendar: the kind, time zone and calendar step of the times of a table, and the times that follow them.
 
 Times are float64: numbers as they are, or seconds. A day, a week, a business day or a month is not a fixed number of
 seconds, so that dates at such steps are continued on the calendar, in their own time zone.
@@ -29,7 +29,7 @@ _STEP = re.compile(rf"[1-9]\d{{0,3}}(?:D|B|MS|ME|BMS|BME|WOM-[1-4](?:{'|'.join(_
 
 @dataclass(frozen=True)
 class Calendar:
-    """What the times of a panel are.
+    """Kind, time zone and calendar step of times.
 
     Args:
         kind: "numbers", "dates" (times are seconds since 1970, in UTC) or "durations" (times are seconds).
@@ -80,8 +80,8 @@ class Calendar:
     def after(self, times: np.ndarray, count: int) -> np.ndarray:
         """Return the `count` times that follow.
 
-        They follow the calendar step of the times or, where these are too few to show one, that of the panel. Without
-        a calendar step they are as far apart as the median of the times.
+        The step is inferred from the times. If they are too few, it is the step of the calendar. Times without a
+        calendar step continue by their median gap.
         """
         if self.kind == "dates" and count:
             local = self._local(times)
@@ -115,10 +115,10 @@ def seconds(dates: Any) -> np.ndarray:
 
 
 def check_zone(zone: str) -> None:
-    """Refuse what is no time zone.
+    """Refuse text that names no time zone.
 
     Raises:
-        ValueError: no offset such as "+02:00", and no name of the IANA database.
+        ValueError: neither an offset such as "+02:00" nor a name of the IANA database.
     """
     try:
         if not _OFFSET.fullmatch(zone):

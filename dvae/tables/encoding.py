@@ -57,7 +57,7 @@ class PanelSchema(Schema):
         logarithms: of those that are read as such, the least that is, and their mean and deviation.
         lacking: names of columns that have an indicator: those that lack entries in training, or end with the present.
         step: median time from one step to the next; 0 where steps are evenly spaced.
-        calendar: what times are, and the step by which forecasts continue them.
+        calendar: kind, time zone and calendar step of the times.
     """
 
     kind: ClassVar[str] = "panel"

@@ -38,7 +38,7 @@ class PanelForecasts:
         columns: coordinate to its unit; of a category, its shares are forecast, in a coordinate for each class.
         keys: (sequence, first step of the future) of each window.
         times: (N, O + H) of the steps, see `Calendar`; None for steps.
-        calendar: what the times are.
+        calendar: kind, time zone and calendar step of the times.
     """
 
     draws: np.ndarray
@@ -150,7 +150,7 @@ class PanelImputed:
         columns: coordinate to its unit.
         keys: (sequence, first step) of each.
         times: (N, T) of the steps, see `Calendar`; None for steps.
-        calendar: what the times are.
+        calendar: kind, time zone and calendar step of the times.
     """
 
     draws: np.ndarray

@@ -34,9 +34,9 @@ from .proposing import LARGEST, TIMES, Told, is_date
 SPLITS = ("train", "validation", "test")
 COUNTS = ("count", "overdispersed", "sparse", "sparse-overdispersed")
 """Families of whole numbers."""
-RECORDING, MINGLED = 4, 5
-"""Rows that stand in order on average, and changes between such parts for each step back in time, from which these are
-recordings whose times overlap; fewer are rows in disorder."""
+RUN, CHANGES = 4, 5
+"""Rows of an increasing run on average, and changes from one run to another in the order of time for each step back in
+time, above which the runs are recordings whose times overlap. Below, they are rows of one sequence in disorder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Series:
         return len(self.values)
 
     def moments(self, start: int, steps: int, calendar: Calendar) -> np.ndarray | None:
-        """Times (steps,) from a step on; after the end they continue by the calendar, see `Calendar.after`."""
+        """Return the times (steps,) from a step on, continued after the end by `Calendar.after`."""
         if self.times is None:
             return None
         own = self.times[start : start + steps]
@@ -77,7 +77,7 @@ class Panel:
         series: the sequences.
         columns: what their columns are.
         name: for titles.
-        calendar: what their times are.
+        calendar: kind, time zone and calendar step of their times.
         complete: names of mapped sequences, in which nothing can change, that lack no value of a target; found.
 
     Raises:
@@ -252,17 +252,18 @@ class Panel:
         return cls([Series(str(place), each) for place, each in enumerate(found)], columns, name)
 
     @classmethod
-    def wide(cls, data: Any, column: Column | None = None, name: str = "panel") -> Panel:
+    def wide(cls, data: Any, column: Column | None = None, name: str = "panel", zone: str | None = None) -> Panel:
         """A table of a pandas frame with one row for each step and one column for each sequence of one variable.
 
         Args:
             data: whose index is the time, where it is of numbers, dates or durations.
             column: what all of them hold; a real target named "value", if not given.
             name: for titles.
+            zone: time zone of dates in the index, see `Columns`.
         """
         index, when, calendar = data.index.to_series(name="index"), None, Calendar()
         if is_number(index) or is_date(index) or is_duration(index):
-            when, calendar = times(index)
+            when, calendar = times(index, zone)
             order = _ordered(when, np.arange(len(when)), f"the table {name}", calendar, "index")
             data, when = data.iloc[order], when[order]
         own = column or Column("value")
@@ -380,16 +381,16 @@ def _ordered(when: np.ndarray, rows: np.ndarray, who: str, calendar: Calendar, c
     if calendar.kind == "dates" and calendar.zone is None:
         advice += ', or, if clocks were set back, their zone, such as zone = "Europe/Berlin"'
     if calendar.kind == "durations":
-        advice += ", or write the date before clocks that begin again each day"
+        advice += ", or write the date before clocks that begin again at midnight"
     if (twice := np.diff(when[found]) == 0).any():
         first, second = found[np.argmax(twice) :][:2]
         raise ValueError(f"{who} has two rows at {column} {calendar.text(when[first])}, {first} and {second}; {advice}")
-    part = np.concatenate([[0], np.cumsum(np.diff(when[rows]) < 0)])  # of rows that stand in order
-    if len(rows) >= RECORDING * (part[-1] + 1) and (np.diff(part[order]) != 0).sum() > MINGLED * part[-1]:
-        last, row = rows[np.argmax(part) - 1 :][:2]
+    run = np.concatenate([[0], np.cumsum(np.diff(when[rows]) < 0)])  # number of the increasing run that a row is in
+    overlap = len(rows) >= RUN * (run[-1] + 1) and (np.diff(run[order]) != 0).sum() > CHANGES * run[-1]
+    if overlap or (calendar.kind == "durations" and run[-1] < len(rows) - 1):  # clocks pass midnight
+        last, row = rows[np.argmax(run) - 1 :][:2]
         raise ValueError(
             f"{who} goes back from {column} {calendar.text(when[last])} in row {last} to {calendar.text(when[row])} in "
-            f"row {row}, and the rows before and after overlap in time; {advice}, or, if it is one sequence, sort its "
-            f"rows by {column}"
+            f"row {row}; {advice}, or, if it is one sequence, sort its rows by {column}"
         )
     return found

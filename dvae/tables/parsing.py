@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterable
 from reprlib import repr as brief
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..options import nearest
-from .calendar import Calendar, seconds
+from .calendar import NUMBERS, Calendar, seconds
 from .columns import Column
 
 LONGEST = 64
@@ -30,6 +31,8 @@ WRITTEN = [
         r"(?P<first>\d{1,2})(?P<sign>[-/. ])\s?(?P<second>\d{1,2})(?P=sign)\s?(?P<year>\d{4}|\d\d)",
         r"(?P<year>\d{4})[-/. ](?P<month>\d{1,2})[-/. ](?P<day>\d{1,2})",
         r"(?P<month>\d{1,2})[-/](?P<year>\d{4})",
+        r"(?P<year>\d{4})[-/ ]?Q(?P<quarter>[1-4])",
+        r"(?P<year>\d{4})-?W(?P<week>\d\d)(?:-?(?P<day>[1-7]))?",
         rf"{_WEEKDAY}{_DAY}[-/.\s]{{0,2}}{_WORD}[-/.,\s]{{0,2}}(?P<year>\d{{4}}|\d\d)",
         rf"{_WEEKDAY}{_WORD}[-/.\s]{{0,2}}{_DAY}[-/.,\s]{{1,2}}(?P<year>\d{{4}})",
         rf"{_WORD}[-/.,\s]{{0,2}}(?P<year>\d{{4}})",
@@ -117,18 +120,35 @@ def dates(column: Any) -> Any:
         when = pd.to_datetime(said, utc=True, format="ISO8601", errors="coerce")
         if (wrong := when.isna()).any():
             raise _unread(pd.Series(held)[wrong]) from None
-    offsets = said.astype(str).str.extract(_OFFSET)[0].str.upper().replace({"UTC": "Z", "GMT": "Z"})
+    offsets = _offsets(said)
     known = offsets.dropna().unique()
     if len(known) and (naive := offsets.isna()).any():
         raise Undecided(
-            f"dates of which some, such as {brief(str(held[naive.argmax()]))}, have no offset from UTC, and others do; "
-            "write it for all, or for none"
+            f"dates with an offset from UTC and others, such as {brief(str(held[naive.argmax()]))}, without one; write "
+            "it for all, or for none"
         )
     if not len(known):
         when = when.dt.tz_localize(None)
     elif len(known) == 1 and known[0] != "Z":
         when = when.dt.tz_convert(pd.Timestamp(said[0]).tz)
     return when.reindex(codes).set_axis(column.index)
+
+
+def _offsets(said: Any) -> Any:
+    """Offsets from UTC of dates as they are written, missing where a date has none."""
+    return said.astype(str).str.extract(_OFFSET)[0].str.upper().replace({"UTC": "Z", "GMT": "Z"})
+
+
+def _compact(numbers: np.ndarray) -> Any:
+    """Dates of whole numbers that are written as 20241231 or 202412; None where some are not."""
+    import pandas as pd
+
+    least, most = (numbers.min(), numbers.max()) if len(numbers) and (numbers % 1 == 0).all() else (0, 0)
+    for digits, written in ((8, "%Y%m%d"), (6, "%Y%m")):
+        if least // 10 ** (digits - 4) >= 1800 and most // 10 ** (digits - 4) <= 2200:
+            when = pd.to_datetime(pd.Series(numbers.astype(int).astype(str)), format=written, errors="coerce")
+            return None if when.isna().any() else when
+    return None
 
 
 def is_duration(column: Any) -> bool:
@@ -141,6 +161,8 @@ def is_duration(column: Any) -> bool:
 
 def _as_iso(said: Any) -> Any:
     """Texts, of which the first is a date in another way, in that of ISO 8601; as they are, where it is in none."""
+    import pandas as pd
+
     fitting = (way for first in said[:1] if len(first) <= LONGEST for way in WRITTEN if way.fullmatch(first))
     way = next(fitting, None)
     if way is None:
@@ -154,6 +176,11 @@ def _as_iso(said: Any) -> Any:
         parts["month"] = parts.word.str.lower().map({name: str(place) for place, name in enumerate(MONTHS, 1)})
         century = parts.year.lt("69").map({True: "20", False: "19"})  # as POSIX has it
         parts["year"] = parts.year.where(parts.year.str.len() != 2, century + parts.year)
+    if "quarter" in parts:
+        parts["month"] = (3 * parts.quarter.astype(int) - 2).astype(str)
+    if "week" in parts:
+        weeks = pd.to_datetime(parts.year + parts.week + parts.day.fillna("1"), format="%G%V%u", errors="coerce")
+        parts[["year", "month", "day"]] = weeks.astype(str).str.extract(r"(\d+)-(\d+)-(\d+)").fillna("0").to_numpy()
     if "day" not in parts:
         parts["day"] = "1"
     late = parts.half.str.lower().map({"a": 0, "p": 12})
@@ -166,7 +193,7 @@ def _as_iso(said: Any) -> Any:
 
 def _unread(said: Any) -> ValueError:
     """Of texts, the first is no date as others are."""
-    return ValueError(f"{brief(said.iloc[0])} among them; write dates as {WANTED}")
+    return ValueError(f"{brief(said.iloc[0])} among them; write dates as {WANTED}, durations as 02:30:00")
 
 
 def _order(parts: Any, example: str) -> dict[str, str]:
@@ -185,7 +212,7 @@ def _order(parts: Any, example: str) -> dict[str, str]:
 def times(
     column: Any, zone: str | None = None, sequences: Iterable[np.ndarray] | None = None
 ) -> tuple[np.ndarray, Calendar]:
-    """Times (N,) of rows, and what they are: seconds of dates since 1970 or of durations, or the numbers that they are.
+    """Return the times (N,) of rows and their calendar.
 
     Args:
         column: numbers, dates or durations.
@@ -199,8 +226,10 @@ def times(
     import pandas as pd
 
     if is_number(column):
-        found, calendar = column.to_numpy(np.float64, na_value=np.nan), Calendar()
+        found, calendar = column.to_numpy(np.float64, na_value=np.nan), NUMBERS
         known = np.isfinite(found)
+        if known.all() and (when := _compact(found)) is not None:
+            return times(when.rename(column.name), zone, sequences)
     elif is_duration(column):
         spans = pd.to_timedelta(column if column.dtype.kind == "m" else column.astype(str).where(column.notna()))
         found, known, calendar = seconds(pd.TimedeltaIndex(spans)), spans.notna().to_numpy(), Calendar("durations")
@@ -215,6 +244,16 @@ def times(
             ) from error
         known = when.notna().to_numpy()
         moments = pd.DatetimeIndex(when)
+        if (
+            zone is None
+            and str(moments.tz) == "UTC"
+            and len(several := _offsets(column.drop_duplicates()).dropna().unique()) > 1
+        ):
+            warnings.warn(
+                f"column {column.name!r} has several offsets from UTC, {', '.join(several[:3])}, and no time zone: its "
+                'times are in UTC; name their zone, such as zone = "Europe/Berlin"',
+                stacklevel=2,
+            )
         if zone is not None:
             moments = moments.tz_convert(zone) if moments.tz else _localized(moments, zone, sequences, column)
         found = seconds(moments)

@@ -107,7 +107,7 @@ class PanelWindows:
 
     @property
     def too_short(self) -> str:
-        """Sequences that are too short for a window there, with their steps, in words; empty where none is."""
+        """Names and numbers of steps of the sequences that are too short for a window; empty if there are none."""
         named = [f"{name}: {steps}" for name, steps in islice(self.skipped.items(), NAMED)]
         more = f" and {len(self.skipped) - NAMED} more" if len(self.skipped) > NAMED else ""
         said = f"{len(self.skipped)} sequences, which have fewer than {self.length} steps there"
@@ -232,6 +232,8 @@ class PanelWindows:
         observed, horizon = self.protocol.observed, self.protocol.horizon
         if observed is None or horizon is None:
             raise ValueError("whole sequences have no future; cut them, with observed and horizon steps, to forecast")
+        if self.skipped:
+            warnings.warn(f"forecasts leave out {self.too_short}", stacklevel=2)
         batch = self.all()
         past, known = past_of(batch, observed), gapped(batch).numpy()
         with reproducibly(model, seed):
@@ -270,9 +272,9 @@ class PanelWindows:
         return PanelImputed(np.concatenate(parts, 1), lacking, columns_of(self), keys, *self.times(steps))
 
     def times(self, steps: int) -> tuple[np.ndarray | None, Calendar]:
-        """Times (N, steps) from the start of the listed windows, and what they are; None where rows have none.
+        """Return times (N, steps) from the start of each listed window, None without times, and their calendar.
 
-        After the end of a sequence they continue as `Series.moments` says.
+        After the end of a sequence they continue as `Calendar.after` describes.
         """
         calendar = self.panel.calendar
         places, starts = map(Tensor.tolist, self._windows)

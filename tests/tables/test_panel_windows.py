@@ -276,7 +276,9 @@ def test_sequences_that_are_too_short_are_listed():
     assert [*data.windows("train").skipped] == short
     named = ", ".join(f"{name}: {round(0.7 * steps[name])}" for name in short)
     with pytest.warns(UserWarning, match=rf"training leaves out .* fewer than 7 steps there \({named}\)"):
-        dvae.method("autoregressive", width=4).fit(data, steps=1, batch_size=2, progress=False)
+        fit = dvae.method("autoregressive", width=4).fit(data, steps=1, batch_size=2, progress=False)
+    with pytest.warns(UserWarning, match=rf"forecasts leave out .* fewer than 7 steps there \({named}\)"):
+        data.windows("train").forecast(fit.model, 1)
     said = data.parts()
     assert list(said) == ["train", "validation", "test"]
     assert f"{len(short)} sequences, which have fewer than 7 steps there" in said["train"]
