@@ -396,14 +396,18 @@ def sequences(data: Any) -> Sequences:
     if isinstance(data, Sequences):
         return data
     if isinstance(data, Mapping):
-        return Sequences(each(data, tensor_of))
+        x, mask = unmasked(data.get("x"))
+        own = data if mask is None or "mask" in data else {**data, "x": x, "mask": mask}
+        return Sequences(each(own, tensor_of))
     if isinstance(data, Tensor | np.ndarray):
-        if data.ndim != 3:
+        check_real(data, "x")
+        x, mask = unmasked(data)
+        if x.ndim != 3:
             raise ValueError(
-                f"x has shape {tuple(data.shape)}, expected (sequences, frames, features); a single sequence is "
+                f"x has shape {tuple(x.shape)}, expected (sequences, frames, features); a single sequence is "
                 "x[None], and windows of a long one are dvae.tables.PanelData.of(x, cut=...).windows('train')"
             )
-        return Sequences({"x": tensor_of(data)})
+        return Sequences(each({"x": x} if mask is None else {"x": x, "mask": mask}, tensor_of))
     if isinstance(data, Listed):
         return Sequences(data.all())
     raise TypeError(
@@ -424,12 +428,38 @@ def in_batches(data: Any) -> InBatches:
     return data if isinstance(data, InBatches) else sequences(data)
 
 
+def unmasked(values: Any) -> tuple[Any, np.ndarray | None]:
+    """Return an array without its NumPy mask, 0 where it was masked, and where it was observed, None for everywhere."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return values, None
+    mask = np.ma.getmaskarray(values)
+    return (values.filled(0), ~mask) if mask.any() else (values.data, None)
+
+
+def check_real(values: Any, name: str = "an array") -> None:
+    """Refuse complex numbers and records, which no model reads.
+
+    Raises:
+        TypeError: an array or tensor of complex numbers or with fields.
+    """
+    dtype = getattr(values, "dtype", None)
+    if getattr(dtype, "is_complex", False) or getattr(dtype, "kind", "") == "c":
+        raise TypeError(f"{name} is {dtype}; expected real numbers: stack the real and the imaginary part as columns")
+    if fields := getattr(dtype, "names", None):
+        raise TypeError(
+            f"{name} has the fields {', '.join(fields[:10])}; expected plain numbers: give pandas.DataFrame(x), or "
+            "numpy.lib.recfunctions.structured_to_unstructured(x)"
+        )
+
+
 def tensor_of(values: Any) -> Tensor:
     """Return a tensor on an array's own memory, or on the mapped file, to which nobody may write then.
 
     Raises:
+        TypeError: complex numbers, records, or an array of which some entries are masked.
         ValueError: a tensor on the meta device.
     """
+    check_real(values)
     if isinstance(values, Tensor):
         if values.is_meta:
             raise ValueError(
@@ -437,6 +467,9 @@ def tensor_of(values: Any) -> Tensor:
             )
         # autograd refuses inference tensors
         return values.clone() if values.is_inference() and not torch.is_inference_mode_enabled() else values
+    values, mask = unmasked(values)
+    if mask is not None:
+        raise TypeError('an array is masked; give values.filled(0), and ~values.mask as the "mask" of the batch')
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The given NumPy array is not writable")
         return torch.as_tensor(values)
@@ -455,7 +488,7 @@ class ArrayWindows:
     """Plain arrays as windows to evaluate on.
 
     Args:
-        x: `(N, T, D)`, tensor or numpy array, which may be mapped.
+        x: `(N, T, D)`, tensor or numpy array, which may be mapped, or masked (`numpy.ma`).
         observed: frames the model sees; the other T - observed are predicted.
         multimodal_threshold: distance below which two last observed frames are alike, in the unit of x.
         clips: name of the clip each window was cut from; without it the windows count as independent.
@@ -482,6 +515,11 @@ class ArrayWindows:
     season: int | None = None
 
     def __post_init__(self) -> None:
+        check_real(self.x, "x")
+        x, mask = unmasked(self.x)
+        if mask is not None:
+            object.__setattr__(self, "x", x)
+            object.__setattr__(self, "mask", mask if self.mask is None else mask & np.asarray(self.mask, bool))
         if self.x.ndim != 3:
             raise ValueError(f"windows must be (N, T, D), but x has shape {tuple(self.x.shape)}")
         if self.mask is not None and self.mask.shape != self.x.shape:

@@ -7,9 +7,21 @@ import torch
 from typing_extensions import get_protocol_members
 
 import dvae
-from dvae.data import BESIDE, Fingerprinted, HeldOutWindows, InBatches, Listed, Source, leaves, past_of
+from dvae.data import (
+    BESIDE,
+    ArrayWindows,
+    Fingerprinted,
+    HeldOutWindows,
+    InBatches,
+    Listed,
+    Source,
+    leaves,
+    past_of,
+    sequences,
+)
 from dvae.inference.objectives import Asking
 from dvae.program.protocols import Forecasting, Program
+from dvae.tables import Panel
 
 
 @pytest.mark.parametrize(
@@ -132,3 +144,38 @@ def test_tensors_without_values_are_refused(model, name):
     if name not in ("a method's fit", "compare"):
         with pytest.raises(ValueError, match="on the meta device"):
             ENTRIES[name](dvae.DynamicalVAE("p(z) p(x_t | z)", "q(z | x_{1:T})", {"z": 2, "x": 3}).to("meta"), X)
+
+
+def test_masks_of_arrays_are_masks_of_batches():
+    x = np.ma.masked_values(np.arange(12.0).reshape(2, 3, 2) - 999 * (np.arange(12) == 5).reshape(2, 3, 2), -994)
+    windows, (one, other) = ArrayWindows(x, observed=2), Panel.of(x)
+    for batch in (sequences(x).batch, sequences({"x": x}).batch, windows.all()):
+        np.testing.assert_array_equal(batch["mask"], ~x.mask)
+        np.testing.assert_array_equal(batch["x"], x.filled(0))
+    assert windows.fingerprint == ArrayWindows(x.filled(0), observed=2, mask=~x.mask).fingerprint
+    np.testing.assert_array_equal([one.values, other.values], x.filled(np.nan))
+    assert "mask" not in sequences(np.ma.array(x.filled(0))).batch
+    with pytest.raises(TypeError, match="an array is masked; give"):
+        sequences({"x": x.filled(0), "y": x})
+
+
+@pytest.mark.parametrize(
+    ("x", "said"),
+    [
+        (np.ones((2, 3, 1), complex), "is complex128; expected real numbers: stack the real and the imaginary part"),
+        (torch.ones((2, 3, 1), dtype=torch.complex64), "is torch.complex64; expected real numbers"),
+        (np.zeros((2, 3, 1), [("a", float), ("b", int)]), r"has the fields a, b; .* pandas.DataFrame\(x\)"),
+    ],
+    ids=["complex", "tensor", "records"],
+)
+def test_what_no_model_reads_is_refused(x, said):
+    model = dvae.method("autoregressive", width=2).build({"x": 1})
+    for read in (
+        sequences,
+        Panel.of,
+        lambda x: Panel.of([*x]),
+        lambda x: ArrayWindows(x, 1),
+        lambda x: model.model({"x": x}),
+    ):
+        with pytest.raises(TypeError, match=said):
+            read(x)

@@ -19,6 +19,7 @@ ONTO = {skeleton.name: skeleton for skeleton in (motion.WALKER, motion.HUMAN36M,
 
 def data(
     action: Annotated[Literal["info", "convert", "get"], tyro.conf.Positional],
+    table: tables.ColumnOptions,
     files: Annotated[tuple[str, ...], tyro.conf.Positional] = (SIMULATED,),
     out: Path | None = None,
     format: Literal["npz", "bvh", "csv", "amass"] | None = None,
@@ -41,6 +42,7 @@ def data(
 
     Args:
         action: what to do.
+        table: of info: what the columns of tables are.
         files: motion files, or folders of them: npz, bvh, amc, c3d, csv, exponential maps; or "simulated". Of get: cmu.
         out: of convert and get: the file or folder to write.
         format: of convert: what to write; by default as the name of --out ends.
@@ -53,6 +55,8 @@ def data(
         url: of get: where the files lie, instead of their owner's site.
         skip_bad: leave out clips that cannot be used, and list them, instead of refusing the file.
     """
+    if table != tables.ColumnOptions() and (action != "info" or not all(map(tables.is_table, files))):
+        raise UsageError("options of columns are about tables, and of info")
     if action == "info":
         if format or fps or onto or url:
             raise UsageError("--format, --fps, --onto and --url are of convert and get")
@@ -60,7 +64,7 @@ def data(
         if out and len(found) < len(files):
             raise UsageError("--out takes the schema that info proposes for a table; of motion info writes nothing")
         if found:
-            tables.info(found, out)
+            tables.info(found, out, table)
         for file in files if not found else [file for file in files if file not in found]:
             OUT.print(_read(file, metres, up, recorded, skip_bad, missing).info())
         return

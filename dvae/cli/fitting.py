@@ -36,7 +36,7 @@ from ..runs.kinds import DATA
 from ..runs.sweep import sweep as sweep_methods
 from ..tables.dataset import PanelData
 from .console import ERROR, OUT, Missing, UsageError, arguments, at_least
-from .tables import is_table
+from .tables import ColumnOptions, is_table
 
 
 def options_of(name: str, kind: type[Any], *aside: str) -> Any:
@@ -83,7 +83,7 @@ else:
 
 
 @dataclass(frozen=True)
-class DataOptions:
+class DataOptions(ColumnOptions):
     """Data to fit to: motion, or a table.
 
     Args:
@@ -97,15 +97,6 @@ class DataOptions:
         scaling: of motion-latent: of turns, less no turn, or less their mean and by their deviation.
         warped: of motion-latent: time goes along the most typical gait cycles, instead of evenly.
         bodies: of motion-latent: deviation of shapes of bodies that are drawn for training segments; 0 for their own.
-        columns: of a table: what is modelled, each as NAME, NAME:FAMILY or NAME:FAMILY:UNIT, such as
-            riders:count:people. Without it, all that is nothing else; a schema beside the file says the same.
-        covariates: of a table: columns that forecasts are given for the future too, such as a calendar.
-        past: of a table: columns that forecasts are given up to the present.
-        attributes: of a table: columns with one value a sequence.
-        id: of a table: columns that tell sequences apart.
-        time: of a table: column of dates or numbers.
-        group: of a table: column that is the same within a sequence.
-        zone: of a table: time zone of its dates, such as Europe/Berlin.
         observed: of a table: steps that a forecast is given.
         horizon: of a table: steps to forecast.
         stride: of a table: steps from one test window to the next.
@@ -124,14 +115,6 @@ class DataOptions:
     scaling: Literal["identity", "deviation"] = "identity"
     warped: bool = False
     bodies: Amount = 1.0
-    columns: tuple[str, ...] = ()
-    covariates: tuple[str, ...] = ()
-    past: tuple[str, ...] = ()
-    attributes: tuple[str, ...] = ()
-    id: tuple[str, ...] = ()
-    time: str | None = None
-    group: str | None = None
-    zone: str | None = None
     observed: int | None = None
     horizon: int | None = None
     stride: int | None = None
@@ -162,8 +145,8 @@ class DataOptions:
                 raise UsageError(
                     f"--{min(strange).replace('_', '-')} is about {SAID[other]}, and {name} is fitted on {SAID[kind]}"
                 )
-        if attributes := given.pop("attributes", ()):  # a method may have a `static` of its own
-            given["static"] = attributes
+        columns = {field.name for field in fields(ColumnOptions)}
+        given = {name: value for name, value in given.items() if name not in columns} | self.given()
         with arguments() if kind == "panel" else nullcontext():  # of which columns are arguments
             opened = DATA[kind].open(given.pop("data", SIMULATED), **given)
         if isinstance(opened, PanelData):
@@ -177,7 +160,7 @@ OF_KINDS = {
     "motion": ("protocol", "representation", "missing", "skip_bad"),
     "segments": ("cut", "scaling", "warped", "bodies", "skip_bad"),
     "panel": (
-        *("columns", "covariates", "past", "attributes", "id", "time", "group", "zone"),
+        *(field.name for field in fields(ColumnOptions)),
         *("observed", "horizon", "stride", "split", "validation", "test", "season"),
     ),
 }

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any, Literal
 
 from .. import files
 from ..blocks import ColumnSummary, row_blocks
@@ -24,6 +26,42 @@ OF_MOTION = {".amc", ".bvh", ".c3d", ".npz"}
 """Ends of names of files that make a folder one of motion, whatever else lies in it."""
 SAMPLES = 100
 """Draws of a table where nobody says how many: its quantiles from 2.5 to 97.5 % need 39, and are rough then."""
+
+
+@dataclass(frozen=True)
+class ColumnOptions:
+    """What the columns of a table are.
+
+    Args:
+        columns: of a table: what is modelled, each as NAME, NAME:FAMILY or NAME:FAMILY:UNIT, such as
+            riders:count:people. Without it, all that is nothing else; a schema beside the file says the same.
+        covariates: of a table: columns that forecasts are given for the future too, such as a calendar.
+        past: of a table: columns that forecasts are given up to the present.
+        attributes: of a table: columns with one value a sequence.
+        id: of a table: columns that tell sequences apart.
+        time: of a table: column of dates or numbers, or columns that are joined, such as a date and a clock.
+        group: of a table: column that is the same within a sequence.
+        zone: of a table: time zone of its dates, such as Europe/Berlin.
+        na_values: of a table: texts or numbers that mark missing values, beside empty cells and NaN.
+        decimal: of a table: decimal sign of its numbers, where they do not show it.
+    """
+
+    columns: tuple[str, ...] = ()
+    covariates: tuple[str, ...] = ()
+    past: tuple[str, ...] = ()
+    attributes: tuple[str, ...] = ()
+    id: tuple[str, ...] = ()
+    time: tuple[str, ...] = ()
+    group: str | None = None
+    zone: str | None = None
+    na_values: tuple[str, ...] = ()
+    decimal: Literal[".", ","] | None = None
+
+    def given(self) -> dict[str, Any]:
+        """Return the options that differ from their defaults, under the names that `PanelData.open` gives them."""
+        found = {each.name: getattr(self, each.name) for each in fields(ColumnOptions)}
+        found["static"] = found.pop("attributes")  # a method may have a `static` of its own
+        return {name: value for name, value in found.items() if value}
 
 
 def is_table(path: str) -> bool:
@@ -114,12 +152,12 @@ def _say_left_out(samples: int, out: Path, figure: Path | None = None) -> None:
         note(f"left out, as they need more than {samples} draws (--samples): {', '.join(lacking)}")
 
 
-def info(paths: Sequence[str], out: Path | None) -> None:
-    """What tables hold, and a schema to be read and corrected."""
+def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
+    """What tables hold, and a schema to be read and corrected, from what is said of the columns."""
     if out is not None and len(paths) > 1:
         raise UsageError("--out takes the schema of one table")
     for path in paths:
-        opened = PanelData.open(path)
+        opened = PanelData.open(path, **told.given())
         panel = opened.panel
         table = Table(title=f"{path}: {panel!r}")
         for name in ("column", "role", "family", "unit", "known", "smallest", "mean", "largest"):

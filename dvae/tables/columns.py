@@ -1,8 +1,9 @@
 """Columns: what each column of a table holds and what it is for, as a small schema that stands beside the file.
 
 id = ["station"]                      # tell sequences apart
-time = "date"
+time = "date"                         # or ["date", "hour"], which are joined
 zone = "Europe/Berlin"                # of the times, where they do not name it
+na_values = ["?"]                     # mark missing values
 group = "region"                      # of sequences, for panels
 split = "part"                        # train, validation or test, where the data say it
 
@@ -108,24 +109,34 @@ class Columns:
     Args:
         columns: those that are read, in order.
         id: names of the columns that tell sequences apart; none for one sequence.
-        time: name of the column that orders them, dates or numbers; rows as they stand, where there is none.
+        time: name of the column that orders them, dates or numbers, or names of columns that are joined to one time,
+            see `dvae.tables.clocks`; rows as they stand, where there is none.
         group: name of a column that is the same within each sequence, for panels.
         split: name of a column that says "train", "validation" or "test".
         zone: time zone of the times, such as "Europe/Berlin", whose clocks show the dates without an offset from UTC.
+        na_values: texts or numbers that mark missing values, beside empty cells and NaN.
+        decimal: "." or ",", the decimal sign of numbers in text; None to infer it.
 
     Raises:
-        ValueError: two columns of one name, no target, or a zone that is none or of no time.
+        ValueError: two columns of one name, no target, a zone that is none or of no time, or another decimal sign.
     """
 
     columns: tuple[Column, ...]
     id: tuple[str, ...] = ()
-    time: str | None = None
+    time: str | tuple[str, ...] | None = None
     group: str | None = None
     split: str | None = None
-    zone: str | None = field(default=None, repr=False)  # fingerprints of panels hash the times
+    zone: str | None = field(default=None, repr=False)  # fingerprints of panels hash the times and values
+    na_values: tuple[str, ...] = field(default=(), repr=False)
+    decimal: str | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        names = [*self.names, *self.id, *(each for each in (self.time, self.split) if each is not None)]
+        if not isinstance(self.time, str | None):
+            time = tuple(self.time)
+            object.__setattr__(self, "time", time if len(time) > 1 else (*time, None)[0])
+        if self.decimal not in (None, ".", ","):
+            raise ValueError(f'decimal is {self.decimal!r}; expected "." or ","')
+        names = [*self.names, *self.id, *self.times, *(each for each in (self.split,) if each is not None)]
         if "" in (*names, self.group):
             raise ValueError("a column has no name; give it one")
         if len(names) > MOST:
@@ -144,6 +155,11 @@ class Columns:
         return [column for column in self.columns if column.role in roles]
 
     @property
+    def times(self) -> tuple[str, ...]:
+        """Names of the columns of the time."""
+        return (self.time,) if isinstance(self.time, str) else self.time or ()
+
+    @property
     def targets(self) -> list[Column]:
         """The columns that are modelled."""
         return self.of("target")
@@ -156,7 +172,7 @@ class Columns:
     @property
     def needed(self) -> list[str]:
         """Names of all columns that a table must have."""
-        return [*self.id, *filter(None, (self.time, self.group, self.split)), *self.names]
+        return [*self.id, *self.times, *filter(None, (self.group, self.split)), *self.names]
 
     def but(self, name: str, **told: Any) -> Self:
         """The same, but that one column is another: what a person corrects.
@@ -190,8 +206,11 @@ class Columns:
 
     def config(self) -> dict[str, Any]:
         """It in JSON's types; `from_config` reads it."""
-        found: dict[str, Any] = {"id": list(self.id), "time": self.time, "group": self.group, "split": self.split}
-        found |= {"zone": self.zone} if self.zone else {}  # fingerprints of windows hash what is here
+        time = list(self.time) if isinstance(self.time, tuple) else self.time
+        found: dict[str, Any] = {"id": list(self.id), "time": time, "group": self.group, "split": self.split}
+        # fingerprints of windows hash what is here
+        found |= {name: value for name in ("zone", "decimal") if (value := getattr(self, name))}
+        found |= {"na_values": list(self.na_values)} if self.na_values else {}
         columns = {}
         for column in self.columns:
             own = {entry.name: getattr(column, entry.name) for entry in fields(Column) if entry.name != "name"}
@@ -210,29 +229,19 @@ class Columns:
         columns = rest.pop("columns", {})
         if not isinstance(columns, Mapping):
             raise ValueError(f"columns is {brief(columns)}; expected a table for each column, such as [columns.riders]")
-        _refuse_others(rest, (entry.name for entry in fields(cls)), "the schema")
         found = []
         for name, told in columns.items():
             if not isinstance(told, Mapping):
                 raise ValueError(f"column {name!r} is {brief(told)}; expected a table, [columns.{name}]")
             _refuse_others(told, (entry.name for entry in fields(Column)[1:]), f"column {name!r}")
             found.append(Column(name, **tuples(told)))
-        own = rest.pop("id", ())
-        own = [own] if isinstance(own, str) else own
-        if not isinstance(own, list | tuple) or not all(isinstance(each, str) for each in own):
-            raise ValueError(f"id is {brief(own)}; expected names of columns")
-        for name in ("time", "group", "split", "zone"):
-            if not isinstance(rest.get(name), str | None):
-                expected = "a time zone" if name == "zone" else "the name of a column"
-                raise ValueError(f"{name} is {brief(rest[name])}; expected {expected}")
-        return cls(tuple(found), tuple(own), **rest)
+        return cls(tuple(found), **layout(rest))
 
     def to_toml(self) -> str:
         """The schema as a file to be edited."""
-        lines = [f"id = [{', '.join(map(_quoted, self.id))}]"] if self.id else []
-        lines += [
-            f"{name} = {_quoted(value)}"
-            for name in ("time", "zone", "group", "split")
+        lines = [
+            f"{name} = {_quoted(value) if isinstance(value, str) else _listed(value)}"
+            for name in ("id", "time", "zone", "group", "split", "na_values", "decimal")
             if (value := getattr(self, name))
         ]
         for column in self.columns:
@@ -241,7 +250,7 @@ class Columns:
             lines += [f'role = "{column.role}"'] if column.role != "target" else []
             lines += [f'family = "{column.family}"']
             lines += [f"unit = {_quoted(column.unit)}"] if column.unit else []
-            lines += [f"classes = [{', '.join(map(_quoted, column.classes))}]"] if column.classes else []
+            lines += [f"classes = {_listed(column.classes)}"] if column.classes else []
             lines += [f"other = {_quoted(column.other)}"] if column.other else []
         return "\n".join(lines).strip() + "\n"
 
@@ -269,11 +278,39 @@ def parsed(text: str) -> dict[str, Any]:
         raise ValueError("it has tables within tables, deeper than any schema") from None
 
 
+def layout(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a schema about the whole table, with their types checked.
+
+    Raises:
+        ValueError: an entry that a schema does not have, or of another type.
+    """
+    _refuse_others(told, (each.name for each in fields(Columns)), "the schema")
+    found: dict[str, Any] = {}
+    for name, value in told.items():
+        many = isinstance(value, list | tuple)
+        listed = tuple(value) if many else (value,)
+        if (name in ("id", "time", "na_values") and many) or name in ("id", "na_values"):
+            if not all(isinstance(each, str) for each in listed):
+                what = 'texts, such as ["?"]' if name == "na_values" else "names of columns"
+                raise ValueError(f"{name} is {brief(value)}; expected {what}")
+            found[name] = listed
+        elif isinstance(value, str | None):
+            found[name] = value
+        else:
+            what = {"zone": "a time zone", "decimal": '"." or ","'}.get(name, "the name of a column")
+            raise ValueError(f"{name} is {brief(value)}; expected {what}")
+    return found
+
+
 def _refuse_others(given: Mapping[str, Any], known: Iterable[str], who: str) -> None:
     names: Sequence[str] = list(known)
     for name in given:
         if name not in names:
             raise ValueError(f"{who} has an entry {name!r}{nearest(name, names)}; known are {', '.join(names)}")
+
+
+def _listed(words: Iterable[str]) -> str:
+    return f"[{', '.join(map(_quoted, words))}]"
 
 
 def _quoted(text: str) -> str:

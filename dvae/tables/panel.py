@@ -24,10 +24,13 @@ import numpy as np
 import torch
 
 from ..blocks import hash_values, ranges, row_blocks
+from ..data import check_real
 from ..npy import is_mapped
 from ..options import nearest
 from .calendar import NUMBERS, Calendar
+from .clocks import time_of
 from .columns import Column, Columns
+from .numerals import read_numbers
 from .parsing import is_duration, is_number, numeric, tabular, texts, times
 from .proposing import LARGEST, TIMES, Told, is_date
 
@@ -228,19 +231,24 @@ class Panel:
                 columns = Told(columns=tuple(columns or ()))
             if kind == "xarray":
                 data, columns = _of_grid(data, columns)
+            columns = columns.of(data) if isinstance(columns, Told) else columns
             frame = tabular(data)
-            columns = columns.of(frame) if isinstance(columns, Told) else columns
             series, calendar = _of_frame(frame, columns)
             return cls(series, columns, name, calendar)
+        check_real(data, "the table")
         arrays = [data] if hasattr(data, "ndim") and data.ndim == 2 else data
         if not isinstance(arrays, np.ndarray | torch.Tensor | list | tuple):
             raise TypeError(
                 f"a table is made of a pandas frame, an xarray Dataset, arrays (N, T, D) or a list of arrays (T, D), "
                 f"not of {type(data).__name__}"
             )
+        for each in arrays:
+            check_real(each, "the table")
         plain = [each.detach().cpu().double().numpy() if isinstance(each, torch.Tensor) else each for each in arrays]
         found = [
-            each.view(np.ndarray) if is_mapped(each) and each.dtype.kind in "fiu" else np.array(each, np.float64)
+            each.view(np.ndarray)
+            if is_mapped(each) and each.dtype.kind in "fiu" and not np.ma.is_masked(each)
+            else np.ma.filled(np.ma.array(each, np.float64, copy=True), np.nan)
             for each in plain
         ]
         if not found or any(each.ndim != 2 for each in found):
@@ -339,21 +347,25 @@ def _of_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
         )
     if not len(frame):
         raise ValueError("the table has no rows")
-    values = np.stack([numeric(frame[column.name], column) for column in columns.columns], 1)
+    settled = (columns.na_values, columns.decimal)
+    values = np.stack([numeric(frame[column.name], column, *settled) for column in columns.columns], 1)
     told = {name: own for name in ("group", "split") if (own := getattr(columns, name))}
     labels = {name: texts(frame[own]).fillna("").to_numpy() for name, own in told.items()}
     rows, names = [np.arange(len(frame))], ["0"]
     if columns.id:
-        found = frame.groupby(list(columns.id), sort=True, observed=True, dropna=False).indices
+        found = frame.groupby(list(columns.id), sort=False, observed=True, dropna=False).indices
         rows = [np.sort(places) for places in found.values()]
-        firsts = frame.iloc[[places[0] for places in rows]]
-        names = ["/".join(key) for key in zip(*(texts(firsts[own]).fillna("") for own in columns.id), strict=True)]
+        keys = frame.iloc[[places[0] for places in rows]][list(columns.id)]
+        order = _order(keys)
+        rows, keys = [rows[place] for place in order], keys.iloc[order]
+        names = ["/".join(key) for key in zip(*(texts(keys[own]).fillna("") for own in columns.id), strict=True)]
     when, calendar, found = None, Calendar(), []
     if columns.time is not None:
-        when, calendar = times(frame[columns.time], columns.zone, rows)
+        moments = time_of(frame, columns.time, columns.decimal)
+        when, calendar = times(moments, columns.zone, rows)
     for name, places in zip(names, rows, strict=True):
         if when is not None:
-            places = _ordered(when, places, f"sequence {name!r}", calendar, columns.time)
+            places = _ordered(when, places, f"sequence {name!r}", calendar, moments.name)
         own = {}
         for what, all_labels in labels.items():
             if len(said := set(all_labels[places])) > 1:
@@ -365,6 +377,16 @@ def _of_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
             raise ValueError(f"sequence {name!r} is of split {own['split']!r}; expected one of {', '.join(SPLITS)}")
         found.append(Series(name, values[places], None if when is None else when[places], **own))
     return found, calendar.stepping(one.times for one in found)
+
+
+def _order(keys: Any) -> np.ndarray:
+    """Places of ids (N, K) in order: numbers by size, also those in text, others by their text, missing ones last."""
+    levels: list[np.ndarray] = []
+    for name in keys:
+        read, said = read_numbers(keys[name]), texts(keys[name])
+        size = np.zeros(len(keys)) if read.wrong.any() or read.marks else read.values
+        levels += [said.isna().to_numpy(), size, np.unique(said.fillna("").to_numpy(str), return_inverse=True)[1]]
+    return np.lexsort(levels[::-1])
 
 
 def _ordered(when: np.ndarray, rows: np.ndarray, who: str, calendar: Calendar, column: str | None) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from reprlib import repr as brief
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from ..options import nearest
 from .calendar import NUMBERS, Calendar, seconds
 from .columns import Column
+from .numerals import read_numbers
 
 LONGEST = 64
 """Characters of a date; patterns are tried on none that is longer."""
@@ -66,15 +67,10 @@ def tabular(data: Any) -> Any:
     frame = data.to_frame() if data.ndim == 1 else data
     frame = frame.set_axis([str(name) for name in frame.columns], axis=1)
     columns, levels = [*frame.columns], []
-    for place in range(frame.index.nlevels):
-        level = frame.index.get_level_values(place)
-        dated = isinstance(level, pd.DatetimeIndex | pd.PeriodIndex | pd.TimedeltaIndex)
-        if level.name is not None or dated or not (frame.index.nlevels == 1 or is_number(level)):
-            unnamed = "time" if dated and "time" not in columns else f"level_{place}"
-            name = unnamed if level.name is None else str(level.name)
-            kept = columns.count(name) == 1 and level.equals(pd.Index(frame[name]))  # by set_index(drop=False)
-            if not kept:
-                levels.append((name, level))
+    for name, level in index_levels(data):
+        kept = columns.count(name) == 1 and level.equals(pd.Index(frame[name]))  # by set_index(drop=False)
+        if not kept:
+            levels.append((name, level))
     names = [*(name for name, _ in levels), *columns]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -85,6 +81,20 @@ def tabular(data: Any) -> Any:
     for place, (name, level) in enumerate(levels):
         frame.insert(place, name, level)
     return frame
+
+
+def index_levels(data: Any) -> list[tuple[str, Any]]:
+    """Return names and values of the index that are columns of a table: several levels, or one with a name or dates."""
+    import pandas as pd
+
+    found = []
+    for place in range(data.index.nlevels):
+        level = data.index.get_level_values(place)
+        dated = isinstance(level, pd.DatetimeIndex | pd.PeriodIndex | pd.TimedeltaIndex)
+        if level.name is not None or dated or data.index.nlevels > 1:
+            unnamed = "time" if dated and "time" not in map(str, getattr(data, "columns", ())) else f"level_{place}"
+            found.append((unnamed if level.name is None else str(level.name), level))
+    return found
 
 
 def texts(column: Any) -> Any:
@@ -139,7 +149,7 @@ def _offsets(said: Any) -> Any:
     return said.astype(str).str.extract(_OFFSET)[0].str.upper().replace({"UTC": "Z", "GMT": "Z"})
 
 
-def _compact(numbers: np.ndarray) -> Any:
+def compact(numbers: np.ndarray) -> Any:
     """Dates of whole numbers that are written as 20241231 or 202412; None where some are not."""
     import pandas as pd
 
@@ -228,7 +238,7 @@ def times(
     if is_number(column):
         found, calendar = column.to_numpy(np.float64, na_value=np.nan), NUMBERS
         known = np.isfinite(found)
-        if known.all() and (when := _compact(found)) is not None:
+        if known.all() and (when := compact(found)) is not None:
             return times(when.rename(column.name), zone, sequences)
     elif is_duration(column):
         spans = pd.to_timedelta(column if column.dtype.kind == "m" else column.astype(str).where(column.notna()))
@@ -294,17 +304,22 @@ def _localized(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, co
     return type(local)(moments)
 
 
-def numeric(column: Any, told: Column) -> np.ndarray:
+def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: str | None = None) -> np.ndarray:
     """The values as numbers, NaN where missing, of a category as the place of its class.
+
+    Args:
+        column: (N,) of any type.
+        told: what it holds.
+        na_values: further texts or numbers that mark missing values; one that is a class is that class.
+        decimal: "." or ",", the decimal sign of texts.
 
     Raises:
         ValueError: values that are none.
     """
-    import pandas as pd
-
     if told.family == "category":
         places = {each: place for place, each in enumerate(told.classes)}
         said = texts(column)
+        said = said.mask(said.isin([each for each in na_values if each not in places]))
         unknown = said.notna() & ~said.isin(list(places))
         if told.other:
             said = said.mask(unknown, told.other)
@@ -315,15 +330,20 @@ def numeric(column: Any, told: Column) -> np.ndarray:
                 f"{', '.join(told.classes[:10])}; a class can stand for all others: other = {told.classes[-1]!r}"
             )
         return said.map(places).to_numpy(np.float64)  # type: ignore[no-any-return]
-    advice = "leave it out, or give it the family 'category'"
     if column.dtype.kind in "mMc":
-        raise ValueError(f"column {told.name!r} holds {column.dtype}, which are no numbers; {advice}")
-    if pd.api.types.is_bool_dtype(column):
-        column = column.astype(float)
-    try:
-        return pd.to_numeric(column).to_numpy(np.float64, na_value=np.nan)  # type: ignore[no-any-return]
-    except (TypeError, ValueError, OverflowError) as error:
-        said = column.astype(str)
-        wrong = pd.to_numeric(said, errors="coerce").isna() & column.notna()
-        value = brief(said[wrong].iloc[0]) if wrong.any() else "something"
-        raise ValueError(f"column {told.name!r} holds {value}, which is no number; {advice}") from error
+        raise ValueError(
+            f"column {told.name!r} holds {column.dtype}, which are no numbers; leave it out, or give it the family "
+            "'category'"
+        )
+    read = read_numbers(column, na_values, decimal, column.attrs.get("decimal", "."))
+    read.check(column, "or give the column the family 'category'")
+    if read.marks:
+        warnings.warn(f"column {told.name!r} {said_of_marks(read.marks)}", stacklevel=2)
+    return read.values
+
+
+def said_of_marks(marks: Mapping[str, tuple[int, int]]) -> str:
+    """Say which cells of a column of numbers are read as missing."""
+    cells = ", ".join(f"{brief(mark)} (row {row}, {count} in all)" for mark, (row, count) in marks.items())
+    listed = ", ".join(f'"{mark}"' for mark in marks)
+    return f"holds {cells} among numbers, read as missing; na_values = [{listed}] says so without this warning"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from reprlib import repr as brief
 from typing import Any
@@ -12,8 +13,21 @@ from typing import Any
 import numpy as np
 
 from ..options import nearest
+from .clocks import is_clock, joined, parts_of, unit_of
 from .columns import Column, Columns, Role
-from .parsing import Undecided, dates, is_duration, is_number, tabular, texts
+from .numerals import NEARLY_ALL, read_numbers
+from .parsing import (
+    MONTHS,
+    Undecided,
+    compact,
+    dates,
+    index_levels,
+    is_duration,
+    is_number,
+    said_of_marks,
+    tabular,
+    texts,
+)
 
 CLASSES = 20
 """Most different texts of a category; more are an id, or a text."""
@@ -25,6 +39,17 @@ TIMES = re.compile(
     r"(^|_)(time|date|datetime|timestamp|day|week|month|quarter|year|hour|minute|second|step|frame|t|ds)(_|$)"
 )
 IDS = re.compile(r"(^|_)(id|unique_id|series|sequence|subject|station|store|item|patient|name|key)(_|$)")
+ROWS = re.compile(r"no\.?|nr\.?|num|number|row|row_?(id|no|nr|num|number)|index|idx|obs|#", re.IGNORECASE)
+"""Names of columns that only number the rows."""
+COVERAGE = 0.6
+"""Share of the steps between its first and its last that a sequence has, where a text tells sequences apart."""
+MOST_HEADERS = 4
+"""Rows of names at the top of a file."""
+DATED_NAME = re.compile(
+    r"\d{4}([-/.]\d{1,2}){0,2}([T ]\d.*)?|\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}|\d{4}[-_ ]?[QM]\d{1,2}|"
+    rf"({'|'.join(MONTHS)})[a-z]*[-/ .]?\d{{2,4}}",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True)
@@ -37,9 +62,12 @@ class Told:
         past: covariates that end with the present.
         static: covariates with one value a sequence.
         id: columns that tell sequences apart.
-        time: column of dates or numbers.
+        time: column of dates or numbers, or columns that are joined to one time.
         group: column that is the same within a sequence.
+        split: column that says "train", "validation" or "test".
         zone: time zone of dates, such as "Europe/Berlin".
+        na_values: texts or numbers that mark missing values, beside empty cells and NaN.
+        decimal: "." or ",", the decimal sign of numbers in text; None to infer it.
     """
 
     columns: tuple[str, ...] = ()
@@ -47,56 +75,89 @@ class Told:
     past: tuple[str, ...] = ()
     static: tuple[str, ...] = ()
     id: tuple[str, ...] = ()
-    time: str | None = None
+    time: str | tuple[str, ...] | None = None
     group: str | None = None
+    split: str | None = None
     zone: str | None = None
+    na_values: tuple[str, ...] = ()
+    decimal: str | None = None
 
     def of(self, frame: Any) -> Columns:
         """The columns of a frame, with what is not told as it is proposed.
 
         Raises:
-            ValueError: columns that the frame does not have, or families that there are not.
+            ValueError: columns that the frame does not have, families that there are not, or cells that are unclear.
         """
-        frame = tabular(frame)
+        levels, frame = [name for name, _ in index_levels(frame)], tabular(frame)
         known = list(frame.columns)
         roles: dict[str, tuple[Role, str]] = {}
         said: dict[Role, tuple[str, ...]]
         said = {"target": self.columns, "known": self.covariates, "past": self.past, "static": self.static}
-        for role, words in said.items():
-            for word in words:
+        for role, own_words in said.items():
+            for word in own_words:
                 name = word if word in known else word.partition(":")[0]
                 if name in roles:
                     raise ValueError(f"column {name!r} is named twice")
                 roles[name] = (role, word[len(name) + 1 :])
-        for name in (*roles, *self.id, *filter(None, (self.time, self.group))):
+        times = (self.time,) if isinstance(self.time, str) else tuple(self.time or ())
+        aside = (*self.id, *times, *filter(None, (self.group, self.split)))
+        for name in (*roles, *aside):
             if name not in known:
                 raise ValueError(f"no column {name!r}{nearest(name, known)}; there are {', '.join(known[:20])}")
-        found, undecided = _proposed(frame, self.time, self.id, roles)
-        layout: dict[str, Any] = {"id": found.id, "time": found.time, "group": self.group, "zone": self.zone}
-        aside = {*layout["id"], *filter(None, (found.time, self.group))}
-        own = {column.name: column for column in found.columns if column.name not in aside}
+        families = {name: words.partition(":")[0] for name, (_, words) in roles.items()}
+        found = _Proposal(self, frame, levels, times, aside, families)
+        own = {name: column for name, column in found.columns.items() if name not in aside}
         names = list(roles) if self.columns else [*(name for name in own if name not in roles), *roles]
         columns = []
         for name in names:
-            role, said_of_it = roles.get(name, (own[name].role, "")) if name in own else roles[name]
-            family, _, unit = said_of_it.partition(":")
-            columns.append(_told(name, role, family, unit, frame[name], own.get(name)))
-        return _with_notes(frame, Columns(tuple(columns), **layout), undecided, all_named=not self.columns)
+            role, words = roles.get(name, (own[name].role, "")) if name in own else roles[name]
+            family, _, unit = words.partition(":")
+            columns.append(_told(name, role, family, unit, frame[name], own.get(name), self.na_values))
+        if not any(column.role == "target" for column in columns):
+            static = ", ".join(
+                column.name for column in columns if column.role == "static" and column.name not in roles
+            )
+            reason = f"; {static} have one value in each sequence" if static else ""
+            given = ", ".join(names[:20]) or "none"
+            raise ValueError(f"no column is a target; given are {given}{reason}; name those to model (--columns)")
+        numbers = [column for column in columns if column.family != "category"]
+        marks = [mark for column in numbers for mark in found.numbers[column.name].marks]
+        schema = Columns(
+            tuple(columns),
+            found.id,
+            found.time,
+            self.group,
+            self.split,
+            self.zone,
+            tuple(dict.fromkeys((*self.na_values, *marks))),
+            self.decimal,
+        )
+        for column in numbers:
+            if own_marks := found.numbers[column.name].marks:
+                warnings.warn(f"column {column.name!r} {said_of_marks(own_marks)}", stacklevel=3)
+        found.warn(schema, all_named=not self.columns)
+        return schema
 
 
-def _told(name: str, role: Role, family: str, unit: str, values: Any, guess: Column | None) -> Column:
+def _told(
+    name: str, role: Role, family: str, unit: str, values: Any, guess: Column | None, na_values: Collection[str]
+) -> Column:
     """A column of which a role, and perhaps family and unit, are told."""
     family = family or (guess.family if guess else "real")
     if role != "target" and family != "category":
         family = "real"
-    classes = tuple(sorted(texts(values).dropna().unique())) if family == "category" else ()
-    return Column(name, role, family, unit, classes)
+    return Column(name, role, family, unit, _classes(values, na_values) if family == "category" else ())
 
 
-def proposed(frame: Any, time: str | None = None, id: tuple[str, ...] = (), others: Collection[str] = ()) -> Columns:
+def _classes(values: Any, na_values: Collection[str]) -> tuple[str, ...]:
+    return tuple(sorted({*texts(values).dropna()} - {*na_values}))
+
+
+def proposed(frame: Any) -> Columns:
     """What a pandas frame in the long form probably is.
 
-    The first column of dates, or with the name of a time, is that. Columns of texts that repeat, and of whole numbers
+    The first column of dates, or with the name of a time, is that; a date and a clock, or year, month, day and hour,
+    are joined where single columns leave several rows at one time. Columns of texts that repeat, and of whole numbers
     with the name of an id, tell sequences apart where that leaves no two rows at one time. What is the same within each
     of several sequences is static. All other columns are targets: whole numbers from 0 are counts, two values a binary,
     few texts a category, numbers above 0 that vary by more than half their mean positive. What is none of these is left
@@ -104,110 +165,286 @@ def proposed(frame: Any, time: str | None = None, id: tuple[str, ...] = (), othe
 
     Args:
         frame: whose columns are looked at.
-        time: the column of the times, if it is known.
-        id: the columns that tell sequences apart, if they are known.
-        others: columns that are neither.
 
     Raises:
-        ValueError: no column that could be a target.
+        ValueError: no column that could be a target, cells that are unclear, or a table that is not in the long form.
     """
-    frame = tabular(frame)
-    found, undecided = _proposed(frame, time, id, others)
-    return _with_notes(frame, found, undecided)
+    return Told().of(frame)
 
 
-def _proposed(
-    frame: Any, time: str | None, id: tuple[str, ...], others: Collection[str]
-) -> tuple[Columns, dict[str, str]]:
-    """What it is, and the columns that could be its time, were their dates decided, with what they hold."""
-    names = list(frame.columns)
-    free = [name for name in names if name not in (*others, *id) and not _numbers_rows(name, frame[name])]
-    undecided: dict[str, str] = {}
-    if time is None:
-        time = next((name for name in free if _is_time(name, frame[name], undecided)), None)
-    if time is None and not undecided:
-        time = next((name for name in free if is_duration(frame[name])), None)
-    if time is None:
-        time = next((name for name in free if TIMES.search(name.lower()) and is_number(frame[name])), None)
-    free = [name for name in free if name not in (time, *undecided)]
-    rest = [name for name in names if name in free or (name in others and name != time)]
-    step = time or next(iter(undecided), None)  # which tells rows apart, in whatever order
-    ids = list(id)
-    if not ids and step is not None and frame[step].duplicated().any():
-        named = [n for n in free if _is_whole(frame[n]) and IDS.search(n.lower())]
-        for name in (*named, *(n for n in free if not is_number(frame[n]) and frame[n].nunique() < len(frame))):
-            left = frame.duplicated([*ids, step]).sum()
-            if not left:
+class _Proposal:
+    """What the columns of a frame probably are, where nobody says it.
+
+    Args:
+        told: what is said of them.
+        frame: in the long form.
+        levels: names of the columns that are levels of its index.
+        times: columns of the time, where they are told.
+        aside: all columns that are told to be no data.
+        families: columns that are told to be data, with "" where that says no family.
+    """
+
+    def __init__(
+        self,
+        told: Told,
+        frame: Any,
+        levels: list[str],
+        times: tuple[str, ...],
+        aside: tuple[str, ...],
+        families: Mapping[str, str],
+    ):
+        self.frame, self.levels = frame, levels if len(levels) > 1 else []
+        self.na_values, hint = told.na_values, frame.attrs.get("decimal", ".")
+        self.numbers = {name: read_numbers(frame[name], told.na_values, told.decimal, hint) for name in frame}
+        numerals = {
+            name: read.values
+            for name, read in self.numbers.items()
+            if read.is_numeric and frame[name].dtype.kind != "c" and str(frame[name].dtype) != "category"
+        }
+        self.plain = frame.assign(**numerals)
+        """The frame, with numbers for texts that are numbers."""
+        self.undecided: dict[str, str] = {}
+        """Columns that could be the time, were their dates decided, with what they hold."""
+        if not told.columns:
+            self._refuse_layout(aside)
+        free = [name for name in frame if name not in families and name not in aside and not self._numbers_rows(name)]
+        free += [name for name in self.levels if name not in free and name not in aside]
+        self.id: tuple[str, ...] = told.id
+        self.time = times
+        self._find_id_and_time(free)
+        taken = {*aside, *self.id, *self.time, *self.undecided}
+        if not self.id:  # a panel of one sequence
+            named = (name for name in free if name not in taken and IDS.search(name.lower()))
+            self.id = tuple(name for name in named if frame[name].nunique(dropna=False) == 1)
+        taken = ({*taken, *self.id} | {*self.levels}) - {*families}
+        wanted = (name for name in frame if name in families or (name in free and not told.columns))
+        found = (self._column(name, families.get(name, "")) for name in wanted if name not in taken)
+        columns = {column.name: column for column in found if column is not None}
+        if (
+            columns
+            and self.id
+            and len(groups := self.plain.groupby(self._keys(self.id), observed=True, dropna=False)) > 1
+        ):
+            changing = groups[[*columns]].nunique().max() > 1
+            columns = {name: each if changing[name] else _static(each) for name, each in columns.items()}
+        if not columns and not families:
+            raise ValueError(f"none of the columns {', '.join([*frame][:20])} holds numbers or a few classes")
+        self.columns = columns
+
+    def _find_id_and_time(self, free: list[str]) -> None:
+        """Take the first time with which no two rows of a sequence are at one time, or the one with the fewest."""
+        found = []
+        for time in [self.time] if self.time else self._times(free):
+            try:
+                step = joined(self.frame, time) if len(time) > 1 else self.plain[time[0]]
+            except ValueError:
+                if self.time:
+                    raise
+                continue
+            id, twice = self._find_id(free, time, step)
+            found.append((twice, id, time))
+            if not twice:
                 break
-            if frame.duplicated([*ids, name, step]).sum() < left:
+        if found:
+            _, self.id, self.time = min(found, key=lambda each: each[0])
+        elif self.undecided:  # which tell rows apart, in whatever order
+            self.id, _ = self._find_id(free, (*self.undecided,), self.frame[next(iter(self.undecided))])
+        elif not self.id:
+            self.id = tuple(self.levels) or self._ids_in_runs(free)
+
+    def _times(self, free: list[str]) -> list[tuple[str, ...]]:
+        """List columns that may be the time, the likeliest first."""
+        frame = self.frame
+        clocks = [name for name in free if is_clock(frame[name])]
+        dated = [name for name in free if name not in clocks and (self._is_time(name) or self._is_compact(name))]
+        dated.sort(key=lambda name: name not in self.levels)
+        rest = [name for name in free if name not in self.undecided]
+        numbers = [name for name in rest if is_number(self.plain[name])]
+        if dated:
+            hours = {unit_of(name, frame[name]): name for name in reversed(numbers)}
+            fine = clocks[:1] or [hours[unit] for unit in ("hour", "minute", "second") if unit in hours]
+            return [(dated[0],), *([(dated[0], *fine)] if fine else [])]
+        spans = [] if self.undecided else [name for name in (*self.levels, *rest) if is_duration(frame[name])]
+        levels = [name for name in self.levels if name in numbers]
+        named = [name for name in (*levels, *numbers) if TIMES.search(name.lower())]
+        parts = parts_of(frame, [name for name in rest if name not in clocks])
+        joint = [parts] if len(parts) > 1 else []
+        return [*joint, *((name,) for name in dict.fromkeys((*spans, *named, *levels[-1:])))]
+
+    def _find_id(self, free: list[str], time: tuple[str, ...], step: Any) -> tuple[tuple[str, ...], int]:
+        """Return the columns that tell sequences apart, and how many rows then are at the time of another."""
+        steps = step.to_numpy()
+        rows = self.frame.assign(**{" step": steps})
+
+        def twice(ids: Collection[str]) -> int:
+            return int(rows.duplicated([*ids, " step"]).sum())
+
+        if self.id:
+            return self.id, twice(self.id)
+        others = [name for name in self.levels if name not in time]
+        if others:
+            if len(others) > 1 and others[-1].startswith("level_") and is_number(self.plain[others[-1]]):
+                others = others[:-1] if not twice(others[:-1]) else others
+            return tuple(others), twice(others)
+        left = [name for name in free if name not in time and name not in self.undecided]
+        if not twice(()):
+            return self._ids_in_runs(left), 0
+        named = [name for name in left if self._is_named_id(name) and is_number(self.plain[name])]
+        ids: list[str] = []
+        for name in (*named, *(name for name in left if self._may_be_id(name))):
+            if not (before := twice(ids)):
+                break
+            if twice([*ids, name]) < before:
                 ids.append(name)
         for name in tuple(ids):  # those before the one that alone suffices
             fewer = [other for other in ids if other != name]
-            ids = ids if frame.duplicated([*fewer, step]).any() else fewer
-    found = [column for name in rest if name not in ids and (column := _column(name, frame[name])) is not None]
-    if not ids:  # a panel of one sequence
-        ids = [name for name in free if IDS.search(name.lower()) and frame[name].nunique(dropna=False) == 1]
-        found = [column for column in found if column.name not in ids]
-    if ids and len(groups := frame.groupby(ids, observed=True)) > 1:
-        changing = groups[[column.name for column in found]].nunique().max() > 1
-        found = [column if changing[column.name] else _static(column) for column in found]
-    if not found:
-        raise ValueError(f"none of the columns {', '.join(names[:20])} holds numbers or a few classes")
-    return Columns(tuple(found), tuple(ids), time), undecided
+            ids = ids if twice(fewer) else fewer
+        if not all(map(self._is_named_id, ids)) and not self._in_runs(ids) and self._coverage(ids, steps) < COVERAGE:
+            return (), twice(())
+        return tuple(ids), twice(ids)
 
+    def _keys(self, ids: Collection[str]) -> list[Any]:
+        """Return ids as they are written, by which to group."""
+        return [self.frame[name].rename(None) for name in ids]
 
-def _is_time(name: str, values: Any, undecided: dict[str, str]) -> bool:
-    """Whether a column holds dates; notes those whose day and month cannot be told apart."""
-    try:
-        return is_date(values)
-    except Undecided as error:
-        undecided[name] = str(error)
-        return False
+    def _is_named_id(self, name: str) -> bool:
+        """Whether whole numbers or texts have the name of an id."""
+        values = self.plain[name]
+        return IDS.search(name.lower()) is not None and (not is_number(values) or _is_whole(values))
 
+    def _may_be_id(self, name: str) -> bool:
+        """Whether a column holds texts, or codes such as 007, that repeat and say nothing of the time."""
+        values = self.frame[name]
+        if is_number(values) or values.nunique() == len(values):
+            return False
+        if is_number(self.plain[name]) and not texts(values).str.fullmatch(r"0\d+").any():
+            return False
+        return IDS.search(name.lower()) is not None or not (TIMES.search(name.lower()) or is_clock(values))
 
-def _numbers_rows(name: str, values: Any) -> bool:
-    """Whether a column is the index that pandas writes into a CSV, without a name."""
-    return name == "Unnamed: 0" and _is_whole(values) and bool(values.is_unique)
+    def _ids_in_runs(self, names: Collection[str]) -> tuple[str, ...]:
+        """Return columns with the name of an id, of which the rows of each value follow each other."""
+        return tuple(name for name in names if self._is_named_id(name) and self._in_runs([name]))
 
+    def _in_runs(self, ids: list[str]) -> bool:
+        """Whether the rows of each sequence follow each other, and some sequence has several."""
+        codes = self.frame.groupby(self._keys(ids), sort=False, dropna=False, observed=True).ngroup().to_numpy()
+        runs = 1 + int((np.diff(codes) != 0).sum())
+        return 1 < runs == len(np.unique(codes)) < len(codes)
 
-def _with_notes(frame: Any, columns: Columns, undecided: dict[str, str], all_named: bool = True) -> Columns:
-    """The columns; what of the frame is not among them is said in warnings."""
-    lacking = () if columns.time else undecided
-    aside = [name for name in frame.columns if name not in columns.needed and (all_named or name in lacking)]
-    said = []
-    for name in aside:
-        values = frame[name].dropna()
-        why = f"neither numbers nor 2 to {CLASSES} classes"
-        if len(values):
-            why += f", such as {brief(str(values.iloc[0]))}"
-        if name in undecided:
-            why = f"perhaps the time: {undecided[name]}"
-        elif _numbers_rows(name, values):
-            why = "the numbers of the rows, without a name"
-        said.append(f"{name!r} ({why})")
-    if said:
-        warnings.warn(f"left out of what is proposed: {', '.join(said)}", stacklevel=3)
-    return columns
+    def _coverage(self, ids: list[str], steps: np.ndarray) -> float:
+        """Return the share of all steps from the first to the last of each sequence at which it has a row."""
+        import pandas as pd
 
+        moments = pd.Series(steps)
+        with suppress(TypeError, ValueError):
+            moments = moments if is_number(moments) else dates(moments)
+        place = pd.Series(pd.factorize(moments, sort=True)[0], self.frame.index)
+        spans = place.groupby(self._keys(ids), dropna=False, observed=True).agg(["min", "max"])
+        return len(place) / float((spans["max"] - spans["min"] + 1).sum())
 
-def _column(name: str, values: Any) -> Column | None:
-    """What a column probably holds; None for what is no target, as texts that are all different."""
-    known = values.dropna().infer_objects()  # true and false, where some are missing
-    if not len(known):
-        return None
-    if not is_number(known):
-        classes = sorted(texts(known).unique())
-        return Column(name, family="category", classes=tuple(classes)) if 2 <= len(classes) <= CLASSES else None
-    numbers = known.to_numpy(np.float64)
-    if set(np.unique(numbers)) == {0.0, 1.0}:
-        return Column(name, family="binary")
-    if not (np.abs(numbers) < LARGEST).all():
-        return Column(name)  # which reading refuses
-    if (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2:
-        return Column(name, family="overdispersed" if numbers.var() > SPREAD * numbers.mean() else "count")
-    if (numbers > 0).all() and numbers.std() > 0.5 * numbers.mean():
-        return Column(name, family="positive")
-    return Column(name)
+    def _is_time(self, name: str) -> bool:
+        """Whether a column holds dates; notes those whose day and month cannot be told apart."""
+        try:
+            return is_date(self.plain[name])
+        except Undecided as error:
+            self.undecided[name] = str(error)
+            return False
+
+    def _is_compact(self, name: str) -> bool:
+        """Whether numbers with the name of a time are dates such as 20241231."""
+        values = self.plain[name]
+        if not TIMES.search(name.lower()) or not _is_whole(values) or values.isna().any():
+            return False
+        return compact(values.to_numpy(np.float64)) is not None
+
+    def _numbers_rows(self, name: str) -> bool:
+        """Whether a column numbers the rows, as the index without a name that pandas writes into a CSV."""
+        values = self.plain[name]
+        if name == "Unnamed: 0":
+            return _is_whole(values) and bool(values.is_unique)
+        if ROWS.fullmatch(name.strip()) is None or not _is_whole(values):
+            return False
+        return bool((np.diff(values.to_numpy(np.float64, na_value=np.nan)) == 1).all())
+
+    def _refuse_layout(self, aside: Collection[str]) -> None:
+        """Refuse a table with dates as names of columns, or with several rows of names."""
+        names = [name for name in self.frame if name not in aside]
+        dated = [name for name in names if DATED_NAME.fullmatch(name) and is_number(self.plain[name])]
+        if len(dated) > 2 and 2 * len(dated) >= len(names):
+            rest = [name for name in self.frame if name not in dated]
+            raise ValueError(
+                f"{len(dated)} columns are named by dates, {dated[0]!r} to {dated[-1]!r}, so each row is a sequence; "
+                f"write a row for each step, as frame.melt({rest}, var_name='time', value_name='value') does"
+            )
+        firsts, odd = [len(self.frame)], False
+        for read in (self.numbers[name] for name in names):
+            if (known := ~np.isnan(read.values)).any():
+                firsts.append(int(np.argmax(known)))
+                odd |= bool(read.wrong[: firsts[-1]].any())
+        count, top = min(firsts), self.frame.iloc[: min(*firsts, MOST_HEADERS)][names].astype(object)
+        if (
+            odd
+            and 0 < count < MOST_HEADERS
+            and not any(re.match(r"\s*\d", str(cell)) for cell in top.to_numpy().ravel())
+        ):
+            said = [str(value) for value in self.frame.iloc[:count].to_numpy().ravel() if value == value]
+            raise ValueError(
+                f"above the numbers are {count + 1} rows of names, also {', '.join(map(brief, said[:6]))}; "
+                "write one row of names, such as 'power MW', or read the table with pandas.read_csv("
+                f"…, header={[*range(count + 1)]}) and join them"
+            )
+
+    def _column(self, name: str, family: str) -> Column | None:
+        """What a column probably holds; None for what is no target, as texts that are all different."""
+        read, values = self.numbers[name], self.plain[name]
+        if values.dtype.kind == "c":
+            raise ValueError(
+                f"column {name!r} holds complex numbers; give their real and imaginary parts as two columns"
+            )
+        if family:
+            return None  # nothing is left to guess
+        if not is_number(values):
+            known = self.frame[name].dropna()
+            count = int((~np.isnan(read.values)).sum())
+            if str(values.dtype) != "category" and count and count >= NEARLY_ALL * (count + read.wrong.sum()):
+                read.check(values, "or declare the column as an id or a category, or leave it out (--columns)")
+            classes = _classes(known, self.na_values)
+            return Column(name, family="category", classes=classes) if 2 <= len(classes) <= CLASSES else None
+        if read.ambiguous:
+            read.check(self.frame[name], "")
+        numbers = read.values[~np.isnan(read.values)]
+        if not len(numbers):
+            return None
+        if set(np.unique(numbers)) == {0.0, 1.0}:
+            return Column(name, family="binary")
+        if not (np.abs(numbers) < LARGEST).all():
+            return Column(name)  # which reading refuses
+        if (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2:
+            return Column(name, family="overdispersed" if numbers.var() > SPREAD * numbers.mean() else "count")
+        if (numbers > 0).all() and numbers.std() > 0.5 * numbers.mean():
+            return Column(name, family="positive")
+        return Column(name)
+
+    def warn(self, columns: Columns, all_named: bool) -> None:
+        """Name what of the frame is not among the columns."""
+        lacking = () if columns.time else self.undecided
+        aside = [name for name in self.frame if name not in columns.needed and (all_named or name in lacking)]
+        said = []
+        for name in aside:
+            values, read = self.frame[name].dropna(), self.numbers[name]
+            why = f"neither numbers nor 2 to {CLASSES} classes"
+            if len(values):
+                odd = self.frame[name][read.wrong] if read.wrong.any() else values
+                why += f", such as {brief(str(odd.iloc[0]))}"
+            if name in self.undecided:
+                why = f"perhaps the time: {self.undecided[name]}"
+            elif self._numbers_rows(name):
+                why = "the numbers of the rows, without a name" if name == "Unnamed: 0" else "the numbers of the rows"
+            elif name in self.levels:
+                why = "a level of the index that tells no sequences apart"
+            said.append(f"{name!r} ({why})")
+        if said:
+            warnings.warn(f"left out of what is proposed: {', '.join(said)}", stacklevel=4)
 
 
 def _static(column: Column) -> Column:

@@ -34,7 +34,7 @@ import numpy as np
 from .. import files
 from ..npy import mapped
 from ..options import nearest
-from .columns import MOST, Columns, parsed
+from .columns import MOST, Columns, layout, parsed
 from .domains import DOMAINS, domain
 from .panel import SPLITS, Panel, Series, plain_columns
 from .proposing import Told
@@ -43,6 +43,9 @@ from .protocol import Cut
 SEPARATORS = {".csv": ",;\t", ".tsv": "\t"}
 """What may stand between entries, the likeliest first: spreadsheets write what their country does."""
 DECIMAL_COMMA = re.compile(r"(?:^|[;\t])\s*[-+]?\d+,\d+\s*(?:[;\t]|$)", re.MULTILINE)
+DECLARED = re.compile(rb'"?sep=([,;:|\t ])"?\r?\n', re.IGNORECASE)
+"""A first line that names the separator."""
+BLANK = re.compile(rb"\n[ \t]*\r?\n|\r\r(?!\n)")
 SUFFIXES = (*SEPARATORS, ".parquet", ".npz")
 LARGEST = 2 * 10**9
 """Bytes of a file, or of what it holds."""
@@ -52,7 +55,7 @@ LARGEST_HEADER = 2**20
 
 
 def read_frame(path: str | os.PathLike[str]) -> Any:
-    """A pandas frame of a CSV, TSV, Parquet or npz file.
+    """A pandas frame of a CSV, TSV, Parquet or npz file; what a CSV or TSV holds are texts, missing where it is empty.
 
     An npz holds an array (N, T, D), or (T, D) of one sequence, named "x" or alone, and perhaps "lengths" (N,); its
     columns are x0, x1, … beside "sequence" and "step".
@@ -77,24 +80,25 @@ def read_frame(path: str | os.PathLike[str]) -> Any:
 
 
 def _separated(content: bytes, separators: str) -> Any:
-    """The frame of a CSV, of whose rows none is longer than the header."""
+    """The frame of a CSV, of texts: only their roles decide which are numbers; no row is longer than the header."""
     import pandas as pd
 
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         content = content.decode("utf-16").encode()
     content = content.removeprefix(codecs.BOM_UTF8)
+    if declared := DECLARED.match(content):  # as spreadsheets write it
+        separators, content = declared[1].decode(), content[declared.end() :]
     head = content[:LARGEST_HEADER].decode("utf-8", "replace")
     separator = max(separators, key=lambda each: len(_header(head, each)))
     if max(map(len, _rows(head, separator)), default=0) > MOST:
         raise ValueError(f"it has more than {MOST} columns")
     if b"\0" in content:
         raise ValueError("it has bytes of 0, which are no text")
-    point = "," if separator != "," and DECIMAL_COMMA.search(head) else "."
-    read = partial(pd.read_csv, sep=separator, decimal=point, index_col=False, low_memory=False)
+    read = partial(pd.read_csv, sep=separator, index_col=False, dtype=str, keep_default_na=False, na_values=[""])
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
-            return read(BytesIO(content), skiprows=_comments(content))
+            frame = read(BytesIO(content), skiprows=_comments(content))
         except pd.errors.ParserWarning as error:
             raise ValueError("some of its rows have more entries than its header") from error
         except UnicodeDecodeError as error:
@@ -107,6 +111,24 @@ def _separated(content: bytes, separators: str) -> Any:
                     "`iconv -f latin1 -t utf-8`"
                 ) from error
             raise
+    if separator != "," and DECIMAL_COMMA.search(head):
+        frame.attrs["decimal"] = ","
+    return _without_empty_end(frame, content)
+
+
+def _without_empty_end(frame: Any, content: bytes) -> Any:
+    """Leave out rows at the end that hold nothing, as spreadsheets write them, and warn of lines that are skipped."""
+    if frame.shape[1] == 1 and BLANK.search(content.strip()):
+        warnings.warn(
+            "empty lines between the values of a single column are skipped; write NaN where a value is missing",
+            stacklevel=5,
+        )
+    held = np.flatnonzero(frame.notna().any(axis=1))
+    end = int(held[-1]) + 1 if len(held) else 0
+    if end and end < len(frame):
+        warnings.warn(f"{len(frame) - end} rows at the end that hold nothing are left out", stacklevel=5)
+        frame = frame.iloc[:end]
+    return frame
 
 
 def _rows(head: str, separator: str) -> Iterator[list[str]]:
@@ -288,7 +310,7 @@ def _check_header(name: str, member: Any) -> None:
         raise ValueError(f"{name} is {shape}; at most {LARGEST // 8} numbers are read")
 
 
-def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | None, Cut | None]:
+def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | Told | None, Cut | None]:
     """What the schema beside a file says, None where there is none.
 
     Raises:
@@ -305,8 +327,8 @@ def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | None, Cut | N
     return None, None
 
 
-def read_schema(text: str) -> tuple[Columns | None, Cut | None]:
-    """Columns and cut of a schema; None for what it does not say."""
+def read_schema(text: str) -> tuple[Columns | Told | None, Cut | None]:
+    """Return columns and cut of a schema, None for what it does not say; the columns are proposed where it has none."""
     told = parsed(text)
     cut = told.pop("cut", None)
     if cut is not None:
@@ -316,7 +338,8 @@ def read_schema(text: str) -> tuple[Columns | None, Cut | None]:
         for name in cut:
             if name not in known:
                 raise ValueError(f"[cut] has an entry {name!r}{nearest(name, known)}; known are {', '.join(known)}")
-    return Columns.from_config(told) if told else None, None if cut is None else Cut(**cut)
+    columns = Columns.from_config(told) if "columns" in told else Told(**layout(told)) if told else None
+    return columns, None if cut is None else Cut(**cut)
 
 
 def written_schema(columns: Columns, cut: Cut) -> str:

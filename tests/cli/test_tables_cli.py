@@ -101,6 +101,11 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     schema = tmp_path / "riders.toml"
     assert main(["data", "info", str(path), "--out", str(schema)]) == 0
     assert "correct it" in capsys.readouterr().err
+    assert main(["data", "info", str(path), "--columns", "temp", "--time", "day", "--na-values", "-999", "?"]) == 0
+    told = capsys.readouterr().out
+    assert 'na_values = ["-999", "?"]' in told
+    assert "riders" not in told.partition("a schema")[2].partition("columns")[2]
+    assert "are about tables, and of info" in failure(capsys, "data", "info", "simulated", "--id", "s", code=2)
     assert schema.read_text() in printed
     schema.write_text(schema.read_text().replace('family = "count"', 'family = "overdispersed"\nunit = "people"'))
     assert main(["data", "info", str(path)]) == 0

@@ -206,14 +206,19 @@ def test_a_class_that_is_named_stands_for_all_others():
 @pytest.mark.parametrize(
     ("column", "said"),
     [
-        ([1.0, "a few", 2], "column 'y' holds 'a few', which is no number"),
-        (["x", None], "column 'y' holds 'x'"),
+        (
+            [1.0, "a few", 2],
+            "column 'y': 2 of 3 values are numbers; row 1 is 'a few', which is no number; .* na_values",
+        ),
+        (["x", None], "column 'y': row 0 is 'x', which is no number"),
         (pd.to_datetime(["2024", None]), r"column 'y' holds datetime64\[.s\], which are no numbers"),
         (pd.to_timedelta([1, 2], "s"), "column 'y' holds timedelta"),
         ([1j, 2], "column 'y' holds complex128"),
-        ([10**400, 1], "column 'y' holds something, which is no number"),
+        ([10**400, 1], "column 'y': 1 of 2 values are numbers; row 0 is 1000"),
+        ([[1], 2], "column 'y': row 0 is .1., which is no number"),
+        (["1,234", "5,678"], "column 'y' holds '1,234', which may be 1234 or a fraction; give the decimal sign"),
     ],
-    ids=["mixed", "text", "dates", "spans", "complex", "huge"],
+    ids=["mixed", "text", "dates", "spans", "complex", "huge", "lists", "sign"],
 )
 def test_what_holds_no_numbers_is_named(column, said):
     with pytest.raises(ValueError, match=said):
@@ -342,7 +347,7 @@ def test_dates_before_1970_are_times_too():
     [
         ([0, 1, 1], "sequence '0' has two rows at t 1, 1 and 2; name the id columns that tell sequences apart$"),
         (
-            ["2020", "2021", "2021"],
+            ["2020-01", "2021-01", "2021-01"],
             "two rows at t 2021-01-01 00:00:00, 1 and 2; .* if clocks were set back, their zone",
         ),
         (["1:00:00", "2:00:00", "2:00:00"], "two rows at t 0 days 02:00:00, .*, or write the date before clocks"),

@@ -1,10 +1,13 @@
 """What a table that nobody described is taken for."""
 
+import re
+
 import numpy as np
 import pytest
 
-from dvae.tables import Panel
+from dvae.tables import Column, Columns, Panel, PanelData
 from dvae.tables.proposing import Told, proposed
+from dvae.tables.reading import read_frame, read_panel
 
 pd = pytest.importorskip("pandas")
 
@@ -132,8 +135,8 @@ def test_the_numbers_of_rows_that_pandas_writes_are_left_out():
 
 
 def test_numbers_that_are_written_as_texts_are_named():
-    prices = [f"{n},234.50" for n in range(10, 31)]
-    with pytest.warns(UserWarning, match="left out of what is proposed: 'price' .*, such as '10,234.50'"):
+    prices = [f"{n},234.50 €" for n in range(10, 31)]
+    with pytest.warns(UserWarning, match="left out of what is proposed: 'price' .*, such as '10,234.50 €'"):
         assert "price" not in proposed(panel(price=prices)).names
 
 
@@ -195,3 +198,201 @@ def test_a_name_may_have_colons():
 def test_what_is_told_wrongly_is_refused(told, said):
     with pytest.raises(ValueError, match=said):
         Told(**told).of(panel().iloc[:7])
+
+
+def hourly(days=14):
+    """A load on every hour."""
+    return pd.DataFrame(
+        {"when": pd.date_range("2024-01-01", periods=24 * days, freq="h"), "load": np.arange(24.0 * days)}
+    )
+
+
+SPLIT_TIMES = {
+    "date and clock": lambda when: {"Date": when.dt.strftime("%Y-%m-%d"), "Time": when.dt.strftime("%H:%M:%S")},
+    "clock first": lambda when: {"Time": when.dt.strftime("%H:%M"), "Date": when.dt.strftime("%d.%m.%Y")},
+    "half days": lambda when: {"Date": when.dt.strftime("%Y-%m-%d"), "Time": when.dt.strftime("%I:%M %p")},
+    "objects": lambda when: {"Date": when.dt.normalize(), "Time": when.dt.time},
+    "hour": lambda when: {"date": when.dt.strftime("%Y-%m-%d"), "hour": when.dt.hour},
+    "compact": lambda when: {"date": when.dt.strftime("%Y%m%d").astype(int), "time": when.dt.hour * 100},
+    "hundreds": lambda when: {"date": when.dt.strftime("%Y-%m-%d"), "time": when.dt.strftime("%H%M")},
+    "parts": lambda when: {name: getattr(when.dt, name) for name in ("year", "month", "day", "hour")},
+    "parts in text": lambda when: (
+        {"DAY": when.dt.strftime("%d"), "MONTH": when.dt.strftime("%b"), "YEAR": "2024"}
+        | {"HOUR": when.dt.strftime("%H")}
+    ),
+    "day of the year": lambda when: {"Year": when.dt.year, "doy": when.dt.day_of_year, "Hour": when.dt.hour},
+}
+
+
+@pytest.mark.parametrize("how", SPLIT_TIMES)
+@pytest.mark.parametrize("shops", [1, 2])
+def test_columns_that_are_one_time_are_joined(how, shops):
+    frame = hourly()
+    parts = pd.DataFrame({**SPLIT_TIMES[how](frame.when), "sky": np.where(frame.load % 5, "sun", "rain")})
+    parts = parts.assign(No=np.arange(1, len(frame) + 1), load=frame.load)
+    if shops > 1:
+        parts = pd.concat([parts.assign(shop="b"), parts.assign(shop="a")]).sort_index(kind="stable").drop(columns="No")
+    else:
+        with pytest.warns(UserWarning, match=r"'No' \(the numbers of the rows\)"):
+            proposed(parts)
+    found = proposed(parts.drop(columns="No", errors="ignore"))
+    assert len(found.times) > 1
+    assert found.id == (("shop",) if shops > 1 else ())
+    assert found.names == ["sky", "load"]
+    assert Columns.from_toml(found.to_toml()) == Columns.from_config(found.config()) == found
+    panel = Panel.of(parts, found)
+    assert panel.calendar.kind == "dates"
+    for one in panel:
+        np.testing.assert_array_equal(one.times, frame.when.astype("datetime64[s]").astype(int))
+        np.testing.assert_array_equal(one.values[:, 1], frame.load)
+
+
+def test_a_clock_is_not_joined_where_the_date_suffices():
+    frame = panel(station=np.repeat(["a", "b", "c"], 7), opened=["09:30"] * 20 + ["10:00"])
+    found = proposed(frame)
+    assert (found.id, found.time) == (("station",), "day")
+    days = pd.DataFrame({"day": np.repeat([1, 2], 24), "hour": np.tile(np.arange(24), 2), "y": np.arange(48) / 8})
+    assert proposed(days).time == ("day", "hour")
+    np.testing.assert_array_equal(Panel.of(days).series[0].times, np.arange(24, 72))
+    quarters = pd.DataFrame({"year": np.repeat([2020, 2021], 4), "quarter": [f"Q{n}" for n in (1, 2, 3, 4)] * 2})
+    quarters["y"] = np.arange(8) / 8
+    assert proposed(quarters).time == ("year", "quarter")
+    assert Panel.of(quarters).series[0].times[4] == pd.Timestamp("2021").timestamp()
+
+
+def test_parts_that_are_no_time_are_named():
+    frame = pd.DataFrame({"year": [2023, 2023], "month": [2, 2], "day": [28, 29], "hour": [0, 25], "y": [0.5, 1.5]})
+    for parts, said in [
+        (("year", "month", "day"), "row 1 of year month day is no date: 2023-02 has no day 29"),
+        (("year", "month", "hour"), "row 0 of column 'hour' is 0; expected days from 1"),
+        (("year", "y"), "row 0 of column 'y' is 0.5; expected months from 1 to 12"),
+    ]:
+        with pytest.raises(ValueError, match=said):
+            Panel.of(frame, Told(columns=("y",) if "y" not in parts else ("hour",), time=parts))
+
+
+def test_what_merely_makes_rows_unique_is_no_id():
+    days = pd.date_range("2024-01-01", periods=40).strftime("%Y-%m-%d")
+    frame = pd.DataFrame({"day": [*days, days[5], days[20]], "sky": ["sun", "rain"] * 20 + ["sun", "rain"]})
+    frame = frame.assign(
+        sky=frame.sky.where(frame.index != 5, "rain").where(frame.index != 20, "sun"), y=np.arange(42.0)
+    )
+    assert not frame.duplicated(["day", "sky"]).any()
+    assert proposed(frame).id == ()
+    with pytest.raises(ValueError, match="two rows at day 2024-01-06 00:00:00, 5 and 40; name the id columns"):
+        Panel.of(frame)
+
+
+@pytest.mark.parametrize("names", [("entity", "year"), (None, None), ("firm", "t")])
+def test_levels_of_an_index_are_ids_and_time(names):
+    index = pd.MultiIndex.from_product([[11, 12, 13], [2000, 2001, 2002, 2003]], names=names)
+    frame = pd.DataFrame({"y": np.arange(12) / 8}, index=index)
+    read = Panel.of(frame)
+    assert [one.name for one in read] == ["11", "12", "13"]
+    assert read.columns.names == ["y"]
+    np.testing.assert_array_equal(read.series[1].times, [2000, 2001, 2002, 2003])
+    stacked = pd.concat({1: frame.iloc[:4].reset_index(drop=True), 2: frame.iloc[4:8].reset_index(drop=True)})
+    assert [len(one) for one in Panel.of(stacked)] == [4, 4]
+
+
+@pytest.mark.parametrize("ids", [["07", "7"], ["1E5", "100000"], ["NA", "None"], ["0x10", "16"]])
+def test_ids_and_classes_are_text(tmp_path, ids):
+    rows = [f"{one},{t},{t}.5,{ids[t % 2]}" for one in ids for t in range(4)]
+    (tmp_path / "a.csv").write_text("\n".join(["station,t,y,sky", *rows]) + "\n")
+    read = read_panel(tmp_path / "a.csv", Told(columns=("y", "sky:category")))
+    assert {one.name for one in read} == {*ids}
+    assert read.columns.columns[1].classes == tuple(sorted(ids))
+    for one in read:
+        np.testing.assert_array_equal(one.values[:, 1], [sorted(ids).index(ids[t % 2]) for t in range(4)])
+
+
+def texted(*odd, count=60):
+    """A column of numbers in text, with some other cells."""
+    cells = [f"{n}.25" for n in range(count)]
+    cells[20 : 20 + len(odd)] = odd
+    return pd.DataFrame({"day": pd.date_range("2024-01-01", periods=count), "power": cells})
+
+
+@pytest.mark.parametrize("mark", ["?", "-", ".", "n.a.", "—", "#DIV/0!"])
+def test_marks_among_numbers_are_missing_and_named(mark):
+    with pytest.warns(
+        UserWarning, match=f"'power' holds {re.escape(repr(mark))} .row 20, 2 in all. among numbers"
+    ) as said:
+        read = Panel.of(texted(mark, mark))
+    assert len(said) == 1
+    assert read.columns.na_values == (mark,)
+    assert np.isnan(read.series[0].values[20:22, 0]).all()
+    np.testing.assert_array_equal(np.delete(read.series[0].values[:, 0], [20, 21]) % 1, 0.25)
+    Panel.of(texted(mark), read.columns)  # and again without a warning
+    with pytest.warns(UserWarning, match="read as missing"):
+        Panel.of(texted(mark), Columns((Column("power"),), time="day"))
+
+
+def test_cells_that_are_no_numbers_are_named_with_what_settles_them():
+    for columns in (None, Columns((Column("power"),), time="day"), ["power"]):
+        with pytest.raises(ValueError, match=r"'power': 58 of 60 values are numbers; row 20 is 'off', .* na_values"):
+            Panel.of(texted("off", "on"), columns)
+    settled = Panel.of(texted("off", "on"), Told(na_values=("off", "on", "3.25")))
+    assert np.flatnonzero(np.isnan(settled.series[0].values[:, 0])).tolist() == [3, 20, 21]
+    assert Columns.from_toml(settled.columns.to_toml()) == settled.columns
+    assert Panel.of(texted("off"), Told(columns=("power:category",))).columns.columns[0].family == "category"
+
+
+def test_declared_marks_and_signs_are_read(tmp_path):
+    rows = [f'{3 * n},"1,234",?\n{3 * n + 1},-999,sun\n{3 * n + 2},"5,678",rain\n' for n in range(9)]
+    (tmp_path / "a.csv").write_text("t,y,sky\n" + "".join(rows))
+    (tmp_path / "a.toml").write_text('time = "t"\nna_values = ["-999", "?"]\ndecimal = ","\n')
+    with pytest.raises(ValueError, match="'y' holds '1,234', which may be 1234 or a fraction; give the decimal sign"):
+        read_panel(tmp_path / "a.csv", Told(na_values=("-999",)))
+    data = PanelData.open(tmp_path / "a.csv")  # a schema without columns: they are proposed
+    assert data.panel.columns.columns[1].classes == ("rain", "sun")
+    np.testing.assert_array_equal(data.panel.series[0].values[:3], [[1.234, np.nan], [np.nan, 1], [5.678, 0]])
+    again = PanelData.reopened(data.recorded(), data.schema)
+    assert again.fingerprint == data.fingerprint
+
+
+LAYOUTS = {
+    "dates as names": (
+        "shop,2024-01-01,2024-01-02,2024-01-03\na,1,2,3\nb,4,5,6\n",
+        r"3 columns are named by dates, .*melt",
+    ),
+    "years as names": ("shop,1990,1991,1992\na,1,2,3\nb,4,5,6\n", "3 columns are named by dates"),
+    "two rows of names": (
+        "day,power,volt\n,MW,V\n2024-01-01,1,2\n2024-01-02,2,3\n",
+        "2 rows of names, also 'MW', 'V'",
+    ),
+    "three rows of names": (
+        "Price,Close,Low\nTicker,AA,BB\nDate,,\n2024-01-01,1,2\n2024-01-02,2,3\n",
+        "3 rows of names",
+    ),
+    "constants": (
+        "station,t,y\na,1,2.5\na,2,2.5\nb,1,3.5\nb,2,3.5\n",
+        "no column is a target; given are y; y have one value",
+    ),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_another_layout_is_refused_with_what_was_seen(tmp_path, layout):
+    content, said = LAYOUTS[layout]
+    (tmp_path / "a.csv").write_text(content)
+    with pytest.raises(ValueError, match=said):
+        read_panel(tmp_path / "a.csv")
+
+
+def test_empty_rows_at_the_end_are_left_out_and_empty_lines_are_named(tmp_path):
+    (tmp_path / "a.csv").write_text("day,y\n2024-01-01,1.5\n,\n2024-01-03,2.5\n,\n,\n")
+    with pytest.warns(UserWarning, match="2 rows at the end that hold nothing are left out"):
+        assert len(read_frame(tmp_path / "a.csv")) == 3
+    (tmp_path / "a.csv").write_text("y\n1.5\n\n2.5\n")
+    with pytest.warns(UserWarning, match="empty lines between the values of a single column are skipped"):
+        assert len(read_frame(tmp_path / "a.csv")) == 2
+
+
+def test_ids_count_where_no_time_repeats():
+    frame = pd.DataFrame({"patient": [7, 7, 7, 3, 3], "t": [0.5, 2.0, 3.5, 1.0, 7.0], "y": np.arange(5) / 4})
+    for table in (frame, frame.drop(columns="t")):
+        assert [(one.name, len(one)) for one in Panel.of(table)] == [("3", 2), ("7", 3)]
+    doubled = hourly().assign(Date=lambda x: x.when.dt.strftime("%Y-%m-%d"), Time=lambda x: x.when.dt.strftime("%H:%M"))
+    with pytest.raises(ValueError, match="two rows at Date Time 2024-01-01 05:00"):
+        Panel.of(pd.concat([doubled, doubled[5:6]]).drop(columns="when"))

@@ -1,0 +1,154 @@
+"""Join the columns of a table that together are one time: a date and a clock, or year, month, day and hour."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+from .numerals import read_numbers
+from .parsing import MONTHS, compact, dates, is_number
+
+CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:\.\d{1,9})?))?\s?(?:([ap])\.?m\.?)?", re.IGNORECASE | re.ASCII)
+UNITS = ("year", "quarter", "month", "day", "hour", "minute", "second")
+NAMES = dict(
+    zip(
+        UNITS,
+        (
+            r"years?|yr|yyyy",
+            r"quarters?|qtr|q",
+            r"months?|mon?|mm|mth",
+            r"days?|dom|dd?|dy|mday|doy",
+            r"hours?|hr?s?|hh|time|hhmm",
+            r"minutes?|mins?|mi",
+            r"seconds?|secs?|ss?",
+        ),
+        strict=True,
+    )
+)
+SECONDS = {"day": 86400, "hour": 3600, "minute": 60, "second": 1}
+_MOST = {"year": 9999, "quarter": 4, "month": 12, "day": 366, "hour": 24, "minute": 59, "second": 60}
+
+
+def is_clock(values: Any) -> bool:
+    """Whether a column holds times of day, such as 13:05."""
+    known = values.dropna()
+    if values.dtype.kind != "O":
+        return False
+    return bool(len(known)) and all(CLOCK.fullmatch(str(each).strip()) for each in known.unique())
+
+
+def unit_of(name: str, values: Any) -> str | None:
+    """Return the unit, such as "month", of a column that is one part of a time, by its name and values."""
+    word = re.sub(r"^[\W\d_]+|[\W\d_]+$|\W.*", "", name.strip().lower())
+    unit = next((unit for unit, pattern in NAMES.items() if re.fullmatch(pattern, word)), None)
+    if unit is None:
+        return None
+    try:
+        part = _part(values, unit)
+    except ValueError:
+        return None
+    return unit if not np.isnan(part).any() else None
+
+
+def parts_of(frame: Any, names: Collection[str]) -> tuple[str, ...]:
+    """Return the columns that are the parts of one time, from the largest unit to the smallest."""
+    units: dict[str, str] = {}
+    for name in names:
+        unit = unit_of(name, frame[name])
+        if unit is not None:
+            units.setdefault(unit, name)
+    if "month" in units:
+        units.pop("quarter", None)
+    begin = [unit for unit in ("year", "day") if unit in units][:1]
+    return tuple(units[unit] for unit in UNITS[UNITS.index(begin[0]) :] if unit in units) if begin else ()
+
+
+def time_of(frame: Any, time: str | tuple[str, ...], decimal: str | None = None) -> Any:
+    """Return the time of each row, from one column or several; numbers that are written as text become numbers."""
+    if isinstance(time, tuple):
+        return joined(frame, time)
+    column = frame[time]
+    read = read_numbers(column, (), decimal, column.attrs.get("decimal", "."))
+    if is_number(column) or not read.is_numeric:
+        return column
+    return type(column)(read.values, column.index, name=time)
+
+
+def joined(frame: Any, names: tuple[str, ...]) -> Any:
+    """Return the time of each row from several columns.
+
+    Args:
+        frame: table.
+        names: columns of dates and of clocks or hours; or of whole numbers, named year, quarter, month, day, hour,
+            minute and second, or in that order without a quarter. Without a year, days are counted.
+
+    Raises:
+        ValueError: columns that are no parts of a time.
+    """
+    import pandas as pd
+
+    label, first = " ".join(names), read_numbers(frame[names[0]])
+    when = compact(first.values) if first.is_numeric else dates(frame[names[0]])
+    if when is not None:
+        when = when.set_axis(frame.index)
+        for name, unit in zip(names[1:], ("hour", "minute", "second"), strict=False):
+            when = when + pd.to_timedelta(_part(frame[name], unit), unit="s")
+        return when.rename(label)
+    order = iter(unit for unit in UNITS if unit != "quarter")
+    units = [unit_of(name, frame[name]) for name in names]
+    if None in units or len(set(units)) < len(units):
+        units = [next(order) for _ in names]
+    parts = {str(unit): _part(frame[name], str(unit)) for unit, name in zip(units, names, strict=True)}
+    seconds = sum(
+        (parts[unit] * (SECONDS[unit] if unit == "day" else 1) for unit in SECONDS if unit in parts),
+        start=np.zeros(len(frame)),
+    )
+    if "year" not in parts:
+        return pd.Series(seconds / SECONDS[str(units[-1])], frame.index, name=label)
+    month = parts.get("month", 3 * parts["quarter"] - 2 if "quarter" in parts else np.ones(len(frame)))
+    months = (12 * (parts["year"] - 1970) + month - 1).astype(int).astype("datetime64[M]")
+    if "day" in parts:
+        if "month" in parts:
+            _refuse_late_days(parts["day"], months, label)
+        seconds = seconds - SECONDS["day"]
+    moments = months.astype("datetime64[us]") + np.round(1e6 * seconds).astype("timedelta64[us]")
+    return pd.Series(moments, frame.index, name=label)
+
+
+def _refuse_late_days(days: np.ndarray, months: np.ndarray, label: str) -> None:
+    lengths = ((months + 1).astype("datetime64[D]") - months.astype("datetime64[D]")).astype(int)
+    if (days > lengths).any():
+        row = int(np.argmax(days > lengths))
+        raise ValueError(f"row {row} of {label} is no date: {months[row]} has no day {days[row]:g}")
+
+
+def _part(column: Any, unit: str) -> Any:
+    """Return one part (N,) of each time: years, months and days as numbers, hours and smaller ones in seconds."""
+    if column.dtype.kind == "m":
+        return column.dt.total_seconds().to_numpy(np.float64)
+    if unit == "hour" and is_clock(column):
+        fields = column.astype(str).str.strip().str.extract(f"^{CLOCK.pattern}$", flags=CLOCK.flags)
+        hour, minute, second = (fields[place].astype(np.float64).fillna(0).to_numpy() for place in range(3))
+        half = fields[3].str.lower()
+        hour = np.where(half.notna(), hour % 12 + np.where(half == "p", 12, 0), hour)
+        return np.where(column.notna(), 3600 * hour + 60 * minute + second, np.nan)
+    texts = column.astype(str).str.strip().str.lower()
+    if unit == "month" and texts.str[:3].isin(MONTHS).all():
+        return texts.str[:3].map({name: place for place, name in enumerate(MONTHS, 1)}).to_numpy(np.float64)
+    if unit == "quarter" and texts.str.fullmatch(r"q[1-4]").all():
+        return texts.str[1:].to_numpy(np.float64)
+    read = read_numbers(column)
+    read.check(column, f"or write {unit}s as whole numbers")
+    values = read.values
+    least, most = {"year": 1000, "hour": 0, "minute": 0, "second": 0}.get(unit, 1), _MOST[unit]
+    if unit == "hour" and values.max() > 99 and (values % 100 < 60).all():  # 1330 is 13:30
+        values = np.floor(values / 100) + values % 100 / 60
+    wrong = ~((values >= least) & (values <= most) & ((values % 1 == 0) | (unit in ("hour", "second"))))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        cell = str(column.iloc[row])[:40]
+        raise ValueError(f"row {row} of column {column.name!r} is {cell}; expected {unit}s from {least} to {most}")
+    return values * (SECONDS[unit] if least == 0 else 1)

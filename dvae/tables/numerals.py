@@ -1,0 +1,163 @@
+"""Read a column of a table as float64 numbers, and report every cell that is not one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from reprlib import repr as brief
+from typing import Any
+
+import numpy as np
+
+NA = {"", "na", "n/a", "<na>", "#n/a", "#na", "#n/a n/a", "nan", "-nan", "null", "none"}
+"""Texts, in lower case, that pandas reads as missing in a column of numbers."""
+MARKS = {"?", "-", "--", "---", ".", "..", "...", "*", ":", "–", "—", "…", "n.a.", "n.a", "n/d", "nd", "missing"}
+MARKS |= {"#div/0!", "#value!", "#ref!", "#num!", "#name?", "#null!", "nat"}
+"""Texts that often mark a missing number; a warning names them."""
+NEARLY_ALL = 0.8
+"""Share of numbers above which the other cells of a column are probably errors."""
+_GROUP = {".": ",", ",": r"\."}
+_TEXTS = {
+    decimal: re.compile(
+        rf"([-+]?)(\d+|[1-9]\d{{0,2}}(?:(?P<group>[{group} \u00a0\u202f'’])\d{{3}}(?:(?P=group)\d{{3}})*)|)"
+        rf"(?:{re.escape(decimal)}(\d*))?((?:e[-+]?\d+)?)",
+        re.IGNORECASE,
+    )
+    for decimal, group in _GROUP.items()
+}
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """A column as numbers.
+
+    Args:
+        values: (N,) float64, NaN where a cell is missing or no number.
+        wrong: (N,) True where a cell is neither a number nor missing.
+        marks: cells of `MARKS` that are read as missing, with their row and how many there are.
+        ambiguous: a cell whose value depends on the decimal sign, where the column does not show it.
+    """
+
+    values: np.ndarray
+    wrong: np.ndarray
+    marks: dict[str, tuple[int, int]]
+    ambiguous: str | None = None
+
+    @property
+    def is_numeric(self) -> bool:
+        """Whether every cell is a number or missing, and some cell is a number."""
+        return not self.wrong.any() and bool((~np.isnan(self.values)).any())
+
+    def check(self, column: Any, how: str) -> None:
+        """Raise an error that names a cell that is no number, and what to do.
+
+        Args:
+            column: that was read.
+            how: another way to settle it.
+
+        Raises:
+            ValueError: cells that are no numbers, or that depend on the decimal sign.
+        """
+        if self.ambiguous is not None:
+            plain = self.ambiguous.replace(",", "").replace(".", "")
+            raise ValueError(
+                f"column {column.name!r} holds {self.ambiguous!r}, which may be {plain} or a fraction; give the "
+                'decimal sign, decimal = "," or decimal = "." (--decimal)'
+            )
+        if not self.wrong.any():
+            return
+        row = int(np.argmax(self.wrong))
+        count, known = int(self.wrong.sum()), int((self.wrong | ~np.isnan(self.values)).sum())
+        cell = brief(column.iloc[row])
+        share = f"{known - count} of {known} values are numbers; " if known > count else ""
+        raise ValueError(
+            f"column {column.name!r}: {share}row {row} is {cell}, which is no number; correct it, list it in na_values "
+            f"(--na-values) if it marks a missing value, {how}"
+        )
+
+
+def read_numbers(column: Any, na_values: Sequence[str] = (), decimal: str | None = None, hint: str = ".") -> Numbers:
+    """Read a pandas column as numbers: numbers, Booleans, decimals, and texts of them.
+
+    Args:
+        column: (N,) of any type.
+        na_values: texts or numbers that mark missing values.
+        decimal: "." or ",", the decimal sign of texts; None to infer it from the column.
+        hint: decimal sign that the rest of the file suggests.
+    """
+    import pandas as pd
+
+    nothing, sentinels = np.full(len(column), np.nan), [float(mark) for mark in na_values if _is_float(mark)]
+    if pd.api.types.is_numeric_dtype(column) and column.dtype.kind != "c":
+        values = column.to_numpy(np.float64, na_value=np.nan, copy=True)
+        values[np.isin(values, sentinels)] = np.nan
+        return Numbers(values, np.zeros(len(column), bool), {})
+    if column.dtype.kind in "mMc" or isinstance(column.dtype, pd.PeriodDtype | pd.IntervalDtype):
+        return Numbers(nothing, column.notna().to_numpy(), {})
+    try:
+        codes, cells = pd.factorize(column.astype(object))  # each different cell is read once
+    except TypeError:  # of lists
+        return Numbers(nothing, column.notna().to_numpy(), {})
+    cells = [cell.strip() if isinstance(cell, str) else cell for cell in cells]
+    absent = np.array([isinstance(cell, str) and (cell.lower() in NA or cell in na_values) for cell in cells], bool)
+    marked = np.array([isinstance(cell, str) and cell.lower() in MARKS for cell in cells], bool) & ~absent
+    others = [cell for cell, skip in zip(cells, absent | marked, strict=True) if not skip]
+    own, ambiguous = _numbers(others, decimal, hint)
+    found = np.full(len(cells), np.nan)
+    found[~(absent | marked)] = own
+    wrong = np.isnan(found) & ~absent
+    if not np.isnan(own).all():
+        wrong &= ~marked  # without any number, a mark is a text
+    found[np.isin(found, sentinels)] = np.nan
+    said = {}
+    for place in np.flatnonzero(marked & ~wrong):
+        rows = np.flatnonzero(codes == place)
+        said[str(cells[place])] = (int(rows[0]), len(rows))
+    return Numbers(np.append(found, np.nan)[codes], np.append(wrong, False)[codes], said, ambiguous)
+
+
+def _numbers(cells: list[Any], decimal: str | None, hint: str) -> tuple[np.ndarray, str | None]:
+    """Return the numbers of different cells, NaN for others, and a cell that two decimal signs read differently."""
+    words = [cell for cell in cells if isinstance(cell, str)]
+    if words and len(words) == len(cells) and {word.lower() for word in words} <= {"true", "false"}:
+        return np.array([word.lower() == "true" for word in words], float), None
+    commas = any("," in word for word in words)
+    if decimal is not None or (hint == "." and not commas):
+        return _parsed(cells, decimal or "."), None
+    dot, comma = _parsed(cells, "."), _parsed(cells, ",")
+    differ = ~np.isnan(dot) & (dot != comma)
+    if (lost := int(np.isnan(dot).sum() - np.isnan(comma).sum())) or not differ.any():
+        return (comma if lost > 0 else dot), None
+    if hint == "," and commas:
+        return comma, None
+    return dot, str(cells[int(np.argmax(differ))])
+
+
+def _parsed(cells: list[Any], decimal: str) -> np.ndarray:
+    """Each cell as float64, exactly as Python reads it; NaN where it is no number."""
+    plain = decimal == "." and not any(isinstance(cell, str) and ("_" in cell or "," in cell) for cell in cells)
+    if plain:
+        try:
+            return np.array(cells, object).astype(np.float64)
+        except (TypeError, ValueError, OverflowError):
+            pass
+    return np.array([_number(cell, decimal) for cell in cells], np.float64)
+
+
+def _number(cell: Any, decimal: str) -> float:
+    if not isinstance(cell, str):
+        try:
+            return float(cell)
+        except (TypeError, ValueError, OverflowError):
+            return float("nan")
+    text = cell.replace("−", "-")
+    match = _TEXTS[decimal].fullmatch(text)
+    if match and (match[2] or match[4]):
+        whole = re.sub(r"\D", "", match[2])
+        return float(f"{match[1]}{whole or 0}.{match[4] or 0}{match[5]}")
+    return float(text) if text.lower().lstrip("+-") in ("inf", "infinity") else float("nan")
+
+
+def _is_float(text: str) -> bool:
+    return not np.isnan(_number(text, "."))
