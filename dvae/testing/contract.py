@@ -297,9 +297,10 @@ class FactorizationContract:
         context = {name: value for name, value in self._data(model, count).items() if name in model.context}
         drawn, _ = _run(model.model, context, length=self.steps, size=count)
         scored = {**context, **{name: drawn[name] for name in model.observed}}
-        below = annealed_bound(model, scored, temperatures=2, chains=2).bound
+        annealing = {"temperatures": 2, "chains": 2, "leaps": 1}
+        below = annealed_bound(model, scored, **annealing).bound
         latents = {name: drawn[name] for name in model.latents}
-        gap = annealed_bound(model, scored, temperatures=2, chains=2, latents=latents).bound - below
+        gap = annealed_bound(model, scored, latents=latents, **annealing).bound - below
         assert gap.mean() > -4 * gap.std() / math.sqrt(count) - self.tolerance
 
     def test_training_stays_finite(self) -> None:

@@ -3,11 +3,7 @@
 import io
 import json
 import math
-import os
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -476,61 +472,3 @@ def test_another_objective_is_refused_where_it_would_go_on(tmp_path):
         run(steps=10, objective=MIXED, out=tmp_path, resume=True)
     result = run(stages=[Stage(5, BALANCED), Stage(20, MIXED)], out=tmp_path, resume=True)
     assert weighing(result, "x")[0] == 1.0
-
-
-# Several processes --------------------
-
-SCRIPT = """
-import atexit
-import sys
-import torch
-atexit.register(lambda: print("left" if not torch.distributed.is_initialized() else "aborted"))  # what is first is last
-sys.path[:0] = sys.argv[2:]
-import dvae
-from dvae.inference.checkpoints import Run
-from dvae.inference.resuming import restore, store
-from test_gradnorm import CERTAIN, TRAIN, certain
-
-def begun():
-    svi = dvae.SVI(certain(), steps=8, objective=CERTAIN, devices=2, accelerator="cpu")
-    svi.init()
-    return svi, svi.fabric.global_rank
-
-svi, rank = begun()
-while svi.state.step < 8:
-    if svi.state.step == 5:
-        store(svi, Run(sys.argv[1]))
-        svi.fabric.barrier()
-        svi, _ = begun()
-        restore(svi, Run(sys.argv[1]))
-    svi.step(TRAIN[12 * rank : 12 * (rank + 1)])
-torch.save((svi.objective.state, svi.model.state_dict()), f"{sys.argv[1]}/{rank}.pt")
-"""
-
-
-def certain():
-    """A model that draws nothing, so that what a batch gives does not depend on where its halves are."""
-    torch.manual_seed(0)
-    return Scaled("p(x_t | x_{t-1})", None, {"x": 3}, network=Dense(widths=(8,))).double()
-
-
-@pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch is built without torch.distributed")
-@pytest.mark.slow
-def test_two_processes_have_the_weights_of_one_that_has_both_their_batches(tmp_path):
-    svi = dvae.SVI(certain(), steps=8, objective=CERTAIN)
-    svi.init()
-    for _ in range(8):
-        svi.step(TRAIN)
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT)
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(script), str(tmp_path), *map(str, Path(__file__).parents[:2])]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("left") == 2, done.stdout  # two processes write at once
-    (first, model), (second, other) = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
-    assert first == second
-    assert all(torch.equal(model[name], other[name]) for name in model)
-    for found, expected in ((first, svi.objective.state), (model, svi.model.state_dict())):
-        for name, value in expected.items():
-            torch.testing.assert_close(found[name], value, rtol=1e-9, atol=1e-12)

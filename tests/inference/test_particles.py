@@ -69,6 +69,8 @@ def gaps(batch=3):
 
 
 BATCHES = {"whole": dict, "ragged": lambda: {"lengths": torch.tensor([T, 1, 3])}, "gaps": gaps}
+CASES = [(*model, list(BATCHES)[place % 3]) for place, model in enumerate(MODELS)]
+"""Every model with one kind of batch."""
 
 
 def bounded(pair, seed=1):
@@ -90,11 +92,11 @@ def test_it_is_unbiased_for_the_evidence(pair):
     x = model.sample(500, T)["x"].mean(0, keepdim=True)  # data far out give heavy tails, and errors without meaning
     with torch.no_grad():
         evidence = Oracle(model, T).evidence(x)
-    n = 8000
+    n = 3000
     for resample_below in (0.0, 0.7, 1.0):
         out = particle_bound(model, x.repeat(n, 1, 1), 4, resample_below=resample_below, chunk=4 * n)
         ratio = (out.bound - evidence).exp()
-        assert abs(ratio.mean() - 1) < 4 * ratio.std() / n**0.5 < 0.15
+        assert abs(ratio.mean() - 1) < 4 * ratio.std() / n**0.5 < 0.25
         assert (out.resamplings > 0).any() == (resample_below > 0)
 
 
@@ -104,7 +106,7 @@ def test_one_particle_is_the_evidence_lower_bound_and_more_are_closer_to_the_evi
     x = model.sample(1, T)["x"]
     with torch.no_grad():
         exact, evidence = Oracle(model, T).bound(x).item(), Oracle(model, T).evidence(x).item()
-    n = 2000
+    n = 1000
     for estimate in (particle_bound, importance_bound):
         means, errors = [], []
         for particles in (1, 5, 25):
@@ -165,8 +167,7 @@ def weights(model, batch, latents):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("extra", BATCHES)
-@pytest.mark.parametrize(("pair", "kind"), MODELS)
+@pytest.mark.parametrize(("pair", "kind", "extra"), CASES)
 def test_without_resampling_it_weighs_its_draws_as_the_program_does(pair, kind, extra):
     model, particles = build(pair, kind), 4
     batch = data(model, **BATCHES[extra]())
@@ -248,8 +249,7 @@ def textbook(model, batch, particles, resample_below):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("extra", BATCHES)
-@pytest.mark.parametrize(("pair", "kind"), MODELS)
+@pytest.mark.parametrize(("pair", "kind", "extra"), CASES)
 def test_it_is_the_textbooks_filter(pair, kind, extra):
     model = build(pair, kind)
     batch = data(model, **BATCHES[extra]())

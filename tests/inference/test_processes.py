@@ -12,12 +12,15 @@ from pathlib import Path
 import pytest
 import torch
 from stopping import At
+from test_gradnorm import TRAIN, Scaled
 
 from dvae.data import Sequences
 from dvae.inference import processes
 from dvae.inference.checkpoints import Run
 from dvae.inference.fit import fit
+from dvae.inference.gradnorm import GradNorm
 from dvae.inference.processes import LostProcess, launched, seed_of, together
+from dvae.inference.resuming import restore, store
 from dvae.inference.svi import SVI
 from dvae.inference.training import Training
 from dvae.networks import Dense
@@ -95,6 +98,31 @@ def stopped(rank, out):
     return fitted(out / "stopped", callbacks=[At(6, lambda state: setattr(state, "stop", True))] if rank else ())
 
 
+def certain():
+    """A model that draws nothing, so that what a batch gives does not depend on where its halves are."""
+    torch.manual_seed(0)
+    return Scaled("p(x_t | x_{t-1})", None, {"x": 3}, network=Dense(widths=(8,))).double()
+
+
+def begun():
+    svi = SVI(certain(), steps=4, objective=GradNorm(("x", "other", "large"), "generator.x.", asymmetry=0.0))
+    svi.init()
+    return svi
+
+
+def weighed(rank, out):
+    """What GradNorm and the model have after steps on half of each batch, with a checkpoint between."""
+    svi, run = begun(), Run(out / "weighed")
+    while svi.state.step < 4:
+        if svi.state.step == 2:
+            store(svi, run)
+            svi.fabric.barrier()
+            svi = begun()
+            restore(svi, run)
+        svi.step(TRAIN[12 * rank : 12 * (rank + 1)])
+    return svi.objective.state, svi.model.state_dict()
+
+
 def play(out, *names):
     """Each of these functions in two processes, forked from one that has imported all, as if torchrun had."""
     launched(Training())  # which imports fabric
@@ -123,7 +151,7 @@ def of_two(tmp_path_factory):
     if not torch.distributed.is_available():
         pytest.skip("this torch is built without torch.distributed")
     out = tmp_path_factory.mktemp("processes")
-    names = ["joint", "some_gradients", "whole", "killed", "resumed", "silent", "stopped"]
+    names = ["joint", "some_gradients", "weighed", "whole", "killed", "resumed", "silent", "stopped"]
     here = Path(__file__).parent
     paths = os.pathsep.join(map(str, (here.parents[1], here.parent, here)))
     script = "import sys, test_processes; test_processes.play(*sys.argv[1:])"
@@ -162,6 +190,15 @@ def test_a_parameter_has_no_gradient_where_it_has_none_in_any_process(of_two):
         torch.testing.assert_close(both, torch.full((2,), (1 + 3 * 2) / 4))
         torch.testing.assert_close(one, torch.full((2,), 3 / 4))
         assert (float(loss), float(share)) == ((2 + 3 * 1) / 4, (1 + 2 * rank) / 4)
+
+
+def test_they_have_the_gradnorm_of_one_that_has_both_their_batches(of_two):
+    first, second = of_two[0]("weighed")
+    torch.testing.assert_close(first, second, rtol=0, atol=0)
+    svi = begun()
+    for _ in range(4):
+        svi.step(TRAIN)
+    torch.testing.assert_close(first, (svi.objective.state, svi.model.state_dict()), rtol=1e-9, atol=1e-12)
 
 
 def test_they_draw_differently_and_have_the_same_weights(of_two):

@@ -59,7 +59,7 @@ def beside():
     """What the oracle says of a mean-field guide, and what NUTS does."""
     model, oracle, x = simulated()
     known = dvae.reference_posterior(model, x, progress=False)
-    by_nuts = posterior_by_nuts(model, x, [0], draws=120, chains=2, warmup=60)
+    by_nuts = posterior_by_nuts(model, x, [0], draws=100, chains=2, warmup=40)
     return model, oracle, x, known, by_nuts
 
 

@@ -386,8 +386,8 @@ def test_missing_joints_stay_missing_where_windows_are_turned(windows):
 # -------------------------------------------------------------------------------------------------- runs, ablations
 
 
-@pytest.mark.parametrize("ablation", ABLATIONS)
-def test_every_ablation_is_fitted_loaded_and_forecasts(people, tmp_path, ablation):
+@pytest.mark.parametrize("ablation", ["whole", "without attention and w", "evidence, turned"])
+def test_an_ablation_is_fitted_loaded_and_forecasts(people, tmp_path, ablation):
     """And the best weights are by what is trained."""
     data = dvae.motion.MotionData.open(people)
     method = small(warm_up=1, **ABLATIONS[ablation])

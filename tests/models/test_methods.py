@@ -600,11 +600,11 @@ def people(real):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", ["srnn", "dsae", "kvae"])  # recurrent, with a static latent, a filter
 def test_training_on_real_motion_stays_finite(name, people):
     method = small(name, 4, warm_up=20)
     model = method.build({"x": people.size})
-    recipe = method.train(people, steps=100)
+    recipe = method.train(people, steps=30)
     result = recipe.fit(model, batch_size=4, accelerator="cpu", progress=False)
     assert result.history
     assert all(torch.isfinite(parameter).all() for parameter in model.parameters())
