@@ -11,12 +11,14 @@ from dense import library_bound, masked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyro.infer import Trace_ELBO
+from scipy import optimize
 from torch.distributions.transforms import ReshapeTransform
 
 from dvae import DynamicalVAE, Oracle, SequenceELBO, audit, model_arrow_prices, model_price, price, twin
 from dvae.laws import FixedNormal, Mixture, StandardNormal
 from dvae.networks import Linear
 from dvae.notation import Factorization
+from dvae.oracle import _lost
 from dvae.testing.strategies import factorizations
 from dvae.units import Coordinate
 
@@ -343,6 +345,23 @@ def test_a_model_without_dependence_loses_all_of_it(case):
     expected = [dependence(spread(generative, sizes, seed, steps), size) for seed in range(3)]
     assert min(expected) > 1e-6
     assert found.tolist() == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(("steps", "seed"), [(4, 23), (5, 1), (6, 0)])
+def test_one_static_latent_costs_what_the_best_single_factor_does(steps, seed):
+    """By factor analysis from other starts; a single search ends in a local minimum, or where noise vanishes."""
+    whole, less = (Factorization.parse(text) for text in ("p(w) p(x_t | x_{t-1}, w)", "p(w) p(x_t | w)"))
+    covariance = spread(whole, {"w": 1, "x": 1}, seed, steps).numpy()
+
+    def divergence(values):
+        loadings, scales = np.split(values, 2)
+        inverse = np.linalg.inv(np.outer(loadings, loadings) + np.diag(np.exp(2 * scales)))
+        return (np.trace(inverse @ covariance) - steps - np.linalg.slogdet(inverse @ covariance)[1]) / 2
+
+    starts, bounds = np.random.default_rng(0).standard_normal((8, 2 * steps)), [(-8, 8)] * (2 * steps)
+    least = min(optimize.minimize(divergence, start, bounds=bounds).fun for start in starts)
+    found = _lost(Oracle(twin(whole, None, {"w": 1, "x": 1}, steps, seed), steps), less)
+    assert found == pytest.approx(least, abs=1e-5)
 
 
 def test_what_another_arrow_can_carry_costs_nothing():
