@@ -1,11 +1,13 @@
 """What every result is: a table on a terminal, in print and in a notebook, and a file. And the bar while one waits."""
 
 import io
+import os
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import rich.table
 from rich.console import Console, RenderableType
@@ -41,7 +43,13 @@ class Table(rich.table.Table):
 
 
 class Plain(Console):
-    """A console that prints texts as they are: paths, names and messages hold no markup and no emoji."""
+    """A console that prints texts as they are: paths, names and messages hold no markup and no emoji.
+
+    When nobody reads what it prints any more, as in `dvae evaluate RUN | head`, it stops printing and the work goes on.
+    """
+
+    unread: ClassVar[bool] = False
+    """Whether nobody reads the output of one of them any more."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, **options)
@@ -49,6 +57,13 @@ class Plain(Console):
     @override
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(_shown(text), **options)
+
+    @override
+    def on_broken_pipe(self) -> None:
+        Plain.unread = self.quiet = True
+        self.print()  # quiet, it forgets what it was about to write
+        with suppress(OSError), open(os.devnull, "wb") as nowhere:  # what is left in Python's buffer goes there
+            os.dup2(nowhere.fileno(), self.file.fileno())
 
 
 def _as_it_is(cell: Any) -> Any:

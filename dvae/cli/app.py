@@ -1,7 +1,7 @@
 """The program: which command is meant, what it leaves, and how it fails.
 
-Exit codes: 0 done, 1 failed, 2 wrong arguments, 130 after Ctrl-C, 143 after SIGTERM. A fit that a signal
-stopped can be resumed.
+Exit codes: 0 done, 1 failed, 2 wrong arguments, 130 after Ctrl-C, 141 when nobody reads what is printed, 143 after
+SIGTERM. A fit that a signal stopped can be resumed.
 """
 
 from __future__ import annotations
@@ -18,9 +18,13 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 
-from ..inference.result import reason
+from .. import __version__
+from ..inference.result import Plain, reason
 from ..options import nearest
 from .console import ERROR, OUT, UsageError, note, speaks
+
+UNREAD = 128 + getattr(signal, "SIGPIPE", 13)
+"""The exit code that a shell gives to a program whose output nobody reads."""
 
 COMMANDS = {
     "list": ("methods:list_methods", "List the methods: their equations and where they come from."),
@@ -75,6 +79,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = [argument for argument in given if argument != "--debug"]
     warnings.showwarning = note
     OUT.quiet = ERROR.quiet = not speaks()
+    Plain.unread = False
+    return _ended(given, debug) or (UNREAD if _is_unread() else 0)
+
+
+def _is_unread(line: str = "") -> bool:
+    """Whether nobody reads what is printed any more, as the standard output shows when it is to take a line."""
+    try:
+        sys.stdout.write(line)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        OUT.on_broken_pipe()
+    return Plain.unread
+
+
+def _ended(given: list[str], debug: bool) -> int:
+    """Run the command with its arguments, print how it fails, and return its exit code."""
     try:
         _run(given)
         return 0
@@ -87,6 +107,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ERROR.print(str(stop) or "interrupted")
         return 128 + getattr(stop, "signal", signal.SIGINT)
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and _is_unread("\n"):
+            return UNREAD
         ERROR.quiet = False  # it may be this process alone that fails
         if debug:
             traceback.print_exc()
@@ -104,19 +126,22 @@ def _run(given: list[str]) -> None:
         config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitArgPrefixes)
         tyro.cli(meant, prog=f"dvae {given[0]}", args=given[1:], config=config)
         return
+    if given == ["--version"]:
+        OUT.print(f"dvae {__version__}")
+        return
     app = tyro.extras.SubcommandApp()
     for name, (_, about) in COMMANDS.items():
         app.command(name=name, help=about)(lambda: None)
     app.cli(
         prog="dvae",
         description="Dynamical variational autoencoders from their factorizations. "
-        "With --debug, a failure shows its traceback.",
+        "With --debug, a failure shows its traceback; --version alone prints the version.",
         args=given,
     )
 
 
 def _meant(given: Sequence[str]) -> Iterator[str]:
-    """Sentences on names that are none, but near to one: of methods, and the choices of options."""
+    """Sentences on names that are none, but near to one: of options, of methods, and the choices of options."""
     if (called := command(given)) is None:
         return
     from ..models.registry import judges, methods
@@ -126,6 +151,10 @@ def _meant(given: Sequence[str]) -> Iterator[str]:
     kinds = [*filter(is_dataclass, hints.values()), *(methods().values() if name in ("fit", "sweep") else ())]
     for kind in kinds:
         hints = get_type_hints(kind) | hints
+    options = {f"--{option.replace('_', '-')}" for option in [*hints, "from", "to", "help"]}
+    for word in (word.partition("=")[0].replace("--no-", "--") for word in rest if word.startswith("--")):
+        if word not in options and (meant := nearest(word, options)):
+            yield f"{word} is no option of dvae {name}{meant}"
     choices = {option: _choices(hint) for option, hint in hints.items()}
     names = {"fit": [*methods(), *judges()], "sweep": choices.get("method"), "data": choices.get("action")}.get(name)
     for before, word in pairwise(["", *rest]):

@@ -73,6 +73,9 @@ def test_wrong_arguments_exit_with_2(capsys, tmp_path):
     for command in ("fit", "resume", "data"):
         assert f"dvae {command} --help" in failure(capsys, command, code=2)
     assert "did you mean 'info'" in failure(capsys, "data", "inf", code=2)
+    assert "--step is no option of dvae sweep (did you mean '--steps'" in failure(
+        capsys, "sweep", "--step", "4", code=2
+    )
     assert "did you mean 'adam'" in failure(capsys, "fit", "vae", *out, "--optimizer", "adm", code=2)
     assert "--steps" in failure(capsys, "fit", "vae", *out, "--step", "3", code=2)
     assert "emission" in failure(capsys, "fit", "vae", *out, "--emission", "loud", code=2)
@@ -116,6 +119,23 @@ def test_numbers_and_files_that_make_no_sense_exit_with_2_before_any_work(
 
 def test_a_run_is_a_directory(capsys, people):
     assert "is a file; name a directory" in failure(capsys, "fit", "vae", "--out", str(people), code=2)
+
+
+@pytest.mark.parametrize("arguments", [["show", "vae", "--out", "graph.png"], ["list"], ["fit", "--help"]])
+def test_output_that_nobody_reads_loses_no_file(arguments, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as unread, monkeypatch.context() as patched:
+        patched.setattr(sys, "stdout", unread)
+        code = main(arguments)
+    assert code == 128 + signal.SIGPIPE
+    assert not [name for name in arguments if name.endswith(".png") and not (tmp_path / name).exists()]
+
+
+def test_version_is_printed(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"dvae {dvae.__version__}\n"
 
 
 def test_a_typo_in_an_equation_is_shown_under_its_column(capsys, tmp_path):

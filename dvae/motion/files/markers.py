@@ -66,7 +66,7 @@ def read_c3d(path: str | Path) -> Recording:
     numbers = np.frombuffer(content, kind, frames * row, _BLOCK * (start - 1)).reshape(frames, row)
     values = numbers[:, : 4 * markers].reshape(frames, markers, 4).astype(np.float64)
     places: np.ndarray = values[..., :3] * (1 if scale < 0 else scale)
-    zero = (values == 0).all(-1)
+    zero = np.asarray((values == 0).all(-1))
     places[(values[..., 3] < 0) | zero | ~(np.abs(places) < 1e9).all(-1)] = np.nan
     names = _numbered(parameters, "LABELS")[:markers]
     groups = {
@@ -75,7 +75,7 @@ def read_c3d(path: str | Path) -> Recording:
     }
     outputs = {name for group in groups if not group.endswith("_UNITS") for name in _numbered(parameters, group)}
     named = [n for n, name in enumerate(names) if name and name[0] != "*"]
-    seen = np.asarray(np.isfinite(places).all(2)).any(0)
+    seen = np.asarray(np.isfinite(places).all(2).any(0))
     kept = [n for n in named if names[n] not in outputs and seen[n]]
     if not kept:
         raise ValueError(f"{path}: it has no markers with names that are seen")

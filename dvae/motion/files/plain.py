@@ -195,14 +195,14 @@ def check_key(key: tuple[str, str], path: Path | None = None) -> None:
 
 
 def _skeleton_of(
-    path: Path, clips: Sequence[_Read], joints: Sequence[int] | None
+    path: Path, clips: Sequence[_Read], chosen: Sequence[int] | None
 ) -> tuple[Skeleton, tuple[int, ...] | None]:
     """The skeleton beside a file or of a known archive, and which of the file's joints make it up."""
     counts = {positions.shape[1] for _, _, positions, _ in clips if positions.ndim == 3}
     file = companion(path, SKELETON)
     if file.is_file():
         skeleton = Skeleton.from_json(file)
-        if joints is None and counts and skeleton.joints not in counts:
+        if chosen is None and counts and skeleton.joints not in counts:
             raise ValueError(
                 f"{path} has {max(counts)} joints and {file} has {skeleton.joints}, so they do not belong together; "
                 f"put the archive's own skeleton into {own_companion(path, SKELETON).name}, or pass skeleton="
