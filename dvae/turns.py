@@ -2,11 +2,13 @@
 
 Two programs that ran at once would land on each other's stack, and draw from each other's random numbers. So whatever
 runs one for a user is decorated with `alone`: of several threads one goes on, and the others wait until it is done, a
-whole fit if need be. Processes run side by side (`dvae.runs.sweep`).
+whole fit if need be. Processes run side by side (`dvae.runs.sweep`). A process that is forked while another thread
+holds the lock gets a free lock, and none of that thread's handlers.
 """
 
 from __future__ import annotations
 
+import os
 import threading
 from contextlib import ContextDecorator
 
@@ -23,5 +25,17 @@ class _Alone(ContextDecorator):
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
+    def _leave_to_the_parent(self) -> None:
+        """Forget the thread that held the lock, which a forked child does not have."""
+        if self._lock.acquire(blocking=False):
+            self._lock.release()
+            return
+        from pyro.poutine.runtime import _PYRO_STACK
+
+        self._lock = threading.RLock()
+        _PYRO_STACK.clear()
+
 
 alone = _Alone()
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=alone._leave_to_the_parent)

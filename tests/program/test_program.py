@@ -1,5 +1,7 @@
 """What the program does with what is not there, not in order, or not a tensor."""
 
+import os
+import signal
 import threading
 import time
 from typing import Any
@@ -253,6 +255,34 @@ def test_a_bound_and_the_building_of_a_model_wait_for_their_turn():
     for thread in threads:
         thread.join()
     assert len(done) == 8
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system does not fork")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork")
+def test_a_process_that_is_forked_amid_the_program_of_another_thread_runs_its_own():
+    begun, ended = threading.Event(), threading.Event()
+
+    def work() -> None:
+        with alone, pyro.poutine.condition(data={"a": torch.zeros(())}):
+            begun.set()
+            ended.wait()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    begun.wait()
+    child = os.fork()
+    if not child:
+        signal.alarm(10)  # ends it if it waits for the lock
+        observed = True
+        try:
+            with alone, pyro.poutine.trace() as trace:
+                pyro.sample("a", pyro.distributions.Normal(0, 1))
+            observed = trace.trace.nodes["a"]["is_observed"]
+        finally:
+            os._exit(observed)
+    ended.set()
+    thread.join()
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 # ---------------------------------------------------------------------------------------------------------- engines
