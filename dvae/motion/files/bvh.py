@@ -8,6 +8,8 @@ such as those with one row more than they announce.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +20,8 @@ from ...files import written
 from ..rotations import from_matrix, to_matrix
 from .recording import END, Recording, check_joints, check_size, numbers, read_lines
 
+_WORD = re.compile(r"[{}]|[^\s{}]+")
+_KEYWORDS = {"ROOT", "JOINT", "END", "OFFSET", "CHANNELS", "MOTION", "{", "}"}
 _AXES = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
 
 
@@ -134,26 +138,43 @@ def write_bvh(
 
 
 def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
-    """The joints, parents first, and the line after MOTION."""
+    """The joints, parents first, and the line of MOTION, which loses this word.
+
+    Words may be anywhere on lines, but the name of a joint, which may have several, is on one.
+    """
     joints: list[_Joint] = []
     open_: list[int] = []  # joints whose braces are open, the last one inmost
     named = False  # a joint was named, and its brace is to come
+    words = ((word, number) for number, line in enumerate(lines, 1) for word in _WORD.findall(line))
+    ahead = next(words, None)
 
     def wrong(number: int, expected: str) -> ValueError:
         return ValueError(f"{path}: line {number} is {lines[number - 1].strip()[:60]!r}, expected {expected}")
 
-    for number, line in enumerate(lines, 1):
-        word, _, rest = line.strip().partition(" ") if "\t" not in line.strip() else line.strip().partition("\t")
-        kind, rest = word.upper(), rest.strip()
-        if not word or (kind == "HIERARCHY" and not joints):
+    def following(belongs: Callable[[str, int], bool]) -> list[str]:
+        """The next words, as long as they belong to the one before."""
+        nonlocal ahead
+        found = []
+        while ahead is not None and belongs(*ahead):
+            found.append(ahead[0])
+            ahead = next(words, None)
+        return found
+
+    while ahead is not None:
+        (word, number), ahead = ahead, next(words, None)
+        kind = word.upper()
+        if kind == "HIERARCHY" and not joints:
             continue
         if kind == "MOTION":
             if open_ or named or not joints:
                 raise wrong(number, "the hierarchy to be whole before")
-            return joints, number
+            lines[number - 1] = lines[number - 1][lines[number - 1].upper().rindex(kind) + len(kind) :]
+            return joints, number - 1
         if kind in ("ROOT", "JOINT", "END"):
             if named or (kind == "ROOT") == bool(joints) or (kind != "ROOT" and not open_):
                 raise wrong(number, "one ROOT, and JOINT or End Site within its braces")
+            line = number if ahead is None else ahead[1]  # of the name, which may have several words
+            rest = " ".join(following(lambda word, at: at == line and word != "{"))  # noqa: B023
             parent = open_[-1] if open_ else -1
             name = rest if kind != "END" else joints[parent].name + END
             if any(joint.name == name for joint in joints):
@@ -176,12 +197,12 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
             if closed.ends and closed is joints[-1] and not (closed.offset.any() or closed.channels):
                 joints.pop()  # at its parent, which has a name
         elif kind == "OFFSET" and open_ and not named:
-            found = numbers(rest, f"{path}: line {number}")
+            found = numbers(" ".join(following(_is_value)), f"{path}: line {number}")
             if len(found) != 3:
                 raise wrong(number, "three numbers")
             joints[open_[-1]].offset = found
         elif kind == "CHANNELS" and open_ and not named:
-            count, *channels = rest.lower().split() or [""]
+            count, *channels = [word.lower() for word in following(_is_value)] or [""]
             unknown = [channel for channel in channels if channel not in _AXES]
             if unknown or not count.isdecimal() or len(channels) != len(set(channels)) or str(len(channels)) != count:
                 raise wrong(number, "their number and as many of Xposition ... Zrotation, each once")
@@ -191,19 +212,23 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
     raise ValueError(f"{path}: no BVH file: it has no line MOTION")
 
 
+def _is_value(word: str, _: int) -> bool:
+    return word.upper() not in _KEYWORDS
+
+
 def _header(path: Path, lines: list[str], line: int) -> tuple[int, float, int]:
     """Number of frames, seconds from one to the next, and the line at which they begin."""
     found: list[float] = []
     for expected in ("frames:", "frame time:"):
-        while line < len(lines) and not lines[line].strip():
+        text = ""
+        while line < len(lines) and len(text) <= len(expected):
+            text = " ".join((text + " " + lines[line].lower()).split())
             line += 1
-        text = " ".join(lines[line].lower().split()) if line < len(lines) else ""
         said = text.removeprefix(expected) if text.startswith(expected) else ""
-        value = numbers(said, f"{path}: line {line + 1}")
+        value = numbers(said, f"{path}: line {line}")
         if len(value) != 1:
-            raise ValueError(f"{path}: line {line + 1} is {text[:60]!r}, expected {expected.capitalize()} and a number")
+            raise ValueError(f"{path}: line {line} is {text[:60]!r}, expected {expected.capitalize()} and a number")
         found.append(value[0])
-        line += 1
     frames, seconds = found
     if frames != int(frames) or frames < 1 or not 1e-6 < seconds < 1e3:
         raise ValueError(f"{path}: {frames:g} frames, {seconds:g} s each, are no recording")

@@ -1,5 +1,6 @@
 """BVH files: what animation programs would show, there and back, and what is damaged."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +140,29 @@ def test_any_joint_may_be_placed_and_turned_about_any_axes(tmp_path):
     np.testing.assert_allclose(read.positions[1, 1], knee, atol=1e-9)
     np.testing.assert_allclose(read.positions[1, 2], knee + np.array([0, 0, -5]), atol=1e-9)  # its y looks along z
     np.testing.assert_allclose(read.positions[1, 4], hip + np.array([-1, 3, 0]), atol=1e-9)
+
+
+HEAD, FRAMES = SMALL.replace("a knee", "knee").split("Frame Time")
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        re.sub(r"\s*\n\s*{", " {", HEAD),
+        re.sub(r"\s*\n\s*{", "{", HEAD),
+        re.sub(r"\s*}", "}", HEAD),
+        " ".join(HEAD.split()) + "\n",
+        "\n".join(HEAD.split()) + "\n",
+        HEAD.lower(),
+    ],
+    ids=["brace after the name", "brace at the name", "brace after a number", "one line", "a line each", "lower case"],
+)
+def test_words_may_be_anywhere_on_lines(head, tmp_path):
+    (tmp_path / "a.bvh").write_text(SMALL.replace("a knee", "knee"))
+    (tmp_path / "b.bvh").write_text(f"{head}Frame Time{FRAMES}")
+    usual, other = read_bvh(tmp_path / "a.bvh"), read_bvh(tmp_path / "b.bvh")
+    assert (other.names, other.parents, other.fps) == (usual.names, usual.parents, usual.fps)
+    np.testing.assert_array_equal(other.positions, usual.positions)
 
 
 def test_what_is_written_has_the_layout_that_animation_programs_import(tmp_path):
