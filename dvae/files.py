@@ -9,15 +9,23 @@ from __future__ import annotations
 
 import errno
 import os
+import platform
+import re
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 from uuid import uuid4
 
 # neither follows a link at the end of the path nor waits for the other end of a FIFO; Windows has no such flags
 _PLAIN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+_HOST = re.sub(r"\W", "", platform.node())
+_TEMPORARY = re.compile(rf"\.(new|sweep)-{_HOST}-(\d{{1,9}})-\w+")
 
 
 class FileRefused(ValueError):
@@ -75,12 +83,17 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
     """Write a new file in place of whatever has this name, and force it to the disk.
 
     Raises:
-        OSError: it cannot be written; the error names it.
+        OSError: it cannot be written; the error names it, and nothing of it is left.
     """
-    Path(path).unlink(missing_ok=True)  # a link, not where it leads
+    path = Path(path)
+    path.unlink(missing_ok=True)  # a link, not where it leads
     with open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as file, naming(path):
-        put(file, content)
-        os.fsync(file.fileno())
+        try:
+            put(file, content)
+            os.fsync(file.fileno())
+        except OSError:
+            path.unlink(missing_ok=True)
+            raise
 
 
 def put(file: BinaryIO, content: bytes) -> None:
@@ -101,17 +114,65 @@ def written(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     path = Path(path)
     if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
         raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device; choose another name")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_name(f".{uuid4().hex}.new")
+    with made(path.parent):
+        _swept(path.parent)
+        new = path.with_name(f"{temporary('new')}{uuid4().hex}")
+        try:
+            with naming(path, new):
+                number = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL | _PLAIN, 0o666)
+                with os.fdopen(number, "w+b") as file:
+                    yield file
+                os.replace(new, path)
+        finally:
+            with suppress(OSError):
+                new.unlink()
+
+
+@contextmanager
+def made(folder: Path) -> Iterator[None]:
+    """Make a folder and those above it; if what follows fails, remove those that were made and are empty."""
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
     try:
-        with naming(path, new):
-            number = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL | _PLAIN, 0o666)
-            with os.fdopen(number, "w+b") as file:
-                yield file
-            os.replace(new, path)
-    finally:
-        with suppress(OSError):
-            new.unlink()
+        yield
+    except BaseException:
+        for each in missing:
+            with suppress(OSError):
+                each.rmdir()
+        raise
+
+
+def temporary(kind: str) -> str:
+    """Return how the names of this process's temporary files of a kind begin, by which others can remove them later.
+
+    Args:
+        kind: "new", of what takes another name once it is whole; or "sweep", of the lease of a sweep.
+    """
+    return f".{kind}-{_HOST}-{os.getpid()}-"
+
+
+def sweep(folder: Path) -> None:
+    """Remove the temporary files and folders that processes of this machine left in a folder when they were killed."""
+    with suppress(OSError):
+        for path in [Path(entry) for entry in os.scandir(folder) if entry.name.startswith(".")]:
+            if (found := _TEMPORARY.fullmatch(path.name)) and not _is_running(int(found[2])):
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
+
+
+_swept = cache(sweep)  # a folder may get many thousands of files, one by one
+
+
+def _is_running(process: int) -> bool:
+    if os.name == "nt":  # where to ask is to send
+        return True
+    try:
+        os.kill(process, 0)
+    except OSError as error:
+        return error.errno != errno.ESRCH
+    return True
 
 
 @contextmanager
@@ -119,14 +180,16 @@ def naming(path: str | os.PathLike[str], temporary: Path | None = None) -> Itera
     """What fails within it for want of space, rights or a sound disk says which file it was about.
 
     Args:
-        path: the file.
+        path: the file, or a folder of files.
         temporary: what it is called until it is whole.
     """
     try:
         yield
     except OSError as error:
-        if error.filename is not None and error.filename not in (temporary, str(temporary)):
-            raise
+        if error.filename is not None:
+            if temporary is None or not Path(os.fsdecode(error.filename)).is_relative_to(temporary):
+                raise
+            path = Path(path) / Path(os.fsdecode(error.filename)).relative_to(temporary)
         if error.errno is None:  # of a library
             raise OSError(f"{path}: {error}") from error
         raise OSError(error.errno, error.strerror, os.fspath(path)) from error

@@ -26,7 +26,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from safetensors import SafetensorError
@@ -130,10 +130,7 @@ class Run:
         Raises:
             CheckpointError: when another process holds it.
         """
-        self.path.mkdir(parents=True, exist_ok=True)
-        with _refusing():
-            lock = files.open_plain(self.path / LOCK, os.O_RDWR | os.O_CREAT)
-        with lock as file:
+        with files.made(self.path), self._opened_lock() as file:
             if fcntl is not None:
                 try:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -142,7 +139,21 @@ class Run:
                         f"{self.path} is being fitted by another process; wait for it or stop it, or choose another "
                         "directory"
                     ) from error
-            yield
+            try:
+                yield
+            except BaseException:
+                if not self.exists:
+                    (self.path / LOCK).unlink(missing_ok=True)
+                raise
+
+    def _opened_lock(self) -> BinaryIO:
+        with _refusing():
+            return files.open_plain(self.path / LOCK, os.O_RDWR | os.O_CREAT)
+
+    def _write_new(self, name: str, content: bytes) -> None:
+        """Write a file under the name that it has until it is whole."""
+        with files.naming(self.path / name, self.path / f"{name}.new"):
+            files.write(self.path / f"{name}.new", content)
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Write `config.json`.
@@ -152,7 +163,7 @@ class Run:
         """
         content = json.dumps(config, indent=2).encode()
         self.path.mkdir(parents=True, exist_ok=True)
-        files.write(self.path / f"{CONFIG}.new", content)
+        self._write_new(CONFIG, content)
         os.replace(self.path / f"{CONFIG}.new", self.path / CONFIG)
 
     def commit(self, state: Mapping[str, Any], contents: Mapping[str, bytes]) -> None:
@@ -162,12 +173,14 @@ class Run:
         for name in fingerprints:
             self._settle(name, fingerprints[name])
         for name, content in contents.items():
-            files.write(self.path / f"{name}.new", content)
+            self._write_new(name, content)
         fingerprints |= {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
-        files.write(self.path / f"{STATE}.new", json.dumps({**state, "fingerprints": fingerprints}, indent=2).encode())
+        self._write_new(STATE, json.dumps({**state, "fingerprints": fingerprints}, indent=2).encode())
         os.replace(self.path / f"{STATE}.new", self.path / STATE)
         for name in contents:
             os.replace(self.path / f"{name}.new", self.path / name)
+        for name in {BEST, LAST, OPTIMISER} - contents.keys():  # of a process that was killed while it wrote one
+            (self.path / f"{name}.new").unlink(missing_ok=True)
 
     def read(self, name: str, most: int = LARGEST_WEIGHTS) -> bytes:
         """Return a file of the checkpoint, of at most so many bytes, after checking its fingerprint.

@@ -1,11 +1,17 @@
 """Two methods on simulated people, from equations to scored forecasts, in a few minutes on a laptop.
 
-`make demo` runs it. It prints the table of scores, and saves demo/futures.png and demo/report.html. Everything here is
-the public interface; copy what you need.
+`make demo` runs it. It prints the table of scores, and saves demo/futures.png and demo/report.html. After Ctrl-C,
+`make demo` continues. Everything here is the public interface; copy what you need.
 """
 
+import os
 import shutil
+import signal
+import sys
 from pathlib import Path
+
+if __name__ == "__main__":  # amid an import, a KeyboardInterrupt can come out as any error
+    signal.signal(signal.SIGINT, lambda *_: os.write(2, b"interrupted\n") and os._exit(130))
 
 import torch
 import tyro
@@ -15,8 +21,11 @@ from rich import print
 import dvae
 from dvae.cli import main as command
 from dvae.inference.checkpoints import Run
+from dvae.inference.fit import Fit
+from dvae.inference.recipe import Trainable
 from dvae.motion.plot import futures
-from dvae.runs.directory import fit_run
+from dvae.runs.directory import fit_run, read_config, resume
+from dvae.runs.kinds import Dataset
 
 STEPS = {"hit-dvae": 400, "srnn": 700}
 RATES = {"hit-dvae": 3e-3, "srnn": 1e-3}
@@ -26,13 +35,16 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
     """Fit, score, draw and report.
 
     Args:
-        out: where people, runs, scores, picture and page go, in place of those of an earlier demonstration.
+        out: where people, runs, scores, picture and page go, in place of those of an earlier complete demonstration.
         share: of the steps of training.
         samples: futures of a window that are scored.
         clips: of simulated people.
     """
     out.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(out / "runs", ignore_errors=True)
+    report = out / "report.html"
+    if report.exists():
+        shutil.rmtree(out / "runs", ignore_errors=True)
+        report.unlink()
     dvae.motion.save(out / "people.npz", dvae.motion.simulate(clips=clips, frames=150, seed=0))
     data = dvae.motion.MotionData.open(out / "people.npz", "simulated")
     protocol, test = data.protocol, data.windows("test")
@@ -44,7 +56,7 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
         method = dvae.method(name, latent=8, self_feeding=1.0, warm_up=steps // 3, **loss)
         print(f"\n[bold]{name}[/bold]  {method.generative}   {method.inference}", method.source)
         training = dvae.Training(steps=steps, batch_size=32, learning_rate=RATES[name], decay=0.5)
-        result = fit_run(method, data, run, training)
+        result = fitted(method, data, run, training)
         print(f"best validation bound: {result.best_bound:.2f} nats a frame at step {result.best_step}")
 
     models = {name: dvae.load(run).model for name, run in runs.items()}
@@ -70,9 +82,24 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
         axes.set_title(name, fontsize=9)
     figure.savefig(out / "futures.png", dpi=150)
     print(f"saved {out / 'futures.png'} and {out / 'evaluation.json'}")
-    if command(["report", *map(str, runs.values()), "--out", str(out / "report.html")]):
+    if command(["report", *map(str, runs.values()), "--out", str(report)]):
         raise SystemExit("the report failed")
 
 
+def fitted(method: Trainable, data: Dataset, run: Path, training: dvae.Training) -> Fit:
+    """Fit a method, or continue a run that was interrupted."""
+    if Run(run).exists:
+        before = read_config(run)
+        if (before.training.steps, before.data.fingerprint) == (training.steps, data.fingerprint):
+            return resume(run)
+        shutil.rmtree(run)
+    return fit_run(method, data, run, training)
+
+
 if __name__ == "__main__":
-    tyro.cli(main, description=__doc__)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        tyro.cli(main, description=__doc__)
+    except KeyboardInterrupt:
+        print("interrupted; the same command continues", file=sys.stderr)
+        sys.exit(128 + signal.SIGINT)

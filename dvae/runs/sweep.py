@@ -151,7 +151,7 @@ def sweep(
     if by_torchrun():
         raise ValueError("a sweep starts processes itself; start it without torchrun")
     out = Path(out)
-    lease = out.absolute() / f".sweep-{uuid4().hex}"
+    lease = out.absolute() / f"{files.temporary('sweep')}{uuid4().hex}"
     source = data.location
     runs = [
         _Run(
@@ -176,6 +176,7 @@ def sweep(
     notes: list[str] = []
     received, blind = None, False
     out.mkdir(parents=True, exist_ok=True)
+    files.sweep(out)
     lease.touch(exist_ok=False)
     with (
         _Progress(waiting, runs[0].training.progress) as progress,

@@ -11,6 +11,7 @@ import networkx as nx
 import numpy as np
 import pytest
 import torch
+from stopping import At, interrupt
 
 from benchmarks import bench, speed
 from benchmarks.tables import (
@@ -41,7 +42,7 @@ from dvae import Descent, Evaluation, Training, alternatives, method, motion
 from dvae.cli import main as command
 from dvae.inference.checkpoints import Run
 from dvae.motion.segments import dataset
-from dvae.runs.directory import fit_run, load
+from dvae.runs.directory import fit_run, load, resume
 from dvae.tables import Column, Columns, Panel, Series
 
 SMALL = ["--steps", "2", "--batch-size", "4", "--validate-every", "2"]
@@ -931,8 +932,15 @@ def test_products_alone_are_those_of_the_work():
     noted.run()
 
 
-def test_demo(tmp_path):
-    demo.main(tmp_path / "demo", share=0.002, samples=2, clips=10)
+def test_demo_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
+    resumed = []
+    with monkeypatch.context() as patch:
+        patch.setattr(demo, "fit_run", partial(fit_run, callbacks=[At(1, interrupt)]))
+        with pytest.raises(KeyboardInterrupt):
+            demo.main(tmp_path / "demo", share=0.005, samples=2, clips=10)
+    monkeypatch.setattr(demo, "resume", lambda run: resumed.append(resume(run)) or resumed[-1])
+    demo.main(tmp_path / "demo", share=0.005, samples=2, clips=10)
+    assert [(fit.status, fit.step, fit.run.name) for fit in resumed] == [("finished", 2, "hit-dvae")]
     rows = Evaluation.load(tmp_path / "demo" / "evaluation.json").rows
     assert rows.keys() == {"zero velocity", "nearest neighbours", *demo.STEPS}
     data = {"people.npz", "people.npz.labels.csv", "people.npz.skeleton.json"}

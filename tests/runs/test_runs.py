@@ -463,19 +463,42 @@ def test_a_full_disk_names_the_file(run, tmp_path, monkeypatch, capsys):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with (
-        pytest.raises(OSError, match=f"No space left on device.*{tmp_path / 'a.txt'}"),
-        files.written(tmp_path / "a.txt"),
+        pytest.raises(OSError, match=f"No space left on device.*{tmp_path}/new/a.txt"),
+        files.written(tmp_path / "new" / "a.txt"),
     ):
         full()
-    assert not [path for path in tmp_path.iterdir() if path != run]
+    walks, new = motion.simulate(clips=2, frames=30), tmp_path / "new"
     with monkeypatch.context() as patch:
         patch.setattr(files.os, "fsync", full)
-        assert f"No space left on device: '{run / CONFIG}.new'" in failure(capsys, "resume", run, "--steps", "6")
+        assert f"No space left on device: '{run / CONFIG}'" in failure(capsys, "resume", run, "--steps", "6")
+        with pytest.raises(OSError, match=f"No space left on device: '{new / CONFIG}'"), Run(new).locked():
+            Run(new).write_config({})
+    with monkeypatch.context() as patch:
+        patch.setattr(files.os, "replace", full)
+        with pytest.raises(OSError, match=f"No space left on device: '{new}/train/person_0000.csv'"):
+            motion.write_motion(new, walks, "csv")
+    assert list(tmp_path.iterdir()) == [run]
     log = JSONLines(run / "log.jsonl")
     log.start(4)
     log._file.close()
     with open("/dev/full", "wb", buffering=0) as log._file, pytest.raises(OSError, match=r"log\.jsonl"):
         log.log(5, {"loss": 1.0})
+
+
+def test_what_killed_processes_left_is_removed_by_the_next_one(tmp_path, monkeypatch):
+    dead = subprocess.Popen(["true"])
+    dead.wait()
+    own = tmp_path / f"{files.temporary('new')}a"
+    monkeypatch.setattr(files.os, "getpid", lambda: dead.pid)
+    left = [tmp_path / f"{files.temporary(kind)}{name}" for kind in ("new", "sweep") for name in "ab"]
+    monkeypatch.undo()
+    for path in (own, *left[1:]):
+        path.touch()
+    left[0].mkdir()
+    (left[0] / "walk.csv").touch()
+    with files.written(tmp_path / "a.txt"):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == {own.name, "a.txt"}
 
 
 # The command line --------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -159,12 +160,18 @@ def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
 
     Raises:
         FileNotFoundError: there is nothing.
-        ValueError: a folder has files of several kinds; or their names are none for clips.
+        ValueError: the file has no known format, a folder has files of several kinds, or their names are none for
+            clips.
     """
     if not path.is_dir():
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file")
         suffix = path.suffix.lower()
+        if suffix not in READERS and not zipfile.is_zipfile(path):
+            raise ValueError(
+                f"{path}: motion is read from files that end in {', '.join(READERS)}, or from folders of them, and "
+                "tables from .csv, .tsv, .parquet, .npz and .npy; export it as one of these"
+            )
         if suffix not in READERS or (suffix == ".npz" and not is_amass(path)):
             return []
         return _known([File("all", path.stem, path)], companion(path, LABELS), labels)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ... import files
 from ...inference.result import progress_bar
 from ..data import Clip, MotionSet
 from ..skeleton import Skeleton, brief
@@ -87,13 +88,16 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
 def _staged(out: Path) -> Iterator[Path]:
     """Where files are written that go to a folder, or a file to its place, once all of them are whole."""
     folder = out.parent if out.suffix else out
-    folder.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=".new-", dir=folder, ignore_cleanup_errors=True) as stage:
-        yield Path(stage, out.name) if out.suffix else Path(stage)
-        for file in [file for file in Path(stage).rglob("*") if file.is_file()]:
-            place = folder / file.relative_to(stage)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            file.replace(place)
+    with files.made(folder):
+        files.sweep(folder)
+        with TemporaryDirectory(prefix=files.temporary("new"), dir=folder, ignore_cleanup_errors=True) as name:
+            stage = Path(name)
+            with files.naming(folder, stage):
+                yield stage / out.name if out.suffix else stage
+                for file in [file for file in stage.rglob("*") if file.is_file()]:
+                    place = folder / file.relative_to(stage)
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    file.replace(place)
 
 
 def write_clip(path: Path, motion: MotionSet, format: str) -> None:

@@ -195,6 +195,12 @@ def test_what_is_given_goes_before_what_is_found(bvh, people):
         assert read_motion(path).splits == ["all"]
 
 
+def test_files_of_unknown_formats_are_refused_with_the_known_ones(tmp_path):
+    (tmp_path / "a.trc").write_text("PathFileType\t4\t(X/Y/Z)\ta.trc\n")
+    with pytest.raises(ValueError, match=r"a\.trc: motion is read from files that end in \.bvh, .*\.c3d"):
+        read_motion(tmp_path / "a.trc")
+
+
 def test_a_unit_that_no_person_has_is_asked_for(tmp_path, people):
     write_motion(tmp_path / "a.bvh", MotionSet(people.clips[:1], people.skeleton))
     text = (tmp_path / "a.bvh").read_text().splitlines()
