@@ -115,7 +115,7 @@ def written(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
         raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device; choose another name")
     with made(path.parent):
-        _swept(path.parent)
+        _remove_leftovers(path.parent)
         new = path.with_name(f"{temporary('new')}{uuid4().hex}")
         try:
             with naming(path, new):
@@ -151,7 +151,7 @@ def temporary(kind: str) -> str:
     return f".{kind}-{_HOST}-{os.getpid()}-"
 
 
-def sweep(folder: Path) -> None:
+def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files and folders that processes of this machine left in a folder when they were killed."""
     with suppress(OSError):
         for path in [Path(entry) for entry in os.scandir(folder) if entry.name.startswith(".")]:
@@ -162,7 +162,7 @@ def sweep(folder: Path) -> None:
                     path.unlink(missing_ok=True)
 
 
-_swept = cache(sweep)  # a folder may get many thousands of files, one by one
+_remove_leftovers = cache(remove_leftovers)  # a folder may get many thousands of files, one by one
 
 
 def _is_running(process: int) -> bool:

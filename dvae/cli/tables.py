@@ -13,7 +13,6 @@ from .. import files
 from ..blocks import ColumnSummary, row_blocks
 from ..inference.result import Table
 from ..inference.scores import reaching
-from ..motion.files.plain import SKELETON, companion
 from ..runs import directory as runs
 from ..tables.dataset import PanelData
 from ..tables.forecasts import BANDS, FORMATS, QUANTILES, column_of, needed
@@ -87,7 +86,8 @@ def is_table(path: str) -> bool:
             held = [entry.removesuffix(".npy") for entry in archive.namelist()]
     except zipfile.BadZipFile:
         return False
-    of_motion = "positions_3d" in held or companion(place, SKELETON).is_file()
+    skeletons = (place.with_name(name) for name in (f"{place.name}.skeleton.json", "skeleton.json"))
+    of_motion = "positions_3d" in held or any(skeleton.is_file() for skeleton in skeletons)
     return not of_motion and ("x" in held or len(held) == 1)
 
 

@@ -176,7 +176,7 @@ def sweep(
     notes: list[str] = []
     received, blind = None, False
     out.mkdir(parents=True, exist_ok=True)
-    files.sweep(out)
+    files.remove_leftovers(out)
     lease.touch(exist_ok=False)
     with (
         _Progress(waiting, runs[0].training.progress) as progress,

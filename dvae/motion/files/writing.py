@@ -89,7 +89,7 @@ def _staged(out: Path) -> Iterator[Path]:
     """Where files are written that go to a folder, or a file to its place, once all of them are whole."""
     folder = out.parent if out.suffix else out
     with files.made(folder):
-        files.sweep(folder)
+        files.remove_leftovers(folder)
         with TemporaryDirectory(prefix=files.temporary("new"), dir=folder, ignore_cleanup_errors=True) as name:
             stage = Path(name)
             with files.naming(folder, stage):
