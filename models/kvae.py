@@ -223,7 +223,7 @@ class KalmanNetwork(Network):
         with torch.autocast(a.device.type, enabled=False):
             chain, emission, _ = self.chain_of(a, None if present is None else present.t())
             parts = self.parts_of(*chain.predicted, emission)
-        return torch.cat([part.transpose(0, 1) for part in parts], dim=-1)
+        return torch.cat([part.transpose(0, 1) for part in parts], dim=-1).to(a.dtype)
 
     def chain_of(
         self, a: Tensor, present: Tensor | None = None, valid: Tensor | None = None
@@ -247,7 +247,7 @@ class KalmanNetwork(Network):
         if present is not None:
             transition, noise = self.past(transition, control, emission[:-1], present[:-1])
             a = a * present[..., None]
-        offset = (control @ a[:-1, ..., None])[..., 0]
+        offset = (control @ a[:-1, ..., None].double())[..., 0]
         chain = LinearGaussianChain(transition, offset, noise, mean, covariance, information, potential)
         return chain, emission, alpha
 
@@ -263,7 +263,7 @@ class KalmanNetwork(Network):
         rows = []
         for t, there in enumerate(present):
             state = self.ahead(state, t, {})
-            rows.append(torch.where(there[:, None], a[t], (state.emission @ state.mean[..., None])[..., 0]))
+            rows.append(torch.where(there[:, None], a[t], (state.emission @ state.mean[..., None])[..., 0].to(a.dtype)))
         return torch.stack(rows)
 
     def past(self, transition: Tensor, control: Tensor, emission: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
@@ -283,7 +283,7 @@ class KalmanNetwork(Network):
         valid = None if lengths is None else valid_steps(lengths, a.shape[1]).t()
         chain, _, alpha = self.chain_of(a.transpose(0, 1), present.t(), valid)
         drawn = self.emitted(chain.draw(torch.randn_like(chain.potential)), alpha).transpose(0, 1)
-        return torch.where(present[..., None], a, drawn)
+        return torch.where(present[..., None], a, drawn.to(a.dtype))
 
     def emitted(self, z: Tensor, alpha: Tensor) -> Tensor:
         """Draws of a (T, B, D) given z_{1:T} (T, B, N), where it is not there.
@@ -309,13 +309,13 @@ class KalmanNetwork(Network):
         """
         refuse_half(self.A.dtype)
         noise = self.log_noise.exp().diag()
-        covariance = 20.0 * torch.eye(len(noise), dtype=noise.dtype, device=noise.device)
-        return noise.new_zeros(batch, len(noise)), covariance.expand(batch, -1, -1), noise
+        covariance = 20.0 * torch.eye(len(noise), dtype=torch.float64, device=noise.device)
+        return covariance.new_zeros(batch, len(noise)), covariance.expand(batch, -1, -1), noise
 
     def mixed(self, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A (..., N, N), B (..., N, D) and C (..., D, N) under weights (..., K)."""
+        """A (..., N, N), B (..., N, D) and C (..., D, N) under weights (..., K), in float64."""
         parts = (self.A, self.B, self.C)
-        mixed = alpha @ torch.cat([part.flatten(1) for part in parts], dim=1)
+        mixed = (alpha @ torch.cat([part.flatten(1) for part in parts], dim=1)).double()
         pieces = mixed.split([part[0].numel() for part in parts], dim=-1)
         a, b, c = (piece.unflatten(-1, part.shape[1:]) for piece, part in zip(pieces, parts, strict=True))
         return a, b, c
@@ -323,7 +323,7 @@ class KalmanNetwork(Network):
     def seen(self, emission: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """What a (..., D) says of z: G (..., N, N) and g (..., N)."""
         weighted = (emission * torch.exp(-self.log_emission)[:, None]).mT
-        return weighted @ emission, (weighted @ a[..., None])[..., 0]
+        return weighted @ emission, (weighted @ a[..., None].double())[..., 0]
 
     def parts_of(self, mean: Tensor, covariance: Tensor, emission: Tensor) -> tuple[Tensor, Tensor]:
         """Location (..., D) and whitening matrix (..., D * D) of a_t from the moments of z_t."""
@@ -342,7 +342,7 @@ class KalmanNetwork(Network):
         with torch.autocast(self.A.device.type, enabled=False):
             state = self.ahead(state, t, drawn)
             features = torch.cat(self.parts_of(state.mean, state.covariance, state.emission), dim=-1)
-        return features, state
+        return features.to(self.A.dtype), state
 
     def ahead(self, state: Predicted, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Predicted:
         """The prediction of step t from that of the last one, and what is known by then."""
@@ -351,7 +351,7 @@ class KalmanNetwork(Network):
         before = values[t - 1].to(self.A.dtype) if t else self.first.expand(len(mean), -1)
         present = None if state.present is None or not t else state.present[t - 1]
         if present is not None:
-            before = torch.where(present[:, None], before, (emission @ mean[..., None])[..., 0])
+            before = torch.where(present[:, None], before, (emission @ mean[..., None])[..., 0].to(before.dtype))
         gates = functional.linear(before, self.memory.weight_ih_l0, self.memory.bias_ih_l0)
         hidden = lstm_cell(gates, state.hidden, self.memory)
         transition, control, emitted = self.mixed(self.weights(hidden[0]).softmax(-1))
@@ -361,7 +361,7 @@ class KalmanNetwork(Network):
             if present is not None:
                 information, potential = information * present[:, None, None], potential * present[:, None]
             mean, covariance = update(mean, covariance, information, potential)
-            mean = (transition @ mean[..., None] + control @ before[..., None])[..., 0]
+            mean = (transition @ mean[..., None] + control @ before[..., None].double())[..., 0]
             if present is not None:
                 transition, noise = self.past(transition, control, emission, present)
             covariance = transition @ covariance @ transition.mT + noise
@@ -438,4 +438,4 @@ def smooth(model: DynamicalVAE, batch: AnyBatch, samples: int = 1) -> SmoothedLa
     results = [a, z, mean, covariance, chain.lag_one, alpha]
     if valid is not None:
         results = [r * valid[-len(r) :].view(*valid[-len(r) :].shape, *[1] * (r.dim() - 2)) for r in results]
-    return SmoothedLatents(*(r.transpose(0, 1).unflatten(0, (samples, -1)) for r in results))
+    return SmoothedLatents(*(r.to(network.A.dtype).transpose(0, 1).unflatten(0, (samples, -1)) for r in results))
