@@ -249,7 +249,7 @@ class FamilyLaw(Law):
         made = self.kind(**shaped, **given)
         for kind, support in OPEN.items():
             if isinstance(made, kind):
-                made.support = support
+                made.support = support  # type: ignore[misc]
         return made  # type: ignore[no-any-return]
 
     @override
