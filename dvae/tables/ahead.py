@@ -32,9 +32,9 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
     if observed is None or steps is None:
         raise ValueError("whole sequences have no horizon; fit with observed and horizon steps to forecast")
     known = schema.columns.of("known")
-    calendar = panel.calendar
-    if calendar.kind == schema.calendar.kind and calendar.step is None:  # too few or short sequences to show one
-        calendar = replace(calendar, step=schema.calendar.step)
+    calendar, trained = panel.calendar, schema.calendar
+    if calendar.kind == trained.kind:  # these sequences may be too short to show a step
+        calendar = replace(calendar, step=calendar.step or trained.step, gap=calendar.gap or trained.gap)
     found, without = [], []  # with all of the past, of which covariates may have their last value
     for one in panel:
         present = panel.present(one)

@@ -16,7 +16,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from ..options import check
+from ..options import Amount, check
 
 MONTH = 30.4369
 """Mean days of a month."""
@@ -35,14 +35,16 @@ class Calendar:
         kind: "numbers", "dates" (times are seconds since 1970, in UTC) or "durations" (times are seconds).
         zone: time zone of the dates, such as "Europe/Berlin" or "UTC+02:00"; None for dates without one.
         step: calendar step as a pandas alias, such as "1MS" or "1B"; None for steps of equal duration.
+        gap: median time between two steps, by which a sequence of one step continues; 0 where it is unknown.
 
     Raises:
-        ValueError: unknown zone or step, or a zone or step of times that are not dates.
+        ValueError: unknown zone or step, a negative gap, or a zone or step of times that are not dates.
     """
 
     kind: Literal["numbers", "dates", "durations"] = "numbers"
     zone: str | None = None
     step: str | None = None
+    gap: Amount = 0.0
 
     def __post_init__(self) -> None:
         check(self)
@@ -54,12 +56,14 @@ class Calendar:
             raise ValueError(f"zone is {self.zone!r} and step {self.step!r}, but times are {self.kind}, not dates")
 
     def stepping(self, times: Iterable[np.ndarray | None]) -> Self:
-        """Return the calendar with the most common calendar step of sequences of times."""
-        if self.kind != "dates":
+        """Return the calendar with the most common calendar step of sequences of times, and their median gap."""
+        some = [own for own in times if own is not None and len(own) > 1]
+        some = some[:: len(some) // SERIES + 1]
+        if not some:
             return self
-        some = [own for own in times if own is not None and len(own) > 2]
-        steps = Counter(_step(self._local(own)) for own in some[:: len(some) // SERIES + 1])
-        return replace(self, step=steps.most_common(1)[0][0] if steps else None)
+        found = replace(self, gap=float(np.median(np.concatenate([np.diff(own) for own in some]))))
+        steps = Counter(_step(self._local(own)) for own in some if len(own) > 2) if self.kind == "dates" else None
+        return replace(found, step=steps.most_common(1)[0][0]) if steps else found
 
     def shown(self, times: np.ndarray) -> Any:
         """Times (N,) as pandas has them: dates in their zone, durations, or the numbers."""
@@ -83,6 +87,8 @@ class Calendar:
         The step is inferred from the times. If they are too few, it is the step of the calendar. Times without a
         calendar step continue by their median gap.
         """
+        import pandas as pd
+
         if self.kind == "dates" and count:
             local = self._local(times)
             own = _step(local)
@@ -90,8 +96,11 @@ class Calendar:
             for step in filter(None, steps):
                 if (following := _following(local, step, count)) is not None:
                     return self._seconds(following)
-        apart = np.median(np.diff(times)) if len(times) > 1 else 1.0
-        return np.asarray(times[-1] + apart * np.arange(1, count + 1))
+            if len(local) > 1 and _is_daily(local):  # whatever the clocks do in between
+                gap = (local[1:] - local[:-1]).to_series().median()
+                return self._seconds(pd.DatetimeIndex([local[-1] + gap * place for place in range(1, count + 1)]))
+        gap = np.median(np.diff(times)) if len(times) > 1 else self.gap or 1.0
+        return np.asarray(times[-1] + gap * np.arange(1, count + 1))
 
     def _local(self, times: np.ndarray) -> Any:
         """Dates as the clocks of their zone show them."""
@@ -129,9 +138,14 @@ def check_zone(zone: str) -> None:
         ) from None
 
 
+def _is_daily(local: Any) -> bool:
+    """Whether dates are all at one time of the day."""
+    return bool((local - local.normalize()).nunique() == 1)
+
+
 def _step(local: Any) -> str | None:
     """Calendar step of increasing dates; None where they have none, or are too few to show one."""
-    if len(local) < 3 or (local - local.normalize()).nunique() > 1:
+    if len(local) < 3 or not _is_daily(local):
         return None
     days = float(np.median(np.diff(seconds(local)))) / 86400
     count, first = round(days / MONTH), local[0]

@@ -269,10 +269,10 @@ class Panel:
             name: for titles.
             zone: time zone of dates in the index, see `Columns`.
         """
-        index, when, calendar = data.index.to_series(name="index"), None, Calendar()
+        index, when, calendar = data.index.to_series(name=data.index.name or "index"), None, Calendar()
         if is_number(index) or is_date(index) or is_duration(index):
             when, calendar = times(index, zone)
-            order = _ordered(when, np.arange(len(when)), f"the table {name}", calendar, "index")
+            order = _ordered(when, np.arange(len(when)), f"the table {name}", calendar, index.name)
             data, when = data.iloc[order], when[order]
         own = column or Column("value")
         series = []

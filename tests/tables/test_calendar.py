@@ -1,5 +1,7 @@
 """Times continue by the calendar step and in the time zone of the table, whatever holds them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -49,8 +51,10 @@ def test_times_continue_by_the_calendar(step, zone):
         ([*pd.date_range("2023-01-01", periods=12, freq="MS").delete([3, 7])], "2024-01-01"),
         ([*pd.bdate_range("2023-01-02", "2023-01-27").delete([5, 11])], "2023-01-30"),
         (["2023-01-02", "2023-01-05", "2023-01-07", "2023-01-10", "2023-01-16"], "2023-01-19"),
+        (pd.DatetimeIndex(["2024-10-19", "2024-10-22", "2024-10-24", "2024-10-26"], tz="Europe/Berlin"),
+            pd.Timestamp("2024-10-28", tz="Europe/Berlin")),
     ],
-    ids=["periods", "15th", "30th", "30th with a gap", "months with gaps", "holidays", "irregular"],
+    ids=["periods", "15th", "30th", "30th with a gap", "months with gaps", "holidays", "irregular", "new clocks"],
 )  # fmt: skip
 def test_steps_are_found_from_any_day_and_with_missing_rows(given, expected):
     assert future(frame_of(given))[0] == pd.Timestamp(expected)
@@ -126,7 +130,7 @@ def test_recordings_whose_clocks_overlap_are_not_mingled():
     )
     with pytest.raises(ValueError, match=said):
         Panel.of(frame_of(clock))
-    with pytest.raises(ValueError, match="goes back from index 19"):
+    with pytest.raises(ValueError, match="the table panel goes back from time 19"):
         Panel.wide(frame_of(clock).set_index("time"))
     assert len(Panel.of(frame_of(clock, s=np.repeat(["a", "b"], 20)), Told(id=("s",)))) == 2
     assert len(Panel.of(frame_of(clock).sort_values("time"))) == 1
@@ -148,12 +152,22 @@ def test_rows_in_disorder_are_put_in_order(order):
     np.testing.assert_array_equal(panel.series[0].times, np.arange(40))
 
 
+def test_one_row_continues_by_the_gap_of_the_others_or_of_the_training_data():
+    series = [
+        Series(name, np.zeros((len(own), 1)), own) for name, own in (("a", np.arange(9) * 0.5), ("b", np.ones(1)))
+    ]
+    panel = Panel(series, Columns((Column("y"),)), calendar=Calendar().stepping(one.times for one in series))
+    schema = PanelSchema.under(panel, Cut(1, 1, split="time"))
+    for some in (panel, Panel(series[1:], panel.columns)):
+        np.testing.assert_array_equal(ahead(some, schema, 2).times(3)[0][-1], [1, 1.5, 2])
+
+
 def test_a_calendar_is_kept_with_a_run_and_checked():
     data = PanelData.of(
         frame_of(pd.date_range("2020", periods=40, freq="MS", tz="Europe/Berlin")), cut=Cut(4, 3, split="time")
     )
     assert PanelSchema.from_config(data.schema.config()) == data.schema
-    assert data.schema.calendar == Calendar("dates", "Europe/Berlin", "1MS")
+    assert replace(data.schema.calendar, gap=0) == Calendar("dates", "Europe/Berlin", "1MS")
     for zone, step in (
         ("../../etc/passwd", "1D"),
         ("Europe", "1D"),
