@@ -1,4 +1,4 @@
-"""Fuzzing by the clock: hypothesis draws examples until a test's share of the time is over.
+"""Fuzzing by the clock: hypothesis draws examples, at least one, until a test's share of the time is over.
 
 All tests of this directory together take DVAE_FUZZ_SECONDS (15 where it is not set), each in proportion to the share
 that it names. DVAE_FUZZ_SEED (0) decides which examples are tried, in which order; time decides how far one gets.
@@ -72,7 +72,7 @@ def fuzz(check: Callable[[Example], None], examples: SearchStrategy[Example], se
     def attempt(example: Example) -> None:
         nonlocal shrunk_by, count
         now = time.monotonic()
-        if (now > end and not failed) or (now > shrunk_by and repr(example) not in failed):
+        if (now > end and count and not failed) or (now > shrunk_by and repr(example) not in failed):
             return
         count += 1
         try:
@@ -83,7 +83,7 @@ def fuzz(check: Callable[[Example], None], examples: SearchStrategy[Example], se
             raise
 
     batch = 0
-    while time.monotonic() < end:
+    while not count or time.monotonic() < end:
         search = settings(
             max_examples=_BATCH,
             derandomize=False,
@@ -96,7 +96,6 @@ def fuzz(check: Callable[[Example], None], examples: SearchStrategy[Example], se
         seed(SEED * 1_000_003 + batch)(search)()
         batch += 1
     print(f"{count} examples in {scaled(seconds):.0f} s, DVAE_FUZZ_SEED={SEED}")
-    assert count, "no example was tried within the time"
 
 
 class Isolated:

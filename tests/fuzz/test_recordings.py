@@ -19,7 +19,7 @@ from .engine import Isolated, fuzz, limited
 from .test_tables import edited
 
 SHARE = 3
-MUTATIONS = 500
+MUTATIONS = 100
 """Of each format, at the least."""
 
 
@@ -169,7 +169,7 @@ def zipped(content, random):
 
 
 @pytest.mark.parametrize("format", SAMPLES)
-def test_five_hundred_changed_files_are_read_or_refused(format, isolated, tmp_path):
+def test_changed_files_are_read_or_refused(format, isolated, tmp_path):
     changed, path = small(format, tmp_path)
     content, random = changed.read_bytes(), np.random.default_rng(0)
     for number in range(MUTATIONS):

@@ -50,7 +50,7 @@ def test_the_posterior_is_calibrated(name):
     assert found.p_value > 1e-3
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", ["count", "category", "multivariate"])
 def test_another_posterior_is_not(name):
     """Of a likelihood that counts four times."""
     model = built(LAWS[name])

