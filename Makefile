@@ -1,6 +1,7 @@
 # make demo    simulated people: fit two methods, print the table, save demo/futures.png and demo/report.html
 # make test    lint, types, tests, and some of these once more as on another processor
 # make quick   lint, types, and the tests that are not slow
+# make studies   the scripts of the result pages on little data, and the scores that are stored
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
 # make coverage   the tests, and which lines none of them runs
 # make bench   the benchmarks, beside their targets and the last release; as JSON in bench.json; on a GPU with DEVICE=cuda
@@ -22,7 +23,7 @@ unexport PYTHONDONTWRITEBYTECODE
 NUMERICAL := laws/test_laws.py networks/test_networks.py networks/test_graphconv.py test_oracle.py program/test_model.py \
 	models/test_trajectories.py motion/test_control.py motion/test_forecasts.py $(addprefix inference/test_,bounds.py metrics.py particles.py)
 
-.PHONY: venv demo lint quick test fuzz coverage bench notebooks docs dist clean
+.PHONY: venv demo lint quick test studies fuzz coverage bench notebooks docs dist clean
 
 venv: .venv/installed
 
@@ -52,6 +53,9 @@ test: venv
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p dvae & types=$$!; $(BIN)/pytest -n 2 --dist worksteal && wait $$types
 	ATEN_CPU_CAPABILITY=default $(BIN)/pytest -n 2 --dist worksteal -m "not slow" -k "not beside_its_result" $(addprefix tests/,$(NUMERICAL))
+
+studies: venv
+	$(BIN)/pytest -n 2 --dist worksteal tests/studies
 
 SECONDS := 600
 SEED := $(shell date +%s)

@@ -11,7 +11,6 @@ import networkx as nx
 import numpy as np
 import pytest
 import torch
-from stopping import At, interrupt
 
 from benchmarks import bench, speed
 from benchmarks.tables import (
@@ -20,7 +19,6 @@ from benchmarks.tables import (
     bounds,
     bracket,
     completion,
-    demo,
     family,
     hit_dvae,
     house,
@@ -38,11 +36,11 @@ from benchmarks.tables import (
     trajevae,
     tuning,
 )
-from dvae import Descent, Evaluation, Training, alternatives, method, motion
+from dvae import Descent, Training, alternatives, method, motion
 from dvae.cli import main as command
 from dvae.inference.checkpoints import Run
 from dvae.motion.segments import dataset
-from dvae.runs.directory import fit_run, load, resume
+from dvae.runs.directory import fit_run, load
 from dvae.tables import Column, Columns, Panel, Series
 
 SMALL = ["--steps", "2", "--batch-size", "4", "--validate-every", "2"]
@@ -930,26 +928,6 @@ def test_products_alone_are_those_of_the_work():
         [(2, 1, 5, 4), (2, 1, 6, 4), (2, 1, 6, 4)],
     ]
     noted.run()
-
-
-def test_demo_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
-    resumed = []
-    with monkeypatch.context() as patch:
-        patch.setattr(demo, "fit_run", partial(fit_run, callbacks=[At(1, interrupt)]))
-        with pytest.raises(KeyboardInterrupt):
-            demo.main(tmp_path / "demo", share=0.005, samples=2, clips=10)
-    monkeypatch.setattr(demo, "resume", lambda run: resumed.append(resume(run)) or resumed[-1])
-    demo.main(tmp_path / "demo", share=0.005, samples=2, clips=10)
-    assert [(fit.status, fit.step, fit.run.name) for fit in resumed] == [("finished", 2, "hit-dvae")]
-    rows = Evaluation.load(tmp_path / "demo" / "evaluation.json").rows
-    assert rows.keys() == {"zero velocity", "nearest neighbours", *demo.STEPS}
-    data = {"people.npz", "people.npz.labels.csv", "people.npz.skeleton.json"}
-    names = {"evaluation.json", "futures.png", "report.html", "runs", *data}
-    assert {file.name for file in (tmp_path / "demo").iterdir()} == names
-    page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
-    for row in rows:
-        assert row in page
-    assert "has changed since it was scored" not in page
 
 
 def test_overview(tmp_path):

@@ -1,0 +1,30 @@
+"""The demo of `make demo`: it goes on where it was interrupted, and leaves a page with the scores."""
+
+from functools import partial
+
+import pytest
+from stopping import At, interrupt
+
+from benchmarks.tables import demo
+from dvae import Evaluation
+from dvae.runs.directory import fit_run, resume
+
+
+def test_demo_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
+    resumed = []
+    with monkeypatch.context() as patch:
+        patch.setattr(demo, "fit_run", partial(fit_run, callbacks=[At(1, interrupt)]))
+        with pytest.raises(KeyboardInterrupt):
+            demo.main(tmp_path / "demo", share=0.005, samples=2, clips=10)
+    monkeypatch.setattr(demo, "resume", lambda run: resumed.append(resume(run)) or resumed[-1])
+    demo.main(tmp_path / "demo", share=0.005, samples=2, clips=10)
+    assert [(fit.status, fit.step, fit.run.name) for fit in resumed] == [("finished", 2, "hit-dvae")]
+    rows = Evaluation.load(tmp_path / "demo" / "evaluation.json").rows
+    assert rows.keys() == {"zero velocity", "nearest neighbours", *demo.STEPS}
+    data = {"people.npz", "people.npz.labels.csv", "people.npz.skeleton.json"}
+    names = {"evaluation.json", "futures.png", "report.html", "runs", *data}
+    assert {file.name for file in (tmp_path / "demo").iterdir()} == names
+    page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
+    for row in rows:
+        assert row in page
+    assert "has changed since it was scored" not in page
