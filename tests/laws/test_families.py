@@ -43,10 +43,6 @@ class Contract(dvae.testing.FactorizationContract):
         return built(self.law, size)
 
 
-class TestBernoulli(Contract):
-    law = Family("Bernoulli")
-
-
 class TestCategorical(Contract):
     law = Family("OneHotCategorical")
     # of one class, or of one of which each is seen once, there is nothing to learn
@@ -54,10 +50,6 @@ class TestCategorical(Contract):
 
 class TestPoisson(Contract):
     law = Family("Poisson")
-
-
-class TestNegativeBinomial(Contract):
-    law = Family("NegativeBinomial", learned=("total_count",))
 
 
 class TestZeroInflated(Contract):
@@ -68,20 +60,8 @@ class TestGamma(Contract):
     law = Family("Gamma")
 
 
-class TestLogNormal(Contract):
-    law = Family("LogNormal")
-
-
 class TestLaplace(Contract):
     law = Family("Laplace", residual=0.5)
-
-
-class TestVonMises(Contract):
-    law = Family("VonMises")
-
-
-class TestBeta(Contract):
-    law = Family("Beta")
 
 
 class TestNormalMixture(Contract):
@@ -90,10 +70,6 @@ class TestNormalMixture(Contract):
 
 class TestLowRankNormal(Contract):
     law = laws.LowRankNormal(1)
-
-
-class TestPower(Contract):
-    law = laws.FAMILIES["power"]
 
 
 class TestMixed(Contract):

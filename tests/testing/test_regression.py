@@ -58,7 +58,7 @@ def worsen(model, by):
 
 def test_a_bound_is_measured_within_its_error(exact):
     model, x, oracle = exact
-    record = Record.of(measure(model.model, model.guide, x, 400, seed=1), {})
+    record = Record.of(measure(model.model, model.guide, x, 150, seed=1), {})
     bound = oracle.bound(x).detach().numpy()
     assert (np.abs(record.bound - bound) < 5 * record.error).all()
     assert abs(record.mean - bound.mean()) < 5 * record.mean_error
@@ -79,13 +79,10 @@ def test_the_rate_of_false_alarms_is_alpha(exact):
 @pytest.mark.parametrize(
     "draw",
     [
-        lambda random, size: random.normal(size=size),
-        lambda random, size: random.standard_t(3, size=size),
         lambda random, size: random.chisquare(1, size=size) - 1,
-        lambda random, size: np.exp(random.normal(size=size)) - math.exp(0.5),
         lambda random, size: np.exp(1.5 * random.normal(size=size)) - math.exp(1.125),
     ],
-    ids=["normal", "t", "chi-squared", "log-normal", "wide log-normal"],
+    ids=["chi-squared", "log-normal"],
 )
 def test_false_alarms_are_rare_where_skewed_draws_become_exact(draw, particles):
     """Of one sequence, as where a sampled KL becomes analytic: old draws miss a long lower tail, or upper one."""
@@ -201,7 +198,7 @@ def test_coupled_draws_find_a_loss_below_the_error_of_either_bound(tmp_path, exa
     model, x, oracle = exact
     poor = worsen(model, 0.05)
     fall = (Oracle(poor, 3).bound(x) - oracle.bound(x)).mean().item()
-    old, new = (Record.of(measure(m.model, m.guide, x, 400, seed=3), {}) for m in (model, poor))
+    old, new = (Record.of(measure(m.model, m.guide, x, 150, seed=3), {}) for m in (model, poor))
     change = Change(old, new, 0.001)
     assert change.worse
     assert abs(fall) < 2 * old.mean_error
@@ -266,16 +263,16 @@ def test_a_fall_is_told_with_the_worst_sequences(tmp_path, exact):
 def test_an_update_renews_and_a_rise_is_told(tmp_path, exact):
     model, x, _ = exact
     poor, notes = worsen(model, 1.0), []
-    regression(tmp_path, notes).check(poor.model, poor.guide, x)
-    regression(tmp_path, notes).check(model.model, model.guide, x)
+    regression(tmp_path, notes).check(poor.model, poor.guide, x, particles=20)
+    regression(tmp_path, notes).check(model.model, model.guide, x, particles=20)
     assert re.match(r"better by \S+ ± .*; run with --update-elbo to keep it", notes[1])
-    regression(tmp_path, notes, update=True).check(model.model, model.guide, x)
+    regression(tmp_path, notes, update=True).check(model.model, model.guide, x, particles=20)
     assert notes[2].startswith("renewed, to be committed: ")
-    regression(tmp_path, notes, update=True).check(model.model, model.guide, x)
-    regression(tmp_path, notes).check(model.model, model.guide, x)
+    regression(tmp_path, notes, update=True).check(model.model, model.guide, x, particles=20)
+    regression(tmp_path, notes).check(model.model, model.guide, x, particles=20)
     assert len(notes) == 3
     with pytest.raises(AssertionError, match="fell significantly"):
-        regression(tmp_path, notes).check(poor.model, poor.guide, x)
+        regression(tmp_path, notes).check(poor.model, poor.guide, x, particles=20)
 
 
 @pytest.mark.parametrize(
@@ -320,9 +317,9 @@ def test_a_damaged_record_is_refused_and_can_be_renewed(tmp_path, exact, text, m
     model, x, _ = exact
     (tmp_path / "test_it.json").write_text(text)
     with pytest.raises(ValueError, match=f"damaged .*{message}"):
-        regression(tmp_path).check(model.model, model.guide, x)
-    regression(tmp_path, update=True).check(model.model, model.guide, x)
-    regression(tmp_path).check(model.model, model.guide, x)
+        regression(tmp_path).check(model.model, model.guide, x, particles=3)
+    regression(tmp_path, update=True).check(model.model, model.guide, x, particles=3)
+    regression(tmp_path).check(model.model, model.guide, x, particles=3)
 
 
 def test_what_cannot_be_compared_is_refused(tmp_path, exact):
@@ -370,7 +367,7 @@ def normal(location, scale, dim=-1):
 
 def test_any_pyro_pair_has_its_bound(tmp_path):
     x = torch.linspace(-1, 2, 6, dtype=torch.float64)
-    record = Record.of(measure(*normal(0.3, 0.9), x, 2000, seed=1), {})
+    record = Record.of(measure(*normal(0.3, 0.9), x, 300, seed=1), {})
     posterior, evidence = dist.Normal(x / 2, math.sqrt(0.5)), dist.Normal(torch.zeros_like(x), math.sqrt(2)).log_prob(x)
     expected = evidence - torch.distributions.kl_divergence(dist.Normal(0.3 * x, 0.9), posterior)
     assert (np.abs(record.bound - expected.numpy()) < 5 * record.error).all()
