@@ -55,6 +55,11 @@ class Calendar:
         if self.kind != "dates" and (self.zone or self.step):
             raise ValueError(f"zone is {self.zone!r} and step {self.step!r}, but times are {self.kind}, not dates")
 
+    def __str__(self) -> str:
+        unit = "" if self.kind == "numbers" else " s"
+        step = f" by {self.step or f'{self.gap:g}{unit}'}" if self.step or self.gap else ""
+        return self.kind + step + (f", {self.zone}" if self.zone else "")
+
     def stepping(self, times: Iterable[np.ndarray | None]) -> Self:
         """Return the calendar with the most common calendar step of sequences of times, and their median gap."""
         some = [own for own in times if own is not None and len(own) > 1]

@@ -159,7 +159,8 @@ class Panel:
     def __repr__(self) -> str:
         lengths = [len(one) for one in self.series]
         steps = f"{min(lengths)}" if min(lengths) == max(lengths) else f"{min(lengths)} to {max(lengths)}"
-        return f"Panel({self.name}: {len(self)} sequences of {steps} steps; {', '.join(self.columns.names)})"
+        times = "" if all(one.times is None for one in self) else f"; {self.calendar}"
+        return f"Panel({self.name}: {len(self)} sequences of {steps} steps{times}; {', '.join(self.columns.names)})"
 
     def fingerprint(self) -> str:
         """SHA-256 of what the columns are and what the sequences hold."""

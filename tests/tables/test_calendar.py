@@ -166,6 +166,7 @@ def test_a_calendar_is_kept_with_a_run_and_checked():
     data = PanelData.of(
         frame_of(pd.date_range("2020", periods=40, freq="MS", tz="Europe/Berlin")), cut=Cut(4, 3, split="time")
     )
+    assert repr(data.panel) == "Panel(panel: 1 sequences of 40 steps; dates by 1MS, Europe/Berlin; y)"
     assert PanelSchema.from_config(data.schema.config()) == data.schema
     assert replace(data.schema.calendar, gap=0) == Calendar("dates", "Europe/Berlin", "1MS")
     for zone, step in (
