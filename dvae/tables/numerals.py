@@ -95,6 +95,9 @@ def read_numbers(column: Any, na_values: Sequence[str] = (), decimal: str | None
         return Numbers(values, np.zeros(len(column), bool), {})
     if column.dtype.kind in "mMc" or isinstance(column.dtype, pd.PeriodDtype | pd.IntervalDtype):
         return Numbers(nothing, column.notna().to_numpy(), {})
+    if decimal != "," and hint == "." and (plain := _plain(column.to_numpy(object, na_value=np.nan))) is not None:
+        plain[np.isin(plain, sentinels)] = np.nan
+        return Numbers(plain, np.zeros(len(column), bool), {})
     try:
         codes, cells = pd.factorize(column.astype(object))  # each different cell is read once
     except TypeError:  # of lists
@@ -136,13 +139,16 @@ def _numbers(cells: list[Any], decimal: str | None, hint: str) -> tuple[np.ndarr
 
 def _parsed(cells: list[Any], decimal: str) -> np.ndarray:
     """Each cell as float64, exactly as Python reads it; NaN where it is no number."""
-    plain = decimal == "." and not any(isinstance(cell, str) and ("_" in cell or "," in cell) for cell in cells)
-    if plain:
-        try:
-            return np.array(cells, object).astype(np.float64)
-        except (TypeError, ValueError, OverflowError):
-            pass
     return np.array([_number(cell, decimal) for cell in cells], np.float64)
+
+
+def _plain(cells: np.ndarray) -> np.ndarray | None:
+    """Return cells as Python reads them, None where some are no numbers; Python also reads 1_000."""
+    try:
+        values = cells.astype(np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return None if "_" in "".join(map(str, cells)) else values
 
 
 def _number(cell: Any, decimal: str) -> float:

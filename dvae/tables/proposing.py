@@ -199,7 +199,7 @@ class _Proposal:
         numerals = {
             name: read.values
             for name, read in self.numbers.items()
-            if read.is_numeric and frame[name].dtype.kind != "c" and str(frame[name].dtype) != "category"
+            if read.is_numeric and not is_number(frame[name]) and not self._holds_codes(name)
         }
         self.plain = frame.assign(**numerals)
         """The frame, with numbers for texts that are numbers."""
@@ -231,6 +231,13 @@ class _Proposal:
             raise ValueError(f"none of the columns {', '.join([*frame][:20])} holds numbers or a few classes")
         self.columns = columns
 
+    def _holds_codes(self, name: str) -> bool:
+        """Whether texts are classes or codes, such as 007, although they could be read as numbers."""
+        values = self.frame[name]
+        if str(values.dtype) == "category":
+            return True
+        return not TIMES.search(name.lower()) and bool(texts(values).str.fullmatch(r"0\d+").any())
+
     def _find_id_and_time(self, free: list[str]) -> None:
         """Take the first time with which no two rows of a sequence are at one time, or the one with the fewest."""
         found = []
@@ -261,7 +268,7 @@ class _Proposal:
         rest = [name for name in free if name not in self.undecided]
         numbers = [name for name in rest if is_number(self.plain[name])]
         if dated:
-            hours = {unit_of(name, frame[name]): name for name in reversed(numbers)}
+            hours = {unit_of(name, frame[name]): name for name in reversed(rest) if name != dated[0]}
             fine = clocks[:1] or [hours[unit] for unit in ("hour", "minute", "second") if unit in hours]
             return [(dated[0],), *([(dated[0], *fine)] if fine else [])]
         spans = [] if self.undecided else [name for name in (*self.levels, *rest) if is_duration(frame[name])]
@@ -315,9 +322,7 @@ class _Proposal:
     def _may_be_id(self, name: str) -> bool:
         """Whether a column holds texts, or codes such as 007, that repeat and say nothing of the time."""
         values = self.frame[name]
-        if is_number(values) or values.nunique() == len(values):
-            return False
-        if is_number(self.plain[name]) and not texts(values).str.fullmatch(r"0\d+").any():
+        if is_number(self.plain[name]) or values.nunique() == len(values):
             return False
         return IDS.search(name.lower()) is not None or not (TIMES.search(name.lower()) or is_clock(values))
 
@@ -406,7 +411,7 @@ class _Proposal:
         if not is_number(values):
             known = self.frame[name].dropna()
             count = int((~np.isnan(read.values)).sum())
-            if str(values.dtype) != "category" and count and count >= NEARLY_ALL * (count + read.wrong.sum()):
+            if not self._holds_codes(name) and count and count >= NEARLY_ALL * (count + read.wrong.sum()):
                 read.check(values, "or declare the column as an id or a category, or leave it out (--columns)")
             classes = _classes(known, self.na_values)
             return Column(name, family="category", classes=classes) if 2 <= len(classes) <= CLASSES else None
