@@ -29,7 +29,7 @@ SAMPLES = 100
 
 @dataclass(frozen=True)
 class ColumnOptions:
-    """What the columns of a table are.
+    """Roles of the columns of a table.
 
     Args:
         columns: of a table: what is modelled, each as NAME, NAME:FAMILY or NAME:FAMILY:UNIT, such as
@@ -153,7 +153,7 @@ def _say_left_out(samples: int, out: Path, figure: Path | None = None) -> None:
 
 
 def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
-    """What tables hold, and a schema to be read and corrected, from what is said of the columns."""
+    """Print a summary of each table and a schema to correct; columns without a given role are guessed."""
     if out is not None and len(paths) > 1:
         raise UsageError("--out takes the schema of one table")
     for path in paths:

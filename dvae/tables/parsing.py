@@ -305,7 +305,7 @@ def _localized(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, co
 
 
 def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: str | None = None) -> np.ndarray:
-    """The values as numbers, NaN where missing, of a category as the place of its class.
+    """Return the values as numbers, NaN where missing; a category is the index of its class.
 
     Args:
         column: (N,) of any type.

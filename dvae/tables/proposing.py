@@ -83,10 +83,10 @@ class Told:
     decimal: str | None = None
 
     def of(self, frame: Any) -> Columns:
-        """The columns of a frame, with what is not told as it is proposed.
+        """Return the schema of a frame; what is not given is proposed, see `proposed`.
 
         Raises:
-            ValueError: columns that the frame does not have, families that there are not, or cells that are unclear.
+            ValueError: columns that the frame does not have, unknown families, or cells that are unclear.
         """
         levels, frame = [name for name, _ in index_levels(frame)], tabular(frame)
         known = list(frame.columns)
@@ -117,7 +117,7 @@ class Told:
             static = ", ".join(
                 column.name for column in columns if column.role == "static" and column.name not in roles
             )
-            reason = f"; {static} have one value in each sequence" if static else ""
+            reason = f"; constant in each sequence are {static}" if static else ""
             given = ", ".join(names[:20]) or "none"
             raise ValueError(f"no column is a target; given are {given}{reason}; name those to model (--columns)")
         numbers = [column for column in columns if column.family != "category"]
@@ -154,17 +154,17 @@ def _classes(values: Any, na_values: Collection[str]) -> tuple[str, ...]:
 
 
 def proposed(frame: Any) -> Columns:
-    """What a pandas frame in the long form probably is.
+    """Propose a schema for a pandas frame in the long form.
 
-    The first column of dates, or with the name of a time, is that; a date and a clock, or year, month, day and hour,
-    are joined where single columns leave several rows at one time. Columns of texts that repeat, and of whole numbers
-    with the name of an id, tell sequences apart where that leaves no two rows at one time. What is the same within each
-    of several sequences is static. All other columns are targets: whole numbers from 0 are counts, two values a binary,
-    few texts a category, numbers above 0 that vary by more than half their mean positive. What is none of these is left
-    out, and a warning says so.
+    The first column of dates, or with the name of a time, is the time. A date and a clock, or year, month, day and
+    hour, are joined where one column leaves several rows at one time. Texts that repeat, and whole numbers with the
+    name of an id, are ids where they leave no two rows at one time. Columns that are constant within each of several
+    sequences are static. All other columns are targets: whole numbers from 0 are counts, two values a binary, few texts
+    a category, numbers above 0 that vary by more than half their mean positive. A warning names the other columns,
+    which are left out.
 
     Args:
-        frame: whose columns are looked at.
+        frame: table.
 
     Raises:
         ValueError: no column that could be a target, cells that are unclear, or a table that is not in the long form.
@@ -173,15 +173,15 @@ def proposed(frame: Any) -> Columns:
 
 
 class _Proposal:
-    """What the columns of a frame probably are, where nobody says it.
+    """Id, time, and the family of each column of a frame, as far as they are not given.
 
     Args:
-        told: what is said of them.
-        frame: in the long form.
+        told: what is given.
+        frame: table in the long form.
         levels: names of the columns that are levels of its index.
-        times: columns of the time, where they are told.
-        aside: all columns that are told to be no data.
-        families: columns that are told to be data, with "" where that says no family.
+        times: columns of the time, if given.
+        aside: columns with a given role other than data.
+        families: columns with a given role, with their family, "" if none is given.
     """
 
     def __init__(
@@ -239,7 +239,7 @@ class _Proposal:
         return not TIMES.search(name.lower()) and bool(texts(values).str.fullmatch(r"0\d+").any())
 
     def _find_id_and_time(self, free: list[str]) -> None:
-        """Take the first time with which no two rows of a sequence are at one time, or the one with the fewest."""
+        """Choose the time that leaves the fewest rows of a sequence at the time of another, the first of equal ones."""
         found = []
         for time in [self.time] if self.time else self._times(free):
             try:
@@ -311,7 +311,7 @@ class _Proposal:
         return tuple(ids), twice(ids)
 
     def _keys(self, ids: Collection[str]) -> list[Any]:
-        """Return ids as they are written, by which to group."""
+        """Return the columns of ids as they are written, as keys to group by."""
         return [self.frame[name].rename(None) for name in ids]
 
     def _is_named_id(self, name: str) -> bool:
@@ -327,17 +327,17 @@ class _Proposal:
         return IDS.search(name.lower()) is not None or not (TIMES.search(name.lower()) or is_clock(values))
 
     def _ids_in_runs(self, names: Collection[str]) -> tuple[str, ...]:
-        """Return columns with the name of an id, of which the rows of each value follow each other."""
+        """Return columns with the name of an id where the rows of each value are adjacent."""
         return tuple(name for name in names if self._is_named_id(name) and self._in_runs([name]))
 
     def _in_runs(self, ids: list[str]) -> bool:
-        """Whether the rows of each sequence follow each other, and some sequence has several."""
+        """Whether the rows of each sequence are adjacent, and some sequence has several."""
         codes = self.frame.groupby(self._keys(ids), sort=False, dropna=False, observed=True).ngroup().to_numpy()
         runs = 1 + int((np.diff(codes) != 0).sum())
         return 1 < runs == len(np.unique(codes)) < len(codes)
 
     def _coverage(self, ids: list[str], steps: np.ndarray) -> float:
-        """Return the share of all steps from the first to the last of each sequence at which it has a row."""
+        """Return the mean share of steps, between the first and last of a sequence, at which it has a row."""
         import pandas as pd
 
         moments = pd.Series(steps)
@@ -400,7 +400,7 @@ class _Proposal:
             )
 
     def _column(self, name: str, family: str) -> Column | None:
-        """What a column probably holds; None for what is no target, as texts that are all different."""
+        """Guess the family of a column; None if it cannot be a target, such as texts that are all different."""
         read, values = self.numbers[name], self.plain[name]
         if values.dtype.kind == "c":
             raise ValueError(

@@ -55,7 +55,7 @@ LARGEST_HEADER = 2**20
 
 
 def read_frame(path: str | os.PathLike[str]) -> Any:
-    """A pandas frame of a CSV, TSV, Parquet or npz file; what a CSV or TSV holds are texts, missing where it is empty.
+    """Read a CSV, TSV, Parquet or npz file as a pandas frame; cells of CSV and TSV are text, empty ones missing.
 
     An npz holds an array (N, T, D), or (T, D) of one sequence, named "x" or alone, and perhaps "lengths" (N,); its
     columns are x0, x1, … beside "sequence" and "step".
@@ -80,7 +80,7 @@ def read_frame(path: str | os.PathLike[str]) -> Any:
 
 
 def _separated(content: bytes, separators: str) -> Any:
-    """The frame of a CSV, of texts: only their roles decide which are numbers; no row is longer than the header."""
+    """Read a CSV as a frame of text, of which roles decide later what are numbers; refuse rows longer than the header."""
     import pandas as pd
 
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -328,7 +328,7 @@ def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | Told | None, 
 
 
 def read_schema(text: str) -> tuple[Columns | Told | None, Cut | None]:
-    """Return columns and cut of a schema, None for what it does not say; the columns are proposed where it has none."""
+    """Return the columns and the cut of a schema, None for a missing part; without [columns], `Told` to propose them."""
     told = parsed(text)
     cut = told.pop("cut", None)
     if cut is not None:

@@ -367,7 +367,7 @@ LAYOUTS = {
     ),
     "constants": (
         "station,t,y\na,1,2.5\na,2,2.5\nb,1,3.5\nb,2,3.5\n",
-        "no column is a target; given are y; y have one value",
+        "no column is a target; given are y; constant in each sequence are y",
     ),
 }
 

@@ -225,7 +225,6 @@ def check(seed, path):
             try:
                 proposed = read_panel(path)
             except ValueError as error:
-                assert 0 < len(str(error)) < 1000
                 return str(error)
         check_named(table, proposed, " ".join(str(each.message) for each in caught))
     except Exception as error:
@@ -238,3 +237,4 @@ def check(seed, path):
 def test_tables_come_back_from_csv_or_are_named(tmp_path, part):
     refused = [check(seed, tmp_path / "a.csv") for seed in range(50 * part, 50 * part + 50)]
     assert sum(map(bool, refused)) < 25  # most are read without a schema
+    assert max(map(len, refused)) < 1000
