@@ -12,13 +12,18 @@ from .numerals import read_numbers
 from .parsing import MONTHS, compact, dates, is_number
 
 CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:\.\d{1,9})?))?\s?(?:([ap])\.?m\.?)?", re.IGNORECASE | re.ASCII)
-UNITS = ("year", "quarter", "month", "day", "hour", "minute", "second")
+PERIOD = re.compile(
+    rf"[ap]\.?m\.?|q[1-4]|({'|'.join(MONTHS)})[a-z]*|(mon|tue|wed|thu|fri|sat|sun)[a-z]*", re.IGNORECASE
+)
+"""A part of a time in words."""
+UNITS = ("year", "quarter", "week", "month", "day", "hour", "minute", "second")
 NAMES = dict(
     zip(
         UNITS,
         (
             r"years?|yr|yyyy",
             r"quarters?|qtr|q",
+            r"(iso)?weeks?|wk|kw",
             r"months?|mon?|mm|mth",
             r"days?|dom|dd?|dy|mday|doy",
             r"hours?|hr?s?|hh|time|hhmm",
@@ -29,7 +34,7 @@ NAMES = dict(
     )
 )
 SECONDS = {"day": 86400, "hour": 3600, "minute": 60, "second": 1}
-_MOST = {"year": 9999, "quarter": 4, "month": 12, "day": 366, "hour": 24, "minute": 59, "second": 60}
+_MOST = {"year": 9999, "quarter": 4, "week": 53, "month": 12, "day": 366, "hour": 24, "minute": 59, "second": 60}
 
 
 def is_clock(values: Any) -> bool:
@@ -60,8 +65,11 @@ def parts_of(frame: Any, names: Collection[str]) -> tuple[str, ...]:
         unit = unit_of(name, frame[name])
         if unit is not None:
             units.setdefault(unit, name)
-    if "month" in units:
-        units.pop("quarter", None)
+    coarse = [unit for unit in ("month", "week", "quarter") if unit in units]
+    if coarse:  # the finest tells the others
+        units = {unit: name for unit, name in units.items() if unit not in coarse[1:]}
+        if coarse[0] != "month":
+            units = {unit: name for unit, name in units.items() if unit not in SECONDS}
     begin = [unit for unit in ("year", "day") if unit in units][:1]
     return tuple(units[unit] for unit in UNITS[UNITS.index(begin[0]) :] if unit in units) if begin else ()
 
@@ -82,8 +90,8 @@ def joined(frame: Any, names: tuple[str, ...]) -> Any:
 
     Args:
         frame: table.
-        names: columns of dates and of clocks or hours; or of whole numbers, named year, quarter, month, day, hour,
-            minute and second, or in that order without a quarter. Without a year, days are counted.
+        names: columns of dates and of clocks or hours; or of whole numbers, named year, month, day, hour, minute and
+            second, or in that order; or named year and quarter, or year and (ISO) week. Without a year, days are counted.
 
     Raises:
         ValueError: columns that are no parts of a time.
@@ -97,7 +105,7 @@ def joined(frame: Any, names: tuple[str, ...]) -> Any:
         for name, unit in zip(names[1:], ("hour", "minute", "second"), strict=False):
             when = when + pd.to_timedelta(_part(frame[name], unit), unit="s")
         return when.rename(label)
-    order = iter(unit for unit in UNITS if unit != "quarter")
+    order = iter(unit for unit in UNITS if unit not in ("quarter", "week"))
     units = [unit_of(name, frame[name]) for name in names]
     if None in units or len(set(units)) < len(units):
         units = [next(order) for _ in names]
@@ -110,7 +118,11 @@ def joined(frame: Any, names: tuple[str, ...]) -> Any:
         return pd.Series(seconds / SECONDS[str(units[-1])], frame.index, name=label)
     month = parts.get("month", 3 * parts["quarter"] - 2 if "quarter" in parts else np.ones(len(frame)))
     months = (12 * (parts["year"] - 1970) + month - 1).astype(int).astype("datetime64[M]")
-    if "day" in parts:
+    if "week" in parts:  # the first holds January 4
+        fourth = months.astype("datetime64[D]") + 3
+        weekday = (fourth.astype(int) + 3) % 7  # 1970 began on a Thursday
+        months = fourth - weekday + 7 * (parts["week"].astype(int) - 1)
+    elif "day" in parts:
         if "month" in parts:
             _refuse_late_days(parts["day"], months, label)
         seconds = seconds - SECONDS["day"]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..options import nearest
-from .clocks import is_clock, joined, parts_of, unit_of
+from .clocks import PERIOD, is_clock, joined, parts_of, unit_of
 from .columns import Column, Columns, Role
 from .numerals import NEARLY_ALL, read_numbers
 from .parsing import (
@@ -45,6 +45,8 @@ COVERAGE = 0.6
 """Share of the steps between its first and its last that a sequence has, where a text tells sequences apart."""
 MOST_HEADERS = 4
 """Rows of names at the top of a file."""
+DATE = r"\d{4}|\d\W{1,2}\d|\d[-/. ]?[A-Za-z]{3}"
+"""What every date has somewhere."""
 DATED_NAME = re.compile(
     r"\d{4}([-/.]\d{1,2}){0,2}([T ]\d.*)?|\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}|\d{4}[-_ ]?[QM]\d{1,2}|"
     rf"({'|'.join(MONTHS)})[a-z]*[-/ .]?\d{{2,4}}",
@@ -193,7 +195,7 @@ class _Proposal:
         aside: tuple[str, ...],
         families: Mapping[str, str],
     ):
-        self.frame, self.levels = frame, levels if len(levels) > 1 else []
+        self.frame, self.index, self.levels = frame, levels, levels if len(levels) > 1 else []
         self.na_values, hint = told.na_values, frame.attrs.get("decimal", ".")
         self.numbers = {name: read_numbers(frame[name], told.na_values, told.decimal, hint) for name in frame}
         numerals = {
@@ -317,12 +319,16 @@ class _Proposal:
     def _is_named_id(self, name: str) -> bool:
         """Whether whole numbers or texts have the name of an id."""
         values = self.plain[name]
-        return IDS.search(name.lower()) is not None and (not is_number(values) or _is_whole(values))
+        named = IDS.search(name.lower()) is not None or name in self.index
+        return named and (not is_number(values) or _is_whole(values))
 
     def _may_be_id(self, name: str) -> bool:
         """Whether a column holds texts, or codes such as 007, that repeat and say nothing of the time."""
         values = self.frame[name]
-        if is_number(self.plain[name]) or values.nunique() == len(values):
+        different = values.dropna().unique()
+        if is_number(self.plain[name]) or len(different) == len(values):
+            return False
+        if all(PERIOD.fullmatch(str(each).strip()) for each in different):
             return False
         return IDS.search(name.lower()) is not None or not (TIMES.search(name.lower()) or is_clock(values))
 
@@ -350,10 +356,20 @@ class _Proposal:
     def _is_time(self, name: str) -> bool:
         """Whether a column holds dates; notes those whose day and month cannot be told apart."""
         try:
-            return is_date(self.plain[name])
+            if is_date(self.plain[name]):
+                return True
+            cells = self.frame[name]
+            plausible = cells.isna() if is_number(cells) else texts(cells).str.contains(DATE, na=True)
+            known = plausible & cells.notna()
+            if NEARLY_ALL * cells.count() <= known.sum() < cells.count() and is_date(cells[known]):
+                row = int(np.argmin(plausible))
+                raise ValueError(
+                    f"column {name!r}: {known.sum()} of {cells.count()} values are dates; row {row} is "
+                    f"{brief(cells.iloc[row])}; correct it, or leave the row out"
+                )
         except Undecided as error:
             self.undecided[name] = str(error)
-            return False
+        return False
 
     def _is_compact(self, name: str) -> bool:
         """Whether numbers with the name of a time are dates such as 20241231."""
@@ -475,7 +491,7 @@ def is_date(values: Any) -> bool:
     if is_number(values) or not len(known):
         return False
     some = known.iloc[:: max(len(known) // 50, 1)].astype(str)
-    if not some.str.contains(r"\d{4}|\d\W{1,2}\d|\d[-/. ]?[A-Za-z]{3}").all():
+    if not some.str.contains(DATE).all():
         return False
     for part in (some, known):
         try:

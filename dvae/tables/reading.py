@@ -80,7 +80,7 @@ def read_frame(path: str | os.PathLike[str]) -> Any:
 
 
 def _separated(content: bytes, separators: str) -> Any:
-    """Read a CSV as a frame of text, of which roles decide later what are numbers; refuse rows longer than the header."""
+    """Read a CSV as a frame of text, whose types are decided after its roles; refuse rows longer than the header."""
     import pandas as pd
 
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -101,6 +101,10 @@ def _separated(content: bytes, separators: str) -> Any:
             frame = read(BytesIO(content), skiprows=_comments(content))
         except pd.errors.ParserWarning as error:
             raise ValueError("some of its rows have more entries than its header") from error
+        except pd.errors.ParserError as error:
+            raise ValueError(
+                f"{str(error).strip()}; lines above the header that describe the data begin with #"
+            ) from error
         except UnicodeDecodeError as error:
             try:
                 content.decode()
@@ -328,7 +332,7 @@ def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | Told | None, 
 
 
 def read_schema(text: str) -> tuple[Columns | Told | None, Cut | None]:
-    """Return the columns and the cut of a schema, None for a missing part; without [columns], `Told` to propose them."""
+    """Return columns and cut of a schema, None for a missing part; `Told` in place of columns if it lists none."""
     told = parsed(text)
     cut = told.pop("cut", None)
     if cut is not None:

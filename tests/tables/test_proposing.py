@@ -254,6 +254,10 @@ def test_a_clock_is_not_joined_where_the_date_suffices():
     days = pd.DataFrame({"day": np.repeat([1, 2], 24), "hour": np.tile(np.arange(24), 2), "y": np.arange(48) / 8})
     assert proposed(days).time == ("day", "hour")
     np.testing.assert_array_equal(Panel.of(days).series[0].times, np.arange(24, 72))
+    weeks = pd.DataFrame({"year": np.repeat([2020, 2021], 52), "week": [*range(1, 53)] * 2, "y": np.arange(104) / 8})
+    moments = Panel.of(weeks).series[0].times
+    assert proposed(weeks).time == ("year", "week")
+    assert (moments[0], moments[52]) == (pd.Timestamp("2019-12-30").timestamp(), pd.Timestamp("2021-01-04").timestamp())
     quarters = pd.DataFrame({"year": np.repeat([2020, 2021], 4), "quarter": [f"Q{n}" for n in (1, 2, 3, 4)] * 2})
     quarters["y"] = np.arange(8) / 8
     assert proposed(quarters).time == ("year", "quarter")
@@ -365,6 +369,12 @@ LAYOUTS = {
         "Price,Close,Low\nTicker,AA,BB\nDate,,\n2024-01-01,1,2\n2024-01-02,2,3\n",
         "3 rows of names",
     ),
+    "a total": (
+        "day,y\n2024-01-01,1\n2024-01-02,2\n2024-01-03,3\n2024-01-04,4\nTotal,10\n",
+        "4 of 5 .* row 4 is 'Total'",
+    ),
+    "a description": ("Station: a\n\nday,y\n2024-01-01,1\n", "saw 2; lines above the header that .* begin with #"),
+    "halves of days": ("day,half,y\n2024-01-01,AM,1\n2024-01-01,PM,2\n2024-01-02,AM,3\n", "two rows at day"),
     "constants": (
         "station,t,y\na,1,2.5\na,2,2.5\nb,1,3.5\nb,2,3.5\n",
         "no column is a target; given are y; constant in each sequence are y",
@@ -390,6 +400,8 @@ def test_empty_rows_at_the_end_are_left_out_and_empty_lines_are_named(tmp_path):
 
 
 def test_ids_count_where_no_time_repeats():
+    firms = pd.DataFrame({"year": [2000, 2001] * 2, "y": [0.5, 1.5, 2.5, 3.5]}, pd.Index([7, 7, 9, 9], name="firm"))
+    assert [one.name for one in Panel.of(firms)] == ["7", "9"]
     frame = pd.DataFrame({"patient": [7, 7, 7, 3, 3], "t": [0.5, 2.0, 3.5, 1.0, 7.0], "y": np.arange(5) / 4})
     for table in (frame, frame.drop(columns="t")):
         assert [(one.name, len(one)) for one in Panel.of(table)] == [("3", 2), ("7", 3)]
