@@ -91,7 +91,8 @@ def joined(frame: Any, names: tuple[str, ...]) -> Any:
     Args:
         frame: table.
         names: columns of dates and of clocks or hours; or of whole numbers, named year, month, day, hour, minute and
-            second, or in that order; or named year and quarter, or year and (ISO) week. Without a year, days are counted.
+            second, or in that order; or named year and quarter, or year and (ISO) week.
+            Without a year, days are counted.
 
     Raises:
         ValueError: columns that are no parts of a time.

@@ -45,6 +45,7 @@ SEPARATORS = {".csv": ",;\t", ".tsv": "\t"}
 DECIMAL_COMMA = re.compile(r"(?:^|[;\t])\s*[-+]?\d+,\d+\s*(?:[;\t]|$)", re.MULTILINE)
 DECLARED = re.compile(rb'"?sep=([,;:|\t ])"?\r?\n', re.IGNORECASE)
 """A first line that names the separator."""
+ABOVE = "; if lines above the header describe the data, begin them with #"
 BLANK = re.compile(rb"\n[ \t]*\r?\n|\r\r(?!\n)")
 SUFFIXES = (*SEPARATORS, ".parquet", ".npz")
 LARGEST = 2 * 10**9
@@ -100,11 +101,9 @@ def _separated(content: bytes, separators: str) -> Any:
         try:
             frame = read(BytesIO(content), skiprows=_comments(content))
         except pd.errors.ParserWarning as error:
-            raise ValueError("some of its rows have more entries than its header") from error
+            raise ValueError(f"some of its rows have more entries than its header{ABOVE}") from error
         except pd.errors.ParserError as error:
-            raise ValueError(
-                f"{str(error).strip()}; lines above the header that describe the data begin with #"
-            ) from error
+            raise ValueError(f"{str(error).strip()}{ABOVE}") from error
         except UnicodeDecodeError as error:
             try:
                 content.decode()

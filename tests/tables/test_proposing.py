@@ -373,7 +373,10 @@ LAYOUTS = {
         "day,y\n2024-01-01,1\n2024-01-02,2\n2024-01-03,3\n2024-01-04,4\nTotal,10\n",
         "4 of 5 .* row 4 is 'Total'",
     ),
-    "a description": ("Station: a\n\nday,y\n2024-01-01,1\n", "saw 2; lines above the header that .* begin with #"),
+    "a description": (
+        "Station: a\n\nday,y\n2024-01-01,1\n",
+        "more entries than its header; if lines above the header describe the data, begin them with #",
+    ),
     "halves of days": ("day,half,y\n2024-01-01,AM,1\n2024-01-01,PM,2\n2024-01-02,AM,3\n", "two rows at day"),
     "constants": (
         "station,t,y\na,1,2.5\na,2,2.5\nb,1,3.5\nb,2,3.5\n",
