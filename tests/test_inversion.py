@@ -51,7 +51,7 @@ def fewer(guide, width):
                 yield replace(guide, factors=tuple(less if each is factor else each for each in guide.factors))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(factorizations(), st.data())
 def test_a_derived_guide_is_exact_and_no_smaller_one_is(pair, data):
     generative = pair[0]

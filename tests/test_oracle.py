@@ -211,7 +211,7 @@ def test_bounds_of_random_factorizations_lie_below_the_evidence(pair, seed):
         assert oracle.gap() > -1e-9
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(factorizations(), st.integers(0, 999))
 def test_random_guides_are_tight_exactly_where_the_audit_says_so(pair, seed):
     verdict = audit(*pair)
@@ -220,7 +220,7 @@ def test_random_guides_are_tight_exactly_where_the_audit_says_so(pair, seed):
     assert (gap < 1e-6) == verdict.exact, gap
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(factorizations(), st.integers(0, 999))
 def test_with_masks_of_ones_own_too(pair, seed):
     rng = np.random.default_rng(seed)

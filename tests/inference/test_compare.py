@@ -273,8 +273,9 @@ def null(seeds, clips, of_seeds, of_clips, rest, random):
     }
 
 
-@pytest.mark.parametrize("kind", [(1.0, 0.1, 0.1), (0.1, 1.0, 0.1), (0.2, 0.7, 0.3), (0.3, 0.7, 1.0)])
-@pytest.mark.parametrize("seeds", [2, 3, 10])
+@pytest.mark.parametrize(
+    ("seeds", "kind"), [(2, (1.0, 0.1, 0.1)), (3, (0.1, 1.0, 0.1)), (10, (0.2, 0.7, 0.3)), (3, (0.3, 0.7, 1.0))]
+)
 def test_a_true_null_is_rejected_about_as_often_as_the_level_says(seeds, kind):
     """At .05, whether seeds, clips, or both rule; Welch's test of two seeds a side is known to keep below."""
     random, runs = np.random.default_rng(0), 1500

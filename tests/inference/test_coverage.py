@@ -431,7 +431,7 @@ def test_copies_of_windows_in_a_clip_narrow_no_band():
         np.testing.assert_allclose(ours, theirs)
 
 
-@pytest.mark.parametrize("shared", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("shared", [0.0, 0.9])
 def test_bands_hold_the_curves_of_dependent_ranks_that_are_uniform(shared):
     """Of 200 sets of 20 clips of 20 numbers that have a normal effect in common: at most .05 + 4 standard errors."""
     random, outside = np.random.default_rng(1), 0

@@ -88,9 +88,7 @@ def test_ranks_of_the_mean_field_guide_are_not(inference):
 @pytest.mark.parametrize(
     ("options", "reading"),
     [
-        ({"factor": 0.6}, "is too narrow"),
         ({"factor": 1.6}, "is too wide"),
-        ({"shift": 0.5}, "draws too high"),
         ({"shift": -0.5}, "draws too low"),
         ({"factor": 0.6, "shift": 0.8}, "is too narrow, draws too high"),
     ],

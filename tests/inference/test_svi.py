@@ -31,10 +31,12 @@ TRAIN, HELD_OUT = walks(24), walks(7, seed=1)
 SHARED = {"batch_size": 8, "log_every": 1, "validate_every": 6, "learning_rate": 0.02, "progress": False}
 WARM_UP = Evidence(kl_weight=Ramp(0.0, 1.0, 10), free_bits=0.1)
 RUNS = {
-    "clipped": {"steps": STEPS, "objective": WARM_UP, "gradient_clip": 0.5, "decay": 0.5},
-    "self-fed": {"steps": STEPS, "self_feeding": Piecewise(((0, 0.0), (11, 0.5))), "particles": 2},
+    "clipped": {"steps": STEPS, "objective": WARM_UP, "gradient_clip": 0.5, "decay": 0.5, "particles": 2},
     "staged": {
-        "stages": [Stage(10, WARM_UP, frozen=("generator.z.",)), Stage(14, learning_rate=0.01, self_feeding=0.3)],
+        "stages": [
+            Stage(10, WARM_UP, frozen=("generator.z.",)),
+            Stage(14, learning_rate=0.01, self_feeding=Piecewise(((10, 0.0), (21, 0.5)))),
+        ],
         "optimizer": "adamw",
         "weight_decay": 0.01,
     },

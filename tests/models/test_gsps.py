@@ -495,7 +495,7 @@ def test_no_further_future_costs_nothing(windows):
 def test_training_brings_the_best_future_nearer(windows):
     model = build(windows, width=16, coefficients=12, diversity=(0.0,)).float()
     method = model.method
-    options = {"steps": 80, "batch_size": 8, "learning_rate": 5e-3, "progress": False}
+    options = {"steps": 60, "batch_size": 8, "learning_rate": 5e-3, "progress": False}
     recipe = method.train(windows, steps=options.pop("steps"))
     result = dvae.fit(model, recipe.batches, stages=recipe.stages, steps=recipe.stages[0].steps, **options)
     errors = result.series("energy/reconstruction")[1]
