@@ -46,7 +46,7 @@ def row_blocks(arrays: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
 
 
 def cut(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, lengths: Tensor | int) -> Tensor:
-    """Windows (B, T, ...) of arrays (N, ...), copied in single precision, in which models compute.
+    """Windows (B, T, ...) of arrays (N, ...), copied in a floating type that holds all their values.
 
     Args:
         arrays: with rows of one shape.
@@ -55,7 +55,8 @@ def cut(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, lengths: Te
         lengths: (B,) rows of each window, or of all; behind a shorter one its last row is repeated.
     """
     steps = [lengths] * len(which) if isinstance(lengths, int) else lengths.tolist()
-    found = np.empty((len(which), max(steps, default=0), *arrays[0].shape[1:]), np.float32)
+    dtype = np.result_type(np.float32, *{values.dtype for values in arrays})
+    found = np.empty((len(which), max(steps, default=0), *arrays[0].shape[1:]), dtype)
     for window, place, start, length in zip(found, which.tolist(), starts.tolist(), steps, strict=True):
         window[:length] = arrays[place][start : start + length]
         window[length:] = window[length - 1]

@@ -29,6 +29,7 @@ from torch import Tensor
 from typing_extensions import Protocol, runtime_checkable  # typing's own, in Python 3.11, evaluates properties
 
 from .blocks import hash_values, ranges
+from .units import exceeds_float32
 
 Batch = Mapping[str, Any]
 BESIDE = "beside"
@@ -560,5 +561,6 @@ class ArrayWindows:
     def all(self) -> Batch:
         """All windows, x `(N, T, D)`, whole numbers as floating-point ones, and the mask if there is one."""
         x = tensor_of(self.x)
-        batch = {"x": x if x.is_floating_point() else x.to(torch.get_default_dtype())}
+        wide = torch.float64 if exceeds_float32(x.dtype) else torch.get_default_dtype()
+        batch = {"x": x if x.is_floating_point() else x.to(wide)}
         return batch if self.mask is None else {**batch, "mask": tensor_of(self.mask)}

@@ -245,7 +245,7 @@ class Oracle:
     def _log_probability(self, name: str, states: Mapping[str, Tensor]) -> Tensor:
         """(C,), of courses of a variable that is summed out given those of the others."""
         conditional, value = self.model.generator[name], states[name]
-        law = conditional.law.distribution(conditional(states, len(value), self.steps))
+        law = conditional.distribution(conditional(states, len(value), self.steps))
         logs: Tensor = (law.logits * value).flatten(1).sum(1)
         return logs
 

@@ -3,6 +3,9 @@
 A network that must find them out first learns much more slowly where what varies is a tenth of what is always there.
 Densities and all that a program returns stay in the variable's own unit.
 
+A variable of the data, or context, may lie far from 0 for its spread, as pressures in pascals do. Its mean stays in
+float64, its values are read in float64, and only their difference becomes the model's float32.
+
 Units are no view of the data (`dvae.views`). Latents and context have them too, of which nothing is handed out in
 another unit. A law is put into the data's unit where it is made (`Law.in_units`, the push-forward), so that given
 scales and every density are in that. And positive data that go over orders of magnitude are read as logarithms, though
@@ -12,14 +15,29 @@ made as a multiple of their mean: of the powers of a spectrum as they are, a net
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from .blocks import ColumnSummary, blocks
+
+ROUNDING = 2e-15
+"""Standard deviation over the mean up to which values in float64 are a constant with rounding errors."""
+RESOLVED = 6e-6
+"""Least standard deviation over the mean of values in float32, of which it loses a hundredth."""
+SMALLEST = 1e-18
+"""Least standard deviation: the inverse of its square is a float32."""
+TOO_SMALL = f"models compute in float32, which needs at least {SMALLEST:g}; multiply the values by a constant"
+
+
+def exceeds_float32(dtype: torch.dtype | np.dtype) -> bool:
+    """Whether float32 rounds some values of a type."""
+    name = getattr(dtype, "name", str(dtype)).removeprefix("torch.")
+    return name in ("float64", "int32", "int64", "uint32", "uint64")
 
 
 class Coordinate(NamedTuple):
@@ -40,12 +58,17 @@ class Coordinate(NamedTuple):
     spread: float = 1.0
 
 
+EXACT = ("mean", "typical")
+"""Buffers that may be in float64 whatever the precision of the model."""
+
+
 class Units(nn.Module):
     """A mean for every coordinate and one scale for all, which keeps angles; 0 and 1 until `fit`.
 
     Args:
         size: D.
         coordinates: those of a table, each with units of its own; nothing of them is fitted.
+        exact: keep means in float64 where they are given, or fitted to values in float64.
     """
 
     mean: Tensor
@@ -55,11 +78,14 @@ class Units(nn.Module):
     level: Tensor
     spread: Tensor
 
-    def __init__(self, size: int, coordinates: Sequence[Coordinate] = ()):
+    def __init__(self, size: int, coordinates: Sequence[Coordinate] = (), exact: bool = False):
         super().__init__()
-        found = dict(zip(Coordinate._fields, torch.tensor(coordinates).T, strict=True)) if coordinates else {}
+        self.exact = exact
+        given = torch.tensor(coordinates, dtype=torch.float64).reshape(-1, len(Coordinate._fields))
+        found = dict(zip(Coordinate._fields, given.T, strict=True)) if coordinates else {}
         for name, value in (found or {"mean": torch.zeros(size), "scale": torch.ones(())}).items():
-            self.register_buffer(name, value)
+            kept = exact and name in EXACT and value.dtype is torch.float64
+            self.register_buffer(name, value if kept else value.to(torch.get_default_dtype()))
         self.logarithms = any(each.floor for each in coordinates)
 
     @torch.no_grad()
@@ -80,8 +106,33 @@ class Units(nn.Module):
                 f"units come from values (..., {size}) that vary, not from {tuple(values.shape)}"
                 f"{' without variance' if alike else ''}"
             )
-        self.mean.copy_(torch.from_numpy(known.mean))
-        self.scale.fill_(math.sqrt(variance))
+        if (scale := math.sqrt(variance)) < SMALLEST:
+            raise ValueError(f"the standard deviation of these values is {scale:g}; {TOO_SMALL}")
+        mean = torch.from_numpy(known.mean).to(self.mean.device)
+        self.mean = mean if self.exact and exceeds_float32(values.dtype) else mean.to(self.scale.dtype)
+        self.scale.fill_(scale)
+
+    @property
+    def wide(self) -> bool:
+        """Whether values are in float64 and the model is not."""
+        return self.mean.dtype is torch.float64 is not self.scale.dtype
+
+    @override
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Keeps float64 where the model changes its precision."""
+        kept = {n: v for n, v in self.named_buffers() if self.exact and n in EXACT and v.dtype is torch.float64}
+        super()._apply(fn, recurse)
+        for name, value in kept.items():
+            setattr(self, name, value.to(getattr(self, name).device))
+        return self
+
+    @override
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
+        """Takes means in float64 as such."""
+        for name in self._buffers.keys() & {*EXACT}:
+            if self.exact and prefix + name in state_dict and state_dict[prefix + name].dtype is torch.float64:
+                setattr(self, name, getattr(self, name).double())
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property
     def filling(self) -> Tensor:
@@ -90,9 +141,9 @@ class Units(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         """Values (..., D) without unit."""
-        plain: Tensor = (values - self.mean) / self.scale
+        plain: Tensor = (values - self.mean).to(self.scale.dtype) / self.scale
         if not self.logarithms:
             return plain
         read = self.floor > 0
         logarithms = values.clamp(min=torch.where(read, self.floor, 1.0)).log()  # finite where it is not read, too
-        return torch.where(read, (logarithms - self.level) / self.spread, plain)
+        return torch.where(read, (logarithms.to(self.level.dtype) - self.level) / self.spread, plain)

@@ -25,6 +25,7 @@ from torch.distributions import kl_divergence
 from ..graph import analytic_kl
 from ..networks.base import computing_once
 from ..program.batch import AnyBatch, repeat
+from ..program.conditional import like
 from ..program.groups import GROUP, Groups
 from ..program.model import DynamicalVAE
 from ..program.rollout import Rollout, Sequence
@@ -262,7 +263,7 @@ def _record(terms: Terms, table: dict[str, Tensor], name: str, value: Tensor, ru
 
 
 def _frames(rollout: Rollout) -> Tensor:
-    some, rows = next(iter(rollout.values.values())), rollout.batch // rollout.draws
+    some, rows = like(next(iter(rollout.conditionals.values()))), rollout.batch // rollout.draws
     if rollout.lengths is None:
         return some.new_full((rows,), float(rollout.length))
     return rollout.lengths[:rows].to(some.dtype)

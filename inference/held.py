@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from ..data import Batch, HeldOutWindows, called, clusters, each, gapped, held_out_windows, mask_of, past_of
 from ..program.batch import rows
 from ..program.conditional import evaluating
+from ..program.model import DynamicalVAE
 
 
 @dataclass(frozen=True)
@@ -139,11 +140,12 @@ def reproducibly(model: nn.Module, seed: int) -> Iterator[None]:
 
 
 def on_device_of(model: nn.Module, batch: Batch) -> dict[str, Any]:
-    """The batch on the device and in the floating type of the model's parameters."""
+    """The batch on the device of the model, and in its floating type where it does not read batches by itself."""
     parameter = next(model.parameters())
+    reads = isinstance(model, DynamicalVAE)  # and takes means off before it rounds
 
     def moved(value: Tensor) -> Tensor:
-        return value.to(parameter) if value.is_floating_point() else value.to(parameter.device)
+        return value.to(parameter.device) if reads or not value.is_floating_point() else value.to(parameter)
 
     return dict(each(batch, moved))
 

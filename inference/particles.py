@@ -193,7 +193,7 @@ class Filter:
         history = {**data, **self.paths}
         for name, law in guide.items():
             parameters = law.step(t, history)
-            self.paths[name][t] = law.conditional.law.draw(parameters, noise[name][t])
+            self.paths[name][t] = law.conditional.draw(parameters, noise[name][t])
             total = total - _log_prob(law.conditional, parameters, self.paths[name][t], _at(counted[name], t))
         for name, law in prior.items():
             parameters = law.step(t, history)
@@ -201,7 +201,7 @@ class Filter:
             total = total + _log_prob(law.conditional, parameters, value, _at(counted[name], t))
             if name in self.hidden:  # the model reads its own mean there
                 seen = self.known.observed[name][:, t].index_select(0, self.sequence)
-                self.paths[name][t] = torch.where(seen, value, law.conditional.law.mean(parameters))
+                self.paths[name][t] = torch.where(seen, value, law.conditional.mean(parameters))
         return total
 
     def _draw_statics(self, late: bool) -> Tensor:
@@ -212,7 +212,7 @@ class Filter:
                 conditional = model.encoder[name]
                 parameters = self._parameters(conditional, self.known.values)
                 noise = conditional.law.noise((len(self.sequence), conditional.size), total)
-                self.statics[name] = Rows([conditional.law.draw(parameters, noise)])
+                self.statics[name] = Rows([conditional.draw(parameters, noise)])
                 total = total - _log_prob(conditional, parameters, self.statics[name][0])
         known = {**self.shared, **self.drawn}
         for factor in model.generative.factors:
@@ -311,7 +311,7 @@ def _log_mean(log_weights: Tensor) -> Tensor:
 
 def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, counted: Tensor | None = None) -> Tensor:
     """(N,) of values (N, D); entries that are not `counted` are left out."""
-    entries = conditional.law.distribution(parameters).log_prob(conditional.scored(value, counted))
+    entries = conditional.distribution(parameters).log_prob(conditional.scored(value, counted))
     if counted is not None and counted.dim() != entries.dim():  # one of guide and model has whole events
         counted = counted.all(-1) if conditional.whole else counted[:, None]
     # where, not a product: an entry that does not count may be infinite

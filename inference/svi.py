@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from ..compiled import compiling, require_compiler
 from ..data import Batch, InBatches, each, in_batches, refuse_table, tensor_of
 from ..options import kind_of
+from ..program.model import DynamicalVAE
 from ..program.protocols import Program
 from ..turns import alone
 from . import processes
@@ -341,11 +342,12 @@ class SVI:
     def _terms(
         self, batch: Batch | Tensor, objective: Objective, where: str, feeding: float, curriculum: float | None = None
     ) -> Terms:
-        """Terms of a batch that the objective needs, on the device and in the precision of the model."""
-        dtype = self.parameters[0].dtype
+        """Terms of a batch that the objective needs, on the device of the model."""
         refuse_table(batch)
-        named = {"x": batch} if not isinstance(batch, Mapping) else batch
-        placed = each(each(named, tensor_of), lambda v: v.to(dtype) if v.is_floating_point() else v)
+        placed = each(batch if isinstance(batch, Mapping) else {"x": batch}, tensor_of)
+        if not isinstance(self.model, DynamicalVAE):  # which reads in its own precision
+            dtype = self.parameters[0].dtype
+            placed = each(placed, lambda v: v.to(dtype) if v.is_floating_point() else v)
         program: dict[str, Any] = {"self_feeding": feeding} if feeding else {}
         program |= {} if curriculum is None else {"curriculum": curriculum}
         if isinstance(objective, Asking) and objective.draws:

@@ -250,7 +250,7 @@ def rising(level: float, steps: int) -> Ramp:
 
 def fit_units(model: DynamicalVAE, train: Any) -> None:
     """Takes the units of x from 1024 windows of the training data, as the model sees them."""
-    seen = model.read(train.sample(1024, torch.default_generator))
+    seen = model.read(train.sample(1024, torch.default_generator), precise=True)
     model.units[WHOLE].fit(bridged(seen[WHOLE], seen.get("mask", {}).get(WHOLE)))
 
 

@@ -136,20 +136,22 @@ class MoGlow(LikelihoodMethod):
 
 def start_flow(model: DynamicalVAE, windows: Any) -> None:
     """Takes the unit of x from 256 windows, and starts flows at them (`ConditionalFlowLaw.start_at`)."""
-    data = model.read(windows.sample(256, torch.default_generator))
-    x, units, law = data[WHOLE], model.units[WHOLE], model.generator[WHOLE].law
+    batch, units, law = windows.sample(256, torch.default_generator), model.units[WHOLE], model.generator[WHOLE].law
     if not units.scale.dim():  # those of columns are known
-        units.fit(bridged(x, data.get("mask", {}).get(WHOLE)))
+        seen = model.read(batch, precise=True)
+        units.fit(bridged(seen[WHOLE], seen.get("mask", {}).get(WHOLE)))
+    data = model.read(batch)
+    x = data[WHOLE]
     run = model._rollout(model.generative, model.generator, data, None, 1)
     with torch.no_grad():
         parameters = run.parameters(WHOLE, x)
-    mask = run.mask(WHOLE)
+    mask, centred = run.mask(WHOLE), model.generator[WHOLE].centred(x)
     parts = law.each(parameters) if isinstance(law, ProductLaw) else [(law, list(range(x.shape[-1])), parameters)]
     for part, places, own in parts:
         if isinstance(part, ConditionalFlowLaw):
             seen = torch.ones(x.shape[:2], dtype=torch.bool) if mask is None else mask
             rows = seen[..., places].all(-1) if seen.dim() == 3 else seen
-            part.start_at(tuple(p[rows] for p in own), x[..., places][rows])
+            part.start_at(tuple(p[rows] for p in own), centred[..., places][rows])
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,9 @@ class Law(nn.Module):
     location_scale: bool = False
     """Whether `in_units` can put the parameters into another unit: a location and a scale, or a scale alone, as a rate.
     Probabilities cannot be."""
+    centred: bool | Sequence[bool] = False
+    """Whether `in_units` adds the mean, so that it can do without one on values less their mean; or of each coordinate
+    whether it does."""
     events: Sequence[Sequence[int]] = ()
     """Coordinates that are one event each, so that they are observed together or not at all, where a value has several
     such events."""

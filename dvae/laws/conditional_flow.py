@@ -58,6 +58,7 @@ class ConditionalFlowLaw(Law):
     """What `ConditionalFlow` describes; its parameters are m, s and h: (..., D), (..., D) and (..., H)."""
 
     location_scale = True
+    centred = True
 
     def __init__(self, spec: ConditionalFlow, shape: Shape):
         super().__init__(spec.residual)

@@ -22,6 +22,7 @@ class Gaussian(Law):
     """A law of independent normals; its parameters are their locations and scales, (..., D) each."""
 
     location_scale = True
+    centred = True
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         """The normals."""
@@ -199,10 +200,23 @@ class StudentT:
         return StudentTLaw(self, shape)
 
 
+class StudentTs(dist.StudentT):
+    """Student t distributions with degrees of freedom, locations and scales (..., D)."""
+
+    @override
+    def log_prob(self, value: Tensor) -> Tensor:
+        df, distance = self.df, (value - self.loc) / self.scale
+        alike = all(size == 1 or not stride for size, stride in zip(df.shape[:-1], df.stride()[:-1], strict=True))
+        half = (df[(0,) * (df.dim() - 1)] if alike else df).double() / 2  # one number for each coordinate, expanded
+        normaliser = (half + 0.5).lgamma() - half.lgamma() - 0.5 * (2 * math.pi * half).log()  # large terms cancel
+        return normaliser.to(df.dtype) - self.scale.log() - (df + 1) / 2 * (distance.square() / df).log1p()
+
+
 class StudentTLaw(Law):
     """What `StudentT` describes."""
 
     location_scale = True
+    centred = True
 
     def __init__(self, spec: StudentT, shape: Shape):
         super().__init__(spec.residual)
@@ -220,7 +234,7 @@ class StudentTLaw(Law):
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         loc, scale, df = parameters
-        return dist.StudentT(df, loc, scale, validate_args=False)
+        return StudentTs(df, loc, scale, validate_args=False)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         """Reparameterised values (..., D): the normal noise over the root of a gamma draw."""
@@ -249,6 +263,7 @@ class DeltaLaw(Law):
 
     deterministic = True
     location_scale = True
+    centred = True
 
     @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
@@ -297,6 +312,7 @@ class DirectionsLaw(DeltaLaw):
     """What `Directions` describes."""
 
     location_scale = False
+    centred = False
 
     def __init__(self, spec: Directions, shape: Shape):
         super().__init__(spec.residual)

@@ -45,6 +45,7 @@ from ..constants import constant
 from ..options import nearest
 from .base import Law, LawSpec, Parameters, Shape
 from .families import FixedNormal, Normal, StudentT
+from .precise import InDouble
 
 ALTERNATIVES = (("logits", "probs"), ("gate_logits", "gate"), ("scale_tril", "covariance_matrix", "precision_matrix"))
 """Parameters that say the same: the first is read."""
@@ -137,6 +138,10 @@ OPEN: Mapping[type[Distribution], Any] = {
 }
 """Supports of distributions that torch declares closed, although the density on their edge is 0 or infinite."""
 
+PLAIN = {"Bernoulli", "Categorical", "Cauchy", "Delta", "Exponential", "HalfCauchy", "HalfNormal", "Laplace"}
+PLAIN |= {"LogNormal", "Normal", "OneHotCategorical", "Uniform", "VonMises"}
+"""Distributions whose log densities do not subtract large terms; those of all others are evaluated in float64."""
+
 
 @dataclass(frozen=True)
 class Family:
@@ -204,6 +209,7 @@ class FamilyLaw(Law):
         self.forms = _forms(spec, shape)
         self.moves = UNITS.get(self.kind.__name__, {})
         self.location_scale = bool(self.moves.keys() & self.forms.keys())
+        self.centred = "loc" in self.forms and self.moves.get("loc") is _location
         if self.residual and "loc" not in self.forms:
             raise ValueError(f"{self.kind.__name__} has no location, to which a previous value could be added")
         widths = {name: math.prod(free) for name, (free, _, _) in self.forms.items()}
@@ -238,6 +244,11 @@ class FamilyLaw(Law):
 
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
+        if not parameters or parameters[0].dtype is torch.float64 or self.kind.__name__ in PLAIN:
+            return self._made(parameters)
+        return InDouble(self._made(parameters), lambda: self._made(tuple(p.double() for p in parameters)))
+
+    def _made(self, parameters: Parameters) -> TorchDistribution:
         shaped = {
             name: value.unflatten(-1, shape) if len(shape) > 1 else value if shape else value[..., 0]
             for (name, (_, _, shape)), value in zip(self.forms.items(), parameters, strict=True)
@@ -357,6 +368,7 @@ class NormalMixtureLaw(Law):
     """What `NormalMixture` describes; its parameters are logits, locations and scales, (..., D K) each."""
 
     location_scale = True
+    centred = True
 
     def __init__(self, spec: NormalMixture, shape: Shape):
         super().__init__()

@@ -65,6 +65,8 @@ class ProductLaw(Law):
                 raise ValueError(f"the part {self.places[place]} of {shape.name} has no density; in a Product all have")
         self.register_buffer("order", _order(self.places), persistent=False)
         self.location_scale = any(part.location_scale for part in parts)
+        own = {place: bool(parts[n].centred) for n, places in enumerate(self.places) for place in places}
+        self.centred = any(own.values()) and tuple(own[place] for place in range(shape.size))
         with torch.no_grad():
             probe, before = torch.randn(1, shape.features), torch.zeros(1, shape.size)
             made = [self._part(n, probe, before, None) for n in range(len(parts))]

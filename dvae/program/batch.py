@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..data import BESIDE, Batch, refuse_table, tensor_of
+from ..data import BESIDE, Batch, mask_of, refuse_table, tensor_of
 from ..laws.product import ProductSupport
 from ..networks.base import again, once, valid_steps
 from ..notation import Factorization
+from ..units import ROUNDING, exceeds_float32
 from ..views import LOG_DET, WHOLE, View
 from .conditional import Conditional
 from .groups import GROUP, Groups
@@ -21,6 +22,9 @@ from .rollout import Rollout
 
 CHUNK = 2048
 """Sequences times samples that a forecast holds at once."""
+
+LOST = 0.01
+"""Share of a standard deviation that rounding to float32 may lose."""
 
 AnyBatch = Tensor | Batch
 
@@ -52,17 +56,21 @@ class Reader:
     density: bool
     grouped: tuple[str, ...]
 
-    def read(self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor]) -> dict[str, Any]:
+    def read(
+        self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor], wide: Collection[str] = ()
+    ) -> dict[str, Any]:
         """The batch by name, in this precision, as the model sees it; what was read stays as it is.
 
         Args:
             batch: see `DynamicalVAE.model`.
             dtype: of floating-point values.
             means: name to what stands for missing entries of a variable, where that is not 0.
+            wide: names of variables that are read in float64 whatever the dtype.
 
         Raises:
             TypeError: a table.
-            ValueError: names that the model does not have, a mask of nothing, or tensors on the meta device.
+            ValueError: names that the model does not have, a mask of nothing, tensors on the meta device, or values
+                that float32 does not resolve.
         """
         if batch is None:
             return {}
@@ -79,7 +87,8 @@ class Reader:
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
             )
-        values = _tensors(batch, dtype, names)
+        exact = {*wide, whole, *self.view.names} if wide else set()  # views make the variables of these
+        values = _tensors(batch, dtype, names, exact)
         if "mask" in values:
             masks = values["mask"] if isinstance(values["mask"], Mapping) else {whole: values["mask"]}
             values["mask"] = masks
@@ -90,6 +99,8 @@ class Reader:
         if self.density and whole in values and LOG_DET not in values and not self.view.keeps_volume:
             seen[LOG_DET] = self.view.counted(values)
         seen = {name: value for name, value in seen.items() if name in values or name not in self.made}
+        narrow = [n for n, v in seen.items() if n not in wide and isinstance(v, Tensor) and v.is_floating_point()]
+        seen |= {name: _narrowed(name, seen[name], dtype, seen) for name in narrow}
         if "mask" in seen:  # of context too, which is told no more of it
             known = {name: mask for name, mask in seen["mask"].items() if name in seen}
             for name in known.keys() & self.laws.keys():
@@ -100,7 +111,8 @@ class Reader:
                             f"density for {len(event)} of them; hide them together, or give {name} a law with one for "
                             "each, such as Normal()"
                         )
-            seen |= {name: torch.where(mask, seen[name], means.get(name, 0.0)) for name, mask in known.items()}
+            fill = {name: means[name].to(seen[name].dtype) if name in means else 0.0 for name in known}
+            seen |= {name: torch.where(mask, seen[name], fill[name]) for name, mask in known.items()}
             kept = {*self.observed, self.view.history}
             seen["mask"] = {name: mask for name, mask in known.items() if name in kept}
         return seen
@@ -249,15 +261,47 @@ def _no_lengths(lengths: Tensor, length: int) -> str:
     return f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}"
 
 
-def _tensors(value: Any, dtype: torch.dtype, names: Collection[str]) -> Any:
+def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Collection[str]) -> dict[str, Any]:
     """Tensors, floating-point ones and those of these names in a precision; the others are counts and masks."""
-    found = {}
-    for name, each in value.items():
+    found: dict[str, Any] = {}
+    for name, each in batch.items():
         if isinstance(each, Mapping):
-            found[name] = _tensors(each, dtype, names if name == BESIDE else ())
+            found[name] = _tensors(each, dtype, names if name == BESIDE else (), ())
             continue
         tensor = tensor_of(each)
-        found[name] = tensor.to(dtype) if tensor.is_floating_point() or name in names else tensor
+        if tensor.is_floating_point() or name in names:
+            tensor = tensor.double() if name in wide else _narrowed(name, tensor, dtype, batch)
+        found[name] = tensor
+    return found
+
+
+def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Tensor:
+    """The value in the precision of the model.
+
+    Raises:
+        ValueError: float32 rounds it by more than `LOST` of its standard deviation.
+    """
+    found = value.to(dtype)
+    if dtype is not torch.float32 or not exceeds_float32(value.dtype) or value.dim() < 2 or not value.numel():
+        return found
+    known, mask, lengths = value.double(), mask_of(batch, name), batch.get("lengths")
+    if mask is not None and mask.shape == value.shape:
+        known = torch.where(torch.as_tensor(mask, device=value.device), known, torch.nan)
+    if lengths is not None and value.dim() == 3:
+        valid = valid_steps(torch.as_tensor(lengths, device=value.device), value.shape[1])
+        known = torch.where(valid[..., None], known, torch.nan)
+    rows = known.flatten(0, -2)
+    mean = rows.nanmean(0)
+    spread = (rows - mean).square().nanmean(0).sqrt()
+    lost = (rows - found.double().flatten(0, -2)).square().nanmean(0).sqrt()
+    wrong = (lost > LOST * spread) & (spread > ROUNDING * mean.abs())
+    if wrong.any():
+        place = int(wrong.nonzero()[0])
+        raise ValueError(
+            f"coordinate {place} of {name} has mean {mean[place]:.9g} and standard deviation {spread[place]:.3g}, of "
+            f"which float32 loses {lost[place] / spread[place]:.0%}; call model.standardise({name!r}).fit(values), "
+            "which takes the mean off in float64, or subtract the mean yourself"
+        )
     return found
 
 

@@ -8,12 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
 from torch.distributions import constraints
 
+from ..constants import constant
 from ..laws.base import LawSpec, Parameters, Shape
 from ..laws.chain import DERIVATIVES, gaussian_chain
 from ..laws.families import NormalLaw
+from ..laws.precise import Offset
 from ..networks.base import (
     Input,
     Network,
@@ -156,7 +159,7 @@ class Conditional(nn.Module):
         support: Any = None
         with suppress(NotImplementedError):  # a distribution that says nothing of its support
             support = law.support
-        self.family = type(law).__name__
+        self.family = type(getattr(law, "base", law)).__name__
         self.discrete = support is not None and support.is_discrete
         """Whether its values are discrete."""
         learns = value.requires_grad or not any(parameter.requires_grad for parameter in parameters)
@@ -250,7 +253,41 @@ class Conditional(nn.Module):
             # networks may compute in half precision, but not densities, divergences and draws
             parameters = tuple(parameter.to(like(self).dtype) for parameter in parameters)
         units = self._made_in
-        return parameters if units is None else self.law.in_units(parameters, units.mean, units.scale)
+        if units is None:
+            return parameters
+        offset = self.offset
+        mean = units.mean if offset is None else units.mean - offset
+        return self.law.in_units(parameters, mean.to(units.scale.dtype), units.scale)
+
+    @property
+    def offset(self) -> Tensor | None:
+        """(D,) the mean of values in float64, less which the parameters are; None where values are as the model is."""
+        units = self._made_in
+        if units is None or not units.wide or not self.law.centred:
+            return None
+        return units.mean if self.law.centred is True else units.mean * constant(self.law.centred, units.mean)
+
+    def centred(self, value: Tensor) -> Tensor:
+        """The value (..., D) of the child less the offset, as the parameters are."""
+        offset = self.offset
+        return value if offset is None else (value - offset).to(like(self).dtype)
+
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        """The distribution of the child, see `Law.distribution`."""
+        law, offset = self.law.distribution(parameters), self.offset
+        return law if offset is None else Offset(law, offset, parameters[0].dtype)
+
+    def mean(self, parameters: Parameters) -> Tensor:
+        """The mean of the child (..., D)."""
+        return self._placed(self.law.mean(parameters))
+
+    def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
+        """Values (..., D) of the child, see `Law.draw`."""
+        return self._placed(self.law.draw(parameters, noise))
+
+    def _placed(self, value: Tensor) -> Tensor:
+        offset = self.offset
+        return value if offset is None else value + offset
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """The state before a loop that draws those of the parents that are not `given`."""

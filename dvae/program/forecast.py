@@ -45,7 +45,10 @@ def forecast(
         raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
     first = data.get(model.view.history or model.observed[0])
     size, past = (len(next(v for v in data.values() if isinstance(v, Tensor))), 0) if first is None else first.shape[:2]
-    given = {name: torch.as_tensor(value).to(like(model)) for name, value in (fix or {}).items()}
+    given = {
+        name: torch.as_tensor(value).to(like(model).device, None if name in model.wide else like(model).dtype)
+        for name, value in (fix or {}).items()
+    }
     fixed = _fixed(model, given, data, size, horizon)
     drawn = {name: model.drawn(name) if draw_emission is None else draw_emission for name in model.observed}
     means = [name for name in model.observed if not drawn[name]]
@@ -123,7 +126,7 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
             if name in model.observed and name not in rollout.values:  # a function of its parents
                 rollout.know(name, rollout.draw(name))
             if name in model.observed:
-                found[name] = model.generator[name].law.mean(rollout.parameters(name, rollout.values[name]))
+                found[name] = model.generator[name].mean(rollout.parameters(name, rollout.values[name]))
         made = {name: mean.unflatten(0, (count, -1)) for name, mean in found.items()}
         return model.shown(made, rows(data, part))
 

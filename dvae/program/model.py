@@ -32,7 +32,7 @@ from ..notation import Factor, Factorization, check_pair
 from ..options import Range, kind_of, problem
 from ..relations import MaskFunction
 from ..turns import alone
-from ..units import Coordinate, Units
+from ..units import Coordinate, Units, exceeds_float32
 from ..views import LOG_DET, View, volume
 from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
@@ -239,10 +239,16 @@ class DynamicalVAE(nn.Module):
         """
         if name not in self.sizes:
             raise ValueError(f"no variable {name!r}; there are {', '.join(self.sizes)}")
-        self.units[name] = Units(self.sizes[name], coordinates)
+        self.units[name] = Units(self.sizes[name], coordinates, exact=name not in self.latents)
         for conditional in (*self.generator.values(), *self.encoder.values()):
             conditional.units[name] = self.units[name]
         return self.units[name]
+
+    @property
+    def wide(self) -> frozenset[str]:
+        """Names of the variables whose values are in float64 whatever the precision of the model."""
+        read = (name for name, units in self.units.items() if units.wide)
+        return frozenset(n for n in read if n not in self.observed or self.generator[n].offset is not None)
 
     @property
     def likelihood(self) -> bool:
@@ -550,7 +556,9 @@ class DynamicalVAE(nn.Module):
     def _evaluating(self) -> Any:
         return evaluating(self) if self.training else nullcontext()
 
-    def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0) -> dict[str, Any]:
+    def read(
+        self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False
+    ) -> dict[str, Any]:
         """A batch as programs read it: by name, in the model's precision, as the view shows it, missing entries filled.
 
         What was read is read as it is. What sequences share is drawn, where it is not there, at a Pyro site of its own
@@ -561,6 +569,7 @@ class DynamicalVAE(nn.Module):
             batch: see `model`.
             size: B, where the batch does not tell.
             curriculum: see `model`.
+            precise: read the variables that have units in float64 where they are so, as to fit these.
 
         Raises:
             ValueError: names that the model does not have, a mask of nothing, or data that the view cannot show.
@@ -572,7 +581,8 @@ class DynamicalVAE(nn.Module):
             )
         means = {name: units.filling for name, units in self.units.items()}
         # by guide and model both, but for what they share
-        data = dict(once(self, [batch], lambda: self.reader.read(batch, like(self).dtype, means)))
+        wide = {name for name in self.units if name in self.wide or (precise and _is_wide(batch, name))}
+        data = dict(once(self, [batch], lambda: self.reader.read(batch, like(self).dtype, means, wide)))
         one = {name: data.pop(name) for name in self.shared if name in data and data[name].dim() == 1}
         size = next((len(value) for value in data.values() if isinstance(value, Tensor)), size)
         for name, spec in self.shared.items():
@@ -604,6 +614,12 @@ class DynamicalVAE(nn.Module):
         rollout = self.reader.rollout(factorization, conditionals, self.read(batch), length, size)
         rollout.sums = self.sums if factorization is self.generative else None
         return rollout
+
+
+def _is_wide(batch: Any, name: str) -> bool:
+    """Whether float32 may not resolve a variable of a batch."""
+    value = batch.get(name) if isinstance(batch, Mapping) else batch
+    return value is not None and exceeds_float32(value.dtype)
 
 
 def _locality(factorization: Factorization) -> dict[str, bool]:

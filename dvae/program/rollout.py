@@ -231,7 +231,7 @@ class Rollout:
             return Sequence(self, name)
         known, groups = {**self.known, **self.history(name)}, self.groups if name in self.grouped else None
         parameters = conditional(known, self.batch, self.length, self.lengths, groups)
-        law = conditional.law.distribution(tuple(p.repeat(draws, *[1] * (p.dim() - 1)) for p in parameters))
+        law = conditional.distribution(tuple(p.repeat(draws, *[1] * (p.dim() - 1)) for p in parameters))
         mask = self.mask(name)
         law = (law if mask is None else law.mask(mask)).to_event(1 - len(law.event_shape))
         return law if groups is None else Grouped(law, groups.again(draws))
@@ -277,7 +277,7 @@ class Rollout:
 
     def evaluate(self, name: str, value: Tensor) -> TorchDistribution:
         """The conditionals of a local variable at all steps: batch (B, T, D), or (B, T) of whole events."""
-        return self.conditionals[name].law.distribution(self.parameters(name, value))
+        return self.conditionals[name].distribution(self.parameters(name, value))
 
     def parameters(self, name: str, value: Tensor) -> Parameters:
         """Those of `evaluate`, (B, T, ...); computed once for a value."""
@@ -390,7 +390,7 @@ class Rollout:
         for _ in range(feeding.passes):
             for name in names:
                 conditional = self.conditionals[name]
-                mean = conditional.law.mean(conditional(known, self.batch, self.length, self.lengths))
+                mean = conditional.mean(conditional(known, self.batch, self.length, self.lengths))
                 known[name] = self._hide(self.hidden[name].fill(self.values[name], mean))
         return {name: known[name] for name in names}
 
@@ -416,8 +416,8 @@ class Rollout:
         for name in live:
             conditional = self.conditionals[name]
             parameters = conditional(given, self.batch, self.length, self.lengths)
-            law = conditional.law
-            value = law.draw(parameters, noise[name]) if name in noise else law.mean(parameters)
+            drawing = name in noise
+            value = conditional.draw(parameters, noise[name]) if drawing else conditional.mean(parameters)
             if hidden is not None:
                 value = hidden[name].fill(told[name], value)
             elif name in self.prefix:
@@ -470,8 +470,8 @@ class Rollout:
                 evaluated[name] += [at_all] if kept else []
                 if known[t]:
                     continue
-                law = conditional.law
-                value = law.draw(parameters, steps[name][t]) if name in steps else law.mean(parameters)
+                drawing = name in steps
+                value = conditional.draw(parameters, steps[name][t]) if drawing else conditional.mean(parameters)
                 if hidden is not None:
                     value = hidden[name].fill(told[name][:, t], value, t)
                 elif name in self.prefix and t < self.prefix[name].shape[1]:

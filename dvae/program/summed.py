@@ -285,7 +285,7 @@ class Summation:
             again = run.again(count)
             again.values |= {n: v.repeat_interleave(run.batch, 0) for n, v in values.items()}
             parameters = conditional(again.known, again.batch, run.length, again.lengths)
-        law = conditional.law.distribution(tuple(p.unflatten(0, (count, -1)) for p in parameters))
+        law = conditional.distribution(tuple(p.unflatten(0, (count, -1)) for p in parameters))
         if own:
             logs = law.logits  # type: ignore[attr-defined]
         else:

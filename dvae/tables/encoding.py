@@ -27,7 +27,7 @@ from ..laws.family import FAMILIES
 from ..laws.product import Product
 from ..options import Amount, Positive, Range, tuples
 from ..schema import Schema
-from ..units import Coordinate
+from ..units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate
 from ..views import Offered, View
 from .calendar import NUMBERS, Calendar
 from .columns import WHOLE_STEPS, Column, Columns
@@ -39,7 +39,7 @@ COVARIATES, STATICS, GAPS = "c", "s", "d"
 EVEN = 1.3
 """Longest gap over the median, and median over the shortest, up to which steps are evenly spaced: months are."""
 LEAST = 1e-7
-"""Of a deviation, as a share of the mean: below it is what rounding leaves of a constant."""
+"""Of the deviation of logarithms: below it is what rounding leaves of a constant."""
 CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
 LOGARITHMIC = ("positive", "log-normal", "power")
 """Families that networks read the logarithms of."""
@@ -110,12 +110,21 @@ class PanelSchema(Schema):
                 raise ValueError(f"column {column.name!r} has no value in the training part of {panel.name}")
             mean, scale = float(known.mean[place]), float(np.sqrt(known.variance[place]))
             if column.family in CENTRED:
-                means[column.name], scales[column.name] = mean, scale if scale > LEAST * abs(mean) else 1.0
-            elif column.family in SCALED:
+                varies = scale > ROUNDING * abs(mean)
+                if varies and scale < SMALLEST:
+                    raise ValueError(f"the standard deviation of column {column.name!r} is {scale:g}; {TOO_SMALL}")
+                means[column.name], scales[column.name] = mean, scale if varies else 1.0
+            elif column.family not in ("binary", "category") and ROUNDING * mean < scale < RESOLVED * mean:
+                raise ValueError(
+                    f"column {column.name!r} has mean {mean:.9g} and standard deviation {scale:.3g}, which float32 "
+                    f"does not resolve in the family {column.family!r}; give it the family 'real', of which models "
+                    "take the mean off in float64"
+                )
+            if column.family in SCALED:
                 means[column.name], scales[column.name] = 0.0, mean or 1.0
                 if column.family in LOGARITHMIC and known.largest[place] > 0:
                     logarithms[column.name] = _logarithms([values[:, place, None] for values in training])
-            elif column.family == "binary":
+            if column.family == "binary":
                 means[column.name] = mean
             if column.role == "past" or known.count[place] < steps:
                 lacking.append(column.name)

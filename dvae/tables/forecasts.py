@@ -227,7 +227,7 @@ def _save(found: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **
             table = found.table()
             if "time" in table and found.calendar.kind == "numbers":
                 table["time"] = table["time"].map("{:.15g}".format)
-            table.to_csv(file, index=False, float_format="%.9g")
+            table.to_csv(file, index=False)
         elif suffix == ".parquet":
             try:
                 found.table().to_parquet(file)

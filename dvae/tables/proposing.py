@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..options import nearest
+from ..units import RESOLVED
 from .clocks import PERIOD, is_clock, joined, parts_of, unit_of
 from .columns import Column, Columns, Role
 from .numerals import NEARLY_ALL, read_numbers
@@ -440,7 +441,8 @@ class _Proposal:
             return Column(name, family="binary")
         if not (np.abs(numbers) < LARGEST).all():
             return Column(name)  # which reading refuses
-        if (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2:
+        whole = (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2
+        if whole and numbers.std() > RESOLVED * numbers.mean():
             return Column(name, family="overdispersed" if numbers.var() > SPREAD * numbers.mean() else "count")
         if (numbers > 0).all() and numbers.std() > 0.5 * numbers.mean():
             return Column(name, family="positive")

@@ -235,7 +235,7 @@ class PanelWindows:
         if self.skipped:
             warnings.warn(f"forecasts leave out {self.too_short}", stacklevel=2)
         batch = self.all()
-        past, known = past_of(batch, observed), gapped(batch).numpy()
+        past, known = past_of(batch, observed), gapped(batch).double().numpy()
         with reproducibly(model, seed):
             parts = [
                 model.forecast(on_device_of(model, part), horizon, samples, draw_emission=True)["x"].cpu().numpy()
@@ -243,7 +243,7 @@ class PanelWindows:
             ]
         keys = [(name, start + observed) for _, name, start in self.keys]
         beside = known[:, :observed], known[:, observed:], columns_of(self), keys
-        return PanelForecasts(np.concatenate(parts, 1), *beside, *self.times(observed + horizon))
+        return PanelForecasts(np.concatenate(parts, 1, dtype=np.float64), *beside, *self.times(observed + horizon))
 
     def impute(self, model: DynamicalVAE, samples: int = 100, seed: int = 0, particles: int = 1) -> PanelImputed:
         """The listed windows with draws where entries of targets are missing.
@@ -269,7 +269,8 @@ class PanelWindows:
         lengths = batch.get("lengths", torch.full((count,), steps))
         lacking = ~batch["mask"].numpy() & (np.arange(steps) < lengths[:, None].numpy())[..., None]
         keys = [(name, start) for _, name, start in self.keys]
-        return PanelImputed(np.concatenate(parts, 1), lacking, columns_of(self), keys, *self.times(steps))
+        draws = np.concatenate(parts, 1, dtype=np.float64)
+        return PanelImputed(draws, lacking, columns_of(self), keys, *self.times(steps))
 
     def times(self, steps: int) -> tuple[np.ndarray | None, Calendar]:
         """Return times (N, steps) from the start of each listed window, None without times, and their calendar.
@@ -319,7 +320,7 @@ class PanelWindows:
     def _cut(self, which: Tensor, starts: Tensor) -> dict[str, Any]:
         """The windows of ranges that start at these steps of their sequences."""
         lengths = self._lengths[which] if self.length is None else self.length
-        x = torch.from_numpy(self.schema.encoded(cut(self._values, which, starts, lengths).numpy())).float()
+        x = torch.from_numpy(self.schema.encoded(cut(self._values, which, starts, lengths).numpy())).double()
         batch: dict[str, Any] = {"x": x}
         if isinstance(lengths, Tensor) and (lengths != lengths[0]).any():
             batch["lengths"] = lengths

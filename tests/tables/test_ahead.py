@@ -32,7 +32,7 @@ def test_the_future_is_behind_the_last_target():
     windows = ahead(panel, schema)
     batch = windows.all()
     for n, one in enumerate(panel):
-        np.testing.assert_array_equal(batch["x"][n, :4, 0], one.values[-4:, 0].astype(np.float32))
+        np.testing.assert_array_equal(batch["x"][n, :4, 0], one.values[-4:, 0])
         assert windows.keys[n][1:] == (one.name, len(one) - 4)
     assert batch["mask"][:, :4].all()
     assert not batch["mask"][:, 4:].any()

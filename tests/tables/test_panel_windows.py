@@ -84,7 +84,7 @@ def test_drawn_windows_are_all_of_them_and_each_alike(cut):
     for place, low, last in cut.starts(panel, "train"):
         for start in range(low, last + 1):
             window = wanted(panel, schema, panel.series[place].name, start, cut.length)
-            every[np.float32(window["d"]).tobytes() + np.float32(window["x"]).tobytes()] = window
+            every[np.float32(window["d"]).tobytes() + np.float64(window["x"]).tobytes()] = window
     counts = dict.fromkeys(every, 0)
     total = 400 * len(every)
     batch = windows.sample(total, torch.Generator().manual_seed(0))
