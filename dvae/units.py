@@ -128,11 +128,19 @@ class Units(nn.Module):
 
     @override
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
-        """Takes means in float64 as such."""
-        for name in self._buffers.keys() & {*EXACT}:
-            if self.exact and prefix + name in state_dict and state_dict[prefix + name].dtype is torch.float64:
-                setattr(self, name, getattr(self, name).double())
+        """Keeps float64 where the state has it, and only there."""
+        for name in self._buffers.keys() & {*EXACT} if self.exact else ():
+            kept = prefix + name in state_dict and state_dict[prefix + name].dtype is torch.float64
+            setattr(self, name, getattr(self, name).to(torch.float64 if kept else self.scale.dtype))
         super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def relative(self, values: Tensor) -> Tensor:
+        """Values (..., D) less the mean where they are in float64, as float32 resolves them; else as they are."""
+        return (values - self.mean).to(self.scale.dtype) if self.wide else values
+
+    def absolute(self, values: Tensor) -> Tensor:
+        """The inverse of `relative`."""
+        return values + self.mean if self.wide else values
 
     @property
     def filling(self) -> Tensor:

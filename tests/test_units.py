@@ -82,3 +82,127 @@ def test_a_scale_that_is_given_is_in_the_variables_own_unit():
 def test_only_variables_have_units():
     with pytest.raises(ValueError, match="no variable 'y'; there are w, z, x"):
         dvae.DynamicalVAE(*PAIR, SIZES).standardise("y")
+
+
+OFFSETS = [(1e6, 1.0), (1e9, 1.0), (101325.0, 0.01)]
+
+
+def far(mean, scale, law=None, network=None, **options):
+    """A float32 model of values of that mean and scale with its units, data (B, T, D), and the same without the mean."""
+    torch.manual_seed(0)
+    shift = torch.tensor([mean, -mean, 0.0], dtype=torch.float64)
+    x = shift + scale * torch.randn(6, 8, 3, dtype=torch.float64)
+    found = []
+    for data in (x, x - shift):
+        torch.manual_seed(1)
+        model = dvae.DynamicalVAE(*PAIR, SIZES, network or Recurrent(4), {"p(x)": law or dvae.laws.Normal()}, **options)
+        model.standardise("x").fit(data)
+        found += [model, data]
+    return shift, *found
+
+
+def seeded(function):
+    torch.manual_seed(2)
+    return function()
+
+
+@pytest.mark.parametrize(("mean", "scale"), OFFSETS)
+@pytest.mark.parametrize(
+    "law",
+    [
+        dvae.laws.Normal(residual=0.5),
+        dvae.laws.StudentT(),
+        dvae.laws.NormalMixture(2),
+        dvae.laws.LowRankNormal(),
+        dvae.laws.Family("Laplace"),
+        dvae.laws.Product((((2, 0), dvae.laws.Normal()), ((1,), dvae.laws.Family("Laplace")))),
+    ],
+    ids=str,
+)
+def test_a_large_mean_changes_neither_bound_nor_forecast(mean, scale, law):
+    shift, model, x, plain, y = far(mean, scale, law)
+    masks = torch.rand(6, 8, 1).expand(6, 8, 3) < 0.8
+    for rest in ({}, {"mask": masks}, {"lengths": torch.tensor([8, 3, 5, 8, 1, 2])}):
+        ours, theirs = (
+            seeded(lambda b=b, m=m: dvae.SequenceELBO().terms(m, b))
+            for m, b in ((model, {"x": x, **rest}), (plain, {"x": y, **rest}))
+        )
+        assert ours.bound.dtype == torch.float32
+        torch.testing.assert_close(ours.bound, theirs.bound, rtol=1e-5, atol=1e-3)
+        ours.bound.sum().backward()
+    future, same = (
+        seeded(lambda m=m, b=b: m.forecast(b, 3, 4, draw_emission=True)["x"]) for m, b in ((model, x), (plain, y))
+    )
+    assert future.dtype == torch.float64
+    torch.testing.assert_close((future - shift) / scale, same / scale, rtol=0, atol=1e-3)
+    filled = model.impute({"x": x, "mask": masks}, draw=True)["x"][0]
+    assert torch.equal(filled[masks], x[masks])
+
+
+@pytest.mark.parametrize("mean", [0.0, 1e9])
+def test_context_and_sites_are_in_their_own_unit(mean):
+    torch.manual_seed(0)
+    sizes = {"z": 2, "x": 1, "c": 1}
+    model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t, c_t)", "q(z_t | x_{1:T}, c_t)", sizes)
+    x, c = (mean + torch.randn(2, 4, 7, 1, dtype=torch.float64)).unbind()
+    for name, values in (("x", x), ("c", c)):
+        model.standardise(name).fit(values)
+    trace = poutine.trace(model.model).get_trace({"x": x, "c": c})
+    assert torch.equal(trace.nodes["x"]["value"], x)
+    torch.testing.assert_close(trace.nodes["x"]["fn"].steps(x).mean / 1e9, x / 1e9, rtol=0, atol=1e-8)
+    read = model.read({"x": x, "c": c})
+    assert torch.equal(model.read(read)["c"], c)
+    bounds = [dvae.particle_bound(model, {"x": x, "c": c}, particles=3).bound for _ in range(2)]
+    assert all(bound.isfinite().all() and (bound > -100).all() for bound in bounds)
+
+
+def test_scheduled_sampling_and_priors_of_the_data_read_a_large_mean():
+    vamp = {"laws": {"p(w)": dvae.laws.Vamp(3, steps=2), "p(x)": dvae.laws.Normal()}}
+    pair = ("p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)")
+    found = []
+    for mean in (0.0, 1e9):
+        torch.manual_seed(0)
+        x = torch.randn(4, 6, 3, dtype=torch.float64)
+        model = dvae.DynamicalVAE(*pair, SIZES, Recurrent(4), **vamp)
+        model.standardise("x").fit(mean + x)
+        model.generator["w"].law.start_at(model.read(mean + x[:3]))
+        feeding = dvae.SelfFeeding(0.5)
+        found.append(seeded(lambda m=model, d=mean + x: dvae.SequenceELBO().terms(m, d, self_feeding=feeding).bound))
+    torch.testing.assert_close(*found, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("rest", ["", "mask", "lengths"])
+def test_values_that_float32_does_not_resolve_are_refused_without_units(rest):
+    x, mask = 1e9 + torch.randn(4, 6, 3, dtype=torch.float64), torch.rand(4, 6, 3) < 0.9
+    lengths = torch.tensor([6, 5, 6, 2])
+    data = {"": {"x": x}, "mask": {"x": x * mask, "mask": mask}, "lengths": {"x": x, "lengths": lengths}}[rest]
+    if rest == "lengths":
+        data["x"] = torch.where((torch.arange(6) < lengths[:, None])[..., None], x, 0.0)
+    model = dvae.DynamicalVAE(*PAIR, SIZES)
+    with pytest.raises(ValueError, match=r"coordinate 0 of x has mean 1e\+09 and .* model.standardise\('x'\).fit"):
+        model.guide(data)
+    model.double().guide(data)
+    dvae.DynamicalVAE(*PAIR, SIZES).guide({"x": torch.full((2, 3, 3), 1 / 3, dtype=torch.float64)})  # no spread to lose
+
+
+def test_means_stay_in_float64_through_changes_of_precision_and_files():
+    _, model, x, *_ = far(1e9, 1.0)
+    mean = model.units["x"].mean.clone()
+    for changed in (model.double(), model.bfloat16(), model.float()):
+        assert torch.equal(changed.units["x"].mean, mean)
+    fresh = dvae.DynamicalVAE(*PAIR, SIZES, Recurrent(4))
+    fresh.standardise("x")
+    fresh.load_state_dict(model.state_dict())
+    assert torch.equal(fresh.units["x"].mean, mean)
+    older = {name: value.float() for name, value in model.state_dict().items()}
+    fresh.load_state_dict(older)  # of a run before means were in float64: it goes on as it was
+    assert fresh.units["x"].mean.dtype == torch.float32
+    single = dvae.DynamicalVAE(*PAIR, SIZES).standardise("x")
+    single.fit(x.float())  # values in float32, such as those of motion, are read as they are
+    assert not single.wide
+
+
+@pytest.mark.parametrize("scale", [1e-40, 1e-19])
+def test_values_too_small_for_float32_are_told_so(scale):
+    with pytest.raises(ValueError, match=r"standard deviation of these values is .*e-\d+; .* multiply the values"):
+        Units(3).fit(scale * torch.randn(40, 3, dtype=torch.float64))

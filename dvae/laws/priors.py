@@ -138,11 +138,14 @@ class VampLaw(Prior):
                     f"a Vamp has pseudo-sequences of {self.steps} steps, but those of {name} that it is to start at "
                     f"have {data[name].shape[1]}; give it at most so many steps"
                 )
-            pseudo.copy_(data[name][:, : self.steps])
+            first = data[name][:, : self.steps]
+            pseudo.copy_(self.guide.units[name].relative(first) if name in self.guide.units else first)
 
     @override
     def prior(self) -> Any:
-        posteriors = self.guide.law.joint(self.guide(dict(self.pseudo.items()), self.components, self.steps))
+        units = self.guide.units
+        data = {name: units[name].absolute(p) if name in units else p for name, p in self.pseudo.items()}
+        posteriors = self.guide.law.joint(self.guide(data, self.components, self.steps))
         same = next(self.pseudo.parameters()).new_zeros(self.components)
         weights = dist.Categorical(logits=same, validate_args=False)
         return dist.MixtureSameFamily(weights, posteriors, validate_args=False)

@@ -239,7 +239,8 @@ class DynamicalVAE(nn.Module):
         """
         if name not in self.sizes:
             raise ValueError(f"no variable {name!r}; there are {', '.join(self.sizes)}")
-        self.units[name] = Units(self.sizes[name], coordinates, exact=name not in self.latents)
+        units = Units(self.sizes[name], coordinates, exact=name not in self.latents)
+        self.units[name] = units.to(like(self))
         for conditional in (*self.generator.values(), *self.encoder.values()):
             conditional.units[name] = self.units[name]
         return self.units[name]

@@ -109,12 +109,12 @@ class PanelSchema(Schema):
             if not known.count[place]:
                 raise ValueError(f"column {column.name!r} has no value in the training part of {panel.name}")
             mean, scale = float(known.mean[place]), float(np.sqrt(known.variance[place]))
+            varies = scale > ROUNDING * abs(mean)
+            if column.role == "target" and varies and scale < SMALLEST:
+                raise ValueError(f"the standard deviation of column {column.name!r} is {scale:g}; {TOO_SMALL}")
             if column.family in CENTRED:
-                varies = scale > ROUNDING * abs(mean)
-                if varies and scale < SMALLEST:
-                    raise ValueError(f"the standard deviation of column {column.name!r} is {scale:g}; {TOO_SMALL}")
                 means[column.name], scales[column.name] = mean, scale if varies else 1.0
-            elif column.family not in ("binary", "category") and ROUNDING * mean < scale < RESOLVED * mean:
+            elif column.family not in ("binary", "category") and varies and scale < RESOLVED * abs(mean):
                 raise ValueError(
                     f"column {column.name!r} has mean {mean:.9g} and standard deviation {scale:.3g}, which float32 "
                     f"does not resolve in the family {column.family!r}; give it the family 'real', of which models "
