@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -123,7 +124,8 @@ class Oracle:
             raise ValueError(f"the oracle knows no law of the context {', '.join(model.context)}")
         if type(model).penalties is not DynamicalVAE.penalties:
             raise ValueError(f"{type(model).__name__} adds energies to the log joint, which is not normal then")
-        self.model, self.steps = model, steps
+        # what is affine in a variable far from 0 is found from values that float32 does not resolve
+        self.model, self.steps = deepcopy(model).double() if model.wide else model, steps
         for name in model.summed:
             if other := [parent for parent in model.generator[name].parents if parent not in model.summed]:
                 raise ValueError(
@@ -245,7 +247,7 @@ class Oracle:
     def _log_probability(self, name: str, states: Mapping[str, Tensor]) -> Tensor:
         """(C,), of courses of a variable that is summed out given those of the others."""
         conditional, value = self.model.generator[name], states[name]
-        law = conditional.distribution(conditional(states, len(value), self.steps))
+        law = conditional.law.distribution(conditional(states, len(value), self.steps))
         logs: Tensor = (law.logits * value).flatten(1).sum(1)
         return logs
 

@@ -88,7 +88,7 @@ OFFSETS = [(1e6, 1.0), (1e9, 1.0), (101325.0, 0.01)]
 
 
 def far(mean, scale, law=None, network=None, **options):
-    """A float32 model of values of that mean and scale with its units, data (B, T, D), and the same without the mean."""
+    """A float32 model with the units of its data (B, T, D), of that mean and scale, and the same without the mean."""
     torch.manual_seed(0)
     shift = torch.tensor([mean, -mean, 0.0], dtype=torch.float64)
     x = shift + scale * torch.randn(6, 8, 3, dtype=torch.float64)

@@ -207,9 +207,10 @@ class StudentTs(dist.StudentT):
     def log_prob(self, value: Tensor) -> Tensor:
         df, distance = self.df, (value - self.loc) / self.scale
         alike = all(size == 1 or not stride for size, stride in zip(df.shape[:-1], df.stride()[:-1], strict=True))
-        half = (df[(0,) * (df.dim() - 1)] if alike else df).double() / 2  # one number for each coordinate, expanded
-        normaliser = (half + 0.5).lgamma() - half.lgamma() - 0.5 * (2 * math.pi * half).log()  # large terms cancel
-        return normaliser.to(df.dtype) - self.scale.log() - (df + 1) / 2 * (distance.square() / df).log1p()
+        df = (df[(0,) * (df.dim() - 1)] if alike else df).double()  # one number for each coordinate, expanded
+        half = df / 2  # in double: of large df the terms cancel, and so do those of its gradient
+        normaliser = (half + 0.5).lgamma() - half.lgamma() - 0.5 * (math.pi * df).log()
+        return (normaliser - (half + 0.5) * (distance.square() / df).log1p()).to(value.dtype) - self.scale.log()
 
 
 class StudentTLaw(Law):

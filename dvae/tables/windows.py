@@ -235,7 +235,7 @@ class PanelWindows:
         if self.skipped:
             warnings.warn(f"forecasts leave out {self.too_short}", stacklevel=2)
         batch = self.all()
-        past, known = past_of(batch, observed), gapped(batch).double().numpy()
+        past, known = past_of(batch, observed), gapped(batch).numpy()
         with reproducibly(model, seed):
             parts = [
                 model.forecast(on_device_of(model, part), horizon, samples, draw_emission=True)["x"].cpu().numpy()

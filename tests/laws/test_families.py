@@ -190,6 +190,50 @@ def test_angles_have_densities_and_gradients_at_every_concentration_of_single_pr
     assert draws.isfinite().all()
 
 
+LARGE = {  # parameters by name, and values
+    "count": ({"rate": 1e8}, [1e8 - 2e4, 1e8, 1e8 + 1e4]),
+    "overdispersed": ({"total_count": 50.0, "logits": 16.0}, [1e8, 4e8, 1e9]),
+    "sparse": ({"gate_logits": -1.0, "rate": 1e8}, [0.0, 1e8, 1e8 + 1e4]),
+    "sparse-overdispersed": ({"gate_logits": -1.0, "total_count": 1e5, "logits": 8.0}, [0.0, 3e8, 3.1e8]),
+    "positive": ({"concentration": 1e6, "rate": 1e6}, [0.999, 1.0, 1.001]),
+    "share": ({"concentration1": 3e6, "concentration0": 2e6}, [0.5998, 0.6, 0.6001]),
+    "robust": ({"loc": 0.0, "scale": 1.0, "df": 1e4}, [-1.0, 0.0, 2.0]),
+    "correlated": ({"cov_factor": 30.0, "cov_diag": 1e-4, "loc": 0.0}, [0.011, 0.02, 0.005]),
+}
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_densities_and_gradients_do_not_cancel_in_float32(name):
+    """As in float64, whose own rounding is nine digits smaller."""
+    given, value = LARGE[name]
+    law, value = ALL[name].build(Shape(3, 4)), torch.tensor(value)
+    own = given.values() if name == "robust" else (given[each] for each in law.forms)
+    factors = torch.tensor([1.0, 1.0, 1.0, 2.0, 0.5, 1.0])
+    single = [torch.full((6 if n == 30.0 else 3,), n) * (factors if n == 30.0 else 1.0) for n in own]
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        parameters = [p.to(dtype).requires_grad_() for p in single]
+        density = law.distribution(tuple(parameters)).log_prob(value.to(dtype))
+        assert density.dtype == dtype
+        found.append([density, *torch.autograd.grad(density.sum(), parameters, allow_unused=True)])
+    for ours, theirs in zip(*found, strict=True):
+        ours, theirs = (each if each is None else each.detach() for each in (ours, theirs))
+        if ours is not None:
+            torch.testing.assert_close(ours.double(), theirs, rtol=1e-5, atol=1e-6 * theirs.abs().max().item())
+
+
+@pytest.mark.parametrize("size", [1e5, 1e7, 1e9])
+def test_large_counts_have_the_probability_that_scipy_gives(size):
+    count = (torch.tensor([0.0, 0.9, 1.0, 1.001, 3.0]) * size).round()
+    rates = torch.full((5,), size)
+    found = ALL["count"].build(Shape(5, 4)).distribution((rates,)).log_prob(count)
+    np.testing.assert_allclose(found, stats.poisson(size).logpmf(count.double()), rtol=1e-6)
+    totals, logits = torch.full((5,), 3.0), torch.full((5,), math.log(size / 3))
+    found = ALL["overdispersed"].build(Shape(5, 4)).distribution((totals, logits)).log_prob(count)
+    chance = 1 / (1 + np.exp(logits.double().numpy()))
+    np.testing.assert_allclose(found, stats.nbinom(3.0, chance).logpmf(count.double()), rtol=1e-6)
+
+
 def test_without_a_layer_features_are_parameters_and_a_location_comes_first():
     law = Family("Laplace", project=False).build(Shape(3, 6)).double()
     features, value = torch.randn(2, 6, dtype=torch.float64), torch.randn(2, 3, dtype=torch.float64)

@@ -81,6 +81,32 @@ def test_logarithms_of_a_column_are_read_as_they_vary_and_stand_for_what_is_miss
     assert (flat.level, flat.spread, flat.typical) == pytest.approx((np.log(3), 1.0, 3.0))
 
 
+def test_a_column_far_from_zero_has_its_own_units():
+    """Of 1e9 + N(0, 1) too; a constant with rounding errors is left as it is."""
+    noise = np.random.default_rng(0).normal(size=(4, 9, 3))
+    values = np.array([1e9, 101325, 0.1]) + np.array([1.0, 0.01, 1e-17]) * noise
+    columns = Columns(tuple(map(Column, "abc")))
+    schema = PanelSchema.under(Panel([Series(f"s{n}", one) for n, one in enumerate(values)], columns), Cut())
+    scales = [schema.scales[name] for name in "abc"]
+    assert scales == pytest.approx([*(noise[:, :, :2].std((0, 1)) * [1, 0.01]), 1.0], rel=0.2)
+    assert len(np.unique(PanelWindows(Panel([Series("s", values[0])], columns), schema, "all").all()["x"][..., 1])) == 9
+
+
+@pytest.mark.parametrize(
+    ("family", "values", "said"),
+    [
+        ("positive", 1e9 + np.arange(9.0), r"has mean 1e\+09 and standard deviation 2\.58, .* the family 'real'"),
+        ("count", 1e9 + np.arange(9.0), "does not resolve in the family 'count'"),
+        ("real", 1e-40 * np.arange(9.0), r"column 'x' is 2\.58199e-40; .* multiply the values"),
+        ("positive", 1e-40 * np.arange(1, 10.0), "multiply the values by a constant"),
+    ],
+)
+def test_targets_that_float32_does_not_resolve_are_refused(family, values, said):
+    panel = Panel([Series(f"s{n}", values[:, None]) for n in range(4)], Columns((Column("x", family=family),)))
+    with pytest.raises(ValueError, match=said):
+        PanelSchema.under(panel, Cut())
+
+
 def test_units_are_those_of_the_training_sequences():
     panel = table()
     schema = PanelSchema.under(panel, CUT)

@@ -107,6 +107,36 @@ def test_a_method_is_fitted_to_a_table_forecasts_it_and_does_not_see_what_is_mis
     torch.testing.assert_close(*bounds, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("name", ["srnn", "kvae", "moglow", "erd"])
+def test_the_mean_of_a_column_changes_neither_fit_nor_forecasts_nor_scores(name, tmp_path):
+    """Nor does that of a covariate; forecasts, and the truth beside them, are in float64."""
+    shifts, found = {"temp": 1e9, "plan": -1e9}, []
+    for far in (False, True):
+        table = frame()
+        for column, shift in shifts.items():
+            table[column] = table[column].astype(float) + far * shift
+        data = PanelData.of(table, TOLD, Cut(5, 3))
+        windows, test = data.windows("train"), data.windows("test")
+        torch.manual_seed(0)
+        method = dvae.method(name, **options(name)).suited(windows)
+        model = method.build(data.schema)
+        method.train(windows, None, 2).fit(model, steps=2, batch_size=4, progress=False)
+        forecasts = test.forecast(model, samples=4)
+        forecasts.save(tmp_path / "forecasts.csv")
+        read = pd.read_csv(tmp_path / "forecasts.csv", float_precision="round_trip")
+        np.testing.assert_array_equal(read["truth"], forecasts.truth.ravel())
+        for values in (forecasts.draws, forecasts.past, forecasts.truth):
+            assert values.dtype == np.float64
+            values[..., 1] -= far * shifts["temp"]
+        scores = dvae.evaluate(model, test, scores=panel_scores, samples=4, draw_emission=True, progress=False)["model"]
+        own = {metric: scores[metric].mean for metric in scores if metric != "variogram score"}  # of pairs of columns
+        found.append([forecasts.draws, forecasts.past, forecasts.truth, own])
+    (*arrays, ours), (*others, theirs) = found
+    for one, other in zip(arrays, others, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
+    assert ours == pytest.approx(theirs, rel=1e-3, abs=1e-3, nan_ok=True)
+
+
 def test_equations_read_covariates_and_gaps_where_they_name_them(data):
     guide = "q(z_t | z_{t-1}, x_{1:T}, c_t)"
     given = {"generative": "p(z_t | z_{t-1}, d_t, s) p(x_t | z_t, c_t)", "inference": guide, **SMALL}
