@@ -228,7 +228,7 @@ def test_large_counts_have_the_probability_that_scipy_gives(size):
     rates = torch.full((5,), size)
     found = ALL["count"].build(Shape(5, 4)).distribution((rates,)).log_prob(count)
     np.testing.assert_allclose(found, stats.poisson(size).logpmf(count.double()), rtol=1e-6)
-    totals, logits = torch.full((5,), 3.0), torch.full((5,), math.log(size / 3))
+    totals, logits = torch.full((5,), 3.0), torch.full((5,), np.log(size / 3))
     found = ALL["overdispersed"].build(Shape(5, 4)).distribution((totals, logits)).log_prob(count)
     chance = 1 / (1 + np.exp(logits.double().numpy()))
     np.testing.assert_allclose(found, stats.nbinom(3.0, chance).logpmf(count.double()), rtol=1e-6)
