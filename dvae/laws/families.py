@@ -200,7 +200,7 @@ class StudentT:
         return StudentTLaw(self, shape)
 
 
-class StudentTs(dist.StudentT):
+class StudentTs(dist.StudentT):  # type: ignore[misc]
     """Student t distributions with degrees of freedom, locations and scales (..., D)."""
 
     @override
