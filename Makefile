@@ -23,6 +23,15 @@ unexport PYTHONDONTWRITEBYTECODE
 NUMERICAL := laws/test_laws.py networks/test_networks.py networks/test_graphconv.py test_oracle.py program/test_model.py \
 	models/test_trajectories.py motion/test_control.py motion/test_forecasts.py $(addprefix inference/test_,bounds.py metrics.py particles.py)
 
+# Torch comes first, or another build may come along. Its build for CUDA brings gigabytes that only a GPU uses, so without
+# one the build for the CPU is taken where pip finds it: on its own index or on TORCH_INDEX.
+TORCH_INDEX :=
+TORCH := torch==2.13.0
+pip_torch = $(1) -m pip install -q -c constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+torch = @test `uname` != Linux || command -v nvidia-smi > /dev/null || $(pip_torch) $(TORCH)+cpu 2> /dev/null || \
+	echo "pip finds no torch for the CPU alone and takes the one for CUDA; see TORCH_INDEX in CONTRIBUTING.md"; \
+	$(pip_torch) $(TORCH)
+
 .PHONY: venv demo lint quick test studies fuzz coverage bench notebooks docs dist clean
 
 venv: .venv/installed
@@ -33,7 +42,7 @@ venv: .venv/installed
 	@$(PYTHON) -c 'import venv, ensurepip' || \
 		{ echo "Python lacks venv; on Debian and Ubuntu: apt install python3-venv"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install -q -c constraints.txt torch==2.13.0  # first, or another build may come along
+	$(call torch,$(BIN)/python)
 	$(BIN)/python -m pip install -q -c constraints.txt -e ".[dev]"
 	touch $@
 
@@ -86,7 +95,7 @@ dist: venv
 	rm -rf build dist
 	$(BIN)/python -m build
 	$(PYTHON) -m venv build/clean
-	$(CLEAN)/python -m pip install -q -c constraints.txt torch==2.13.0
+	$(call torch,$(CLEAN)/python)
 	$(CLEAN)/python -m pip install -q -c constraints.txt dist/*.whl
 	cd build && clean/bin/dvae --help > /dev/null && clean/bin/dvae list > /dev/null
 	cd build && clean/bin/python -c 'import dvae, dvae.models.srnn, dvae.inference.fit; print(dvae.__version__, dvae.__file__)'
