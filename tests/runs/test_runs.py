@@ -501,6 +501,12 @@ def test_what_killed_processes_left_is_removed_by_the_next_one(tmp_path, monkeyp
     assert {path.name for path in tmp_path.iterdir()} == {own.name, "a.txt"}
 
 
+def test_what_a_killed_process_left_of_a_checkpoint_is_removed_with_the_next_one(run):
+    (run / f"{BEST}.new").write_bytes(b"cut off")
+    Run(run).commit(Run(run).state, {})
+    assert not list(run.glob("*.new"))
+
+
 # The command line --------------------
 
 

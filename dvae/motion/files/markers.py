@@ -69,11 +69,9 @@ def read_c3d(path: str | Path) -> Recording:
     zero = np.asarray((values == 0).all(-1))
     places[(values[..., 3] < 0) | zero | ~(np.abs(places) < 1e9).all(-1)] = np.nan
     names = _numbered(parameters, "LABELS")[:markers]
-    groups = {
-        *_OUTPUTS,
-        *(name.upper() for name in _numbered(parameters, "TYPE_GROUPS") if "MARKER" not in name.upper()),
-    }
-    outputs = {name for group in groups if not group.endswith("_UNITS") for name in _numbered(parameters, group)}
+    listed = {name.upper() for name in _numbered(parameters, "TYPE_GROUPS")} - {"LABELS"}
+    groups = {*_OUTPUTS, *(name for name in listed if "MARKER" not in name and not name.endswith("_UNITS"))}
+    outputs = {name for group in groups for name in _numbered(parameters, group)}
     named = [n for n, name in enumerate(names) if name and name[0] != "*"]
     seen = np.asarray(np.isfinite(places).all(2).any(0))
     kept = [n for n in named if names[n] not in outputs and seen[n]]
@@ -123,10 +121,10 @@ def _parameters(content: bytes) -> tuple[dict[str, list[str]], str]:
             point = -group if name == "POINT" else point
         elif struct.unpack_from("b", content, here + 2)[0] == -1:  # text
             sizes = list(content[here + 4 : here + 4 + content[here + 3]])
-            width, count = ([*sizes, 1])[0], prod(sizes[1:])
+            width = sizes[0] if sizes else 1
             begin = here + 4 + len(sizes)
-            text = content[begin : begin + width * count].decode("latin1")
-            texts = [text[n * width : (n + 1) * width].strip(" \0") for n in range(count)]
+            text = content[begin : begin + width * prod(sizes[1:])].decode("latin1")
+            texts = [text[n : n + width].strip(" \0") for n in range(0, len(text), max(width, 1))]
             found.setdefault(group, {})[name] = texts
         if not further:
             break
