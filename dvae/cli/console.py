@@ -17,6 +17,9 @@ from ..inference.result import Plain
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+for stream in ("stdout", "stderr"):
+    if getattr(sys, stream) is None:  # it is closed, as in `dvae list >&-`, and the next file would take its number
+        setattr(sys, stream, open(os.devnull, "w"))  # noqa: SIM115
 # Both keep to the width of the terminal; a file or a pipe gets lines as long as they need to be.
 OUT = Plain(width=None if sys.stdout.isatty() else 200)
 ERROR = Plain(stderr=True, soft_wrap=True, highlight=False)

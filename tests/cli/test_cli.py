@@ -133,6 +133,13 @@ def test_output_that_nobody_reads_loses_no_file(arguments, tmp_path, monkeypatch
     assert not [name for name in arguments if name.endswith(".png") and not (tmp_path / name).exists()]
 
 
+def test_a_closed_output_is_no_error(tmp_path):
+    program = f"from dvae.cli.console import OUT; OUT.print('a'); print(open({str(tmp_path / 'a')!r}, 'w').fileno())"
+    started = subprocess.run(["sh", "-c", '"$0" "$@" >&-', sys.executable, "-c", program], capture_output=True)
+    assert (started.returncode, started.stderr) == (0, b"")
+    assert (tmp_path / "a").read_bytes() == b""
+
+
 def test_version_is_printed(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"dvae {dvae.__version__}\n"

@@ -10,8 +10,6 @@ from dvae.motion.files.bvh import read_bvh, write_bvh
 
 SAMPLES = {
     "bvh/indian_13.bvh": (1996, 57),
-    "bvh/martial_04.bvh": (1317, 57),
-    "bvh/salsa_10.bvh": (1198, 57),
     "01_01.bvh": (2752, 38),
     "01_03.bvh": (4511, 38),
     "Boxing_Toes.bvh": (3070, 26),  # a row more than it announces
