@@ -7,6 +7,7 @@ seconds, so that dates at such steps are continued on the calendar, in their own
 from __future__ import annotations
 
 import re
+import warnings
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -18,6 +19,8 @@ import numpy as np
 
 from ..options import Amount, check
 
+HOUR, DAY = 3600, 86400
+"""Seconds."""
 MONTH = 30.4369
 """Mean days of a month."""
 SERIES = 50
@@ -91,6 +94,9 @@ class Calendar:
 
         The step is inferred from the times. If they are too few, it is the step of the calendar. Times without a
         calendar step continue by their median gap.
+
+        Warns:
+            UserWarning: days that are some 23 or 25 hours long, in no time zone that has such days.
         """
         import pandas as pd
 
@@ -104,6 +110,13 @@ class Calendar:
             if len(local) > 1 and _is_daily(local):  # whatever the clocks do in between
                 gap = (local[1:] - local[:-1]).to_series().median()
                 return self._seconds(pd.DatetimeIndex([local[-1] + gap * place for place in range(1, count + 1)]))
+            if self.zone in (None, "UTC") and _changes_clocks(times):
+                warnings.warn(
+                    f"times such as {self.text(times[0])} and {self.text(times[-1])} seem to be days of a time zone "
+                    "whose clocks change, and future times ignore its changes; name the zone, such as zone = "
+                    '"Europe/Berlin"',
+                    stacklevel=2,
+                )
         gap = np.median(np.diff(times)) if len(times) > 1 else self.gap or 1.0
         return np.asarray(times[-1] + gap * np.arange(1, count + 1))
 
@@ -148,11 +161,19 @@ def _is_daily(local: Any) -> bool:
     return bool((local - local.normalize()).nunique() == 1)
 
 
+def _changes_clocks(times: np.ndarray) -> bool:
+    """Whether times are days apart, but for an hour twice a year."""
+    gaps = np.diff(times)
+    changes = gaps % DAY != 0
+    few = 0 < changes.sum() <= 2 + (times[-1] - times[0]) / (180 * DAY)
+    return bool(few and (gaps >= DAY - HOUR).all() and np.isin(gaps[changes] % DAY, (HOUR, DAY - HOUR)).all())
+
+
 def _step(local: Any) -> str | None:
     """Calendar step of increasing dates; None where they have none, or are too few to show one."""
     if len(local) < 3 or not _is_daily(local):
         return None
-    days = float(np.median(np.diff(seconds(local)))) / 86400
+    days = float(np.median(np.diff(seconds(local)))) / DAY
     count, first = round(days / MONTH), local[0]
     if days > 27:
         candidates = [f"{count}{end}" for end in ("ME", "BME", "MS", "BMS")]

@@ -254,16 +254,6 @@ def times(
             ) from error
         known = when.notna().to_numpy()
         moments = pd.DatetimeIndex(when)
-        if (
-            zone is None
-            and str(moments.tz) == "UTC"
-            and len(several := _offsets(column.drop_duplicates()).dropna().unique()) > 1
-        ):
-            warnings.warn(
-                f"column {column.name!r} has several offsets from UTC, {', '.join(several[:3])}, and no time zone: its "
-                'times are in UTC; name their zone, such as zone = "Europe/Berlin"',
-                stacklevel=2,
-            )
         if zone is not None:
             moments = moments.tz_convert(zone) if moments.tz else _localized(moments, zone, sequences, column)
         found = seconds(moments)

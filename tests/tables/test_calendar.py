@@ -79,8 +79,7 @@ def test_an_hour_that_clocks_show_twice_is_two_hours(order):
     local = BERLIN.tz_localize(None)
     two = frame_of([*BERLIN.astype(str)[order]] * 2, s=np.repeat(["a", "b"], 60))
     told = {"id": ("s",), "time": "time"}
-    with pytest.warns(UserWarning, match=r"several offsets from UTC, \+0[12]:00, \+0[12]:00, and no time zone"):
-        panel = Panel.of(two, Told(("y",), **told))
+    panel = Panel.of(two, Told(("y",), **told))
     naive = Panel.of(two.assign(time=[*local[order]] * 2), Told(("y",), zone="Europe/Berlin", **told))
     for one, other in zip(panel, naive, strict=True):
         np.testing.assert_array_equal(one.times, seconds(BERLIN))
@@ -103,6 +102,13 @@ def test_an_hour_that_clocks_show_twice_is_two_hours(order):
 def test_what_a_zone_does_not_settle_is_named(local, zone, said):
     with pytest.raises(ValueError, match=said):
         future(frame_of(local), zone=zone)
+
+
+def test_days_of_a_zone_that_is_not_named_continue_with_a_warning():
+    days = pd.date_range("2024-10-20", periods=20, tz="Europe/Berlin")
+    for written in (days.astype(str), days.tz_convert("UTC"), days.tz_convert("UTC").tz_localize(None)):
+        with pytest.warns(UserWarning, match="seem to be days of a time zone whose clocks change, .* name the zone"):
+            assert future(frame_of(written))[0].time() == pd.Timestamp("23:00").time()
 
 
 SPANS = pd.timedelta_range("0h", periods=30, freq="90min")

@@ -270,9 +270,10 @@ def test_values_are_of_their_family_as_models_see_them(family):
     "column",
     [
         pd.date_range("2020-03-28", periods=3, tz="Europe/Berlin"),
+        ["2020-03-28T00:00+01:00", "2020-03-29T00:00+01:00", "2020-03-30T00:00+02:00"],
         pd.to_datetime(["2020-03-27 23:00", "2020-03-28 23:00", "2020-03-29 22:00"]),
     ],
-    ids=["zone", "utc"],
+    ids=["zone", "texts", "utc"],
 )
 def test_dates_with_time_zones_are_moments(column):
     frame = pd.DataFrame({"t": column, "y": [1.0, 2.0, 3.0]})
