@@ -2,14 +2,17 @@
 
 cuDNN keeps what the gradient is made of in training alone, and latents are sampled, and control and completion descend,
 in evaluation. The mode changes nothing else where there is no dropout, which is refused.
+
+oneDNN has no LSTM in half precision for some processors. There, an LSTM under autocast computes in float32.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from typing_extensions import override
 
 
@@ -35,8 +38,32 @@ class GRU(_Differentiable, nn.GRU):
 
 
 class LSTM(_Differentiable, nn.LSTM):
-    """`torch.nn.LSTM`, without dropout."""
+    """`torch.nn.LSTM`, without dropout; in float32 where the processor has no LSTM in autocast's precision."""
+
+    @override
+    def forward(self, entries: Tensor, states: tuple[Tensor, Tensor] | None = None) -> Any:
+        on_cpu = entries.device.type == "cpu" and torch.is_autocast_enabled("cpu")
+        if not on_cpu or _runs_lstm(torch.get_autocast_dtype("cpu"), torch.is_grad_enabled()):
+            return super().forward(entries, states)
+        precision = self.weight_hh_l0.dtype
+        with torch.autocast("cpu", enabled=False):
+            states = None if states is None else (states[0].to(precision), states[1].to(precision))
+            return super().forward(entries.to(precision), states)
 
 
 class RNN(_Differentiable, nn.RNN):
     """`torch.nn.RNN`, without dropout."""
+
+
+@cache
+def _runs_lstm(precision: torch.dtype, training: bool) -> bool:
+    """Whether this processor runs an LSTM under autocast, tried once on a single entry."""
+    with torch.inference_mode(False), torch.set_grad_enabled(training), torch.autocast("cpu", precision):
+        entry, weight, bias = (torch.zeros(shape, requires_grad=training) for shape in ((1, 1, 1), (4, 1), (4,)))
+        try:
+            found = torch.lstm(entry, (entry, entry), [weight, weight, bias, bias], True, 1, 0.0, training, False, True)
+            if training:
+                found[0].sum().backward()
+        except RuntimeError:
+            return False
+    return True
