@@ -70,13 +70,13 @@ def rows(device: torch.device) -> dict[str, float]:
     model.eval()
     one = past[:1]
     cached, anew, long = seconds(
-        lambda: model.forecast(one, 60, 50),
+        lambda: model.forecast(one, 60, 50, draw_emission=False),
         lambda: without_caches(model, one, 60, 50),
-        lambda: model.forecast(one, 300, 50),
+        lambda: model.forecast(one, 300, 50, draw_emission=False),
         repeat=3,
     )
     small = dvae.method("hit-dvae", pose_prior=0.0).build(windows).to(device).eval()
-    generation = lambda: small.forecast(one, 60, 50)  # noqa: E731
+    generation = lambda: small.forecast(one, 60, 50, draw_emission=False)  # noqa: E731
     made, apart = seconds(generation, products(generation), repeat=3)
     found["frame"] = made / apart
     found["cache"] = anew / cached
@@ -84,12 +84,12 @@ def rows(device: torch.device) -> dict[str, float]:
     clock = stopwatch()
     begun = clock()
     for part in past.split(20):
-        model.forecast(part, 60, 50)
+        model.forecast(part, 60, 50, draw_emission=False)
     found["seconds"] = clock() - begun
 
     def beside(samples: int) -> int:
         with Held() as held:
-            futures = small.forecast(past[:8], 60, samples)
+            futures = small.forecast(past[:8], 60, samples, draw_emission=False)
         return held.most - sum(value.untyped_storage().nbytes() for value in futures.values())
 
     found["samples"] = beside(1024) / beside(512)

@@ -53,7 +53,8 @@ LARGEST_TEXT = 2**24
 LARGEST_WEIGHTS = 2**32
 """Bytes of a model's weights."""
 
-STATUSES: tuple[str, ...] = ("running", "finished", "stopped early", "interrupted", "failed")
+ENDED: tuple[str, ...] = ("finished", "stopped early")
+STATUSES: tuple[str, ...] = ("running", *ENDED, "interrupted", "failed")
 
 # what state.json holds of a run, and what makes a value of it sound
 _NUMBER = "a whole number from 0"

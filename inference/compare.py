@@ -88,7 +88,7 @@ def compare(
             0 leaves it out.
         samples: forecasts per window of the free-running scores; 0 leaves these out, which take longest. Data that are
             no windows, or whole sequences, have none.
-        draw_emission: forecast draws of x, or its means; see `evaluate`.
+        draw_emission: forecast draws of x, or (False) its means; None as in `evaluate`.
         seed: of every model's draws, and of the choice of contrasts.
         batch_size: sequences scored at once.
         configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.

@@ -173,6 +173,7 @@ class Tubes(Result):
             models,
             windows,
             scores=self.scores,
+            draw_emission=True,
             samples=self.samples,
             seed=self.seed,
             references=references,

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from ..data import HeldOutWindows, called, columns_of
 from ..program.model import DynamicalVAE
-from ..program.protocols import Forecasting
+from ..program.protocols import Emitting, Forecasting
 from ..turns import alone
 from .bounds import SequenceELBO, importance_bound
 from .evaluation import Evaluation, Row
@@ -68,9 +68,9 @@ def evaluate(
         samples: K, the forecasts per window.
         seed: seed of every method's draws.
         batch_size: windows forecast at once.
-        draw_emission: forecast draws of x, or (False) its means. The motion papers score means; proper scoring rules
-            judge the model's predictive distribution only when x is drawn. None for draws where a score is of nothing
-            else (`Measure.of_draws`), or where the data are discrete, and for means elsewhere.
+        draw_emission: forecast draws of x, or (False) its means. Proper scoring rules judge the model's predictive
+            distribution only when x is drawn; the papers of motion score means. None for draws, or for means where
+            a score is published for these (`Measure.of_means`); see `DynamicalVAE.is_drawn` for exceptions.
         bound_particles: particles of the importance-weighted bound and its k-hat; 0 leaves both out.
         log_score_particles: particles of the log score, see `predictive_bound`; 0 leaves it out.
         references: whether to add the reference rows, each where it can be had; or names of some, see `References`.
@@ -103,8 +103,8 @@ def evaluate(
     held = hold(windows)
     windows = held.windows
     measures = _measures(scores, windows)
-    if draw_emission is None and any(measure.of_draws for measure in measures):
-        draw_emission = True
+    means = any(measure.of_means for measure in measures)
+    drawn = {name: _is_drawn(each, draw_emission, means) for name, each in models.items()}
     judge = _Judge(held, measures, bound_particles, log_score_particles)
     known = References(held, samples, seed, training_windows, season)
     baselines = _references(references, known, measures)
@@ -119,21 +119,21 @@ def evaluate(
                 yield slice(start, start + batch_size)
 
         for name, (count, forecaster) in baselines.items():
-            means, histograms = judge.forecasts(name, forecaster, count, parts(name))
-            rows[name] = Row(count, means, histograms=histograms)
+            scored, histograms = judge.forecasts(name, forecaster, count, parts(name))
+            rows[name] = Row(count, scored, histograms=histograms)
         for name, each in models.items():
             with reproducibly(each, seed):
-                forecaster = forecaster_of(each, held, samples, {"draw_emission": draw_emission, **(options or {})})
-                means, histograms = judge.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
+                forecaster = forecaster_of(each, held, samples, {"draw_emission": drawn[name], **(options or {})})
+                scored, histograms = judge.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
             if each.likelihood:
                 with reproducibly(each, seed):
-                    means |= judge.bounds(name, each, parts(f"{name}, bound"))
+                    scored |= judge.bounds(name, each, parts(f"{name}, bound"))
                 with reproducibly(each, seed):
-                    means |= judge.log_score(name, each, parts(f"{name}, log score"))
+                    scored |= judge.log_score(name, each, parts(f"{name}, log score"))
             equations = {"generative": each.generative.text, "inference": each.inference.text}
-            rows[name] = Row(samples, means, equations, dict((configs or {}).get(name, {})), histograms)
+            rows[name] = Row(samples, scored, equations, dict((configs or {}).get(name, {})), histograms)
 
-    kinds = {_emission(each, draw_emission) for each in models.values()} or {_emission(None, draw_emission)}
+    kinds = {"drawn" if each else "mean" for each in drawn.values() or [_is_drawn(None, draw_emission, means)]}
     return Evaluation(
         rows=rows,
         metrics=judge.metrics(rows),
@@ -148,11 +148,11 @@ def evaluate(
         basis={name: value for measure in measures for name, value in measure.basis.items()},
         notes=[
             *dict.fromkeys([*held.notes, *(measure.note for measure in measures if measure.note)]),
-            *_reservations(measures, samples, draw_emission),
+            *_reservations(measures, samples, [name for name, each in drawn.items() if not each]),
             *(
                 f"{name} draws nothing: its {samples} forecasts of a window are one, which is the best of them"
                 for name, each in models.items()
-                if samples > 1 and _certain(each, draw_emission)
+                if samples > 1 and _certain(each, drawn[name])
             ),
             *(
                 f"bounds of {name}: densities of {each.view.measured}"
@@ -188,25 +188,26 @@ def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
     return measures
 
 
-def _emission(model: Any, draw_emission: bool | None) -> str:
-    """What a model forecasts, as `DynamicalVAE.forecast` decides where nobody says."""
-    if draw_emission is None and isinstance(model, DynamicalVAE):
-        draw_emission = any(map(model.drawn, model.observed))
-    return "drawn" if draw_emission else "mean"
+def _is_drawn(model: Any, draw_emission: bool | None, means: bool) -> bool:
+    """Whether a model's forecasts draw the data: as the caller says, or else by what the scores are published for."""
+    if draw_emission is not None:
+        return draw_emission
+    return model.is_drawn(means) if isinstance(model, Emitting) else not means
 
 
-def _certain(model: Any, draw_emission: bool | None) -> bool:
+def _certain(model: Any, drawn: bool) -> bool:
     """Whether all forecasts of a window are one: means of a model in which nothing is latent."""
-    means = _emission(model, draw_emission) == "mean"
-    return isinstance(model, DynamicalVAE) and means and not (model.latents or model.summed or model.shared)
+    return isinstance(model, DynamicalVAE) and not (drawn or model.latents or model.summed or model.shared)
 
 
-def _reservations(measures: Sequence[Measure], samples: int, draw_emission: bool | None) -> Iterator[str]:
+def _reservations(measures: Sequence[Measure], samples: int, of_means: Sequence[str]) -> Iterator[str]:
     """Notes on scores that cannot be had of these forecasts, or say little."""
     if lacking := [f"{measure.name} ({measure.least})" for measure in measures if measure.least > samples]:
         yield f"left out, as they need more than {samples} forecasts: {', '.join(lacking)}"
-    if not draw_emission and (of_draws := [m.name for m in measures if m.of_draws and m.least <= samples]):
-        yield f"of means, which lack the emission's noise, and so too narrow: {', '.join(of_draws)}"
+    judged = [each.name for each in measures if each.of_draws and not each.of_means and each.least <= samples]
+    if of_means and judged:
+        names = f"forecasts of {', '.join(of_means)}"
+        yield f"{names} are means, which lack the emission's noise and are too narrow for {', '.join(judged)}"
 
 
 @dataclass(frozen=True)

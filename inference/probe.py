@@ -59,6 +59,10 @@ class Redrawn(nn.Module):
         self.model, self.laws = model, dict(laws)
         self.generative, self.inference = model.generative, model.inference
 
+    def is_drawn(self, means: bool = False) -> bool:
+        """As the model decides."""
+        return bool(self.model.is_drawn(means))
+
     @alone
     def forecast(self, batch: AnyBatch, horizon: int, samples: int = 1, **options: Any) -> Mapping[str, Tensor]:
         """As the model's, with latents from the other laws."""

@@ -107,8 +107,9 @@ class Measure:
         bins: 0 of a score; of a histogram, which is in `Row.histograms` and in no table, the number of its bins, and
             `function` gives shares `(B, bins)`.
         least: forecasts of a window that it needs; rows with fewer, such as points, are left without it.
-        of_draws: whether it judges the distribution that forecasts are drawn from, so that they are drawn where nobody
-            says otherwise, and a note says so of means.
+        of_draws: whether it scores the distribution of the data. A note says so where forecasts are means.
+        of_means: whether it is published for means of the emission, as errors of motion are. Forecasts are then means
+            by default; otherwise they are draws.
     """
 
     name: str
@@ -124,6 +125,7 @@ class Measure:
     bins: int = 0
     least: int = 1
     of_draws: bool = False
+    of_means: bool = False
 
     @property
     def metric(self) -> Metric:
@@ -136,9 +138,9 @@ def paired(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tenso
     return lambda forecasts, truth, past, index: score(forecasts, truth)
 
 
-ENERGY = Measure("energy score", paired(metrics.energy_score), headline=True)
-VARIOGRAM = Measure("variogram score", paired(metrics.variogram_score))
-CRPS = Measure("CRPS", paired(metrics.continuous_ranked_probability_score), headline=True)
+ENERGY = Measure("energy score", paired(metrics.energy_score), headline=True, of_draws=True)
+VARIOGRAM = Measure("variogram score", paired(metrics.variogram_score), of_draws=True)
+CRPS = Measure("CRPS", paired(metrics.continuous_ranked_probability_score), headline=True, of_draws=True)
 
 
 def proper(windows: HeldOutWindows) -> list[Measure]:

@@ -72,7 +72,7 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
         """The squared error, where no other law is asked for."""
         if self.emission is not None:
             return super().laws()
-        return {"p(x)": FixedNormal(scale=sqrt(0.5), residual=self.residual)}
+        return {"p(x)": FixedNormal(scale=sqrt(0.5), residual=self.residual, error_weight=True)}
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
@@ -104,8 +104,7 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
         if method.heading:
             poses = Poses.of(schema, self.name, self.representation)
             view = Heading(poses.skeleton, poses.protocol.observed)
-        squared = self.emission is None and schema.emission is None
-        model = method.suited_to(schema, True, DeterministicModel if squared else DynamicalVAE, view)
+        model = method.suited_to(schema, True, view=view)
         if method.standardise and not schema.units:
             model.standardise(WHOLE)
         model.feeding = method.fed()
@@ -120,11 +119,3 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
     def _start(self, model: DynamicalVAE, train: Any) -> None:
         if WHOLE in model.units and not model.units[WHOLE].scale.dim():  # those of columns are known
             fit_units(model, train)
-
-
-class DeterministicModel(DynamicalVAE):
-    """A model whose forecasts are means: its variance is a weight of the loss, and no spread of the data."""
-
-    @override
-    def drawn(self, name: str) -> bool:
-        return False

@@ -82,11 +82,6 @@ class DSFModel(ModesModel):
     method: DSF
 
     @override
-    def drawn(self, name: str) -> bool:
-        """No: futures differ by the mode."""
-        return False
-
-    @override
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
         """The energies of the futures of each window in all modes."""
         found = super().penalties(rollout, data, {})

@@ -15,7 +15,7 @@ from ..notation import Factorization
 from ..options import Range, Size, nearest
 from ..program.model import DynamicalVAE
 from ..program.summed import LARGEST, Discrete
-from ..schema import Schema
+from ..schema import Schema, SchemaError
 from .method import LatentMethod
 
 
@@ -87,5 +87,29 @@ class Equations(LatentMethod):
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model of these equations and no others; gradients flow through fed means."""
-        return self.suited_to(Schema.of(data), extended=False)
+        """The model of these equations and no others; gradients flow through fed means.
+
+        Raises:
+            SchemaError: data without context that the equations read.
+        """
+        schema = Schema.of(data)
+        if missing := [name for name in self._given() if name not in schema.sizes]:
+            raise SchemaError(
+                f"the equations read {', '.join(missing)}, which has no factor and comes from the data, but these have "
+                f"{', '.join(schema.sizes)}; a table has covariates as c, attributes as s, and uneven steps as d"
+            )
+        return self.suited_to(schema, extended=False)
+
+    @override
+    def check(self) -> None:
+        """Refuses options that do not fit together, whatever the sizes of the context will be."""
+        self.build(Schema({"x": 1, **dict.fromkeys(self._given(), 1)}))
+
+    def _given(self) -> list[str]:
+        """Names of the context of both equations."""
+        generative, inference = self.equations()
+        return [
+            n
+            for n in {**dict.fromkeys(generative.context), **dict.fromkeys(inference.context)}
+            if n not in generative.variables
+        ]

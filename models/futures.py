@@ -80,7 +80,7 @@ class FutureMethod(PoseMethod):
     @override
     def laws(self) -> Mapping[str, LawSpec]:
         """x is normal with variance 1/2, minus whose log-density is the squared error."""
-        return {"p(x)": FixedNormal(scale=sqrt(0.5))}
+        return {"p(x)": FixedNormal(scale=sqrt(0.5), error_weight=True)}
 
     @override
     def build(self, data: Any) -> FutureModel:

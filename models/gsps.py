@@ -289,12 +289,15 @@ class GSPSModel(EnergyModel):
 
     @torch.no_grad()
     @override
-    def impute(self, batch: AnyBatch, samples: int = 1, **options: Any) -> dict[str, Tensor]:
+    def impute(
+        self, batch: AnyBatch, samples: int = 1, *, draw: bool | None = None, **options: Any
+    ) -> dict[str, Tensor]:
         """Whole windows with their gaps filled in, S times, by the motion that is nearest to all that was observed.
 
         Ours, as there is no guide that reads what is behind a gap. Each filling is from as many draws as in training,
         of which the best is what the model learns to have near the truth. Across a gap it is moved so that it meets
-        what was observed at both ends: by its errors there, on a straight line in time.
+        what was observed at both ends: by its errors there, on a straight line in time. `draw` changes nothing, as
+        the emission has no noise.
 
         Raises:
             ValueError: a batch without a mask, or windows of another length than the networks make.

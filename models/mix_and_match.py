@@ -138,7 +138,7 @@ class MixAndMatchMotion(PoseMethod):
 
     @override
     def laws(self) -> Mapping[str, LawSpec]:
-        return {"p(x)": FixedNormal(self.scale, project=False)}
+        return {"p(x)": FixedNormal(self.scale, project=False, error_weight=True)}
 
     @override
     def build(self, data: Any) -> DynamicalVAE:

@@ -89,7 +89,7 @@ class MotionLatent(Method):
 
     @override
     def laws(self) -> Mapping[str, LawSpec]:
-        return {f"p({name})": FixedNormal(self.scale, project=False) for name in PARTS}
+        return {f"p({name})": FixedNormal(self.scale, project=False, error_weight=True) for name in PARTS}
 
     @override
     def build(self, data: Any) -> DynamicalVAE:

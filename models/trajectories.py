@@ -143,7 +143,7 @@ class LatentTrajectoryMethod(TrajectoryMethod):
     @override
     def laws(self) -> Mapping[str, LawSpec]:
         """x is normal with variance 1/2, minus whose log-density is the squared error."""
-        return {"p(x)": FixedNormal(scale=sqrt(0.5))}
+        return {"p(x)": FixedNormal(scale=sqrt(0.5), error_weight=True)}
 
     @override
     def beside(self) -> Paths:
@@ -209,11 +209,6 @@ class TrajectoryModel(DynamicalVAE):
             seen.append(Heading(skeleton, pose=FIRST, turned=(FIRST, GIVEN, REST, WHOLE)))
         super().__init__(view=Views(*seen), **options)
         self.method, self.skeleton, self.frames = method, skeleton, frames
-
-    @override
-    def drawn(self, name: str) -> bool:
-        """Never, where nobody says: the emission is the weight of an error, and its draws are noise."""
-        return False
 
     @override
     def model(self, batch: AnyBatch | None = None, *, curriculum: float = 1.0, **options: Any) -> dict[str, Tensor]:
@@ -284,6 +279,7 @@ class TrajectoryModel(DynamicalVAE):
                 stacklevel=3,  # torch.no_grad is between
             )
         length = data[GIVEN].shape[1]
+        draw_emission = self.is_drawn() if draw_emission is None else draw_emission
         distinct = samples if draw_emission or (temperature and self.latents) else 1
 
         def futures(part: slice, count: int) -> dict[str, Tensor]:

@@ -118,7 +118,7 @@ class TrajeVAE(LatentTrajectoryMethod):
     def laws(self) -> Mapping[str, LawSpec]:
         """The decoder makes poses; normal latents, of which those beyond `components` are noise that nothing reads."""
         latent: LawSpec = SlowNormal(steps=self.components) if self.components else Normal()
-        emission = FixedNormal(scale=sqrt(0.5), project=False)
+        emission = FixedNormal(scale=sqrt(0.5), project=False, error_weight=True)
         return {"p(x)": emission, "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
 
     @override

@@ -63,7 +63,7 @@ def imputed(model: Any, batch: Mapping[str, Tensor], samples: int, seed: int) ->
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         for rows in torch.arange(len(batch["x"])).split(64):
-            drawn = model.impute({name: value[rows] for name, value in batch.items()}, samples)["x"]
+            drawn = model.impute({name: value[rows] for name, value in batch.items()}, samples, draw=False)["x"]
             means.append(drawn.mean(0))
             spreads.append(drawn.var(0).unflatten(-1, (-1, 3)).sum(-1).sqrt())
     return torch.cat(means), torch.cat(spreads)

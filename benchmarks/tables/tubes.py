@@ -160,9 +160,9 @@ def first(page: Path | None, model: Any, opened: MotionData, apart: motion.Proto
     ]
     header = ["held at once", "said", "width (m)", "conformal", "width (m)"]
     write(page, table(header, lines), name="tubes")
-    scores = dvae.evaluate(model, halves[1], scores=over_horizon, samples=SAMPLES, references=False, progress=False)[
-        "model"
-    ]
+    scores = dvae.evaluate(
+        model, halves[1], scores=over_horizon, samples=SAMPLES, draw_emission=True, references=False, progress=False
+    )["model"]
     frames = [int(name.split()[-1]) for name in scores if name.startswith("coverage 90 %, frame")]
     lines = [
         [f"{level} %", *(str(scores[f"coverage {level} %, frame {frame}"]) for frame in frames)]

@@ -30,6 +30,12 @@ Missing = Annotated[
 ]
 """The option of every command that reads motion."""
 
+Failed = Annotated[
+    bool,
+    tyro.conf.arg(help="use the weights of a run that failed, or has made no step, as they are"),
+]
+"""The option of every command that uses runs."""
+
 
 def speaks() -> bool:
     """Whether this process is the first of a run's, which it is where there is one; known before torch is imported."""

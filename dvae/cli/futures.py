@@ -21,11 +21,13 @@ from ..motion.files.writing import format_of
 from ..options import nearest
 from ..runs import directory as runs
 from . import tables
-from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, save_figure
+from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, save_figure
 from .opening import data_of, kind_of, load_run
 
 SAMPLES = 10
 """Futures and fillings of motion where nobody says how many."""
+EMISSIONS = {"drawn": "draws of the emission", "mean": "means of the emission", "": "draws or means of the emission"}
+"""What the emission of futures is called."""
 
 
 def forecast(
@@ -35,9 +37,11 @@ def forecast(
     horizon: int | None = None,
     samples: int | None = None,
     fix: tuple[str, ...] = (),
+    draw_emission: bool | None = None,
     seed: int = 0,
     data: str | None = None,
     missing: Missing = False,
+    failed: Failed = False,
     figure: Path | None = None,
     beyond: bool = False,
 ) -> None:
@@ -50,8 +54,9 @@ def forecast(
     without an ending is a new folder, and gets a BVH file for every window and future: Blender opens these.
 
     The npz holds, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
-    (windows, frames, joints, 3), NaN where a joint was missing, `split`, `clip` and `start` of each window, and the
-    skeleton. `dvae animate` plays it, `dvae.motion.Forecasts.load` reads it.
+    (windows, frames, joints, 3), NaN where a joint was missing, `split`, `clip` and `start` of each window, the
+    skeleton, and `emission`: whether futures are "drawn" or "mean". `dvae animate` plays it,
+    `dvae.motion.Forecasts.load` reads it.
 
     Args:
         run: the run directory.
@@ -61,6 +66,8 @@ def forecast(
         beyond: of a table: what comes after its last row with a target, from rows behind that with known covariates.
         samples: forecasts of each window; by default 10, and of a table, of which quantiles are written, 100.
         fix: parts of the body, such as lower, or static latents, of which all forecasts of a window share one draw.
+        draw_emission: of motion: futures with the noise of the emission, or its means given draws of the latents. By
+            default draws in an npz, and means in BVH, which is played, unless nothing is latent.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
         figure: save a figure of the first window's futures.
@@ -68,28 +75,33 @@ def forecast(
     at_least(1, samples=samples, horizon=horizon)
     check_files(out, figure)
     if kind_of([run], data) == "panel":
-        if fix or missing:
-            raise UsageError(f"--{'fix' if fix else 'missing'} is about motion, and {run} is of a table")
-        tables.forecast(run, out, clip, horizon, samples, seed, data, figure, beyond)
+        of_motion = {"fix": bool(fix), "missing": missing, "draw-emission": draw_emission is not None}
+        if given := [name for name, is_given in of_motion.items() if is_given]:
+            raise UsageError(f"--{given[0]} is about motion, and {run} is of a table")
+        tables.forecast(run, out, clip, horizon, samples, seed, data, figure, beyond, failed)
         return
     samples = samples or SAMPLES
     if beyond:
         raise UsageError(f"--beyond is about tables, and {run} is of motion")
     suffix = out.suffix.lower()
     check_files(out, figure, ".npz", ".bvh", "")
-    loaded = load_run(run, data)
+    loaded = load_run(run, data, failed=failed)
     windows = windows_of(loaded, data, clip, missing)
     chosen: Sequence[int] = range(len(windows))
     if suffix == ".bvh":
         chosen = [_liveliest(windows.positions(gapped(windows.all())).numpy(), None)]
-    futures = draw_futures(loaded, windows, chosen, samples, seed, horizon, fix)
+    if draw_emission is None and suffix == ".npz":
+        draw_emission = loaded.model.is_drawn()
+    futures = draw_futures(loaded, windows, chosen, samples, seed, horizon, fix, draw_emission)
     if suffix == ".npz":
         futures.save(out)
     else:
         motion.write_motion(out, (futures.window(0, 1) if suffix else futures).motion(), "bvh")
     frames = futures.forecasts.shape[2]
     said = f"the first of {samples} futures" if suffix == ".bvh" else f"{samples} futures"
-    ERROR.print(f"wrote {out}: {said} of {frames} frames for each of {len(chosen)} windows")
+    ERROR.print(
+        f"wrote {out}: {said} of {frames} frames for each of {len(chosen)} windows, {EMISSIONS[futures.emission]}"
+    )
     _save_futures(futures, figure)
 
 
@@ -106,6 +118,7 @@ def complete(
     seed: int = 0,
     data: str | None = None,
     missing: Missing = False,
+    failed: Failed = False,
     figure: Path | None = None,
 ) -> None:
     """Complete motion along paths of some joints, from a clip or from a file.
@@ -133,7 +146,7 @@ def complete(
     at_least(1, samples=samples)
     at_least(0, window=window)
     check_files(out, figure, ".npz")
-    loaded = load_run(run, data)
+    loaded = load_run(run, data, failed=failed)
     if not isinstance(loaded.model, TrajectoryModel):
         raise UsageError(f"{run} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
     if exact and not (joints or paths):
@@ -148,7 +161,9 @@ def complete(
         torch.manual_seed(seed)
         done = loaded.model.complete(pose, given, None if given else len(truth), samples, **how)
     before_and_after = pose[None, None], truth[None, : done.positions.shape[1]]
-    motions = motion.Forecasts(windows.skeleton, [windows.keys[chosen]], done.positions[:, None], *before_and_after)
+    motions = motion.Forecasts(
+        windows.skeleton, [windows.keys[chosen]], done.positions[:, None], *before_and_after, "mean"
+    )
     motions.save(out)
     OUT.print(str(done))
     ERROR.print(f"wrote {out}: window {chosen}, {_title(motions)}")
@@ -162,17 +177,19 @@ def impute(
     clip: str | None = None,
     samples: int | None = None,
     particles: int = 1,
+    draw_emission: bool | None = None,
     seed: int = 0,
     data: str | None = None,
     missing: Missing = False,
+    failed: Failed = False,
 ) -> None:
     """Fill in the joints that test windows lack, or those of a whole clip, several times each.
 
     The npz of --out holds, in metres, `filled` (samples, windows, frames, joints, 3), positions as windows have them,
     with joints as they were observed, or else filled in; `observed` (windows, frames, joints), which were; `spread`,
-    how far the samples' places of a joint are from their mean; `split`, `clip` and `start` of each window, and the
-    skeleton. --filled is the motion itself, where it was in the world, with the gaps in these windows filled once: for
-    `dvae evaluate --data`, or other programs.
+    how far the samples' places of a joint are from their mean; `split`, `clip` and `start` of each window, the
+    skeleton, and `emission`: whether fillings are "drawn" or "mean". --filled is the motion itself, where it was in the
+    world, with the gaps in these windows filled once: for `dvae evaluate --data`, or other programs.
 
     Args:
         run: the run directory.
@@ -181,45 +198,44 @@ def impute(
         clip: name of a clip, or split/name where the name is not unique; of any split, filled as one window.
         samples: fillings of each window; by default 10, and of a table, of which quantiles are written, 100.
         particles: of a table, draws for each filling, of which those are taken that what was observed makes likely.
+        draw_emission: of motion: fill with the noise of the emission, or with its means given draws of the latents. By
+            default draws in --out, and means in --filled, unless nothing is latent.
         seed: of the draws.
         data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
     """
     at_least(1, samples=samples, particles=particles)
     check_files(out, None)
     if kind_of([run], data) == "panel":
-        if out is None or filled is not None or clip is not None:
-            raise UsageError("of a table, impute writes --out FILE.csv, .parquet or .npz")
-        tables.impute(run, out, samples, particles, seed, data)
+        if out is None or filled is not None or clip is not None or draw_emission is not None:
+            raise UsageError("of a table, impute writes draws to --out FILE.csv, .parquet or .npz")
+        tables.impute(run, out, samples, particles, seed, data, failed)
         return
     samples = samples or SAMPLES
     if particles > 1:
-        raise UsageError("fillings of motion are means, among which there is nothing to choose; leave --particles out")
+        raise UsageError("--particles chooses among fillings of tables; leave it out for motion")
     check_files(out, None, ".npz")
     if out is None and filled is None:
         raise UsageError("impute writes files; say which, by --out or --filled")
     kind = None if filled is None else format_of(filled, None if filled.suffix else "bvh")
-    loaded = load_run(run, data)
+    loaded = load_run(run, data, failed=failed)
     windows = windows_of(loaded, data, clip, missing, whole=clip is not None)
     if filled is not None and filled.suffix and kind != "npz" and len(windows.clips) > 1:
         raise UsageError(
             f"--filled {filled} holds one clip, of {len(windows.clips)}; say which by --clip, or end it in .npz"
         )
-    listed, parts = windows.all(), []
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        for some in torch.arange(len(windows)).split(64):
-            made = loaded.model.impute(each(listed, itemgetter(some)), samples)["x"]
-            parts.append(windows.positions(made).numpy())
-    seen = windows.skeleton.with_root(listed["mask"].unflatten(-1, (-1, 3)), True)[..., 0].numpy()
-    found = motion.Imputed(windows.skeleton, windows.keys, np.concatenate(parts, 1), seen)
+    model = loaded.model
     if out is not None:
+        found = _fillings(model, windows, samples, seed, model.is_drawn() if draw_emission is None else draw_emission)
+        seen = found.observed
         found.save(out)
         spread = 1000 * found.spread[~seen].mean() if not seen.all() else 0.0
         ERROR.print(
             f"wrote {out}: {samples} fillings of each of {len(windows)} windows, which lacked {1 - seen.mean():.1%} of "
-            f"their joints; they spread by {spread:.0f} mm"
+            f"their joints; they spread by {spread:.0f} mm, {EMISSIONS[found.emission]}"
         )
     if filled is not None:
+        drawn = model.is_drawn(means=True) if draw_emission is None else draw_emission
+        found = _fillings(model, windows, 1, seed, drawn)
         whole = windows.filled(torch.from_numpy(found.filled[0]))
         motion.write_motion(filled, whole, kind)
         left = sum(int(np.isnan(each.positions).any(-1).sum()) for each in whole)
@@ -227,6 +243,19 @@ def impute(
             f"wrote {filled}: {len(whole)} clips"
             + (f"; {left} joints are missing in frames of no window" if left else "")
         )
+
+
+def _fillings(model: Any, windows: motion.Windows, samples: int, seed: int, drawn: bool) -> motion.Imputed:
+    """Motion with its missing joints filled in."""
+    listed, parts = windows.all(), []
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        for some in torch.arange(len(windows)).split(64):
+            made = model.impute(each(listed, itemgetter(some)), samples, draw=drawn)["x"]
+            parts.append(windows.positions(made).numpy())
+    seen = windows.skeleton.with_root(listed["mask"].unflatten(-1, (-1, 3)), True)[..., 0].numpy()
+    emission = "drawn" if drawn else "mean"
+    return motion.Imputed(windows.skeleton, windows.keys, np.concatenate(parts, 1), seen, emission)
 
 
 def _told(joints: Sequence[str], truth: Any, paths: Path | None, skeleton: motion.Skeleton) -> dict[str, Any]:
@@ -249,6 +278,7 @@ def animate(
     seed: int = 0,
     data: str | None = None,
     missing: Missing = False,
+    failed: Failed = False,
     every: int | None = None,
     figure: Path | None = None,
 ) -> None:
@@ -276,7 +306,7 @@ def animate(
     if out.suffix.lower() == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise UsageError("an mp4 needs imageio-ffmpeg: pip install 'pyro-dvae[video]'; or end the name in .gif")
     if Path(source).is_dir():
-        loaded = load_run(Path(source), data)
+        loaded = load_run(Path(source), data, failed=failed)
         windows = windows_of(loaded, data, clip, missing)
         chosen = _liveliest(windows.positions(gapped(windows.all())).numpy(), window)
         futures = draw_futures(loaded, windows, [chosen], samples or 5, seed, fix=fix)
@@ -364,9 +394,11 @@ def draw_futures(
     seed: int,
     horizon: int | None = None,
     fix: Sequence[str] = (),
+    draw_emission: bool | None = None,
 ) -> motion.Forecasts:
-    """Futures of some of the windows; those of a window share one draw of what is fixed."""
+    """Futures of some of the windows; those of a window share one draw of what is fixed. To be shown, by default."""
     model = loaded.model
+    drawn = model.is_drawn(means=True) if draw_emission is None else draw_emission
     free = {*(model.view.parts or ()), *(name for name in model.latents if not model.generative.local(name))}
     if unknown := [name for name in fix if name not in free]:
         raise UsageError(
@@ -382,13 +414,14 @@ def draw_futures(
         whole = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # parts are fixed as a whole
         parts = []
         for given in Sequences(past).batches(64):
-            once = model.forecast(given, whole, 1) if fix else {}
+            once = model.forecast(given, whole, 1, draw_emission=drawn) if fix else {}
             held = {"fix": {name: once[name][0] for name in fix}} if fix else {}
-            made = model.forecast(given, whole, samples, **held)["x"][:, :, :horizon]
+            made = model.forecast(given, whole, samples, draw_emission=drawn, **held)["x"][:, :, :horizon]
             parts.append(windows.positions(made).numpy())
             del made  # with many samples the largest thing here
-    positions = [np.concatenate(parts, axis=1), *(windows.positions(x).numpy() for x in (gapped(past), future))]
-    return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], *positions)
+    observed_frames, truth = (windows.positions(x).numpy() for x in (gapped(past), future))
+    forecasts, emission = np.concatenate(parts, axis=1), "drawn" if drawn else "mean"
+    return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], forecasts, observed_frames, truth, emission)
 
 
 def _alike(futures: motion.Forecasts) -> list[int]:
@@ -410,7 +443,7 @@ def _liveliest(positions: np.ndarray, window: int | None) -> int:
 
 def _title(futures: motion.Forecasts) -> str:
     split, clip, start = futures.keys[0]
-    return f"{split}/{clip} from frame {start}: {len(futures.forecasts)} futures"
+    return f"{split}/{clip} from frame {start}: {len(futures.forecasts)} futures, {EMISSIONS[futures.emission]}"
 
 
 def _save_futures(futures: motion.Forecasts, path: Path | None, paths: Mapping[str, Any] | None = None) -> None:

@@ -28,7 +28,7 @@ from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
 from ..tables.scoring import panel_scores
 from . import opening, tables
-from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, note, save_figure
+from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, note, save_figure
 from .futures import joint_names
 
 MOST_REMEMBERED = 2**32
@@ -74,6 +74,7 @@ def evaluate(
     control: Control,
     data: str | None = None,
     missing: Missing = False,
+    failed: Failed = False,
     samples: int = 50,
     bound_particles: int = 0,
     log_score_particles: int = 0,
@@ -109,7 +110,7 @@ def evaluate(
     at_least(1, samples=samples, batch_size=batch_size)
     at_least(0, bound_particles=bound_particles, log_score_particles=log_score_particles)
     check_files(out, figure, ".json")
-    how = Judged(samples, log_score_particles, pose_prior, classifier, control, missing)
+    how = Judged(samples, log_score_particles, pose_prior, classifier, control, missing, failed)
     score = SCORERS.get(opening.kind_of(run, data), _forecasts)
     result, record = score(run, data, how, bound_particles=bound_particles, seed=seed, batch_size=batch_size)
     _keep(result, [each / f"{record}.json" for each in run] if out is None else [out], figure)
@@ -125,16 +126,17 @@ class Judged:
     classifier: tuple[Path, ...] = ()
     control: Control = Control()
     missing: bool = False
+    failed: bool = False
 
 
 def _forecasts(paths: Sequence[Path], data: str | None, how: Judged, **settings: Any) -> tuple[Any, str]:
     """Scores of forecasts of test windows, and what to call them."""
-    loaded, opened = opening.on_the_same_data(paths, data, how.missing)
-    opening.note_unfinished(loaded)
+    loaded = opening.alike(paths, data, failed=how.failed)
+    opened = opening.data_of(data, *loaded, missing=how.missing)
     called, windows = dict(zip(opening.names(loaded), loaded, strict=True)), opened.windows("test")
     given = how.control.windows(windows, loaded)
-    classifiers = _classifiers(how.classifier, data, loaded[0])
-    prior = None if how.pose_prior is None else _pose_prior(how.pose_prior, data, windows.skeleton)
+    classifiers = _classifiers(how, data, loaded[0])
+    prior = _pose_prior(how, data, windows.skeleton)
     own, temperature = opening.own(loaded[0], opened), how.control.temperature
     result = evaluate_models(
         {name: each.model for name, each in called.items()},
@@ -165,12 +167,11 @@ def _remembered(opened: Any) -> Any:
 
 def _segments(paths: Sequence[Path], data: str | None, how: Judged, **settings: Any) -> tuple[Any, str]:
     """How near test segments come back, and what to call that."""
-    if odd := [name for name, value in vars(how).items() if value != getattr(Judged, name)]:
+    if odd := [name for name, value in vars(how).items() if name != "failed" and value != getattr(Judged, name)]:
         options = "--joints, --exchange and --temperature are" if odd[0] == "control" else f"--{odd[0]} is"
         raise UsageError(f"{options.replace('_', '-')} about forecasts, and {paths[0]} makes whole segments")
-    loaded = opening.alike(paths, data, "segments")
+    loaded = opening.alike(paths, data, "segments", how.failed)
     opened = opening.data_of(data, *loaded)
-    opening.note_unfinished(loaded)
     called = dict(zip(opening.names(loaded), loaded, strict=True))
     try:
         own = opened if opening.own(loaded[0], opened) else replace(loaded[0], where=None).data
@@ -197,9 +198,8 @@ def _tables(paths: Sequence[Path], data: str | None, how: Judged, **settings: An
     ]
     if odd:
         raise UsageError(f"--{odd[0].replace('_', '-')} is about motion, and {paths[0]} is of a table")
-    loaded = opening.alike(paths, data, "panel")
+    loaded = opening.alike(paths, data, "panel", how.failed)
     opened = opening.data_of(data, *loaded)
-    opening.note_unfinished(loaded)
     called = dict(zip(opening.names(loaded), loaded, strict=True))
     result = evaluate_models(
         {name: each.model for name, each in called.items()},
@@ -234,6 +234,7 @@ def criticise(
     run: Annotated[Path, tyro.conf.Positional],
     data: str | None = None,
     missing: Missing = False,
+    failed: Failed = False,
     simulations: int = 200,
     draws: int = 99,
     ranked_steps: int = 4,
@@ -267,8 +268,7 @@ def criticise(
     at_least(19, samples=samples)
     check_files(out, figure, ".json")
     kind = opening.kind_of([run], data)
-    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion")
-    opening.note_unfinished([loaded])
+    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion", failed)
     opened, model = opening.data_of(data, loaded, missing=missing), loaded.model
     windows: Any = tables.windows(loaded, opened) if kind == "panel" else opened.windows("test")
     steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
@@ -300,6 +300,7 @@ def reference(
     run: Annotated[Path, tyro.conf.Positional],
     data: str | None = None,
     missing: Missing = False,
+    failed: Failed = False,
     windows: int = 3,
     frames: int | None = None,
     draws: int = 1000,
@@ -334,8 +335,7 @@ def reference(
     at_least(4, draws=draws)
     check_files(out, figure, ".json")
     kind = opening.kind_of([run], data)
-    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion")
-    opening.note_unfinished([loaded])
+    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion", failed)
     opened = opening.data_of(data, loaded, missing=missing)
     batch = opened.windows("test").all()
     some = np.unique(np.linspace(0, len(batch["x"]) - 1, windows).round().astype(int))
@@ -363,6 +363,7 @@ def tubes(
     run: Annotated[Path, tyro.conf.Positional],
     data: str | None = None,
     missing: Missing = False,
+    failed: Failed = False,
     level: float = 0.9,
     label: str | None = None,
     values: tuple[str, ...] = (),
@@ -397,8 +398,7 @@ def tubes(
     if bool(values) != (label is not None):
         raise UsageError("--label and --values tell together which test clips calibrate")
     kind = opening.kind_of([run], data)
-    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion")
-    opening.note_unfinished([loaded])
+    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion", failed)
     opened = opening.data_of(data, loaded, missing=missing)
     kept, judged = _kept_and_judged(kind, loaded, opened, label, values)
     found = conformal(loaded.model, kept, level, samples=samples, seed=seed, batch_size=batch_size)
@@ -459,7 +459,8 @@ def compare(
         contrasts: windows among which the information of latents is measured; 0 leaves it out.
         samples: forecasts of each window.
         forecasts: score forecasts too, which takes longest.
-        draw_emission: forecast draws of x, or its means; by default means, but of tables and discrete data.
+        draw_emission: forecast draws of x, or its means; by default draws of a table, and of motion means, for which
+            its scores are published, unless data are discrete or nothing is latent.
         stride: frames between the starts of test windows, in place of the protocol's: more is faster.
         seed: of the draws.
         batch_size: windows scored at once.
@@ -470,10 +471,10 @@ def compare(
     at_least(0, contrasts=contrasts, filter_particles=filter_particles)
     check_files(out, figure, ".json")
     kind = opening.kind_of(run, data)
-    loaded = opening.alike(run, data, kind if kind == "panel" else "motion")
+    loaded = opening.alike(run, data, kind if kind == "panel" else "motion", failed=True)
     opened = opening.data_of(data, *loaded, missing=missing)
-    if stopped := opening.unfinished(loaded):
-        raise ValueError("\n".join(stopped))
+    if stopped := [str(each.path) for each in loaded if each.unfinished]:
+        raise ValueError(f"{', '.join(stopped)} is no whole fit, and cannot be compared; resume it, or leave it out")
     windows, judged = _compared(loaded[0], opened, stride)
     shown = opening.rows(loaded)
     result = compare_models(
@@ -485,7 +486,7 @@ def compare(
         filter_particles=filter_particles,
         contrasts=contrasts,
         samples=samples if forecasts else 0,
-        draw_emission=True if draw_emission is None and kind == "panel" else draw_emission,
+        draw_emission=draw_emission,
         seed=seed,
         batch_size=batch_size,
         configs={name: opening.config_without_seed(row[0]) for name, row in shown.items()},
@@ -497,6 +498,7 @@ def bracket(
     run: Annotated[Path, tyro.conf.Positional],
     data: str | None = None,
     missing: Missing = False,
+    failed: Failed = False,
     count: int = 32,
     particles: int = 64,
     temperatures: int = 50,
@@ -531,8 +533,7 @@ def bracket(
     at_least(0, fitting=fitting, reach=reach)
     check_files(out, figure, ".json")
     kind = opening.kind_of([run], data)
-    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion")
-    opening.note_unfinished([loaded])
+    loaded = opening.load_run(run, data, kind if kind == "panel" else "motion", failed)
     opened = opening.data_of(data, loaded, missing=missing)
     windows, _ = _compared(loaded, opened, None)
     result = bracketed(
@@ -562,19 +563,21 @@ def _compared(first: runs.Loaded, opened: Any, stride: int | None) -> tuple[Any,
     return motion.windows(opened.motion, protocol, "test"), motion.scores
 
 
-def _pose_prior(path: Path, data: str | None, skeleton: motion.Skeleton) -> Any:
-    """The pose prior of a run, for poses of a skeleton."""
-    model = runs.load(path, data).model
+def _pose_prior(how: Judged, data: str | None, skeleton: motion.Skeleton) -> Any:
+    """The pose prior of a run, for poses of a skeleton; None where there is none."""
+    if (path := how.pose_prior) is None:
+        return None
+    model = opening.load(path, data, how.failed).model
     if not isinstance(model, PosePriorModel) or model.skeleton != skeleton:
         raise UsageError(f"--pose-prior {path} is no run of a pose-prior of the skeleton {skeleton.name!r}")
     return model
 
 
-def _classifiers(paths: Sequence[Path], data: str | None, judged: runs.Loaded) -> dict[str, Any]:
+def _classifiers(how: Judged, data: str | None, judged: runs.Loaded) -> dict[str, Any]:
     """The action classifiers of runs by their label, fitted on what the judged run was."""
     found: dict[str, Any] = {}
-    for path in paths:
-        loaded = runs.load(path, data)
+    for path in how.classifier:
+        loaded = opening.load(path, data, how.failed)
         if loaded.method.name != "action-classifier":
             raise UsageError(f"--classifier {path} is a fitted {loaded.method.name}, no action-classifier")
         if loaded.model.label in found:
@@ -585,6 +588,5 @@ def _classifiers(paths: Sequence[Path], data: str | None, judged: runs.Loaded) -
                 f"--classifier {path} was fitted on other data or under another protocol ({there}) than the runs "
                 f"({here}); it may have seen test clips"
             )
-        opening.note_unfinished([loaded])
         found[loaded.model.label] = loaded.model
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +15,6 @@ from ..models.equations import Equations
 from ..models.registry import judges
 from ..options import flat
 from ..runs import directory as runs
-from ..runs.sweep import ENDED
 from ..views import View
 from .console import UsageError, note
 
@@ -26,15 +26,35 @@ USES = {
 """What there is for runs, by the kind of their data."""
 
 
-def load_run(path: Path, data: str | None, kind: str = "motion") -> runs.Loaded:
-    """A run of a method that is fitted on data of a kind: if nothing is said, of one that forecasts."""
-    loaded = runs.load(path, data)
+def load_run(path: Path, data: str | None, kind: str = "motion", failed: bool = False) -> runs.Loaded:
+    """A run of a method that is fitted on data of a kind: if nothing is said, of one that forecasts.
+
+    Raises:
+        ValueError: another run, or a failed one unless `failed`.
+    """
+    loaded = load(path, data, failed)
     if loaded.config.kind != kind and (use := USES.get(loaded.config.kind)):
         raise ValueError(f"{path} is a fitted {loaded.method.name}, which {use}")
     if loaded.method.name in judges():
         raise ValueError(
             f"{path} is a fitted {loaded.method.name}, which forecasts nothing; its bounds are in {path / 'log.jsonl'}"
         )
+    return loaded
+
+
+def load(path: Path, data: str | None, failed: bool = False) -> runs.Loaded:
+    """Any run. One that has not ended is noted, and one that failed or has made no step refused, unless `failed`.
+
+    Raises:
+        ValueError: a run that failed.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the note is of more runs
+        loaded = runs.load(path, data)
+    if loaded.failed and not failed:
+        raise ValueError(f"{loaded.unfinished}, and --failed uses its weights as they are")
+    if loaded.unfinished:
+        note(loaded.unfinished)
     return loaded
 
 
@@ -66,20 +86,14 @@ def data_of(path: str | None, *shared: runs.Loaded, missing: bool = False) -> An
     return found
 
 
-def on_the_same_data(paths: Sequence[Path], path: str | None, missing: bool = False) -> tuple[list[runs.Loaded], Any]:
-    """Runs, and the data whose test windows they share: those that all were fitted on, or other data."""
-    loaded = alike(paths, path)
-    return loaded, data_of(path, *loaded, missing=missing)
-
-
-def alike(paths: Sequence[Path], path: str | None, kind: str = "motion") -> list[runs.Loaded]:
+def alike(paths: Sequence[Path], path: str | None, kind: str = "motion", failed: bool = False) -> list[runs.Loaded]:
     """Runs that share their test windows: those of the data that all were fitted on, or of other data."""
     if not paths:
         raise UsageError("give at least one run directory")
     twice, count = Counter(map(str, paths)).most_common(1)[0]
     if count > 1:
         raise UsageError(f"a run is named twice: {twice}")
-    loaded = [load_run(each, path, kind) for each in paths]
+    loaded = [load_run(each, path, kind, failed) for each in paths]
     first = loaded[0]
     for other in loaded[1:]:
         if not (other.alike(first) if path is None else other.schema.windows == first.schema.windows):
@@ -151,23 +165,6 @@ def _options(run: runs.Loaded) -> dict[str, Any]:
     config = config_without_seed(run)
     training = {key: value for key, value in config["training"].items() if key != "self_feeding"}
     return dict(flat({"method": config["method"], "training": training}))
-
-
-def unfinished(loaded: Sequence[runs.Loaded]) -> list[str]:
-    """A sentence on every run that has not ended."""
-    sentences = []
-    for run in loaded:
-        state, steps = Run(run.path).state, run.config.training.steps
-        if (status := state["status"]) not in ENDED:
-            where = f"{status} at step {state['step']} of {steps}"
-            sentences.append(f"{run.path} has not ended ({where}); dvae resume {run.path} goes on")
-    return sentences
-
-
-def note_unfinished(loaded: Sequence[runs.Loaded]) -> None:
-    """Notes on them."""
-    for sentence in unfinished(loaded):
-        note(sentence)
 
 
 def config_without_seed(run: runs.Loaded) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from ..runs import directory as runs
 from ..runs.ablation import Ablation
 from ..tables.windows import PanelWindows
 from . import opening
-from .console import ERROR, Missing, UsageError, at_least, check_files
+from .console import ERROR, Failed, Missing, UsageError, at_least, check_files
 from .futures import draw_futures
 from .judging import Control
 from .judging import evaluate as evaluate_runs
@@ -55,6 +55,7 @@ def report(
     ablation: Path | None = None,
     data: str | None = None,
     missing: Missing = False,
+    failed: Failed = False,
 ) -> None:
     """One page of what is known of runs: equations, graphs, curves, scores, bounds, latents, and futures.
 
@@ -78,11 +79,10 @@ def report(
     check_files(out, None, ".html", ".htm")
     ablated = None if ablation is None else _ablation(ablation)
     kind = opening.kind_of(run, data)
-    loaded = opening.alike(run, data, kind if kind == "panel" else "motion")
+    loaded = opening.alike(run, data, kind if kind == "panel" else "motion", failed)
     if evaluate:
-        evaluate_runs(run, Control(), data=data, missing=missing, seed=seed)
+        evaluate_runs(run, Control(), data=data, missing=missing, failed=failed, seed=seed)
     named = dict(zip(opening.names(loaded), loaded, strict=True))
-    opening.note_unfinished(loaded)
 
     with progress_bar(True) as bar:
         shown = [make(named) for make in bar.track(OF_DIRECTORIES, description="run directories")]
@@ -143,7 +143,8 @@ def _futures(named: Mapping[str, Any], windows: Any, count: int, samples: int, s
         return player(scenes)
 
     about = (
-        f"Black: observed. Green: what happened. In colour: {samples} futures, drawn from the model. "
-        "To turn the people, drag them, or press the arrow keys."
+        f"Black: observed. Green: what happened. In colour: {samples} futures, each from a draw of the latents, "
+        "and without the noise of the emission where there are latents. To turn the people, drag them, or press the "
+        "arrow keys."
     )
     return Section("Futures", sections.cells(named, cell, "futures"), about)

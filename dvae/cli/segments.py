@@ -28,7 +28,7 @@ from ..options import Positive, Range, check
 from ..runs import directory as runs
 from ..views import WHOLE
 from . import opening
-from .console import ERROR, OUT, UsageError, at_least, check_files, note
+from .console import ERROR, OUT, Failed, UsageError, at_least, check_files, note
 
 MOST_STEPS = MOST_DRAWS = 100
 
@@ -47,6 +47,7 @@ def interpolate(
     steps: int = 9,
     fps: float | None = None,
     data: str | None = None,
+    failed: Failed = False,
 ) -> None:
     """Go from one segment to another on the straight line in the latent space of a run, motion and body together.
 
@@ -71,8 +72,7 @@ def interpolate(
     if fps is not None and not 1 <= fps <= 1000:
         raise UsageError(f"--fps is {fps:g}; it must be between 1 and 1000")
     check_files(out, None, ".npz", ".html", ".htm", ".bvh", "")
-    loaded = opening.load_run(run, data, "segments")
-    opening.note_unfinished([loaded])
+    loaded = opening.load_run(run, data, "segments", failed)
     opened = opening.data_of(data, loaded)
     ends = [opened.found(name) for name in (first, second)]
     found = interpolate_segments(loaded.model, ends[0].all(), ends[1].all(), steps)
@@ -174,6 +174,7 @@ def recover(
     out: Path | None = None,
     seed: int = 0,
     data: str | None = None,
+    failed: Failed = False,
 ) -> None:
     """Recover whole segments, with their timing and bodies, from what was seen of them.
 
@@ -213,8 +214,7 @@ def recover(
         raise UsageError("give what was seen, either of the run's segments (--from NAME --seen KIND) or as a --file")
     if file is not None and glimpse != Glimpse():
         raise UsageError("a --file says all that was seen; --seen and what goes with it are about segments of --from")
-    loaded = opening.load_run(run, data, "segments")
-    opening.note_unfinished([loaded])
+    loaded = opening.load_run(run, data, "segments", failed)
     model, truth, takes = loaded.model, None, set()
     if file is None:
         opened = opening.data_of(data, loaded)

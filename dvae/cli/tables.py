@@ -115,10 +115,11 @@ def forecast(
     data: str | None,
     figure: Path | None,
     beyond: bool,
+    failed: bool,
 ) -> None:
     """Forecasts test windows, those of one sequence, or what comes after the end of the table."""
     check_files(out, figure, *FORMATS)
-    loaded = load_run(path, data, "panel")
+    loaded = load_run(path, data, "panel", failed)
     opened = data_of(data, loaded)
     opened = opened if sequence is None else opened.only([sequence])
     samples = samples or SAMPLES
@@ -132,10 +133,12 @@ def forecast(
         save_figure(found.plot(), figure)
 
 
-def impute(path: Path, out: Path, samples: int | None, particles: int, seed: int, data: str | None) -> None:
+def impute(
+    path: Path, out: Path, samples: int | None, particles: int, seed: int, data: str | None, failed: bool
+) -> None:
     """Fills what the sequences of a table lack, in a table of every missing entry."""
     check_files(out, None, *FORMATS)
-    loaded, samples = load_run(path, data, "panel"), samples or SAMPLES
+    loaded, samples = load_run(path, data, "panel", failed), samples or SAMPLES
     held = data_of(data, loaded).whole()
     with arguments():
         found = held.impute(loaded.model, samples, seed, particles)

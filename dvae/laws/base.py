@@ -58,6 +58,8 @@ class Law(nn.Module):
 
     deterministic: ClassVar[bool] = False
     """Whether the variable is a function of its parents, without a density."""
+    error_weight: bool = False
+    """Whether the scale is the weight of a squared error and no spread of the data, so that forecasts show the mean."""
     location_scale: bool = False
     """Whether `in_units` can put the parameters into another unit: a location and a scale, or a scale alone, as a rate.
     Probabilities cannot be."""

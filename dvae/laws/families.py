@@ -80,6 +80,7 @@ class FixedNormal:
         residual: see `Law`.
         fitted: what the density's gradient reaches: "both", or the "scale" alone, where the location learns from
             energies in its place.
+        error_weight: the scale is the weight of a squared error and no spread of the data; forecasts show the location.
     """
 
     scale: float = 1.0
@@ -88,6 +89,7 @@ class FixedNormal:
     steps: int = 0
     residual: float = False
     fitted: Literal["both", "scale"] = "both"
+    error_weight: bool = False
 
     def build(self, shape: Shape) -> Law:
         """The law of a variable of this shape."""
@@ -118,7 +120,7 @@ class FixedNormalLaw(Gaussian):
         else:
             self.register_buffer("log_scale", log_scale)
         self.steps = spec.steps
-        self.fitted, self.learned = spec.fitted, spec.learned
+        self.fitted, self.learned, self.error_weight = spec.fitted, spec.learned, spec.error_weight
 
     @override
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:

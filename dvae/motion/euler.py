@@ -43,6 +43,7 @@ from ..inference.evaluate import evaluate
 from ..inference.evaluation import Evaluation
 from ..inference.scores import Measure
 from ..program.model import DynamicalVAE
+from ..program.protocols import Emitting
 from ..turns import alone
 from ..views import WHOLE, Views
 from . import kinematics
@@ -196,6 +197,10 @@ class Angled(nn.Module):
                 "what it is compared with likewise"
             )
 
+    def is_drawn(self, means: bool = False) -> bool:
+        """As the model decides."""
+        return self.model.is_drawn(means) if isinstance(self.model, Emitting) else not means
+
     @alone
     def forecast(self, batch: Batch, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
         """{"x": (S, B, times, A)}, angles at all times, of which there are as many as the horizon."""
@@ -284,6 +289,7 @@ def _measures(angles: Angles, counts: Sequence[int]) -> list[Measure]:
             lambda forecasts, truth, past, index: best(forecasts, truth, count)[:, place],
             "rad",
             note=note,
+            of_means=True,
         )
 
     source = "found in positions" if angles.protocol.inverse else "of data and models"

@@ -34,6 +34,8 @@ class Forecasts:
         forecasts: (S, N, H, J, 3), S futures of each window.
         observed: (N, O, J, 3), NaN where a joint was missing.
         truth: (N, F, J, 3), what came after the observed frames, likewise; F is at most H.
+        emission: "drawn" where futures have the noise of the emission, "mean" where they are its means given draws of
+            latents; "" where that is unknown.
 
     Raises:
         ValueError: the shapes do not fit each other or the skeleton, or there is nothing.
@@ -45,6 +47,7 @@ class Forecasts:
     forecasts: np.ndarray
     observed: np.ndarray
     truth: np.ndarray
+    emission: str = ""
 
     def __post_init__(self) -> None:
         windows, joint = len(self.keys), (self.skeleton.joints, 3)
@@ -67,7 +70,7 @@ class Forecasts:
         """The first of the futures, or all, of window n alone."""
         one = slice(n, n + 1)
         future = self.forecasts[:samples, one]
-        return Forecasts(self.skeleton, self.keys[one], future, self.observed[one], self.truth[one])
+        return Forecasts(self.skeleton, self.keys[one], future, self.observed[one], self.truth[one], self.emission)
 
     def motion(self) -> MotionSet:
         """Every future after what was observed, as a clip named after its window and place among the samples."""
@@ -87,12 +90,12 @@ class Forecasts:
     def save(self, path: str | Path) -> None:
         """Write an npz of plain arrays.
 
-        Its members are `forecasts`, `observed`, `truth`; `split`, `clip` and `start` of each window; and the
-        skeleton as in its JSON file: `name`, `joint_names`, `parents`, `joints_left`, `joints_right`, `up_axis`,
-        `fps`.
+        Its members are `forecasts`, `observed`, `truth`; `emission`, where it is known; `split`, `clip` and `start` of
+        each window; and the skeleton as in its JSON file: `name`, `joint_names`, `parents`, `joints_left`,
+        `joints_right`, `up_axis`, `fps`.
         """
         arrays = {"forecasts": self.forecasts, "observed": self.observed, "truth": self.truth}
-        _write(path, arrays, self.keys, self.skeleton)
+        _write(path, arrays, self.keys, self.skeleton, self.emission)
 
     @classmethod
     def load(cls, path: str | Path) -> Forecasts:
@@ -114,7 +117,7 @@ class Forecasts:
                 raise ValueError(
                     "forecasts, observed and truth are numbers, none infinite, and forecasts none NaN; these are not"
                 )
-            return cls(skeleton, keys, *motions)
+            return cls(skeleton, keys, motions[0], motions[1], motions[2], str(arrays.get("emission", "")))
         except KeyError as error:
             raise ValueError(f"{path} lacks {error}: `dvae forecast` writes files with all that is needed") from error
         except (TypeError, ValueError) as error:
@@ -130,12 +133,14 @@ class Imputed:
         keys: (split, clip, first frame) of the N windows.
         filled: (S, N, T, J, 3), as observed, or filled in.
         observed: (N, T, J), True where a joint was observed.
+        emission: as in `Forecasts`.
     """
 
     skeleton: Skeleton
     keys: Sequence[tuple[str, str, int]]
     filled: np.ndarray
     observed: np.ndarray
+    emission: str = ""
 
     @property
     def spread(self) -> np.ndarray:
@@ -144,15 +149,20 @@ class Imputed:
         return np.where(self.observed, 0.0, variance**0.5)
 
     def save(self, path: str | Path) -> None:
-        """Write an npz: `filled`, `observed`, `spread`, and what `Forecasts.save` says of windows and skeleton."""
+        """Write an npz: `filled`, `observed`, `spread`, and the other members of `Forecasts.save`."""
         arrays = {"filled": self.filled, "observed": self.observed, "spread": self.spread}
-        _write(path, arrays, self.keys, self.skeleton)
+        _write(path, arrays, self.keys, self.skeleton, self.emission)
 
 
 def _write(
-    path: str | Path, arrays: dict[str, np.ndarray], keys: Sequence[tuple[str, str, int]], skeleton: Skeleton
+    path: str | Path,
+    arrays: dict[str, np.ndarray],
+    keys: Sequence[tuple[str, str, int]],
+    skeleton: Skeleton,
+    emission: str,
 ) -> None:
     """Writes arrays beside what says which windows they are of."""
+    arrays |= {"emission": np.array(emission)} if emission else {}
     arrays |= zip(("split", "clip", "start"), map(np.array, zip(*keys, strict=True)), strict=True)
     for field, key in FIELDS.items():
         arrays[key] = np.array(getattr(skeleton, field), int if field in ("left", "right") else None)

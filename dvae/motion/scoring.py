@@ -1,10 +1,12 @@
 """Scores of forecast motion, for `dvae.evaluate(models, windows, scores=dvae.motion.scores)`.
 
 The motion papers compare K futures with the true one in metres (`displacements`; definitions in
-`dvae.inference.metrics`). Where windows move through space (a protocol with root="relative"), these are of poses
-relative to their own root, as in TrajeVAE's evaluation; "global ADE" and "global FDE" are of all joints where they are
-in the world. Where the same joints' paths are given in all windows, "path error" is the mean distance of these joints
-from their paths, over all K futures.
+`dvae.inference.metrics`). Their futures are means of the emission. Forecasts are therefore means by default
+(`Measure.of_means`), and the table says "mean emission"; `draw_emission=True` adds the noise of the emission. Where
+windows move through space (a protocol with root="relative"), these are of poses relative to their own root, as in
+TrajeVAE's evaluation; "global ADE" and "global FDE" are of all joints where they are in the world. Where the same
+joints' paths are given in all windows, "path error" is the mean distance of these joints from their paths, over all K
+futures.
 
 Two scores ask for as much diversity and motion as there really is (BeLFusion: Barquero, Escalera and Palmero 2023,
 arXiv:2211.14304). *APDE* is |APD of the futures - APD of the multimodal ground truth|, the mean over windows that share
@@ -103,7 +105,8 @@ def scores(
     if pose_prior is not None:
         found.append(_pose_nll(pose_prior, windows.protocol.observed))
     judged = [_judged(name, classifier, windows) for name, classifier in sorted((classifiers or {}).items())]
-    return [*found, *(accuracy for accuracy, _ in judged if accuracy), *(distance for _, distance in judged)]
+    found += [*(accuracy for accuracy, _ in judged if accuracy), *(distance for _, distance in judged)]
+    return [replace(measure, of_means=True) for measure in found]
 
 
 _ADE = Measure("ADE", paired(metrics.average_displacement_error), "m", headline=True)
@@ -129,7 +132,7 @@ def displacements(windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = la
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
             return measure.function(body(forecasts), body(truth), past, index)
 
-        return replace(measure, function=function, unit="m")
+        return replace(measure, function=function, unit="m", of_means=True)
 
     diversity = lru_cache(maxsize=1)(metrics.average_pairwise_distance)  # for all scores of a batch
 

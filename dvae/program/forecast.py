@@ -50,8 +50,7 @@ def forecast(
         for name, value in (fix or {}).items()
     }
     fixed = _fixed(model, given, data, size, horizon)
-    drawn = {name: model.drawn(name) if draw_emission is None else draw_emission for name in model.observed}
-    means = [name for name in model.observed if not drawn[name]]
+    drawn = model.is_drawn() if draw_emission is None else draw_emission
     local = {name for name in data if name in model.context and data[name].dim() == 3}
     seen = {name: value[:, :past] if name in local else value for name, value in data.items()}
     if past:
@@ -76,7 +75,7 @@ def forecast(
         program = poutine.condition(model.model, data=statics) if statics else model.model
         prefix = {name: value for name, value in latents.items() if name not in statics}
         known |= {name: value for name, value in held.items() if name in model.observed}
-        out = program(known, length=past + horizon, prefix=prefix, mean_emission=means)
+        out = program(known, length=past + horizon, prefix=prefix, mean_emission=not drawn)
         made = {name: out[name].unflatten(0, (count, -1)) for name in (*model.observed, *model.latents, *model.summed)}
         made |= {name: made[name][:, :, past:] for name in model.observed}
         made = model.shown(made, rows(data, part))
@@ -84,7 +83,7 @@ def forecast(
         return model.shown({**made, **again}) if again else made  # as it was given: the way there and back rounds
 
     # Samples that are all the same are one: rows of one product may differ in their last bits.
-    distinct = samples if model.latents or model.summed or redrawn or any(drawn.values()) else 1
+    distinct = samples if model.latents or model.summed or redrawn or drawn else 1
     with model._evaluating():
         out = in_chunks(futures, size, distinct, _together(model, data, size, chunk))
     return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
@@ -166,7 +165,7 @@ def impute(
     masks = masks if isinstance(masks, Mapping) else {WHOLE if model.view.parts else model.observed[0]: masks}
     if not masks:
         raise ValueError("nothing is missing in this batch; give a 'mask' that is False where entries are to be filled")
-    drawn = any(map(model.drawn, model.observed)) if draw is None else draw
+    drawn = model.is_drawn() if draw is None else draw
     if particles < 1 or (particles > 1 and not (drawn and model.likelihood)):
         raise ValueError(
             f"particles is {particles}; it is at least 1, and more choose among draws (draw=True) by their likelihood, "

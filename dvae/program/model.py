@@ -261,13 +261,19 @@ class DynamicalVAE(nn.Module):
         """Whether a curriculum changes what its programs do: draws of what sequences share."""
         return bool(self.shared)
 
-    def drawn(self, name: str) -> bool:
-        """Whether forecasts of a data variable are draws where they are not told.
+    def is_drawn(self, means: bool = False) -> bool:
+        """Whether forecasts draw the data unless `draw_emission` is given.
 
-        They are of discrete data, of which the mean is no value (.3 of a bit), and of a model without latents, whose
-        means would all be the same.
+        They do, unless the emission's scale is the weight of a squared error (`Law.error_weight`).
+
+        Args:
+            means: means are preferred, as by scores of motion. Data are drawn nevertheless where they are discrete and
+                a mean is no value, and where nothing is latent and all samples would be the same mean.
         """
-        return self.generator[name].discrete or not (self.latents or self.summed)
+        laws = [self.generator[name] for name in self.observed]
+        if means and (self.latents or self.summed) and not any(each.discrete for each in laws):
+            return False
+        return not any(each.law.error_weight for each in laws)
 
     # The Pyro program ----------------------------------------------------------------------------------------------
 
@@ -446,8 +452,9 @@ class DynamicalVAE(nn.Module):
             batch: the observed data (B, O, D), or a mapping; local context must reach over O + horizon steps.
             horizon: H, the number of steps to continue.
             samples: S, continuations of each sequence.
-            draw_emission: draw the data from their distribution, or (False) take its mean, as the papers of human
-                motion do. Predictive densities need the draws. None for what `drawn` says.
+            draw_emission: draw the data from their distribution; False for its means, as the papers of human motion
+                show. Means lack the emission's noise: they vary by the latents alone, and their quantiles are no
+                prediction intervals. None for draws, unless the emission's scale is the weight of a squared error.
             fix: what is the same in all samples: the future (B, H, D) of a data variable, or the value (B, D) of a
                 static latent, such as one sample of an earlier forecast. Later variables read it; latents are not
                 inferred from it.
@@ -495,7 +502,7 @@ class DynamicalVAE(nn.Module):
         Args:
             batch: with a "mask", see `model`.
             samples: S, draws of the latents for each sequence.
-            draw: draw the missing entries, or take their means; None for what `drawn` says.
+            draw: draw the missing entries, or (False) take their means; None for what `is_drawn` returns.
             particles: K, draws for each sample, of which it is chosen.
             chunk: sequences times samples to hold at once, beside the result.
 

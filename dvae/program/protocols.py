@@ -35,6 +35,14 @@ class Program(Protocol):
 
 
 @runtime_checkable
+class Emitting(Protocol):
+    """A forecaster that decides whether it draws the data."""
+
+    def is_drawn(self, means: bool = False) -> bool:
+        """Whether forecasts draw the data by default; see `DynamicalVAE.is_drawn`."""
+
+
+@runtime_checkable
 class Forecasting(Protocol):
     """A model that forecasts, for evaluation; with a likelihood it is a `Program` too, and has a bound."""
 

@@ -30,6 +30,7 @@ from typing_extensions import override
 
 from ..data import called
 from ..drawing import draw_slice
+from ..inference.checkpoints import ENDED
 from ..inference.compare import compare
 from ..inference.comparison import Comparison
 from ..inference.estimates import Estimate, number
@@ -44,7 +45,7 @@ from ..oracle import model_price, ones, price
 from ..schema import Schema
 from .directory import load, training_of
 from .kinds import Dataset
-from .sweep import ENDED, sweep
+from .sweep import sweep
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

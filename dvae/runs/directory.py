@@ -8,6 +8,7 @@ relative path stays relative, so that a project folder can be moved. Runs of for
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -17,7 +18,7 @@ from pathlib import Path
 from reprlib import repr as brief
 from typing import Any
 
-from ..inference.checkpoints import CONFIG, CheckpointError, Run, at_most, load_weights
+from ..inference.checkpoints import CONFIG, ENDED, CheckpointError, Run, at_most, load_weights
 from ..inference.fit import Callback, Fit
 from ..inference.recipe import Trainable
 from ..inference.schedules import from_config as option_from_config
@@ -90,6 +91,22 @@ class Loaded:
             CheckpointError: they are not here, or have changed.
         """
         return opened(self.path, self.config.kind, self.config.data, self.schema, self.where)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the weights are of a fit that failed or has not made a step."""
+        state = Run(self.path).state
+        return state["status"] == "failed" or (state["step"] == 0 and state["status"] not in ENDED)
+
+    @property
+    def unfinished(self) -> str:
+        """A sentence on a run that has not ended; "" for one that has."""
+        state = Run(self.path).state
+        if state["status"] in ENDED:
+            return ""
+        reached = f"{state['status']} at step {state['step']} of {self.config.training.steps}"
+        initial = "" if state["step"] else "; its weights are the initial ones"
+        return f"{self.path} has not ended ({reached}){initial}; dvae resume {self.path} goes on"
 
     def alike(self, other: Loaded) -> bool:
         """Whether another run was fitted on the same windows of the same data, whatever the models see of them."""
@@ -173,7 +190,7 @@ def resume(
     Raises:
         CheckpointError: no run, a damaged one, or one whose data have changed.
     """
-    run = load(path, data)
+    run = _load(path, data)
     training = replace(run.config.training, self_feeding=0.0, **options)
     train, validation = run.data.windows("train"), run.data.windows("validation")
     recipe = run.config.method.train(train, validation, training.steps)
@@ -184,6 +201,8 @@ def resume(
 @alone
 def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> Loaded:
     """Reads a run back: method, and model with its best weights; its data when they are asked for.
+
+    Warns of a run that failed or has not made a step.
 
     Args:
         path: the run directory, as `dvae fit` writes it.
@@ -202,6 +221,13 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
         ...     dvae.load(folder + "/a").method.name
         'vae'
     """
+    loaded = _load(path, data)
+    if loaded.failed:
+        warnings.warn(loaded.unfinished, stacklevel=3)  # `alone` is between
+    return loaded
+
+
+def _load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None) -> Loaded:
     config, size = read_config(path, data), Run(path).size()
     with reading_config(path), at_most(size, f"{Path(path) / CONFIG}"):
         model = config.method.build(config.schema)

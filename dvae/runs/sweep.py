@@ -32,7 +32,7 @@ from rich.live import Live
 from typing_extensions import override
 
 from .. import files
-from ..inference.checkpoints import Run
+from ..inference.checkpoints import ENDED, Run
 from ..inference.fit import Callback, Fit, Interrupted
 from ..inference.processes import by_torchrun
 from ..inference.recipe import Trainable
@@ -48,8 +48,6 @@ from ..schema import Schema
 from ..turns import alone
 from .directory import fit_run, read_config, resume, training_of
 from .kinds import Dataset
-
-ENDED = ("finished", "stopped early")
 
 
 @dataclass(frozen=True)

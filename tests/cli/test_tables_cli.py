@@ -83,6 +83,16 @@ def tabled(table, tmp_path_factory):
     return out
 
 
+def test_equations_read_covariates_and_attributes(table, tmp_path, capsys):
+    reading = ["--generative", "p(z_t | z_{t-1}, c_t) p(x_t | z_t, s)", "--inference", "q(z_t | x_{1:T}, c_{1:T}, s)"]
+    fitted = ["--data", str(table), *SMALL, *LATENT, *TOLD]
+    assert main(["fit", "equations", "--out", str(tmp_path / "a"), *reading, *fitted]) == 0
+    assert set(dvae.load(tmp_path / "a").model.context) == {"c", "s"}
+    reading[1] = "p(z_t | z_{t-1}, e_t) p(x_t | z_t, s)"
+    error = failure(capsys, "fit", "equations", "--out", tmp_path / "b", *reading, *fitted)
+    assert "the equations read e, which has no factor and comes from the data, but these have x, c, s" in error
+
+
 def test_options_of_data_and_of_methods_have_names_of_their_own():
     data = {field.name for field in fields(DataOptions)}
     assert not data & {field.name for field in fields(Training)}

@@ -875,6 +875,32 @@ def test_a_run_that_has_not_ended_is_no_seed(runs, capsys, tmp_path):
     assert f"note: {sentence}" in capsys.readouterr().err.replace("\n", " ")
 
 
+REFUSING = {
+    **dict.fromkeys(("evaluate", "criticise", "reference", "tubes", "bracket", "compare"), ".json"),
+    **dict.fromkeys(("forecast", "complete", "impute"), ".npz"),
+    **dict.fromkeys(("animate", "report"), ".html"),
+}
+
+
+@pytest.mark.parametrize("command", REFUSING)
+def test_a_failed_run_is_refused(runs, capsys, tmp_path, command):
+    path, out = tmp_path / "failed", tmp_path / f"out{REFUSING[command]}"
+    shutil.copytree(runs / "a1", path)
+    state = json.loads((path / "state.json").read_text())
+    (path / "state.json").write_text(json.dumps({**state, "status": "failed", "step": 0}))
+    asked = [command, str(path), "--out", str(out)]
+    assert main(asked) == 1
+    error = capsys.readouterr().err.replace("\n", " ")
+    assert f"{path} has not ended (failed at step 0 of 4); its weights are the initial ones" in error
+    assert not out.exists()
+    if command == "forecast":
+        assert main([*asked, "--failed", "--samples", "1"]) == 0
+        assert "note: " in capsys.readouterr().err
+        assert np.load(out)["emission"] == "drawn"
+        with pytest.warns(UserWarning, match="failed at step 0 of 4"):
+            dvae.load(path)
+
+
 def test_a_stray_file_is_named(runs, capsys, tmp_path):
     (tmp_path / "notes.txt").write_text("of no use")
     assert main(["compare", str(runs / "a0"), str(tmp_path / "notes.txt")]) == 1

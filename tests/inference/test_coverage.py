@@ -292,7 +292,10 @@ def test_means_and_narrow_forecasts_are_told_from_calibrated_ones(truth):
     assert (departs > high).any()
     means = evaluate(model, windows, scores=calibrated, references=False, draw_emission=False, progress=False)
     assert means["model"]["coverage 90 %"].mean < 0.8
-    assert "of means, which lack the emission's noise, and so too narrow: coverage 50 %" in " ".join(means.notes)
+    assert (
+        "forecasts of model are means, which lack the emission's noise and are too narrow for energy score"
+        in " ".join(means.notes)
+    )
     assert not any("noise" in note for note in result.notes)
 
 
@@ -509,6 +512,11 @@ def test_forecasts_of_counts_are_draws_and_calibrated(counted):
     assert means["counts"]["CRPS"].mean > drawn["counts"]["CRPS"].mean
     normal = dvae.DynamicalVAE("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 2}).double()
     both = evaluate({"a": normal, "counts": model}, windows, samples=10, references=False, progress=False)
+    assert both.emission == "drawn"
+    mixed = [replace(measure, of_means=True) for measure in proper(windows)]
+    both = evaluate(
+        {"a": normal, "counts": model}, windows, scores=lambda _: mixed, samples=10, references=False, progress=False
+    )
     assert both.emission == "drawn or mean"
     assert both.rows["counts"] == drawn.rows["counts"]
 

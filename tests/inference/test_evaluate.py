@@ -20,6 +20,7 @@ from dvae.inference.bounds import SequenceELBO
 from dvae.inference.evaluate import evaluate
 from dvae.inference.evaluation import Evaluation, Row, Score
 from dvae.inference.references import multimodal_truths, nearest_neighbours, zero_velocity
+from dvae.inference.scores import proper
 from dvae.program.model import DynamicalVAE
 
 OBSERVED, FRAMES, SIZE = 4, 9, 3
@@ -127,7 +128,7 @@ def test_scores_are_the_metrics_of_the_forecasts_and_the_bound_per_frame(model):
     x = windows.all()["x"]
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(3)
-        forecasts = model.forecast({"x": x[:, :OBSERVED]}, FRAMES - OBSERVED, 5)["x"].movedim(0, 1)
+        forecasts = model.forecast({"x": x[:, :OBSERVED]}, FRAMES - OBSERVED, 5, draw_emission=False)["x"].movedim(0, 1)
         torch.manual_seed(3)
         bound = SequenceELBO().terms(model, {"x": x}).bound / FRAMES
     ade = metrics.average_displacement_error(forecasts, x[:, OBSERVED:])
@@ -152,10 +153,15 @@ def test_evaluation_leaves_mode_and_random_state_alone(model):
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def test_drawn_emissions_are_more_diverse_than_means_and_labelled(model):
+def test_forecasts_are_means_by_default_for_scores_of_motion_and_else_draws(model):
     mean, drawn = (run(model, array_windows(), draw_emission=value) for value in (False, True))
     assert (mean.emission, drawn.emission) == ("mean", "drawn")
     assert drawn["model"]["APD"].mean > mean["model"]["APD"].mean
+    assert run(model, array_windows()).rows == mean.rows
+    draws, of_means = (run(model, array_windows(), scores=proper, draw_emission=how) for how in (None, False))
+    assert draws.emission == "drawn"
+    assert draws["model"]["CRPS"].mean != of_means["model"]["CRPS"].mean
+    assert ["means" in " ".join(each.notes) for each in (mean, drawn, draws, of_means)] == [False, False, False, True]
 
 
 def test_importance_bound_is_above_the_elbo_and_its_diagnosis_beside_it(model):

@@ -111,7 +111,7 @@ def test_a_forecast_takes_what_was_observed_at_once(pair, network, monkeypatch):
     for _ in range(2):
         torch.manual_seed(0)
         whole = model.forecast(past, T - 7, samples=2, draw_emission=True)["x"]
-        found.append((whole, model.forecast({**past, "mask": mask}, T - 7, samples=2)["x"]))
+        found.append((whole, model.forecast({**past, "mask": mask}, T - 7, samples=2, draw_emission=True)["x"]))
         monkeypatch.setattr(RecurrentNetwork, "stretch", Network.stretch)  # step by step
     torch.testing.assert_close(*found, rtol=0, atol=1e-10)
 

@@ -50,6 +50,11 @@ def test_a_grid_is_what_its_file_says(study):
     assert more == [f"more-latent={latent}-width={width}" for latent in (1, 2) for width in (3, 4)]
 
 
+def test_equations_of_a_grid_read_covariates_of_the_data(study):
+    study.write_text(STUDY + """\n[covariates]\ngenerative = "p(z_t | z_{t-1}, c_t) p(x_t | z_t, s)"\n""")
+    assert Grid.read(study).methods["covariates"].build({"x": 2, "c": 3, "s": 1}).context == ("c", "s")
+
+
 def test_the_study_of_the_docs_is_a_grid(tmp_path):
     page = (Path(__file__).parents[2] / "docs" / "study.md").read_text(encoding="utf-8")
     (tmp_path / "study.toml").write_text(page.split("```toml\n")[1].split("```")[0])

@@ -156,7 +156,7 @@ def test_equations_read_covariates_and_gaps_where_they_name_them(data):
     model = plain
     for name in ("c", "d", "s"):
         assert torch.equal(bound({**batch, name: batch[name] + 1}), bound(batch))
-    with pytest.raises(ValueError, match="sizes missing for e"):
+    with pytest.raises(ValueError, match="the equations read e"):
         dvae.method("equations", generative="p(x_t | x_{t-1}, e_t)", inference="").build(data.schema)
 
 
