@@ -25,7 +25,7 @@ MONTH = 30.4369
 """Mean days of a month."""
 SERIES = 50
 """Sequences from which the calendar step of a panel is inferred."""
-_OFFSET = re.compile(r"(?:UTC)?[-+]\d\d:\d\d", re.ASCII)
+_OFFSET = re.compile(r"(?:UTC)?[-+](?:[01]\d|2[0-3]):[0-5]\d", re.ASCII)
 _DAYS = ("MON", "TUE", "WED", "THU", "FRI", "SAT", "SUN")
 _STEP = re.compile(rf"[1-9]\d{{0,3}}(?:D|B|MS|ME|BMS|BME|WOM-[1-4](?:{'|'.join(_DAYS)}))", re.ASCII)
 

@@ -103,6 +103,7 @@ def test_columns_are_real_targets_where_nothing_is_said():
         ("time = ''\n[columns.a]", "a column has no name"),
         ("time = 'a'\nzone = 3\n[columns.b]", "zone is 3; expected a time zone"),
         ("time = 'a'\nzone = 'Berlin'\n[columns.b]", "zone is 'Berlin'; expected a name such as 'Europe/Berlin'"),
+        ("time = 'a'\nzone = '+25:00'\n[columns.b]", "zone is '.25:00'; expected"),
         ("zone = 'UTC'\n[columns.b]", "zone is 'UTC', and no column is the time"),
         (
             "[columns.a]\nfamily = 'category'\nclasses = ['rain', 'sun']\nother = 'rian'",
