@@ -1,7 +1,7 @@
 # make demo    simulated people: fit two methods, print the table, save demo/futures.png and demo/report.html
 # make test    lint, types, tests, and some of these once more as on another processor
 # make quick   lint, types, and the tests that are not slow
-# make studies   the scripts of the result pages on little data, and the scores that are stored
+# make studies   the scripts of the result pages on little data, the scores that are stored, and the longer notebooks
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
 # make coverage   the tests, and which lines none of them runs
 # make bench   the benchmarks, beside their targets and the last release; as JSON in bench.json; on a GPU with DEVICE=cuda

@@ -104,6 +104,18 @@ def execute(path: Path, share: float = 1.0, on: KernelManager | None = None) -> 
     return notebook
 
 
+def check(path: Path, on: KernelManager) -> None:
+    """Run a notebook on a small share of its work and compare what each cell shows with what is stored.
+
+    Raises:
+        AssertionError: a cell shows something else.
+    """
+    stored, run = nbformat.read(path, as_version=4), execute(path, share=0.02, on=on)
+    code = ([cell for cell in each.cells if cell.cell_type == "code"] for each in (stored, run))
+    for before, now in zip(*code, strict=True):
+        assert shown(before) == shown(now), f"{now.source}\n\nshows other things than are stored; run `make notebooks`"
+
+
 def _small(picture: str) -> str:
     """A PNG in base64 with 256 colours, a third as large."""
     file = io.BytesIO()

@@ -33,17 +33,13 @@ def one_kernel():
     manager.shutdown_kernel(now=True)
 
 
-@each_notebook
+@pytest.mark.parametrize("path", NOTEBOOKS[:4], ids=lambda path: path.stem)  # the others: `make studies`
 # The kernel's transport warns of its own affairs.
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.timeout(1200)
 @pytest.mark.slow
 def test_a_run_shows_what_is_stored(path, one_kernel):
-    stored, run = nbformat.read(path, as_version=4), notebooks.execute(path, share=0.02, on=one_kernel)
-    for cell, before, now in zip(
-        (cell for cell in run.cells if cell.cell_type == "code"), shown(stored), shown(run), strict=True
-    ):
-        assert before == now, f"{cell.source}\n\nshows other things than are stored; `make notebooks` stores them"
+    notebooks.check(path, one_kernel)
 
 
 @each_notebook

@@ -1,0 +1,23 @@
+"""The longer notebooks show what is stored; the others are in tests/docs."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.tables import notebooks
+
+NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
+
+
+@pytest.fixture(scope="module")
+def one_kernel():
+    manager = notebooks.kernel()
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS[4:], ids=lambda path: path.stem)
+@pytest.mark.filterwarnings("ignore")  # the kernel's transport warns of its own affairs
+@pytest.mark.timeout(1200)
+def test_a_run_shows_what_is_stored(path, one_kernel):
+    notebooks.check(path, one_kernel)
