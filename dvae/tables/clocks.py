@@ -77,7 +77,7 @@ def parts_of(frame: Any, names: Collection[str]) -> tuple[str, ...]:
 def time_of(frame: Any, time: str | tuple[str, ...], decimal: str | None = None) -> Any:
     """Return the time of each row, from one column or several; numbers that are written as text become numbers."""
     if isinstance(time, tuple):
-        return joined(frame, time)
+        return join_times(frame, time)
     column = frame[time]
     read = read_numbers(column, (), decimal, column.attrs.get("decimal", "."))
     if is_number(column) or not read.is_numeric:
@@ -85,7 +85,7 @@ def time_of(frame: Any, time: str | tuple[str, ...], decimal: str | None = None)
     return type(column)(read.values, column.index, name=time)
 
 
-def joined(frame: Any, names: tuple[str, ...]) -> Any:
+def join_times(frame: Any, names: tuple[str, ...]) -> Any:
     """Return the time of each row from several columns.
 
     Args:

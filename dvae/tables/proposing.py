@@ -14,7 +14,7 @@ import numpy as np
 
 from ..options import nearest
 from ..units import RESOLVED
-from .clocks import PERIOD, is_clock, joined, parts_of, unit_of
+from .clocks import PERIOD, is_clock, join_times, parts_of, unit_of
 from .columns import Column, Columns, Role
 from .numerals import NEARLY_ALL, read_numbers
 from .parsing import (
@@ -246,7 +246,7 @@ class _Proposal:
         found = []
         for time in [self.time] if self.time else self._times(free):
             try:
-                step = joined(self.frame, time) if len(time) > 1 else self.plain[time[0]]
+                step = join_times(self.frame, time) if len(time) > 1 else self.plain[time[0]]
             except ValueError:
                 if self.time:
                     raise
