@@ -89,9 +89,9 @@ def ablate(
     result = ablate_method(
         whole, opened, out, seeds, how, jobs, steps=twin_steps, twins=twins, bound_particles=bound_particles
     )
-    OUT.print(result.table())
     if out is not None:
         result.save(out / "ablation.json")
         ERROR.print(f"wrote {out / 'ablation.json'}")
     if figure is not None:
         save_figure(result.plot(), figure)
+    OUT.print(result.table())

@@ -165,9 +165,9 @@ def complete(
         windows.skeleton, [windows.keys[chosen]], done.positions[:, None], *before_and_after, "mean"
     )
     motions.save(out)
-    OUT.print(str(done))
     ERROR.print(f"wrote {out}: window {chosen}, {_title(motions)}")
     _save_futures(motions, figure, given)
+    OUT.print(str(done))
 
 
 def impute(

@@ -219,8 +219,7 @@ SCORERS = {"motion": _forecasts, "segments": _segments, "panel": _tables}
 
 
 def _keep(result: Any, paths: Sequence[Path], figure: Path | None) -> None:
-    """Prints a result, and writes it to files."""
-    OUT.print(result.table())
+    """Write a result to files, and then print it, as the output may be closed or full."""
     for path in paths:
         result.save(path)
         ERROR.print(f"wrote {path}")
@@ -228,6 +227,7 @@ def _keep(result: Any, paths: Sequence[Path], figure: Path | None) -> None:
         save_figure(result.plot(), figure)
         if "PIT" in {name for row in getattr(result, "rows", {}).values() for name in getattr(row, "histograms", {})}:
             save_figure(result.plot_calibration(), figure.with_stem(f"{figure.stem}-calibration"))
+    OUT.print(result.table())
 
 
 def criticise(
@@ -351,12 +351,12 @@ def reference(
 
 
 def _add(document: dict[str, Any], part: str, result: Any, path: Path, figure: Path | None, drawn: str) -> None:
-    """Prints a part of the criticism, and writes what there is of it."""
-    _keep(result, [], figure and figure.with_stem(f"{figure.stem}-{drawn}"))
+    """Write what there is of the criticism, and print its new part."""
     document[part] = result.document()
     with files.written(path) as file:
         file.write((json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
     ERROR.print(f"wrote {path}: {part}")
+    _keep(result, [], figure and figure.with_stem(f"{figure.stem}-{drawn}"))
 
 
 def tubes(

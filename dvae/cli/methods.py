@@ -86,16 +86,6 @@ def show(
         raise UsageError("give the name of a method, or --generative, with --inference for the audit of a guide")
     with arguments():
         found = audit(*pair, observed=observed, summed=summed)
-    OUT.print(str(found.generative), highlight=False, markup=False, soft_wrap=True)
-    if found.inference.factors:
-        OUT.print(str(found.inference), highlight=False, markup=False, soft_wrap=True)
-        OUT.print(found.table())
-        OUT.print(found.verdict)
-    else:
-        why = "all that is latent is summed out" if summed else "nothing is latent"
-        OUT.print(f"{why}: there is no guide, and the bound is the log evidence")
-    if method is not None:
-        OUT.print("\n".join(_fitted(kind.trainings)), highlight=False, soft_wrap=True)
     if out is not None:
         from matplotlib.figure import Figure
 
@@ -107,6 +97,16 @@ def show(
             title = "guide" if found.exact else "guide (dashed: what the exact posterior also reads)"
             found.draw(steps, ax=axes).set_title(title)
         save_figure(figure, out)
+    OUT.print(str(found.generative), highlight=False, markup=False, soft_wrap=True)
+    if found.inference.factors:
+        OUT.print(str(found.inference), highlight=False, markup=False, soft_wrap=True)
+        OUT.print(found.table())
+        OUT.print(found.verdict)
+    else:
+        why = "all that is latent is summed out" if summed else "nothing is latent"
+        OUT.print(f"{why}: there is no guide, and the bound is the log evidence")
+    if method is not None:
+        OUT.print("\n".join(_fitted(kind.trainings)), highlight=False, soft_wrap=True)
 
 
 def _fitted(trainings: Mapping[str, Training]) -> list[str]:

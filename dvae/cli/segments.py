@@ -76,11 +76,11 @@ def interpolate(
     opened = opening.data_of(data, loaded)
     ends = [opened.found(name) for name in (first, second)]
     found = interpolate_segments(loaded.model, ends[0].all(), ends[1].all(), steps)
-    OUT.print(found.table())
     if out is not None:
         _write(out, found, fps)
         names = " to ".join(end.motion.clips[0].name for end in ends)
         ERROR.print(f"wrote {out}: {steps} steps from {names}")
+    OUT.print(found.table())
 
 
 def _write(out: Path, found: Interpolation, fps: float | None) -> None:
@@ -234,7 +234,6 @@ def recover(
     how: dict[str, Any] = {"truth": truth, "deviations": deviations, "known": known, "descent": descent}
     how["aggregate"] = aggregate
     found = recover_segments(model, seen, keys, **how, seed=seed, progress=True)
-    OUT.print(found.table())
     for doubt in _doubts(found, deviations):
         note(doubt)
     if out is not None:
@@ -242,6 +241,7 @@ def recover(
         _write_recovered(out, found, drawn)
         names = ", ".join(map("/".join, keys))
         ERROR.print(f"wrote {out}: {names}, the most probable" + f" and {drawn} draws of each" * (drawn > 0))
+    OUT.print(found.table())
 
 
 def _known_data(loaded: runs.Loaded, data: str | None) -> Any:
