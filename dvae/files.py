@@ -143,10 +143,10 @@ def made(folder: Path) -> Iterator[None]:
 
 
 def temporary(kind: str) -> str:
-    """Return how the names of this process's temporary files of a kind begin, by which others can remove them later.
+    """Return the start of the names of this process's temporary files, which names the process.
 
     Args:
-        kind: "new", of what takes another name once it is whole; or "sweep", of the lease of a sweep.
+        kind: "new" for a file or folder that is renamed when it is complete, "sweep" for the lease of a sweep.
     """
     return f".{kind}-{_HOST}-{os.getpid()}-"
 
@@ -162,11 +162,11 @@ def remove_leftovers(folder: Path) -> None:
                     path.unlink(missing_ok=True)
 
 
-_remove_leftovers = cache(remove_leftovers)  # a folder may get many thousands of files, one by one
+_remove_leftovers = cache(remove_leftovers)  # once per folder, which may receive many thousands of files
 
 
 def _is_running(process: int) -> bool:
-    if os.name == "nt":  # where to ask is to send
+    if os.name == "nt":  # there, os.kill(process, 0) sends a signal
         return True
     try:
         os.kill(process, 0)

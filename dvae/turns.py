@@ -2,8 +2,8 @@
 
 Two programs that ran at once would land on each other's stack, and draw from each other's random numbers. So whatever
 runs one for a user is decorated with `alone`: of several threads one goes on, and the others wait until it is done, a
-whole fit if need be. Processes run side by side (`dvae.runs.sweep`). A process that is forked while another thread
-holds the lock gets a free lock, and none of that thread's handlers.
+whole fit if need be. Processes run side by side (`dvae.runs.sweep`). When a process forks while another
+thread holds the lock, the child starts with a free lock and without that thread's handlers.
 """
 
 from __future__ import annotations

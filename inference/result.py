@@ -45,11 +45,11 @@ class Table(rich.table.Table):
 class Plain(Console):
     """A console that prints texts as they are: paths, names and messages hold no markup and no emoji.
 
-    When nobody reads what it prints any more, as in `dvae evaluate RUN | head`, it stops printing and the work goes on.
+    It stops printing when the reader closes the pipe, as in `dvae evaluate RUN | head`. The command continues.
     """
 
     unread: ClassVar[bool] = False
-    """Whether nobody reads the output of one of them any more."""
+    """Whether the reader of a console's output has closed the pipe."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, **options)
@@ -61,8 +61,8 @@ class Plain(Console):
     @override
     def on_broken_pipe(self) -> None:
         Plain.unread = self.quiet = True
-        self.print()  # quiet, it forgets what it was about to write
-        with suppress(OSError), open(os.devnull, "wb") as nowhere:  # what is left in Python's buffer goes there
+        self.print()  # a quiet console empties its buffer
+        with suppress(OSError), open(os.devnull, "wb") as nowhere:  # the rest of Python's buffer is written there
             os.dup2(nowhere.fileno(), self.file.fileno())
 
 

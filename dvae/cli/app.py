@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _is_unread(line: str = "") -> bool:
-    """Whether nobody reads what is printed any more, as the standard output shows when it is to take a line."""
+    """Return whether the reader of the standard output has closed it, after writing a line to it."""
     try:
         sys.stdout.write(line)
         sys.stdout.flush()

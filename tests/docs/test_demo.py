@@ -1,4 +1,4 @@
-"""The demo of `make demo`: it goes on where it was interrupted, and leaves a page with the scores."""
+"""The demo of `make demo`: it resumes after an interruption and writes a page with the scores."""
 
 from functools import partial
 

@@ -31,9 +31,8 @@ def read_c3d(path: str | Path) -> Recording:
 
     Markers have no skeleton. Here one hangs from another where their distance hardly changes: the minimum spanning tree
     over the spread of all distances, from the marker in the middle. A marker that is not seen is NaN: its residual is
-    negative, or its place and its residual are exactly zero. Of points without a name and of those that the file lists
-    as angles, forces, moments, powers, reactions or scalars, none is a marker. The notes of the recording list what is
-    left out or renamed.
+    negative, or its place and its residual are exactly zero. Points without a name are left out, and so are those that
+    the file lists as angles, forces, moments, powers, reactions or scalars. The notes of the recording name them.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -96,7 +95,7 @@ def read_c3d(path: str | Path) -> Recording:
 
 
 def _numbered(parameters: dict[str, list[str]], name: str) -> list[str]:
-    """Texts of a parameter that goes on in others, as it has 255 entries at most: LABELS, LABELS2, LABELS3."""
+    """Return the texts of a parameter and its continuations: one holds 255 entries, LABELS2 and LABELS3 the rest."""
     parts = itertools.takewhile(parameters.__contains__, (f"{name}{n if n > 1 else ''}" for n in itertools.count(1)))
     return [text for part in parts for text in parameters[part]]
 

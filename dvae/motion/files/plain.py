@@ -197,7 +197,11 @@ def check_key(key: tuple[str, str], path: Path | None = None) -> None:
 def _skeleton_of(
     path: Path, clips: Sequence[_Read], chosen: Sequence[int] | None
 ) -> tuple[Skeleton, tuple[int, ...] | None]:
-    """The skeleton beside a file or of a known archive, and which of the file's joints make it up."""
+    """Return the skeleton of a file, read or known by its subjects, and the places of its joints in the file.
+
+    Raises:
+        ValueError: the skeleton has another number of joints than the file, or there is none.
+    """
     counts = {positions.shape[1] for _, _, positions, _ in clips if positions.ndim == 3}
     file = companion(path, SKELETON)
     if file.is_file():

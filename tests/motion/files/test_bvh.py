@@ -1,4 +1,4 @@
-"""BVH files: what animation programs would show, there and back, and what is damaged."""
+"""BVH files: read as animation programs do, written, and refused where they are damaged."""
 
 import re
 from pathlib import Path
