@@ -250,9 +250,11 @@ def refusal(name, option):
     return None
 
 
-@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: ", ".join(f"{k}={v}" for k, v in option.items()))
-@pytest.mark.parametrize("name", SMALL)
-def test_every_method_takes_every_option_or_says_why_not(name, option):
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [(name, option) for m, name in enumerate(SMALL) for n, option in enumerate(OPTIONS) if (m + n) % 3 == 0],
+)
+def test_a_method_takes_an_option_or_says_why_not(name, option):
     method = small(name, **{"warm_up": 2, "self_feeding": 0.0, **option})
     if expected := refusal(name, option):
         with pytest.raises(ValueError, match=expected):
