@@ -190,3 +190,20 @@ def test_other_likelihoods_than_normals():
     before, _ = elbo(model, x)
     bound, error = elbo(local_guide(model, x, steps=100, rate=0.5), x)
     assert before + 0.1 < bound < evidence + 4 * error
+
+
+@pytest.mark.parametrize(
+    "search",
+    [
+        lambda model, x: local_guide(model, x, steps=1),
+        lambda model, x: dvae.posterior(model.model, {"x": x}, descent=dvae.Descent(steps=1)),
+        lambda model, x: dvae.annealed_bound(model, x, 1, 1, leaps=1),
+        lambda model, x: dvae.stein_discrepancy(model, x, draws=4, bootstrap=19, progress=False),
+    ],
+    ids=["local guide", "posterior", "annealed bound", "Stein discrepancy"],
+)
+def test_searches_take_gradients_in_inference_mode(search):
+    model = twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, T).eval()
+    x = model.sample(1, T)["x"]
+    with torch.inference_mode():
+        search(model, x)
