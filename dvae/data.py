@@ -92,9 +92,9 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
         """What else a record is to say of the data, in JSON's types, nothing of it being required.
 
         "title" lists phrases for titles; "columns" {name: unit} names the coordinates of x, in their order, in units
-        that tables print, "" for none; "scales" are by what their numbers are divided to have no unit, in the same
-        order; "season" is a period of the data, in frames, for a reference row; "called" is what a clip and a frame are
-        called in tables, such as ["sequence", "step"].
+        that tables print, "" for none; "means" are subtracted from their numbers, and "scales" divide them, to have no
+        unit, in the same order; "season" is a period of the data, in frames, for a reference row; "called" is what a
+        clip and a frame are called in tables, such as ["sequence", "step"].
         """
 
 

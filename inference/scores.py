@@ -159,16 +159,20 @@ def _of_all(measure: Measure, windows: HeldOutWindows) -> Measure:
     units = dict.fromkeys(columns_of(windows).values())
     if scales := scales_of(windows):
         note = "scores of all columns together are of numbers in the scales of their columns, in the training data"
-        return replace(measure, function=_in_scales(measure.function, scales), unit="scales", note=note)
+        means = windows.description.get("means", [0.0] * len(scales))
+        return replace(measure, function=_in_scales(measure.function, means, scales), unit="scales", note=note)
     mixed = f"scores without a unit mix numbers in {', '.join(unit or '1' for unit in units)}; by_column has them apart"
     shared: dict[str, Any] = {"note": mixed} if len(units) > 1 else {"unit": next(iter(units), "")}
     return replace(measure, **shared)
 
 
-def _in_scales(function: Callable[..., Tensor], scales: Sequence[float]) -> Callable[..., Tensor]:
+def _in_scales(
+    function: Callable[..., Tensor], means: Sequence[float], scales: Sequence[float]
+) -> Callable[..., Tensor]:
     def scaled(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        by = torch.tensor(scales).to(truth)
-        return function(forecasts / by, truth / by, {**past, "x": past["x"] / by}, index)
+        less, by = torch.tensor([means, scales], dtype=torch.float64).to(truth)
+        forecasts, truth, x = ((values - less) / by for values in (forecasts, truth, past["x"]))
+        return function(forecasts, truth, {**past, "x": x}, index)
 
     return scaled
 

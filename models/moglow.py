@@ -138,8 +138,8 @@ def start_flow(model: DynamicalVAE, windows: Any) -> None:
     """Takes the unit of x from 256 windows, and starts flows at them (`ConditionalFlowLaw.start_at`)."""
     batch, units, law = windows.sample(256, torch.default_generator), model.units[WHOLE], model.generator[WHOLE].law
     if not units.scale.dim():  # those of columns are known
-        seen = model.read(batch, precise=True)
-        units.fit(bridged(seen[WHOLE], seen.get("mask", {}).get(WHOLE)))
+        exact = model.read(batch, precise=True)
+        units.fit(bridged(exact[WHOLE], exact.get("mask", {}).get(WHOLE)))
     data = model.read(batch)
     x = data[WHOLE]
     run = model._rollout(model.generative, model.generator, data, None, 1)

@@ -191,7 +191,9 @@ class InfillingModel(TrajectoryModel):
         return True
 
     @override
-    def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0) -> dict[str, Any]:
+    def read(
+        self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False
+    ) -> dict[str, Any]:
         """Without the trajectories that are hidden when the curriculum has come so far."""
         if isinstance(batch, Mapping) and HIDDEN in batch:
             whole = batch
@@ -201,7 +203,7 @@ class InfillingModel(TrajectoryModel):
                 return {name: value for name, value in whole.items() if name != HIDDEN} | {GIVEN: given}
 
             batch = once(self, [whole, curriculum], shown)  # by guide and model both
-        return super().read(batch, size=size, curriculum=curriculum)
+        return super().read(batch, size=size, curriculum=curriculum, precise=precise)
 
 
 @dataclass(frozen=True)

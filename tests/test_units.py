@@ -206,3 +206,14 @@ def test_means_stay_in_float64_through_changes_of_precision_and_files():
 def test_values_too_small_for_float32_are_told_so(scale):
     with pytest.raises(ValueError, match=r"standard deviation of these values is .*e-\d+; .* multiply the values"):
         Units(3).fit(scale * torch.randn(40, 3, dtype=torch.float64))
+
+
+def test_a_method_with_units_is_fitted_to_arrays_far_from_zero():
+    torch.manual_seed(0)
+    x, futures = torch.randn(8, 7, 2, dtype=torch.float64), []
+    for mean in (0.0, 1e9):
+        torch.manual_seed(0)
+        model = dvae.method("erd").fit(mean + x, steps=1, progress=False).model
+        torch.manual_seed(2)
+        futures.append(model.forecast(mean + x[:, :4], 3)["x"] - mean)
+    torch.testing.assert_close(*futures, rtol=0, atol=1e-3)

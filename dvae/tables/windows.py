@@ -151,12 +151,13 @@ class PanelWindows:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Columns with their units and scales, for the record."""
+        """Columns with their units, means and scales, for the record."""
         columns = {name: column.unit for column in self.schema.columns.targets for name in column.coordinates}
-        scales = [coordinate.scale for coordinate in self.schema.units["x"]]
+        coordinates = self.schema.units["x"]
         said: dict[str, Any] = {
             "columns": columns,
-            "scales": scales,
+            "means": [coordinate.mean for coordinate in coordinates],
+            "scales": [coordinate.scale for coordinate in coordinates],
             "called": ["group" if self.schema.columns.group else "sequence", "step"],
         }
         said |= {} if self.protocol.season is None else {"season": self.protocol.season}

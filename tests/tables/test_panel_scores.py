@@ -12,9 +12,9 @@ from dvae.tables import Column, Columns, Cut, PanelData, panel_scores
 UNITS = {"shared": ("m", "m"), "mixed": ("people", "°C"), "unsaid": ("", "")}
 
 
-def table(units, factor=1.0, columns=2):
-    """Two columns, the second so many times as large."""
-    x = np.random.default_rng(0).normal(5, 2, (8, 12, 2)) * [1.0, factor]
+def table(units, factor=1.0, columns=2, mean=0.0):
+    """Two columns, the second so many times as large and about another mean."""
+    x = np.random.default_rng(0).normal(5, 2, (8, 12, 2)) * [1.0, factor] + [0.0, mean]
     told = tuple(Column(name, unit=unit) for name, unit in zip("ab", units, strict=True))
     return PanelData.of(x[..., :columns], Columns(told[:columns]), Cut(6, 3)).windows("test")
 
@@ -34,7 +34,7 @@ def of(windows):
 def test_a_score_of_columns_that_share_no_unit_does_not_depend_on_their_units(which):
     windows = table(UNITS[which])
     forecasts, truth, first = of(windows)
-    *_, second = of(table(UNITS[which], factor=1000.0))
+    *_, second = of(table(UNITS[which], factor=1000.0, mean=1e9))
     for name in ("energy score", "variogram score", "CRPS", "width 90 %"):
         torch.testing.assert_close(first[name], second[name], rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(second["CRPS, b"], 1000 * first["CRPS, b"], rtol=1e-3, atol=1e-4)
