@@ -154,13 +154,15 @@ class Audit(_Tabled):
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
+        """Whether the guide misses something, and which of its parents no variable of the pair explains."""
+        known = {*self.generative.variables, *self.generative.context}
+        alone = [name for name in self.inference.context if name not in known]
+        said = f"; {', '.join(alone)} in the guide has no factor and is context that the data give" if alone else ""
         where = "" if self.steps is None else f" at T = {self.steps} (masks of your own may differ at other lengths)"
         if self.exact:
-            return f"exact{where}: the guide reads everything the posterior depends on"
-        return (
-            f"not exact{where}: the guide misses what the posterior depends on, so the bound stays below the evidence"
-        )
+            return f"exact{where}: the guide reads everything the posterior depends on{said}"
+        found = "the guide misses what the posterior depends on, so the bound stays below the evidence"
+        return f"not exact{where}: {found}{said}"
 
     def table(self) -> Table:
         """A rich table with one row per guide factor."""

@@ -9,8 +9,12 @@ thread holds the lock, the child starts with a free lock and without that thread
 from __future__ import annotations
 
 import os
+import re
 import threading
 from contextlib import ContextDecorator
+
+SHAPES = re.compile(r"\n\s*Trace Shapes:.*", re.DOTALL)
+"""The table that Pyro appends to an error that passes a program."""
 
 
 class _Alone(ContextDecorator):
@@ -22,8 +26,10 @@ class _Alone(ContextDecorator):
     def __enter__(self) -> None:
         self._lock.acquire()
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._lock.release()
+        if error is not None and error.args and isinstance(error.args[0], str):
+            error.args = (SHAPES.sub("", error.args[0]), *error.args[1:])
 
     def _leave_to_the_parent(self) -> None:
         """Forget the thread that held the lock, which a forked child does not have."""

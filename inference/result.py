@@ -2,7 +2,6 @@
 
 import io
 import os
-import re
 from collections.abc import Iterable
 from contextlib import suppress
 from importlib.util import find_spec
@@ -16,6 +15,7 @@ from rich.text import Text
 from typing_extensions import override
 
 from .. import files
+from ..turns import SHAPES
 
 if TYPE_CHECKING:
     import matplotlib.text
@@ -77,14 +77,14 @@ def _shown(text: str) -> str:
 
 def reason(error: BaseException) -> str:
     """What an error says, without the table of shapes that Pyro appends where it passes a program."""
-    return re.split(r"\n\s*Trace Shapes:", str(error))[0]
+    return SHAPES.sub("", str(error))
 
 
 def canvas(width: float, height: float) -> "Figure":
     """An empty figure, in inches; matplotlib is imported by whoever draws."""
-    from matplotlib.figure import Figure
+    from .picture import Picture
 
-    return Figure(figsize=(width, height), layout="constrained")
+    return Picture(figsize=(width, height), layout="constrained")
 
 
 def as_they_are(texts: "Iterable[matplotlib.text.Text]") -> None:

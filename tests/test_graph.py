@@ -200,6 +200,12 @@ def test_masks_of_the_users_own_are_audited_over_all_steps_of_one_length(generat
     assert audit("p(z_t) p(x_t | z_t)", "q(z_t | x_t)").steps is None
 
 
+def test_an_audit_names_context_that_the_guide_alone_reads():
+    said = "e in the guide has no factor and is context that the data give"
+    assert said in audit("p(z_t | c_t) p(x_t | z_t)", "q(z_t | x_t, c_t, e_t)").verdict
+    assert said not in audit("p(z_t | c_t, e_t) p(x_t | z_t)", "q(z_t | x_t, c_t, e_t)").verdict
+
+
 def test_long_lags_are_seen_whole():
     result = audit("p(z_t | z_{t-25:t-1}) p(x_t | z_t)", "q(z_t | z_{t-9:t-1}, x_{>=t})")
     assert result.missing == {"z": ("z_{t-25:t-10}",)}

@@ -155,6 +155,7 @@ def test_tubes_are_kept_and_put_around_forecasts(fitted, tmp_path):
         torch.testing.assert_close((upper + lower) / 2, forecasts.mean(0))
     assert "tubes of 80 % · 500 windows of 250 clips" in str(again)
     assert again.plot().axes
+    assert again.plot()._repr_png_().startswith(b"\x89PNG")
     with pytest.raises(ValueError, match=r"no tubes of a 'futures' \(did you mean 'future'\?\)"):
         tubes.tube(forecasts, "futures")
     with pytest.raises(ValueError, match=r"\(20, B, 4, 2\), not \(19, 500, 4, 2\)"):

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -557,6 +558,12 @@ def test_a_file_ends_in_what_is_written(fitted, capsys, tmp_path, monkeypatch, a
 
 
 def test_pyros_table_of_shapes_is_cut():
+    model = dvae.DynamicalVAE("p(z_t | z_{t-1}, c_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 2, "c": 1})
+    for act in (dvae.SequenceELBO().terms, partial(dvae.fit, steps=1, progress=False)):
+        with pytest.raises(ValueError, match="reads c") as caught:
+            act(model, {"x": torch.zeros(2, 3, 2)})
+        assert "Trace Shapes:" not in str(caught.value)
+
     def program():
         pyro.sample("x", pyro.distributions.Normal(torch.zeros(2), -torch.ones(2)))
 
