@@ -77,8 +77,8 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
     figure = Figure(figsize=(9, 2.6 * len(models)), layout="constrained")
     for axes, (name, model) in zip(figure.subplots(len(models)), models.items(), strict=True):
         torch.manual_seed(0)
-        past, horizon = {"x": x[:, : protocol.observed]}, protocol.predicted
-        samples = model.forecast(past, horizon, samples=10, draw_emission=False)["x"]
+        observed, horizon = {"x": x[:, : protocol.observed]}, protocol.predicted
+        samples = model.forecast(observed, horizon, samples=10, draw_emission=False)["x"]
         futures(test.skeleton, past[0], test.positions(samples)[:, 0], future[0], ax=axes)
         axes.set_title(name, fontsize=9)
     figure.savefig(out / "futures.png", dpi=150)

@@ -465,7 +465,7 @@ class TestPlain:
         assert (human36m.skeleton, humaneva.skeleton) == (HUMAN36M, HUMANEVA)
         np.testing.assert_array_equal(human36m.clips[0].positions, wide[:, list(HUMAN36M_KEPT)])
         np.testing.assert_array_equal(humaneva.clips[1].positions, narrow)
-        with pytest.raises(ValueError, match=r"skeleton\.json beside it"):
+        with pytest.raises(ValueError, match=r"skeleton\.json into its folder"):
             read_motion(tmp_path / "stranger.npz")
 
     def test_what_a_file_unpacks_to_is_limited_as_a_whole(self, tmp_path, monkeypatch):
