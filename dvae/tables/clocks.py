@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
+from itertools import pairwise, takewhile
 from typing import Any
 
 import numpy as np
@@ -65,13 +66,11 @@ def parts_of(frame: Any, names: Collection[str]) -> tuple[str, ...]:
         unit = unit_of(name, frame[name])
         if unit is not None:
             units.setdefault(unit, name)
-    coarse = [unit for unit in ("month", "week", "quarter") if unit in units]
-    if coarse:  # the finest tells the others
-        units = {unit: name for unit, name in units.items() if unit not in coarse[1:]}
-        if coarse[0] != "month":
-            units = {unit: name for unit, name in units.items() if unit not in SECONDS}
-    begin = [unit for unit in ("year", "day") if unit in units][:1]
-    return tuple(units[unit] for unit in UNITS[UNITS.index(begin[0]) :] if unit in units) if begin else ()
+    if "year" not in units:
+        return tuple(units[unit] for unit in takewhile(units.__contains__, SECONDS))
+    coarse = next((unit for unit in ("month", "week", "quarter") if unit in units), "year")
+    fine = takewhile(units.__contains__, SECONDS) if coarse in ("year", "month") else ()
+    return tuple(units[unit] for unit in dict.fromkeys(("year", coarse, *fine)))
 
 
 def time_of(frame: Any, time: str | tuple[str, ...], decimal: str | None = None) -> Any:
@@ -100,8 +99,14 @@ def join_times(frame: Any, names: tuple[str, ...]) -> Any:
     import pandas as pd
 
     label, first = " ".join(names), read_numbers(frame[names[0]])
+    if len(names) > 6:
+        raise ValueError(f"{label} are {len(names)} columns of one time; expected at most year, month, …, second")
     when = compact(first.values) if first.is_numeric else dates(frame[names[0]])
     if when is not None:
+        if len(names) > 4:
+            raise ValueError(
+                f"{label} are a date and {len(names) - 1} columns; expected a clock, or hour, minute, second"
+            )
         when = when.set_axis(frame.index)
         for name, unit in zip(names[1:], ("hour", "minute", "second"), strict=False):
             when = when + pd.to_timedelta(_part(frame[name], unit), unit="s")
@@ -110,6 +115,10 @@ def join_times(frame: Any, names: tuple[str, ...]) -> Any:
     units = [unit_of(name, frame[name]) for name in names]
     if None in units or len(set(units)) < len(units):
         units = [next(order) for _ in names]
+    if gap := [fine for coarse, fine in pairwise(SECONDS) if fine in units and coarse not in units]:
+        raise ValueError(
+            f"{label} have a {gap[0]} and no larger unit before it; name the columns from the year or day on"
+        )
     parts = {str(unit): _part(frame[name], str(unit)) for unit, name in zip(units, names, strict=True)}
     seconds = sum(
         (parts[unit] * (SECONDS[unit] if unit == "day" else 1) for unit in SECONDS if unit in parts),

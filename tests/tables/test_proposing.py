@@ -266,9 +266,11 @@ def test_a_clock_is_not_joined_where_the_date_suffices():
 
 def test_parts_that_are_no_time_are_named():
     frame = pd.DataFrame({"year": [2023, 2023], "month": [2, 2], "day": [28, 29], "hour": [0, 25], "y": [0.5, 1.5]})
+    frame["minute"] = [0, 30]
     for parts, said in [
         (("year", "month", "day"), "row 1 of year month day is no date: 2023-02 has no day 29"),
         (("year", "month", "hour"), "row 0 of column 'hour' is 0; expected days from 1"),
+        (("year", "month", "minute"), "year month minute have a minute and no larger unit before it"),
         (("year", "y"), "row 0 of column 'y' is 0.5; expected months from 1 to 12"),
     ]:
         with pytest.raises(ValueError, match=said):
