@@ -444,7 +444,7 @@ class _Proposal:
         whole = (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2
         if whole and numbers.std() > RESOLVED * numbers.mean():
             return Column(name, family="overdispersed" if numbers.var() > SPREAD * numbers.mean() else "count")
-        if (numbers > 0).all() and numbers.std() > 0.5 * numbers.mean():
+        if (numbers.astype(np.float32) > 0).all() and numbers.std() > 0.5 * numbers.mean():
             return Column(name, family="positive")
         return Column(name)
 

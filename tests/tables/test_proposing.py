@@ -1,6 +1,7 @@
 """What a table that nobody described is taken for."""
 
 import re
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -310,6 +311,25 @@ def test_ids_and_classes_are_text(tmp_path, ids):
     assert read.columns.columns[1].classes == tuple(sorted(ids))
     for one in read:
         np.testing.assert_array_equal(one.values[:, 1], [sorted(ids).index(ids[t % 2]) for t in range(4)])
+
+
+@pytest.mark.parametrize(
+    ("cells", "values"),
+    [
+        (["1.234,5", "-12", "0,25"], [1234.5, -12, 0.25]),
+        (["1,234,567", "-12.5", "1e3"], [1234567, -12.5, 1000]),
+        (["1 234,5", "2\u202f000", "7"], [1234.5, 2000, 7]),
+        (["1'234.5", "−2", "+3."], [1234.5, -2, 3]),
+        ([Decimal("0.1"), Decimal("1e9"), None], [0.1, 1e9, np.nan]),
+        (["TRUE", "false", None], [1, 0, np.nan]),
+        (["0.1", "123456789.123456789", "5e-324"], [0.1, 123456789.123456789, 5e-324]),
+    ],
+    ids=["comma", "point", "spaces", "signs", "decimals", "booleans", "digits"],
+)
+def test_numbers_are_read_however_they_are_written(cells, values):
+    read = Panel.of(pd.DataFrame({"t": [1, 2, 3], "y": cells}))
+    assert read.columns.columns[0].family != "category"
+    np.testing.assert_array_equal(read.series[0].values[:, 0], values)
 
 
 def texted(*odd, count=60):
