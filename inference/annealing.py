@@ -54,10 +54,13 @@ class AnnealedBound:
     Args:
         bound: (B,) log of the estimated evidence, in nats; below it on average, or above it where chains ran backward.
         error: (B,) standard error of that, by the spread of the weights, with K - 1 degrees of freedom for an interval
-            by Student's t; of few effective chains it is too small. NaN
-            of chains that ran backward: those of a sequence start at one draw, whose own chance their spread does not
-            tell. The error of a mean over sequences is by the spread of their bounds.
-        effective: (B,) effective number of chains, between 1 and K, or NaN, likewise.
+            by Student's t. It is the error of the modes that the chains visit: where they all stay in one of two equal
+            modes, the bound is log 2 too low, whatever `error` and `effective` are. The upper bound on simulated data
+            shows such a deficit. With few effective chains the error is too small. NaN of chains that ran backward:
+            those of a sequence start at one draw, and their spread does not include the chance of that draw. The error
+            of a mean over sequences is by the spread of their bounds.
+        effective: (B,) effective number of chains, between 1 and K, or NaN, likewise. It does not see a mode that no
+            chain visits.
         accepted: (B,) share of the proposals that were accepted.
         chains: K.
         temperatures: L.

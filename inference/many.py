@@ -218,7 +218,7 @@ class Requirement(Shown):
         level: of the two-sided interval that is not to hold 0.
         clips: number of training seeds of each model to that of clips, infinite where no number is enough.
         now: the numbers of clips, and of seeds of the two, that there are.
-        achieved: the power of these.
+        achieved: the power of these; for the measured difference it follows from the p-value and adds nothing to it.
     """
 
     difference: float

@@ -33,8 +33,10 @@ class SelfFeeding:
 
     Args:
         probability: of each frame, independently.
-        passes: None runs through time, exactly. A number of passes approximates that in parallel: in each, all means
-            are computed at once from the last pass's history (T passes are exact).
+        passes: None runs through time, exactly. A number of passes approximates that in parallel: each computes the
+            means of all steps at once from the last pass's history (T passes are exact). Several data variables follow
+            one another within a pass, in the order of the model: a variable reads the means of those before it from
+            the same pass.
         gradient: whether gradients flow through the means that are fed, and so back in time. Without (as Bengio et al.
             have it) a step takes half the time or less, and the gradient is not that of the self-fed bound. The means
             in place of missing entries always carry theirs.

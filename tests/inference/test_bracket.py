@@ -156,6 +156,25 @@ def test_a_guide_that_goes_backward_has_no_fivo_and_a_law_that_is_no_normal_no_p
     assert "family" not in str(found)
 
 
+def test_chains_that_stay_in_one_mode_are_named():
+    """Of two equal modes the guide knows one: the bound is log 2 too low, and the chains' own error does not see it."""
+    laws, sizes = {"p(w)": dvae.laws.Mixture(2)}, {"w": 1, "x": 1}
+    model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", sizes, dvae.networks.Linear(1), laws).double()
+    model.requires_grad_(False)
+    prior, likelihood, guide = model.generator["w"].law, model.generator["x"], model.encoder["w"]
+    for part in (*likelihood.parameters(), *guide.parameters()):
+        part.zero_()  # so that x is of no w, and the posterior of w is its prior
+    prior.loc.copy_(torch.tensor([[-9.0], [9.0]]))
+    guide.law.out.bias[0] = 9.0
+    x = model.sample(N, 1)["x"]
+    evidence = torch.distributions.Normal(0.0, math.log(2) + 1e-3).log_prob(x[:, 0, 0])
+    alone = dvae.annealed_bound(model, x, 20, 16)
+    assert (alone.bound - evidence).mean() == pytest.approx(-math.log(2), abs=0.05)
+    assert alone.error.max() < 0.2
+    found = bracket(model, x, **{**FEW, "fitting": 0, "temperatures": 20, "chains": 4})
+    assert any("AIS and family may be that much too low" in note for note in found.notes)
+
+
 class Doubled(View):
     """The data twice as large."""
 
