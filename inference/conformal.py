@@ -257,7 +257,8 @@ def conformal(
     """Tubes around forecasts, calibrated on windows that the model has not been fitted to.
 
     They hold the future of new windows as often as the level says if the clips of these are exchangeable with those of
-    calibration: of the same people and styles. Of one person's or style's clips they say nothing of another's.
+    calibration: of the same people and styles. Of one person's or style's clips they say nothing of another's. Later
+    steps of the same sequences are not exchangeable with earlier ones, so that windows divided by time are refused.
 
     Args:
         model: a model (`Forecasting`), or the name of a reference row, see `References`.
@@ -277,7 +278,7 @@ def conformal(
 
     Raises:
         ValueError: a level that is none, too few clips for it, forecasts without a spread, windows that cannot be
-            forecast, or as many groups as windows are not given.
+            forecast or are one part of sequences divided by time, or as many groups as windows are not given.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -288,6 +289,14 @@ def conformal(
     """
     held = hold(windows)
     windows, (clip, _) = held.windows, called(held.windows.description)
+    parts = {split for split, _, _ in held.keys} - {"all", "last"}
+    if parts and getattr(windows.protocol, "split", None) == "time":
+        raise ValueError(
+            f"these windows are the {' and '.join(sorted(parts))} part of {clip}s divided by time (split='time'); bands "
+            f"hold the future of other {clip}s as often as they say, but that of later steps of the same ones less "
+            f"often; divide whole {clip}s by split='sequence' or 'group', or calibrate on all windows of other {clip}s, "
+            "data.windows('all')"
+        )
     keys = clusters(windows) if groups is None else [("", group, 0) for group in groups]
     if len(keys) != len(held.keys):
         raise ValueError(f"{len(held.keys)} windows need as many groups, not {len(keys)}")

@@ -172,6 +172,16 @@ def test_tubes_are_kept_and_put_around_forecasts(fitted, tmp_path):
             Tubes.from_json(json.dumps(document | change))
 
 
+def test_windows_of_sequences_divided_by_time_are_refused():
+    """Later steps of the same sequences are not exchangeable with earlier ones; other sequences as a whole are."""
+    x = draw(6, 40, 1).cumsum(1).numpy()
+    data = dvae.tables.PanelData.of(x, cut=dvae.tables.Cut(4, 2, split="time"))
+    options = {"samples": 5, "training_windows": data.windows("train"), "progress": False}
+    with pytest.raises(ValueError, match="validation part of sequences divided by time .* split='sequence' or 'group'"):
+        conformal("climatology", data.windows("validation"), 0.5, **options)
+    assert conformal("climatology", data.windows("all"), 0.5, **options).clips == 6
+
+
 def test_points_have_the_spread_of_their_residuals(fitted):
     _, kept, new = fitted
     tubes = conformal("zero velocity", kept, residuals=kept, progress=False)
