@@ -108,7 +108,8 @@ class Schema:
         ):
             batch = sequences(data).batch
             sizes = {name: value.shape[-1] for name, value in batch.items() if name != "mask" and np.ndim(value) > 1}
-            data = Schema(sizes, None if "lengths" in batch else batch["x"].shape[1])
+            observed = data.observed if isinstance(data, ArrayWindows) else None
+            data = Schema(sizes, None if "lengths" in batch else batch["x"].shape[1], observed)
         found = Schema(dict(data)) if isinstance(data, Mapping) else getattr(data, "schema", data)
         if not isinstance(found, cls):
             known = found.kind if isinstance(found, Schema) else type(data).__name__

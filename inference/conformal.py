@@ -292,10 +292,10 @@ def conformal(
     parts = {split for split, _, _ in held.keys} - {"all", "last"}
     if parts and getattr(windows.protocol, "split", None) == "time":
         raise ValueError(
-            f"these windows are the {' and '.join(sorted(parts))} part of {clip}s divided by time (split='time'); bands "
-            f"hold the future of other {clip}s as often as they say, but that of later steps of the same ones less "
-            f"often; divide whole {clip}s by split='sequence' or 'group', or calibrate on all windows of other {clip}s, "
-            "data.windows('all')"
+            f"these windows are the {' and '.join(sorted(parts))} part of {clip}s divided by time (split='time'); "
+            f"bands hold the future of other {clip}s as often as they say, and less often that of later steps of the "
+            f"same ones; divide whole {clip}s by split='sequence' or 'group', or calibrate on all windows of other "
+            f"{clip}s, data.windows('all')"
         )
     keys = clusters(windows) if groups is None else [("", group, 0) for group in groups]
     if len(keys) != len(held.keys):

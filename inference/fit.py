@@ -17,9 +17,13 @@ import torch
 from torch import nn
 
 from ..data import Fingerprinted, InBatches, Source, as_source, in_batches, is_divided, take_split
+from ..program.model import DynamicalVAE
+from ..program.rollout import SelfFeeding
 from ..turns import alone
+from ..views import WHOLE
 from . import processes
 from .checkpoints import CONFIG, CheckpointError, Run
+from .last_value import last_value_bound
 from .objectives import Objective
 from .result import as_they_are
 from .resuming import marking_failure, restore, store
@@ -64,6 +68,8 @@ class Fit:
         model: what was fitted, with the best weights; None where only the log of a run was read.
         processor_seconds: of all threads of the first process, validation and checkpoints included; of a resumed run in
             all.
+        last_value: the bound of repeating the last value on the validation windows, to be compared with `best_bound`
+            (see `last_value`); None where these have no horizon, or the model has no likelihood of the data as given.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -81,15 +87,22 @@ class Fit:
     per: str = "frame"
     model: Any = field(default=None, repr=False)
     processor_seconds: float = 0.0
+    last_value: float | None = None
 
     @property
     def best(self) -> str:
-        """What is best, where, in words; empty without validation data."""
+        """What is best, where, in words, and whether the last value is better; empty without validation data."""
         if self.best_bound is None:
             return ""
         if any("validation/loss" in row for row in self.history):
             return f"lowest validation loss {-self.best_bound:.4f} at step {self.best_step}"
-        return f"best bound {self.best_bound:.3f} nats a {self.per} at step {self.best_step}"
+        found = f"best bound {self.best_bound:.3f} nats a {self.per} at step {self.best_step}"
+        if self.last_value is None or self.best_bound >= self.last_value:
+            return found
+        return (
+            f"{found}, worse than repeating the last value ({self.last_value:.3f}): train for more steps, or try "
+            "residual=1, which keeps the last value, or self_feeding=1, which trains on the model's own output"
+        )
 
     def series(self, name: str) -> tuple[list[int], list[float]]:
         """Return the steps and values of one number of the log, such as "kl/z" or "validation/bound"."""
@@ -244,14 +257,29 @@ def fit(
             store(svi, run)  # also of a run that was interrupted at its last step
         _train(svi, source, held_out, run, receivers, callbacks, signals)
         processes.wait(svi.fabric)  # whoever goes on may read what the first one has written
+        last_value = _last_value(svi, source, validation, held_out) if first else None
         if state.best is not None:
             model.load_state_dict(state.best)
     path = run.path if run else None
     told = state.step, state.best_step, state.best_bound, state.status
-    result = Fit(history.rows, *told, path, state.per, model, state.processor_seconds)
+    result = Fit(history.rows, *told, path, state.per, model, state.processor_seconds, last_value)
     if state.status == "interrupted":
         raise Interrupted(result, signals.received or signal.SIGINT)
     return result
+
+
+def _last_value(svi: SVI, train: Source, validation: Any, held_out: InBatches | None) -> float | None:
+    """The bound of repeating the last value, of a run whose weights were selected by a bound of the data as given."""
+    model = svi.model
+    if held_out is None or svi.state.best_bound is None or "validation/loss" in svi.state.row:
+        return None
+    if not isinstance(model, DynamicalVAE) or model.view.measured or WHOLE not in (*model.observed, *model.view.names):
+        return None
+    observed = getattr(getattr(take_split(validation, "validation"), "protocol", None), "observed", None)
+    if observed is None:
+        return None
+    fed = bool(svi.final_feeding) and isinstance(model.feeding, SelfFeeding)
+    return last_value_bound(model, train, held_out, observed, fed=fed, batch_size=svi.training.batch_size)
 
 
 def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapping[str, Any]) -> Run | None:

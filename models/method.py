@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from typing_extensions import override
@@ -84,9 +84,10 @@ class LikelihoodMethod(Method):
             a table say, or "fixed".
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1, an offset, one step
             ahead is sharp, but a free run can drift without bound; somewhat less forgets where it was.
-        self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over a
-            third of training, after the first tenth, and carries no gradient. Nothing is fed to a model that reads no
-            x.
+        self_feeding: scheduled sampling: final probability that a frame of x's history is the model's own mean. It
+            rises from 0 over a third of training, after the first tenth, and carries no gradient. Nothing is fed to a
+            model that reads no x. Where it is left open, 1 for data with a horizon and 0 for others
+            (docs/results/tuning.md).
     """
 
     apart: ClassVar[tuple[str, ...]] = ()
@@ -94,7 +95,14 @@ class LikelihoodMethod(Method):
 
     emission: Literal["fixed", "unit", "normal", "student"] | None = None
     residual: Share = 0.0
-    self_feeding: Share = 0.0
+    self_feeding: Share | None = 0.0
+
+    @override
+    def suited(self, data: Any) -> Self:
+        """With the scheduled sampling chosen for these data, where it is left open."""
+        if self.self_feeding is not None:
+            return self
+        return replace(self, self_feeding=float(Schema.of(data).observed is not None))
 
     @override
     def laws(self) -> Mapping[str, LawSpec]:

@@ -17,7 +17,7 @@ from typing_extensions import override
 
 from ..networks import NetworkSpec, Recurrent
 from ..networks.recurrent import tie
-from ..options import Extra, Size
+from ..options import Extra, Share, Size
 from ..program.model import DynamicalVAE
 from .method import LatentMethod
 
@@ -42,6 +42,7 @@ class SRNN(LatentMethod):
     embed: Extra = 64
     hidden: tuple[Size, ...] = (32,)
     decoder: tuple[Size, ...] = (64,)
+    self_feeding: Share | None = None
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:

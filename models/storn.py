@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing_extensions import override
 
 from ..networks import NetworkSpec, Recurrent
-from ..options import Extra, Size
+from ..options import Extra, Share, Size
 from .method import LatentMethod
 
 
@@ -40,6 +40,7 @@ class STORN(LatentMethod):
     embed: Extra = 64
     embed_latent: Extra = 32
     hidden: tuple[Size, ...] = (32,)
+    self_feeding: Share | None = None
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:

@@ -18,7 +18,7 @@ from typing_extensions import override
 
 from ..networks import NetworkSpec, Recurrent
 from ..networks.recurrent import tie
-from ..options import Size
+from ..options import Share, Size
 from ..program.model import DynamicalVAE
 from .method import LatentMethod
 
@@ -43,6 +43,7 @@ class VRNN(LatentMethod):
     embed: tuple[Size, ...] = (64,)
     embed_latent: tuple[Size, ...] = (16, 32)
     hidden: tuple[Size, ...] = ()
+    self_feeding: Share | None = None
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:

@@ -286,7 +286,8 @@ def fitted(section: Section, data: Data, case: str, seed: int, out: Path) -> Any
     chosen, file = section.cases[case], out / "fitted.json"
     if not file.exists():
         options = {**section.training, **chosen.training}
-        method, training = dvae.method(case, **chosen.options), dvae.Training(seed=seed, progress=False, **options)
+        method = dvae.method(case, **{"self_feeding": 0.0, **chosen.options})
+        training = dvae.Training(seed=seed, progress=False, **options)
         torch.manual_seed(seed)
         model = method.build(data.training.schema)
         start, resumed = time.process_time(), Run(out).exists

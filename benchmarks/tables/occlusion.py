@@ -24,7 +24,7 @@ from dvae.inference.uncertainty import clustered_variance, linearised
 from .pages import DOCS, table, write
 
 METHODS: dict[str, dict[str, Any]] = {
-    "srnn": {"residual": 0.9},
+    "srnn": {"residual": 0.9, "self_feeding": 0.0},
     "hit-dvae": {"loss": "evidence", "heading": True, "self_feeding": 0.0},
 }
 """With options that suit teacher-forced filling; the rest are the presets."""
