@@ -62,6 +62,10 @@ _STORED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "step": (lambda value: _count(value), _NUMBER),
     "best_step": (lambda value: value is None or _count(value), f"{_NUMBER} or null"),
     "best_bound": (lambda v: v is None or (isinstance(v, float) and math.isfinite(v)), "a finite number or null"),
+    "last_value": (
+        lambda v: v is None or v is ... or (isinstance(v, float) and math.isfinite(v)),
+        "a finite number or null",
+    ),
     "waited": (lambda value: _count(value), _NUMBER),
     "status": (lambda value: value in STATUSES, "one of the known ones"),
     "per": (lambda value: value is ... or (isinstance(value, str) and value.isidentifier()), "a word"),

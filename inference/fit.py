@@ -255,31 +255,26 @@ def fit(
         before, state.status = state.status, _status(state, training)
         if run is not None and (not resume or state.status not in ("running", before)):
             store(svi, run)  # also of a run that was interrupted at its last step
-        _train(svi, source, held_out, run, receivers, callbacks, signals)
+        observed = None if validation is None else _observed(svi.model, take_split(validation, "validation"))
+        _train(svi, source, held_out, observed, run, receivers, callbacks, signals)
         processes.wait(svi.fabric)  # whoever goes on may read what the first one has written
-        last_value = _last_value(svi, source, validation, held_out) if first else None
         if state.best is not None:
             model.load_state_dict(state.best)
     path = run.path if run else None
     told = state.step, state.best_step, state.best_bound, state.status
-    result = Fit(history.rows, *told, path, state.per, model, state.processor_seconds, last_value)
+    result = Fit(history.rows, *told, path, state.per, model, state.processor_seconds, state.last_value)
     if state.status == "interrupted":
         raise Interrupted(result, signals.received or signal.SIGINT)
     return result
 
 
-def _last_value(svi: SVI, train: Source, validation: Any, held_out: InBatches | None) -> float | None:
-    """The bound of repeating the last value, of a run whose weights were selected by a bound of the data as given."""
-    model = svi.model
-    if held_out is None or svi.state.best_bound is None or "validation/loss" in svi.state.row:
+def _observed(model: nn.Module, validation: Any) -> int | None:
+    """Observed steps of validation windows with a horizon, if the bound of the model is of the data as given."""
+    if not isinstance(model, DynamicalVAE) or not model.likelihood or model.view.measured:
         return None
-    if not isinstance(model, DynamicalVAE) or model.view.measured or WHOLE not in (*model.observed, *model.view.names):
+    if WHOLE not in (*model.observed, *model.view.names):
         return None
-    observed = getattr(getattr(take_split(validation, "validation"), "protocol", None), "observed", None)
-    if observed is None:
-        return None
-    fed = bool(svi.final_feeding) and isinstance(model.feeding, SelfFeeding)
-    return last_value_bound(model, train, held_out, observed, fed=fed, batch_size=svi.training.batch_size)
+    return getattr(getattr(validation, "protocol", None), "observed", None)
 
 
 def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapping[str, Any]) -> Run | None:
@@ -304,6 +299,7 @@ def _train(
     svi: SVI,
     source: Source,
     held_out: InBatches | None,
+    observed: int | None,
     run: Run | None,
     receivers: Sequence[Tracker],
     callbacks: Sequence[Callback],
@@ -344,6 +340,11 @@ def _train(
         due = state.step % training.validate_every == 0 or state.step == training.steps or state.stop
         if due and held_out is not None:
             report(svi.validate(held_out))
+            if observed is not None and state.last_value is None and "validation/loss" not in state.row:
+                fed = bool(svi.final_feeding) and isinstance(svi.model.feeding, SelfFeeding)
+                state.last_value = last_value_bound(
+                    svi.model, source, held_out, observed, fed=fed, batch_size=training.batch_size
+                )
             call("on_validation")
             stopped = asked_to_stop()
         state.status = "interrupted" if stopped else _status(state, training)

@@ -33,7 +33,7 @@ _KEPT: dict[str, set[str]] = {"adam": {"step", "exp_avg", "exp_avg_sq"}, "sgd": 
 _KEPT["adamw"] = _KEPT["adam"]
 
 # what state.json holds of `State`
-_STORED = ("step", "best_step", "best_bound", "waited", "status", "processor_seconds")
+_STORED = ("step", "best_step", "best_bound", "last_value", "waited", "status", "processor_seconds")
 
 
 def store(svi: SVI, run: Run) -> None:

@@ -53,6 +53,7 @@ class State:
     best: dict[str, Tensor] | None = None
     best_step: int | None = None
     best_bound: float | None = None
+    last_value: float | None = None
     waited: int = 0
     processor_seconds: float = 0.0
     status: str = "running"

@@ -416,7 +416,8 @@ def _fit(run: Loaded) -> Fit:
     """What the training left."""
     state, history = Run(run.path).state, JSONLines(run.path / "log.jsonl").read()
     per = run.model.per if isinstance(run.model, Program) else Fit.per
-    return Fit(history, state["step"], state["best_step"], state["best_bound"], state["status"], run.path, per)
+    told = state["step"], state["best_step"], state["best_bound"], state["status"]
+    return Fit(history, *told, run.path, per, last_value=state.get("last_value"))
 
 
 def _facts(run: Loaded) -> dict[str, str]:

@@ -414,6 +414,7 @@ def _left(run: _Run) -> Fit:
     state = earlier.state
     found = {name: state[name] for name in ("status", "step", "best_step", "best_bound")}
     found |= {"per": state.get("per", Fit.per), "processor_seconds": state.get("processor_seconds", 0.0)}
+    found["last_value"] = state.get("last_value")
     return Fit(JSONLines(run.path / "log.jsonl").read(), run=run.path, **found)
 
 
