@@ -28,7 +28,7 @@ from .blocks import ColumnSummary, blocks
 ROUNDING = 2e-15
 """Standard deviation over the mean up to which values in float64 are a constant with rounding errors."""
 RESOLVED = 6e-6
-"""Least standard deviation over the mean of values in float32, of which it loses a hundredth."""
+"""Standard deviation over the mean below which float32 loses more than a hundredth of it."""
 SMALLEST = 1e-18
 """Least standard deviation: the inverse of its square is a float32."""
 TOO_SMALL = f"models compute in float32, which needs at least {SMALLEST:g}; multiply the values by a constant"

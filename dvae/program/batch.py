@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +15,7 @@ from ..data import BESIDE, Batch, mask_of, refuse_table, tensor_of
 from ..laws.product import ProductSupport
 from ..networks.base import again, once, valid_steps
 from ..notation import Factorization
-from ..units import ROUNDING, exceeds_float32
+from ..units import RESOLVED, ROUNDING, exceeds_float32
 from ..views import LOG_DET, WHOLE, View
 from .conditional import Conditional
 from .groups import GROUP, Groups
@@ -22,9 +23,6 @@ from .rollout import Rollout
 
 CHUNK = 2048
 """Sequences times samples that a forecast holds at once."""
-
-LOST = 0.01
-"""Share of a standard deviation that rounding to float32 may lose."""
 
 AnyBatch = Tensor | Batch
 
@@ -279,12 +277,17 @@ def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Ten
     """The value in the precision of the model.
 
     Raises:
-        ValueError: float32 rounds it by more than `LOST` of its standard deviation.
+        ValueError: values that float32 does not resolve.
     """
-    found = value.to(dtype)
     if dtype is not torch.float32 or not exceeds_float32(value.dtype) or value.dim() < 2 or not value.numel():
-        return found
-    known, mask, lengths = value.double(), mask_of(batch, name), batch.get("lengths")
+        return value.to(dtype)
+    mask, lengths = mask_of(batch, name), batch.get("lengths")
+    if mask is None and lengths is None:
+        least, most = value.flatten(0, -2).aminmax(dim=0)  # a quick look: the deviation is at least range / sqrt(2 N)
+        bound = RESOLVED * math.sqrt(2 * value.numel() / value.shape[-1])
+        if ((most == least) | (most - least > bound * torch.maximum(most.abs(), least.abs()))).all():
+            return value.to(dtype)
+    known = value.double()
     if mask is not None and mask.shape == value.shape:
         known = torch.where(torch.as_tensor(mask, device=value.device), known, torch.nan)
     if lengths is not None and value.dim() == 3:
@@ -292,17 +295,16 @@ def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Ten
         known = torch.where(valid[..., None], known, torch.nan)
     rows = known.flatten(0, -2)
     mean = rows.nanmean(0)
-    spread = (rows - mean).square().nanmean(0).sqrt()
-    lost = (rows - found.double().flatten(0, -2)).square().nanmean(0).sqrt()
-    wrong = (lost > LOST * spread) & (spread > ROUNDING * mean.abs())
+    spread, size = (rows - mean).square().nanmean(0).sqrt(), mean.abs()
+    wrong = (spread < RESOLVED * size) & (spread > ROUNDING * size)
     if wrong.any():
         place = int(wrong.nonzero()[0])
         raise ValueError(
-            f"coordinate {place} of {name} has mean {mean[place]:.9g} and standard deviation {spread[place]:.3g}, of "
-            f"which float32 loses {lost[place] / spread[place]:.0%}; call model.standardise({name!r}).fit(values), "
-            "which takes the mean off in float64, or subtract the mean yourself"
+            f"coordinate {place} of {name} has mean {mean[place]:.9g} and standard deviation {spread[place]:.3g}, "
+            f"which float32 does not resolve; call model.standardise({name!r}).fit(values), which subtracts the mean "
+            "in float64, or subtract it yourself"
         )
-    return found
+    return value.to(dtype)
 
 
 def _meaning(support: Any) -> str:
