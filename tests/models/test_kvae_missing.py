@@ -245,7 +245,7 @@ def test_missing_frames_are_imputed_from_both_sides():
     model, n = build(components=1), 20_000
     present = torch.tensor([True, True, False, True, True])
     data = batch(present[None])
-    filled, seen = model.impute(data, samples=n, draw_emission=False)["x"][:, 0], data["mask"][0]
+    filled, seen = model.impute(data, samples=n, draw=False)["x"][:, 0], data["mask"][0]
     assert torch.equal(filled[:, seen], data["x"][0][seen].expand(n, -1))
     network, out = model.generator["a"].network, model.generator["x"].law.out
     loc, scale = (p[0][present].flatten() for p in model.encoder["a"]({"x": model.read(data)["x"]}, 1, 5))
