@@ -355,7 +355,8 @@ class SVI:
             program["draws"] = objective.draws
         try:
             measure = self.objective.measure if isinstance(self.objective, Adapting) else None
-            return Terms(**self.module(self.fabric.to_device(placed), program, measure))
+            on_device = self.fabric.to_device(placed)
+            return Terms(**self.module(lambda: on_device, program, measure))  # fabric rounds tensors that it sees
         except ValueError as error:
             # torch's distributions refuse NaN parameters and values before there is a term to look at
             if "invalid values" not in str(error) and "within the support" not in str(error):
@@ -375,9 +376,9 @@ class _Bound(nn.Module):
         self.estimator = estimator
 
     def forward(
-        self, batch: Batch, program: Mapping[str, Any], measure: Callable[[Terms], None] | None
+        self, batch: Callable[[], Batch], program: Mapping[str, Any], measure: Callable[[Terms], None] | None
     ) -> dict[str, Any]:
-        terms = self.estimator.terms(self.model, batch, **program)
+        terms = self.estimator.terms(self.model, batch(), **program)
         # here, as from what leaves the module fabric alone may take gradients
         if measure is not None and torch.is_grad_enabled():
             with torch.autocast(terms.frames.device.type, enabled=False):

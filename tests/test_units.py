@@ -217,3 +217,17 @@ def test_a_method_with_units_is_fitted_to_arrays_far_from_zero():
         torch.manual_seed(2)
         futures.append(model.forecast(mean + x[:, :4], 3)["x"] - mean)
     torch.testing.assert_close(*futures, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_training_reads_a_large_mean_in_float64(precision):
+    torch.manual_seed(0)
+    x, losses = torch.randn(6, 5, 3, dtype=torch.float64), []
+    for mean in (0.0, 1e9):
+        torch.manual_seed(0)
+        model = dvae.DynamicalVAE(*PAIR, SIZES, Attention(8, heads=2))
+        model.standardise("x").fit(mean + x)
+        torch.manual_seed(0)
+        dvae.fit(model, mean + x, steps=2, progress=False, precision=precision)
+        losses.append(seeded(lambda m=model, d=mean + x: dvae.SequenceELBO().terms(m, d).bound))
+    torch.testing.assert_close(*losses, rtol=1e-4, atol=1e-2)
