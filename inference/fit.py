@@ -341,9 +341,10 @@ def _train(
         if due and held_out is not None:
             report(svi.validate(held_out))
             if observed is not None and state.last_value is None and "validation/loss" not in state.row:
-                fed = bool(svi.final_feeding) and isinstance(svi.model.feeding, SelfFeeding)
+                model: Any = svi.model
+                fed = bool(svi.final_feeding) and isinstance(model.feeding, SelfFeeding)
                 state.last_value = last_value_bound(
-                    svi.model, source, held_out, observed, fed=fed, batch_size=training.batch_size
+                    model, source, held_out, observed, fed=fed, batch_size=training.batch_size
                 )
             call("on_validation")
             stopped = asked_to_stop()
