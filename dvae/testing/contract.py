@@ -297,7 +297,7 @@ class FactorizationContract:
         context = {name: value for name, value in self._data(model, count).items() if name in model.context}
         drawn, _ = _run(model.model, context, length=self.steps, size=count)
         scored = {**context, **{name: drawn[name] for name in model.observed}}
-        annealing = {"temperatures": 2, "chains": 2, "leaps": 1}
+        annealing: dict[str, Any] = {"temperatures": 2, "chains": 2, "leaps": 1}
         below = annealed_bound(model, scored, **annealing).bound
         latents = {name: drawn[name] for name in model.latents}
         gap = annealed_bound(model, scored, latents=latents, **annealing).bound - below
