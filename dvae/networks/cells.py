@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from typing_extensions import override
 
 
@@ -41,14 +41,15 @@ class LSTM(_Differentiable, nn.LSTM):
     """`torch.nn.LSTM`, without dropout; in float32 where the processor has no LSTM in autocast's precision."""
 
     @override
-    def forward(self, entries: Tensor, states: tuple[Tensor, Tensor] | None = None) -> Any:
-        on_cpu = entries.device.type == "cpu" and torch.is_autocast_enabled("cpu")
+    def forward(self, *args: Any) -> Any:
+        weight = next(self.parameters())
+        on_cpu = weight.device.type == "cpu" and torch.is_autocast_enabled("cpu")
         if not on_cpu or _runs_lstm(torch.get_autocast_dtype("cpu"), torch.is_grad_enabled()):
-            return super().forward(entries, states)
-        precision = self.weight_hh_l0.dtype
+            return super().forward(*args)
+        entries, states = (*args, None)[:2]
         with torch.autocast("cpu", enabled=False):
-            states = None if states is None else (states[0].to(precision), states[1].to(precision))
-            return super().forward(entries.to(precision), states)
+            states = states and tuple(state.to(weight.dtype) for state in states)
+            return super().forward(entries.to(weight.dtype), states)
 
 
 class RNN(_Differentiable, nn.RNN):
