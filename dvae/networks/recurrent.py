@@ -214,7 +214,7 @@ def gru_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple[
     recurrent = functional.linear(h, layer.weight_hh_l0, layer.bias_hh_l0)
     reset, update = torch.sigmoid(gates[:, : 2 * width] + recurrent[:, : 2 * width]).chunk(2, 1)
     candidate = torch.tanh(torch.addcmul(gates[:, 2 * width :], reset, recurrent[:, 2 * width :]))
-    new = torch.lerp(candidate, h, update)
+    new = torch.lerp(candidate.to(h.dtype), h, update.to(h.dtype))  # autocast computes gates in half precision
     return new, new
 
 

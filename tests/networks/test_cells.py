@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+import dvae
 from dvae.networks import cells
 
 KINDS = [(cells.GRU, nn.GRU), (cells.LSTM, nn.LSTM), (cells.RNN, nn.RNN)]
@@ -60,6 +61,19 @@ def test_recurrent_networks_run_under_autocast_on_any_processor(precision, grad)
     for kind, _ in KINDS:
         with torch.autocast("cpu", precision), torch.set_grad_enabled(grad):
             assert kind(2, 3)(torch.randn(4, 1, 2))[0].isfinite().all()
+
+
+@pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("cell", ["gru", "lstm"])
+def test_a_loop_that_reads_its_own_output_runs_under_autocast(cell, precision):
+    model = dvae.DynamicalVAE(
+        "p(z_t | z_{t-1}) p(x_t | x_{<t}, z_t)",
+        "q(z_t | z_{t-1}, x_{1:T})",
+        {"z": 2, "x": 1},
+        network=dvae.networks.Recurrent(4, cell=cell),
+    )
+    with torch.autocast("cpu", precision):
+        assert model.forecast(torch.zeros(2, 3, 1), 2, samples=1)["x"].isfinite().all()
 
 
 @pytest.mark.parametrize(("kind", "base"), KINDS)
