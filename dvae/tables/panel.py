@@ -406,6 +406,7 @@ def _ordered(when: np.ndarray, rows: np.ndarray, who: str, calendar: Calendar, c
     if calendar.kind == "durations":
         advice += ", or write the date before clocks that begin again at midnight"
     if (twice := np.diff(when[found]) == 0).any():
+        advice += ", or remove the row that is there twice"
         first, second = found[np.argmax(twice) :][:2]
         raise ValueError(f"{who} has two rows at {column} {calendar.text(when[first])}, {first} and {second}; {advice}")
     run = np.concatenate([[0], np.cumsum(np.diff(when[rows]) < 0)])  # number of the increasing run that a row is in

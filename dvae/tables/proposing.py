@@ -92,6 +92,8 @@ class Told:
             ValueError: columns that the frame does not have, unknown families, or cells that are unclear.
         """
         levels, frame = [name for name, _ in index_levels(frame)], tabular(frame)
+        if not len(frame):
+            raise ValueError("the table has no rows")
         known = list(frame.columns)
         roles: dict[str, tuple[Role, str]] = {}
         said: dict[Role, tuple[str, ...]]
@@ -138,6 +140,13 @@ class Told:
         for column in numbers:
             if own_marks := found.numbers[column.name].marks:
                 warnings.warn(f"column {column.name!r} {said_of_marks(own_marks)}", stacklevel=3)
+        for name in (column.name for column in numbers if column.role == "target" and column.name in roles):
+            if found.is_constant(name):
+                warnings.warn(
+                    f"column {name!r} is constant, {_first(frame[name])}, and a target as it is named; there is "
+                    "nothing to forecast, and scores over all columns count it",
+                    stacklevel=3,
+                )
         found.warn(schema, all_named=not self.columns)
         return schema
 
@@ -164,7 +173,7 @@ def proposed(frame: Any) -> Columns:
     name of an id, are ids where they leave no two rows at one time. Columns that are constant within each of several
     sequences are static. All other columns are targets: whole numbers from 0 are counts, two values a binary, few texts
     a category, numbers above 0 that vary by more than half their mean positive. A warning names the other columns,
-    which are left out.
+    such as constant ones, which are left out.
 
     Args:
         frame: table.
@@ -435,7 +444,7 @@ class _Proposal:
         if read.ambiguous:
             read.check(self.frame[name], "")
         numbers = read.values[~np.isnan(read.values)]
-        if not len(numbers):
+        if not len(numbers) or self.is_constant(name):
             return None
         if set(np.unique(numbers)) == {0.0, 1.0}:
             return Column(name, family="binary")
@@ -448,26 +457,40 @@ class _Proposal:
             return Column(name, family="positive")
         return Column(name)
 
+    def is_constant(self, name: str) -> bool:
+        """Whether all values of a column that are not missing are one number or text, at several rows."""
+        read, known = self.numbers[name], self.frame[name].dropna()
+        values = known if read.wrong.any() or self._holds_codes(name) else read.values[~np.isnan(read.values)]
+        return len(values) > 1 and len(set(values)) == 1
+
+    def reason(self, name: str) -> str:
+        """Return why a column is not proposed."""
+        read, values = self.numbers[name], self.frame[name].dropna()
+        if name in self.undecided:
+            return f"perhaps the time: {self.undecided[name]}"
+        if self._numbers_rows(name):
+            return "the numbers of the rows, without a name" if name == "Unnamed: 0" else "the numbers of the rows"
+        if name in self.levels:
+            return "a level of the index that tells no sequences apart"
+        if not read.wrong.any() and np.isnan(read.values).all():
+            return "empty: all its values are missing"
+        if self.is_constant(name):
+            return f"constant: {_first(values)}"
+        odd = self.frame[name][read.wrong] if read.wrong.any() else values
+        return f"neither numbers nor 2 to {CLASSES} classes, such as {_first(odd)}"
+
     def warn(self, columns: Columns, all_named: bool) -> None:
         """Name what of the frame is not among the columns."""
         lacking = () if columns.time else self.undecided
         aside = [name for name in self.frame if name not in columns.needed and (all_named or name in lacking)]
-        said = []
-        for name in aside:
-            values, read = self.frame[name].dropna(), self.numbers[name]
-            why = f"neither numbers nor 2 to {CLASSES} classes"
-            if len(values):
-                odd = self.frame[name][read.wrong] if read.wrong.any() else values
-                why += f", such as {brief(str(odd.iloc[0]))}"
-            if name in self.undecided:
-                why = f"perhaps the time: {self.undecided[name]}"
-            elif self._numbers_rows(name):
-                why = "the numbers of the rows, without a name" if name == "Unnamed: 0" else "the numbers of the rows"
-            elif name in self.levels:
-                why = "a level of the index that tells no sequences apart"
-            said.append(f"{name!r} ({why})")
+        said = [f"{name!r} ({self.reason(name)})" for name in aside]
         if said:
             warnings.warn(f"left out of what is proposed: {', '.join(said)}", stacklevel=4)
+
+
+def _first(values: Any) -> str:
+    """Return the first value of a column that is not missing, short."""
+    return brief(str(values.dropna().iloc[0]))
 
 
 def _static(column: Column) -> Column:
@@ -487,7 +510,7 @@ def is_date(values: Any) -> bool:
     """
     import pandas as pd
 
-    if pd.api.types.is_datetime64_any_dtype(values):
+    if pd.api.types.is_datetime64_any_dtype(values) or isinstance(values.dtype, pd.PeriodDtype):
         return True
     known = values.dropna()
     if is_number(values) or not len(known):

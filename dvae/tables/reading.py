@@ -24,7 +24,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, fields
 from functools import partial
-from io import BytesIO, StringIO
+from io import BytesIO, StringIO, TextIOWrapper
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,6 @@ SEPARATORS = {".csv": ",;\t", ".tsv": "\t"}
 DECIMAL_COMMA = re.compile(r"(?:^|[;\t])\s*[-+]?\d+,\d+\s*(?:[;\t]|$)", re.MULTILINE)
 DECLARED = re.compile(rb'"?sep=([,;:|\t ])"?\r?\n', re.IGNORECASE)
 """A first line that names the separator."""
-ABOVE = "; if lines above the header describe the data, begin them with #"
 BLANK = re.compile(rb"\n[ \t]*\r?\n|\r\r(?!\n)")
 SUFFIXES = (*SEPARATORS, ".parquet", ".npz")
 LARGEST = 2 * 10**9
@@ -86,7 +85,7 @@ def _separated(content: bytes, separators: str) -> Any:
 
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         content = content.decode("utf-16").encode()
-    content = content.removeprefix(codecs.BOM_UTF8)
+    whole = content = content.removeprefix(codecs.BOM_UTF8)
     if declared := DECLARED.match(content):  # as spreadsheets write it
         separators, content = declared[1].decode(), content[declared.end() :]
     head = content[:LARGEST_HEADER].decode("utf-8", "replace")
@@ -100,10 +99,8 @@ def _separated(content: bytes, separators: str) -> Any:
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
             frame = read(BytesIO(content), skiprows=_comments(content))
-        except pd.errors.ParserWarning as error:
-            raise ValueError(f"some of its rows have more entries than its header{ABOVE}") from error
-        except pd.errors.ParserError as error:
-            raise ValueError(f"{str(error).strip()}{ABOVE}") from error
+        except (pd.errors.ParserWarning, pd.errors.ParserError) as error:
+            raise ValueError(_longer_row(whole, separator) or str(error).strip()) from error
         except UnicodeDecodeError as error:
             try:
                 content.decode()
@@ -116,7 +113,48 @@ def _separated(content: bytes, separators: str) -> Any:
             raise
     if separator != "," and DECIMAL_COMMA.search(head):
         frame.attrs["decimal"] = ","
+    if len(frame) and frame.iloc[:, -1].isna().any():
+        _warn_of_shorter_rows(whole, separator)
     return _without_empty_end(frame, content)
+
+
+def _cells(content: bytes, separator: str) -> Iterator[tuple[int, int]]:
+    """Yield the number of the last line of each row, and how many cells it has, from the header on."""
+    lines = TextIOWrapper(BytesIO(content), "utf-8", "replace", newline="")
+    declared = DECLARED.match(content)
+    first = bool(declared) + _comments(content[declared.end() if declared else 0 :])
+    rows = csv.reader(islice(lines, first, None), delimiter=separator)
+    with suppress(csv.Error):  # of a cell that is too long
+        yield from ((first + rows.line_num, len(row)) for row in rows if len(row) > 1 or "".join(row).strip())
+
+
+def _longer_row(content: bytes, separator: str) -> str:
+    """Return an error that names the first row with more cells than the header; "" where there is none."""
+    rows = _cells(content, separator)
+    first, width = next(rows, (0, 0))
+    return next(
+        (
+            f"line {line} has {size} cells and the header in line {first} has {width}; correct the line, quote a cell "
+            f"that holds {separator!r}, or, if lines above the header describe the data, begin them with #"
+            for line, size in rows
+            if size > width
+        ),
+        "",
+    )
+
+
+def _warn_of_shorter_rows(content: bytes, separator: str) -> None:
+    """Warn of rows with fewer cells than the header."""
+    rows = _cells(content, separator)
+    _, width = next(rows, (0, 0))
+    short = [(line, size) for line, size in rows if size < width]
+    if short:
+        line, size = short[0]
+        warnings.warn(
+            f"rows with fewer cells than the header: {len(short)}, the first in line {line}, {size} of {width}; their "
+            "last cells are read as missing",
+            stacklevel=5,
+        )
 
 
 def _without_empty_end(frame: Any, content: bytes) -> Any:

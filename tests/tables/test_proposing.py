@@ -31,15 +31,19 @@ def test_families_are_those_that_the_values_have():
             "narrow": 100 + rng.normal(size=200),
             "text": [f"text {n}" for n in range(200)],
             "one": ["same"] * 200,
+            "level": [3.5, None] * 100,
             "empty": [None] * 200,
+            "nan": np.nan,
         }
     )
     with pytest.warns(UserWarning, match="left out of what is proposed") as said:
         found = {name: family for name, (_, family) in families(frame).items()}
     (left_out,) = said
-    for name in ("text", "one", "empty"):
-        assert f"'{name}' (neither numbers nor 2 to 20 classes" in str(left_out.message)
-    assert "such as 'text 0'" in str(left_out.message)
+    assert str(left_out.message).endswith(
+        "'text' (neither numbers nor 2 to 20 classes, such as 'text 0'), 'one' (constant: 'same'), "
+        "'level' (constant: '3.5'), 'empty' (empty: all its values are missing), "
+        "'nan' (empty: all its values are missing)"
+    )
     assert found == {
         "real": "real",
         "few": "count",
@@ -123,6 +127,20 @@ def test_dates_whose_day_and_month_cannot_be_told_apart_are_said_to_be(format, f
     with pytest.raises(ValueError, match=r"dates such as '01.01.(20)?24'"):
         Panel.wide(frame.pivot(index="date", columns="shop", values="sold"))
     Told(columns=("sold",), past=("date:category",), id=("shop",)).of(frame)  # what is named is not left out
+
+
+def test_a_constant_column_is_a_target_only_where_it_is_named():
+    frame = pd.DataFrame({"y": [1.5, 2.5, -1.0], "rate": [3.5, 3.5, 3.5]})
+    with pytest.warns(UserWarning, match=r"left out of what is proposed: 'rate' \(constant: '3.5'\)"):
+        assert proposed(frame).names == ["y"]
+    with pytest.warns(UserWarning, match="column 'rate' is constant, '3.5', and a target as it is named"):
+        assert Told(columns=("y", "rate")).of(frame).names == ["y", "rate"]
+
+
+@pytest.mark.parametrize("freq", ["W", "2W", "Q", "D"])
+def test_periods_are_the_time(freq):
+    frame = pd.DataFrame({"y": [1.5, 2.5, -1.0]}, pd.period_range("2000-01-03", periods=3, freq=freq))
+    assert Panel.of(frame).calendar.kind == "dates"
 
 
 def test_the_numbers_of_rows_that_pandas_writes_are_left_out():
@@ -397,7 +415,7 @@ LAYOUTS = {
     ),
     "a description": (
         "Station: a\n\nday,y\n2024-01-01,1\n",
-        "more entries than its header; if lines above the header describe the data, begin them with #",
+        "line 3 has 2 cells and the header in line 1 has 1; .*if lines above the header describe the data, begin",
     ),
     "halves of days": ("day,half,y\n2024-01-01,AM,1\n2024-01-01,PM,2\n2024-01-02,AM,3\n", "two rows at day"),
     "constants": (

@@ -121,6 +121,19 @@ def forged(shape, dtype="'<f8'", data=bytes(48)):
     return content.getvalue()
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a,b,c\n1,2,3\n4,5\n6,,\n7\n", "header: 2, the first in line 3, 2 of 3"),
+        ('sep=;\n# of a\na;b\n\n1;2\n"3\n"\n', "header: 1, the first in line 7, 1 of 2"),
+    ],
+)
+def test_rows_that_are_shorter_than_the_header_are_named(tmp_path, text, said):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.warns(UserWarning, match=said):
+        assert read_frame(tmp_path / "a.csv").iloc[-1].isna().any()
+
+
 WIDE = ",".join(map(str, range(10**6)))
 
 
@@ -131,13 +144,13 @@ HOSTILE = {
     "latin": ("a.csv", b"a,b\n1,2\n1,\xe9\n", "line 3 is no UTF-8, but perhaps Latin-1; save it as UTF-8"),
     "half of UTF-16": ("a.csv", b"\xff\xfea\0,\0b", "truncated data"),
     "no text behind a mark": ("a.csv", b"\xff\xfe" + bytes(10), "bytes of 0"),
-    "long row": ("a.csv", "a,b\n1,2\n1,2,3\n", "Expected 2 fields in line 3, saw 3"),
-    "shifted": ("a.csv", "a,b\n1,2,3\n4,5,6\n", "rows have more entries than its header"),
+    "long row": ("a.csv", "a,b\n1,2\n1,2,3\n", "line 3 has 3 cells and the header in line 1 has 2; correct"),
+    "shifted": ("a.csv", "a,b\n1,2,3\n4,5,6\n", "line 2 has 3 cells and the header in line 1 has 2"),
     "quote": ("a.csv", 'a,"b\n1,2\n', "EOF inside string"),
     "wide": ("a.csv", WIDE, f"more than {MOST} columns"),
     "wide behind blanks": ("a.csv", "  \n\t\n" + WIDE, f"more than {MOST} columns"),
     "wide row": ("a.csv", "a,b\n" + WIDE, f"more than {MOST} columns"),
-    "wide row at the end": ("a.csv", "a,b\n" + "1,2\n" * 300_000 + WIDE, "Expected 2 fields"),
+    "wide row at the end": ("a.csv", "a,b\n" + "1,2\n" * 300_000 + WIDE, "line 300002 has 1000000 cells"),
     "one field": ("a.csv", "a,b\n1," + "x" * 10**7, "field larger"),
     "no zip": ("a.npz", b"abc", "not a zip file"),
     "no array": ("a.npz", npz(), "holds nothing"),
