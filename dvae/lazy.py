@@ -8,6 +8,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+from .turns import no_fork
+
 
 def importing(package: str, places: Mapping[str, str] | None = None) -> Callable[[str], Any]:
     """The `__getattr__` of a package: its modules by name, and what is shown of them.
@@ -18,12 +20,13 @@ def importing(package: str, places: Mapping[str, str] | None = None) -> Callable
     """
 
     def find(name: str) -> Any:
-        if places and name in places:
-            found = getattr(import_module(f"{package}.{places[name]}"), name)
-        elif name.startswith("_") or find_spec(f"{package}.{name}") is None:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        else:
-            found = import_module(f"{package}.{name}")
+        with no_fork:
+            if places and name in places:
+                found = getattr(import_module(f"{package}.{places[name]}"), name)
+            elif name.startswith("_") or find_spec(f"{package}.{name}") is None:
+                raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            else:
+                found = import_module(f"{package}.{name}")
         setattr(sys.modules[package], name, found)
         return found
 

@@ -8,6 +8,7 @@ thread holds the lock, the child starts with a free lock and without that thread
 
 from __future__ import annotations
 
+import logging  # noqa: F401  its fork hook, registered first, takes its lock after `no_fork`: imports make loggers
 import os
 import re
 import threading
@@ -43,5 +44,8 @@ class _Alone(ContextDecorator):
 
 
 alone = _Alone()
+no_fork = threading.RLock()
+"""A lock held during imports: a child that is forked during one would wait for the lock of the module for ever."""
 if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(before=no_fork.acquire, after_in_parent=no_fork.release, after_in_child=no_fork.release)
     os.register_at_fork(after_in_child=alone._leave_to_the_parent)

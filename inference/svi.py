@@ -22,7 +22,7 @@ from ..data import Batch, InBatches, each, in_batches, refuse_table, tensor_of
 from ..options import kind_of
 from ..program.model import DynamicalVAE
 from ..program.protocols import Program
-from ..turns import alone
+from ..turns import alone, no_fork
 from . import processes
 from .bounds import SequenceELBO, Terms
 from .checkpoints import weights
@@ -147,7 +147,9 @@ class SVI:
     def init(self) -> State:
         """Begin at step 0, with a new optimiser and the random numbers of the seed; the weights stay as they are."""
         training = self.training
-        self.fabric: Fabric = processes.launched(training)
+        with no_fork:  # lightning-fabric, and by the first optimiser parts of torch
+            self.fabric: Fabric = processes.launched(training)
+            torch.optim.SGD([torch.zeros(1)])
         if training.compile:
             require_compiler(self.fabric.device)
         with _forked(self.fabric.device):

@@ -108,7 +108,7 @@ class MotionInfilling(TrajectoryMethod):
     @override
     def laws(self) -> Mapping[str, LawSpec]:
         """x has Laplace's law, minus whose log-density is the absolute error."""
-        return {"p(x)": Family("Laplace", {"scale": 1.0}, project=False)}
+        return {"p(x)": Family("Laplace", {"scale": 1.0}, project=False, error_weight=True)}
 
     @override
     def kind(self) -> type[TrajectoryModel]:

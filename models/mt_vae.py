@@ -100,7 +100,8 @@ class MTVAE(FutureMethod):
 
     @override
     def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
-        return {**super().described(sizes), "laws": {"p(x)": Family("Laplace", {"scale": self.scale(sizes[WHOLE])})}}
+        emission = Family("Laplace", {"scale": self.scale(sizes[WHOLE])}, error_weight=True)
+        return {**super().described(sizes), "laws": {"p(x)": emission}}
 
     def scale(self, size: int) -> float:
         """Metres, of the Laplace law of poses of so many coordinates."""

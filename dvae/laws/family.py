@@ -160,6 +160,7 @@ class Family:
         residual: see `Law`; of a distribution with a location.
         project: a linear layer from features to the parameters; False takes the features themselves, in their order,
             the location first.
+        error_weight: see `Law`.
 
     Example:
         >>> pair, sizes = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"), {"z": 2, "x": 3}
@@ -175,6 +176,7 @@ class Family:
     min_scale: float = 1e-3
     residual: float = False
     project: bool = True
+    error_weight: bool = False
 
     @property
     def kind(self) -> type[Distribution]:
@@ -201,6 +203,7 @@ class FamilyLaw(Law):
 
     def __init__(self, spec: Family, shape: Shape):
         super().__init__(spec.residual)
+        self.error_weight = spec.error_weight
         self.kind: Any = VonMises if spec.kind is dist.VonMises else spec.kind
         self.given: dict[str, Any] = dict(spec.given)
         self.floors = {"scale": spec.min_scale, "cov_diag": spec.min_scale**2}

@@ -351,7 +351,7 @@ def test_a_loaded_run_forecasts_as_the_fitted_model_does(people, tmp_path):
         torch.manual_seed(3)
         draws.append(model.forecast({"x": x}, 5, 2)["x"])
     assert torch.equal(*draws)
-    assert loaded.method == dvae.method("vrnn", latent=3, width=8, warm_up=4)
+    assert loaded.method == dvae.method("vrnn", latent=3, width=8, warm_up=4).suited(data)
     assert loaded.data.protocol == data.protocol
 
 

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from typing import Any
@@ -283,6 +285,35 @@ def test_a_process_that_is_forked_amid_the_program_of_another_thread_runs_its_ow
     ended.set()
     thread.join()
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+FORK_DURING_A_FIT = """
+import os, signal, sys, threading, time
+import dvae, torch
+
+def fit(steps):
+    sizes, network = {"z": 1, "x": 1}, dvae.networks.Recurrent(4)
+    model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", sizes, network)
+    dvae.fit(model, torch.randn(8, 5, 1), steps=steps, progress=False)
+
+thread = threading.Thread(target=fit, args=(10,))
+thread.start()
+while "lightning_fabric" not in sys.modules:  # whose import takes a second
+    time.sleep(0.01)
+child = os.fork()
+if not child:
+    signal.alarm(60)  # ends it if it waits for a lock
+    fit(1)
+    os._exit(0)
+thread.join()
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system does not fork")
+def test_a_process_that_is_forked_amid_the_first_fit_of_another_thread_fits():
+    subprocess.run([sys.executable, "-W", "ignore", "-c", FORK_DURING_A_FIT], check=True, timeout=120)
 
 
 # ---------------------------------------------------------------------------------------------------------- engines
