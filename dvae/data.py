@@ -438,12 +438,14 @@ def unmasked(values: Any) -> tuple[Any, np.ndarray | None]:
 
 
 def check_real(values: Any, name: str = "an array") -> None:
-    """Refuse complex numbers and records, which no model reads.
+    """Refuse complex numbers, records and sparse tensors, which no model reads.
 
     Raises:
-        TypeError: an array or tensor of complex numbers or with fields.
+        TypeError: an array or tensor of complex numbers or with fields, or a sparse tensor.
     """
     dtype = getattr(values, "dtype", None)
+    if isinstance(values, Tensor) and values.layout is not torch.strided:
+        raise TypeError(f"{name} is a tensor of layout {values.layout}; expected a dense one: give x.to_dense()")
     if getattr(dtype, "is_complex", False) or getattr(dtype, "kind", "") == "c":
         raise TypeError(f"{name} is {dtype}; expected real numbers: stack the real and the imaginary part as columns")
     if fields := getattr(dtype, "names", None):
@@ -457,7 +459,7 @@ def tensor_of(values: Any) -> Tensor:
     """Return a tensor on an array's own memory, or on the mapped file, to which nobody may write then.
 
     Raises:
-        TypeError: complex numbers, records, or an array of which some entries are masked.
+        TypeError: complex numbers, records, a sparse tensor, or an array of which some entries are masked.
         ValueError: a tensor on the meta device.
     """
     check_real(values)

@@ -15,6 +15,7 @@ made as a multiple of their mean: of the powers of a spectrum as they are, a net
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
@@ -32,6 +33,26 @@ RESOLVED = 6e-6
 SMALLEST = 1e-18
 """Least standard deviation: the inverse of its square is a float32."""
 TOO_SMALL = f"models compute in float32, which needs at least {SMALLEST:g}; multiply the values by a constant"
+
+
+LEVELS = "subtract from each sequence its own mean, or fit in float64"
+"""What to do if sequences have levels so far apart that float32 resolves nothing around one mean."""
+
+
+def is_lost(known: ColumnSummary, center: Any) -> np.ndarray:
+    """Whether columns vary, but by less than float32 resolves at their distance from a center."""
+    spread = np.sqrt(known.variance)
+    return (spread > ROUNDING * abs(known.mean)) & (spread < RESOLVED * abs(known.mean - center))  # type: ignore[no-any-return]
+
+
+def lost_sequences(values: Tensor | np.ndarray, center: Any) -> np.ndarray:
+    """(N, D), see `is_lost`, of the coordinates of sequences (N, T, D), which are read in blocks."""
+    found = []
+    for block in blocks(values):
+        count, _, size = block.shape
+        columns = block.swapaxes(0, 1).reshape(-1, count * size)
+        found.append(is_lost(ColumnSummary.of([columns]), np.tile(center, count)).reshape(count, size))
+    return np.concatenate(found)
 
 
 def exceeds_float32(dtype: torch.dtype | np.dtype) -> bool:
@@ -92,6 +113,8 @@ class Units(nn.Module):
     def fit(self, values: Tensor | np.ndarray) -> None:
         """Takes mean and root mean variance of values (..., D), in memory or mapped, which are read in blocks.
 
+        Warns if float32 does not resolve how sequences (N, T, D) vary after their common mean is subtracted.
+
         Raises:
             ValueError: values that do not vary, or are of another size; coordinates that have their units.
         """
@@ -111,6 +134,15 @@ class Units(nn.Module):
         mean = torch.from_numpy(known.mean).to(self.mean.device)
         self.mean = mean if self.exact and exceeds_float32(values.dtype) else mean.to(self.scale.dtype)
         self.scale.fill_(scale)
+        if values.ndim == 3 and exceeds_float32(values.dtype) and self.scale.dtype is torch.float32:
+            lost = lost_sequences(values, known.mean)
+            if lost.any():
+                warnings.warn(
+                    f"in {lost.any(1).sum()} of {len(lost)} sequences, such as {lost.any(1).argmax()}, coordinate "
+                    f"{lost.any(0).argmax()} varies by less than float32 resolves at its distance from the mean of "
+                    f"all sequences, {known.mean[lost.any(0).argmax()]:.9g}; {LEVELS}",
+                    stacklevel=3,  # `no_grad` is between
+                )
 
     @property
     def wide(self) -> bool:

@@ -17,6 +17,8 @@ import torch
 from torch import nn
 
 from ..data import Fingerprinted, InBatches, Source, as_source, in_batches, is_divided, take_split
+from ..program.batch import check_scale
+from ..program.conditional import like
 from ..program.model import DynamicalVAE
 from ..program.rollout import SelfFeeding
 from ..turns import alone
@@ -60,8 +62,8 @@ class Fit:
         history: the rows of the log, in nats per frame (see `trackers`).
         step: the last step.
         best_step: the step of the best unweighted validation bound; None without validation data.
-        best_bound: that bound, in nats per frame; of the self-fed program in a run with self-feeding. A model without a
-            likelihood has no bound: minus its objective stands here.
+        best_bound: that bound, in nats per frame; of the self-fed program in a run with scheduled sampling. For a model
+            without a likelihood, minus its objective.
         status: "finished", "stopped early" or "interrupted".
         run: the run directory, if there is one.
         per: what bounds are per: a frame, unless the model has another word in `per`.
@@ -96,13 +98,17 @@ class Fit:
             return ""
         if any("validation/loss" in row for row in self.history):
             return f"lowest validation loss {-self.best_bound:.4f} at step {self.best_step}"
-        found = f"best bound {self.best_bound:.3f} nats a {self.per} at step {self.best_step}"
+        self_fed = any("validation/self_fed/bound" in row for row in self.history)
+        name = "best bound with scheduled sampling" if self_fed else "best bound"
+        found = f"{name} {self.best_bound:.3f} nats a {self.per} at step {self.best_step}"
         if self.last_value is None or self.best_bound >= self.last_value:
             return found
-        return (
-            f"{found}, worse than repeating the last value ({self.last_value:.3f}): train for more steps, or try "
-            "residual=1, which keeps the last value, or self_feeding=1, which trains on the model's own output"
-        )
+        advice = ["train for more steps"]
+        if self.model is None or not any(getattr(module, "residual", False) for module in self.model.modules()):
+            advice.append("try residual=1, which adds the output to the last value")
+        if not self_fed:
+            advice.append("try self_feeding=1, which trains on the model's own output")
+        return f"{found}, worse than repeating the last value ({self.last_value:.3f}): {', or '.join(advice)}"
 
     def series(self, name: str) -> tuple[list[int], list[float]]:
         """Return the steps and values of one number of the log, such as "kl/z" or "validation/bound"."""
@@ -204,6 +210,7 @@ def fit(
         CheckpointError: when `out` holds a run and `resume` is False, or a run that cannot be resumed, such as one
             fitted on training data with another `fingerprint`.
         TypeError: a model or data of another kind, such as a table, whose columns need roles.
+        ValueError: the first batch varies by less than float32 resolves.
         LostProcess: another one of several processes has ended, or does not answer; the last checkpoint stays.
 
     Example:
@@ -331,8 +338,13 @@ def _train(
         return bool(stopped)
 
     begun = time.process_time() - state.processor_seconds
+    unchecked = isinstance(svi.model, DynamicalVAE) and like(svi.model).dtype is not torch.float64
     while state.status == "running":
-        svi.step(source.sample(training.batch_size, svi.generator))
+        batch = source.sample(training.batch_size, svi.generator)
+        if unchecked:  # once, as it waits for the device
+            check_scale(batch, {WHOLE, *svi.model.observed})
+            unchecked = False
+        svi.step(batch)
         if state.step % training.log_every == 0 or state.step == training.steps:
             report(svi.row())
         call("on_step")

@@ -1,11 +1,12 @@
-"""The bound of repeating the last value: what a fit is compared with on its validation windows.
+"""Log density of a forecast that repeats the last value: a reference for bounds on validation windows.
 
     x_t ~ N(x_s, v_{t-s}),    s: the last step before t at which the coordinate was observed
 
-v_h is the mean square of x_{t+h} - x_t over training windows, for each coordinate. The bound on the true past reads
-all steps before t, as the model does. The bound of a program that is fed its own means reads no true step before the
-future, so that observed steps have their mean and variance over training windows, and the future has the last observed
-value. A discrete value has the probability of the interval around it, and a class that of staying what it was.
+v_h is the mean square of x_{t+h} - x_t over training windows, for each coordinate. `fit` compares a model that reads the
+true past with this density given all steps before t. A model trained with scheduled sampling reads its own means
+instead. Its reference gives observed steps their mean and variance over training windows, and every future step the
+last observed value. A discrete value has the probability of the interval around it. A class has the probability that
+it does not change.
 """
 
 from __future__ import annotations

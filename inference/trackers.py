@@ -240,6 +240,7 @@ class Terminal:
         terms = ("log_likelihood/", "kl/", "energy/") if likelihood else ("energy/",)
         names = [name for name in self._latest if name.startswith(terms)]
         score = "bound" if likelihood else "loss"
-        names += [name for name in (score, f"validation/{score}") if name in self._latest]
-        said = [n.replace("log_likelihood", "log p").removeprefix("energy/").replace("/", " ") for n in names]
-        return "  ".join(f"{text} {self._latest[name]:.3f}" for text, name in zip(said, names, strict=True))
+        names += [n for n in (score, f"validation/{score}", f"validation/self_fed/{score}") if n in self._latest]
+        labels = [name.replace(f"self_fed/{score}", f"{score} with scheduled sampling") for name in names]
+        labels = [n.replace("log_likelihood", "log p").removeprefix("energy/").replace("/", " ") for n in labels]
+        return "  ".join(f"{label} {self._latest[name]:.3f}" for label, name in zip(labels, names, strict=True))

@@ -86,6 +86,7 @@ ENTRIES = {
     "checks": lambda model, data: dvae.predictive_checks(model, data, **QUIET),
     "conformal": lambda model, data: dvae.conformal(model, data, level=0.5, samples=3, **QUIET),
     "forecast": lambda model, data: model.forecast(data, 2),
+    "impute": lambda model, data: model.impute(data),
     "bound": dvae.importance_bound,
 }
 
@@ -144,6 +145,22 @@ def test_tensors_without_values_are_refused(model, name):
     if name not in ("a method's fit", "compare"):
         with pytest.raises(ValueError, match="on the meta device"):
             ENTRIES[name](dvae.DynamicalVAE("p(z) p(x_t | z)", "q(z | x_{1:T})", {"z": 2, "x": 3}).to("meta"), X)
+
+
+@pytest.mark.parametrize("name", ["fit", "validation", "a step", "a method's fit", "compare", "forecast", "bound"])
+def test_sparse_tensors_are_refused(model, name):
+    with pytest.raises(TypeError, match=r"layout torch\.sparse_coo; .* x\.to_dense\(\)"):
+        ENTRIES[name](model, X.to_sparse())
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.uint32, np.uint64])
+def test_unsigned_integers_are_read_as_numbers(model, kind):
+    x = np.arange(24, dtype=kind).reshape(2, 4, 3)
+    read = model.read({"x": x})["x"]
+    assert read.dtype is torch.float32
+    np.testing.assert_array_equal(read, x)
+    for given in (x, torch.from_numpy(x)):
+        dvae.units.Units(3).fit(given)
 
 
 def test_masks_of_arrays_are_masks_of_batches():

@@ -208,6 +208,34 @@ def test_values_too_small_for_float32_are_told_so(scale):
         Units(3).fit(scale * torch.randn(40, 3, dtype=torch.float64))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [1e-20, 1e-40, 1e-46])
+def test_a_fit_without_units_refuses_values_too_small_for_float32(scale, dtype):
+    x = (scale * torch.randn(4, 6, 3, dtype=torch.float64)).to(dtype)
+    model = dvae.DynamicalVAE(*PAIR, SIZES)
+    if not x.any():
+        dvae.fit(model, x, steps=1, progress=False)  # a constant has no scale
+        return
+    padded = torch.cat([x, torch.ones_like(x)], 1)
+    for data in (x, {"x": x + 0, "mask": torch.rand(x.shape) < 0.9}, {"x": padded, "lengths": torch.full((4,), 6)}):
+        with pytest.raises(ValueError, match=r"standard deviation of x is .*e-\d+; .* multiply the values"):
+            dvae.fit(model, data, steps=1, progress=False)
+    dvae.fit(model, torch.full((4, 6, 3), 0.05, dtype=dtype), steps=1, progress=False)
+    dvae.fit(model.double(), x, steps=1, progress=False)
+
+
+def test_levels_of_sequences_that_float32_loses_are_named():
+    x = torch.randn(6, 5, 3, dtype=torch.float64)
+    x[..., 1] += torch.linspace(0, 1e9, 6)[:, None]
+    x[2, ..., 1] = 1e8  # a constant loses nothing
+    units = dvae.DynamicalVAE(*PAIR, SIZES).standardise("x")
+    for values in (x, x.numpy()):
+        with pytest.warns(UserWarning, match=r"in 5 of 6 sequences, such as 0, coordinate 1 .* own mean, or fit in"):
+            units.fit(values)
+    dvae.DynamicalVAE(*PAIR, SIZES).double().standardise("x").fit(x)
+    units.fit(1e9 + x - x.mean(1, keepdim=True))
+
+
 def test_a_method_with_units_is_fitted_to_arrays_far_from_zero():
     torch.manual_seed(0)
     x, futures = torch.randn(8, 7, 2, dtype=torch.float64), []

@@ -33,27 +33,27 @@ def data(
     skip_bad: bool = False,
     missing: Missing = False,
 ) -> None:
-    """Look into motion files and tables, convert motion, or get some.
+    """Inspect motion files and tables, convert motion, or download it.
 
-    info of a table says what its columns probably are, as a schema to correct: --out riders.toml writes it.
-    info says what they hold: splits, clips, skeleton, how units and axes were understood, how rigid bones are, labels.
-    convert writes them anew: --out motion.npz holds all clips; a folder, with --format, gets a file for each.
-    get cmu downloads recordings of the CMU Graphics Lab into the folder --out, and checks them.
+    info describes motion files: splits, clips, skeleton, units, axes, bone lengths and labels.
+    info guesses the columns of a table and prints a schema; --out riders.toml writes it to a file that you can edit.
+    convert writes all clips to one file (--out motion.npz), or one file per clip to a folder (--out and --format).
+    get cmu downloads recordings of the CMU Graphics Lab to the folder --out and verifies them.
 
     Args:
         action: what to do.
-        table: of info: what the columns of tables are.
-        files: motion files, or folders of them: npz, bvh, amc, c3d, csv, exponential maps; or "simulated". Of get: cmu.
-        out: of convert and get: the file or folder to write.
-        format: of convert: what to write; by default as the name of --out ends.
-        fps: of convert: frames per second of what is written.
-        onto: of convert: the skeleton to put the motion onto: walker, human36m, humaneva, or a skeleton.json.
-        jobs: of convert: processes; -1 for one on each core.
-        metres: of the files' unit, instead of what they show.
-        up: the files' axis that is up, instead of what they show.
-        recorded: frames per second of the files, where what they say is wrong.
-        url: of get: where the files lie, instead of their owner's site.
-        skip_bad: leave out clips that cannot be used, and list them, instead of refusing the file.
+        table: for info: columns of the tables.
+        files: motion files or folders (npz, bvh, amc, c3d, csv, exponential maps), or "simulated"; for get: cmu.
+        out: file or folder to write.
+        format: for convert: format to write, by default from the name of --out.
+        fps: for convert: frames per second to write.
+        onto: for convert: target skeleton: walker, human36m, humaneva, or the path of a skeleton.json.
+        jobs: for convert: number of processes; -1 for one per core.
+        metres: metres per unit of the files, instead of the detected value.
+        up: vertical axis of the files, instead of the detected one.
+        recorded: frames per second of the files, if they state a wrong rate.
+        url: for get: address to download from, instead of the original site.
+        skip_bad: leave out and list clips that cannot be used, instead of refusing the file.
     """
     if table != tables.ColumnOptions() and (action != "info" or not all(map(tables.is_table, files))):
         raise UsageError("options of columns are about tables, and of info")

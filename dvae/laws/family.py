@@ -45,7 +45,7 @@ from ..constants import constant
 from ..options import nearest
 from .base import Law, LawSpec, Parameters, Shape
 from .families import FixedNormal, Normal, StudentT
-from .precise import InDouble
+from .precise import Bounded, InDouble
 
 ALTERNATIVES = (("logits", "probs"), ("gate_logits", "gate"), ("scale_tril", "covariance_matrix", "precision_matrix"))
 """Parameters that say the same: the first is read."""
@@ -248,8 +248,12 @@ class FamilyLaw(Law):
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         if not parameters or parameters[0].dtype is torch.float64 or self.kind.__name__ in PLAIN:
-            return self._made(parameters)
-        return InDouble(self._made(parameters), lambda: self._made(tuple(p.double() for p in parameters)))
+            return self._bounded(parameters)
+        return InDouble(self._made(parameters), lambda: self._bounded(tuple(p.double() for p in parameters)))
+
+    def _bounded(self, parameters: Parameters) -> TorchDistribution:
+        made = self._made(parameters)
+        return Bounded(made) if constraints.is_dependent(self.kind.support) else made
 
     def _made(self, parameters: Parameters) -> TorchDistribution:
         shaped = {

@@ -1,7 +1,8 @@
 """Distributions whose values or densities need more than the float32 of the networks.
 
 `Offset` takes the mean off values in float64, of which 1e9 + N(0, 1) leaves nothing in float32. `InDouble` evaluates
-in float64 a density whose terms cancel: that of a Poisson of mean 1e7 is the difference of terms near 1e8.
+in float64 a density whose terms cancel: that of a Poisson of mean 1e7 is the difference of terms near 1e8. `Bounded`
+has no density below the scale of a Pareto, where torch extrapolates.
 """
 
 from __future__ import annotations
@@ -83,6 +84,23 @@ class Offset(_Wrapped):
     def expand(self, batch_shape: Any, _instance: object = None) -> Offset:
         """With another batch shape."""
         return Offset(self.base.expand(batch_shape), self.offset, self.dtype)
+
+
+class Bounded(_Wrapped):
+    """A distribution whose density is 0 outside a support that depends on its parameters; torch's may not be.
+
+    Args:
+        base: the distribution.
+    """
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log density or probability."""
+        inside = self.support.check(value)  # type: ignore[no-untyped-call]
+        return torch.where(inside, self.base.log_prob(value), -torch.inf)
+
+    def expand(self, batch_shape: Any, _instance: object = None) -> Bounded:
+        """With another batch shape."""
+        return Bounded(self.base.expand(batch_shape))
 
 
 class InDouble(_Wrapped):

@@ -15,7 +15,7 @@ from ..data import BESIDE, Batch, mask_of, refuse_table, tensor_of
 from ..laws.product import ProductSupport
 from ..networks.base import again, once, valid_steps
 from ..notation import Factorization
-from ..units import RESOLVED, ROUNDING, exceeds_float32
+from ..units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, exceeds_float32
 from ..views import LOG_DET, WHOLE, View
 from .conditional import Conditional
 from .groups import GROUP, Groups
@@ -282,20 +282,13 @@ def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Ten
     if dtype is not torch.float32 or not exceeds_float32(value.dtype) or value.dim() < 2 or not value.numel():
         return value.to(dtype)
     mask, lengths = mask_of(batch, name), batch.get("lengths")
-    if mask is None and lengths is None:
+    if mask is None and lengths is None and value.dtype not in (torch.uint32, torch.uint64):  # torch has no aminmax
         least, most = value.flatten(0, -2).aminmax(dim=0)  # a quick look: the deviation is at least range / sqrt(2 N)
         bound = RESOLVED * math.sqrt(2 * value.numel() / value.shape[-1])
         if ((most == least) | (most - least > bound * torch.maximum(most.abs(), least.abs()))).all():
             return value.to(dtype)
-    known = value.double()
-    if mask is not None and mask.shape == value.shape:
-        known = torch.where(torch.as_tensor(mask, device=value.device), known, torch.nan)
-    if lengths is not None and value.dim() == 3:
-        valid = valid_steps(torch.as_tensor(lengths, device=value.device), value.shape[1])
-        known = torch.where(valid[..., None], known, torch.nan)
-    rows = known.flatten(0, -2)
-    mean = rows.nanmean(0)
-    spread, size = (rows - mean).square().nanmean(0).sqrt(), mean.abs()
+    mean, spread = _moments(name, value, batch)
+    size = mean.abs()
     wrong = (spread < RESOLVED * size) & (spread > ROUNDING * size)
     if wrong.any():
         place = int(wrong.nonzero()[0])
@@ -305,6 +298,41 @@ def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Ten
             "in float64, or subtract it yourself"
         )
     return value.to(dtype)
+
+
+def _moments(name: str, value: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation (D,) in float64 of the observed entries; NaN without any."""
+    mask, lengths, known = mask_of(batch, name), batch.get("lengths"), value.double()
+    if mask is not None and mask.shape == value.shape:
+        known = torch.where(torch.as_tensor(mask, device=value.device), known, torch.nan)
+    if lengths is not None and value.dim() == 3:
+        valid = valid_steps(torch.as_tensor(lengths, device=value.device), value.shape[1])
+        known = torch.where(valid[..., None], known, torch.nan)
+    rows = known.flatten(0, -2)
+    mean = rows.nanmean(0)
+    return mean, (rows - mean).square().nanmean(0).sqrt()
+
+
+def check_scale(batch: AnyBatch, names: Collection[str]) -> None:
+    """Refuse variables that vary, but by less than models in float32 resolve.
+
+    Args:
+        batch: x as a tensor, or a batch.
+        names: of the variables.
+
+    Raises:
+        ValueError: the greatest standard deviation is below `units.SMALLEST`, and not 0.
+    """
+    refuse_table(batch)
+    given = batch if isinstance(batch, Mapping) else {WHOLE: batch}
+    for name in given.keys() & {*names}:
+        value = tensor_of(given[name])
+        if not value.is_floating_point() or value.dim() < 2 or not value.numel():
+            continue
+        mean, spread = _moments(name, value, given)
+        largest = torch.where(spread > ROUNDING * mean.abs(), spread, 0.0).max().item()
+        if 0 < largest < SMALLEST:
+            raise ValueError(f"the standard deviation of {name} is {largest:g}; {TOO_SMALL}")
 
 
 def _meaning(support: Any) -> str:

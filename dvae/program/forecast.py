@@ -12,6 +12,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from ..data import refuse_table
 from ..networks.base import computing_once
 from ..views import WHOLE
 from .batch import AnyBatch, in_chunks, repeat, rows
@@ -160,6 +161,7 @@ def impute(
     model: Any, batch: AnyBatch, samples: int, chunk: int, draw: bool | None, particles: int
 ) -> dict[str, Tensor]:
     """The data, where they are missing with means given latents from the guide, or draws one after the other."""
+    refuse_table(batch)
     given: Any = batch if isinstance(batch, Mapping) else {}
     masks = given.get("mask", {})
     masks = masks if isinstance(masks, Mapping) else {WHOLE if model.view.parts else model.observed[0]: masks}

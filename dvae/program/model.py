@@ -489,15 +489,18 @@ class DynamicalVAE(nn.Module):
     def impute(
         self, batch: AnyBatch, samples: int = 1, *, draw: bool | None = None, particles: int = 1, chunk: int = CHUNK
     ) -> dict[str, Tensor]:
-        """The data with their missing entries filled in, S times: as observed, or given latents of the guide.
+        """Fill in missing entries S times; observed entries stay as they are.
 
-        The guide reads all that was observed, before and after a gap. Means differ as far as latents do; draws of an
-        entry have the noise of the emission too, and a later entry reads an earlier one that was drawn. Of one
-        particle, what was observed after a gap is told by the guide alone. More of them make up for what it gets wrong:
-        of S K draws of latents and missing entries those are taken that the weights p(z, x observed) / q(z) choose
-        (Mattei and Frellsen, 2019, arXiv 1812.02633), which are draws given all that was observed as K grows. The
-        longer a sequence, the more it takes. Frames that a model starts from and does not make, as the first pose of
-        those along paths, take the places of the first frame that it makes.
+        The guide reads all observed entries, before and after a gap. Means of missing entries differ only as far as the
+        draws of the latents do. Draws also have the noise of the emission, and later entries read the earlier ones.
+
+        With one particle, only the guide uses what was observed after a gap. More particles correct the guide: the
+        method draws S K latents and missing entries, and resamples S of them with the weights
+        p(z, x observed) / q(z) (Mattei and Frellsen, 2019, arXiv 1812.02633). As K grows, these become draws given all
+        observed entries. Longer sequences require more particles.
+
+        Some models do not generate the first frames, such as the first pose of a motion along a path. Missing entries
+        there repeat the first frame that the model generates.
 
         Args:
             batch: with a "mask", see `model`.
@@ -567,11 +570,11 @@ class DynamicalVAE(nn.Module):
     def read(
         self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False
     ) -> dict[str, Any]:
-        """A batch as programs read it: by name, in the model's precision, as the view shows it, missing entries filled.
+        """Return a batch by name, in the model's precision and the view's form, with missing entries filled.
 
-        What was read is read as it is. What sequences share is drawn, where it is not there, at a Pyro site of its own
-        outside the plate: model and guide have it in common, so that it costs nothing in a bound. It is given as it is
-        drawn, (D,), or for each sequence, (B, D).
+        A batch that was read before stays as it is. Variables that sequences share are drawn if the batch does not
+        give them, at a Pyro site outside the plate. Model and guide use the same draw, so it adds nothing to a bound.
+        A shared variable may be given once, (D,), or for each sequence, (B, D).
 
         Args:
             batch: see `model`.

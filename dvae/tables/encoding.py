@@ -13,6 +13,7 @@ class), and its indicator is 0 there; one that ends with the present has its las
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -21,13 +22,13 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from typing_extensions import override
 
-from ..blocks import ColumnSummary, row_blocks
+from ..blocks import ColumnSummary, blocks, row_blocks
 from ..laws.base import LawSpec
 from ..laws.family import FAMILIES
 from ..laws.product import Product
 from ..options import Amount, Positive, Range, tuples
 from ..schema import Schema
-from ..units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate
+from ..units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_lost
 from ..views import Offered, View
 from .calendar import NUMBERS, Calendar
 from .columns import WHOLE_STEPS, Column, Columns
@@ -128,6 +129,8 @@ class PanelSchema(Schema):
                 means[column.name] = mean
             if column.role == "past" or known.count[place] < steps:
                 lacking.append(column.name)
+        named = [(one.name, values) for (one, _), values in zip(parts, training, strict=True)]
+        _warn_of_levels(panel.columns, means, named)
         shares = np.array([means[c.name] for c in panel.columns.targets if c.family == "binary"])
         spread = float(np.sqrt((shares * (1 - shares)).mean())) if len(shares) else 0.0
         scales |= {c.name: spread or 1.0 for c in panel.columns.targets if c.family == "binary"}  # one: some are rare
@@ -313,6 +316,20 @@ def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
     read = ColumnSummary.of(np.log(block.astype(np.float64).clip(floor)) for block in row_blocks(parts))
     spread = float(np.sqrt(read.variance.item()))
     return floor, read.mean.item(), spread if spread > LEAST else 1.0
+
+
+def _warn_of_levels(columns: Columns, means: Mapping[str, float], training: Sequence[tuple[str, np.ndarray]]) -> None:
+    """Warn if float32 does not resolve how a column varies in sequences, after the mean of all is subtracted."""
+    center = np.array([means.get(name, 0.0) for name in columns.names])
+    lost = np.array([is_lost(ColumnSummary.of(blocks(values)), center) for _, values in training])
+    for column, mean, sequences in zip(columns.columns, center, lost.T, strict=True):
+        if sequences.any() and column.family not in ("binary", "category"):
+            warnings.warn(
+                f"column {column.name!r} varies by less than float32 resolves at its distance from {mean:.9g} in "
+                f"{sequences.sum()} of {len(training)} training sequences, such as "
+                f"{training[sequences.argmax()][0]!r}; {LEVELS}",
+                stacklevel=3,
+            )
 
 
 def _encoded(values: np.ndarray, column: Column) -> np.ndarray:

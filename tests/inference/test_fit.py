@@ -779,9 +779,10 @@ def test_away_from_a_terminal_there_are_few_lines_and_on_one_a_bar():
         display.start(0)
         for step in range(1, 1001):
             display.log(step, {"bound": -1.0, "kl/z": 0.25})
-        display.log(1000, {"validation/bound": -2.0})
+        display.log(1000, {"validation/bound": -2.0, "validation/self_fed/bound": -3.0})
         display.close()
-        assert "kl z 0.250  bound -1.000  validation bound -2.000" in screen.getvalue()
+        bounds = "bound -1.000  validation bound -2.000  validation bound with scheduled sampling -3.000"
+        assert f"kl z 0.250  {bounds}" in screen.getvalue()
         assert "1000/1000" in screen.getvalue()
         assert lines in (None, len(screen.getvalue().splitlines()))
 

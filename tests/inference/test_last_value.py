@@ -1,5 +1,8 @@
 """The bound of repeating the last value, by its definition, and what a fit says of it."""
 
+import dataclasses
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +12,12 @@ from dvae.data import ArrayWindows, sequences
 from dvae.inference.last_value import last_value_bound
 
 T, OBSERVED = 6, 3
-LAWS = {"real": dvae.laws.FixedNormal(), "class": dvae.laws.FAMILIES["category"], "count": dvae.laws.FAMILIES["count"]}
+LAWS = {
+    "real": dvae.laws.FixedNormal(),
+    "residual": dvae.laws.FixedNormal(residual=1.0),
+    "class": dvae.laws.FAMILIES["category"],
+    "count": dvae.laws.FAMILIES["count"],
+}
 
 
 def model(law="real", size=2):
@@ -72,4 +80,9 @@ def test_a_fit_that_is_worse_says_so_with_both_numbers():
         assert fit.last_value is not None
         assert ("worse than repeating the last value" in fit.best) == worse == (fit.best_bound < fit.last_value)
         assert (f"({fit.last_value:.3f})" in fit.best) == worse
+        assert ("try residual=1" in fit.best, "try self_feeding=1" in fit.best) == (worse, worse)
+    windows = ArrayWindows(walks, OBSERVED)
+    found = dvae.fit(model("residual", size=1), windows, windows, steps=1, self_feeding=1.0, progress=False)
+    assert "best bound with scheduled sampling" in found.best
+    assert "try " not in dataclasses.replace(found, last_value=math.inf).best  # the run has both options
     assert dvae.fit(model(size=1), walks[:40], walks[40:], steps=1, progress=False).last_value is None

@@ -234,6 +234,23 @@ def test_large_counts_have_the_probability_that_scipy_gives(size):
     np.testing.assert_allclose(found, stats.nbinom(3.0, chance).logpmf(count.double()), rtol=1e-6)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("family", "inside", "outside"),
+    [
+        (Family("Pareto", {"scale": 2.0}), 2.5, 1.5),
+        (Family("Binomial", {"total_count": 12}), 12.0, 13.0),
+    ],
+)
+def test_there_is_no_density_outside_a_support_that_depends_on_parameters(family, inside, outside, dtype):
+    law = family.build(Shape(1, 4)).to(dtype)
+    made = law.distribution(law(torch.zeros(2, 4, dtype=dtype)))
+    density = made.log_prob(torch.tensor([[inside], [outside]], dtype=dtype))
+    assert density.isfinite().tolist() == [[True], [False]]
+    assert density[1] == -torch.inf
+    made.expand((3, 2, 1)).log_prob(torch.full((3, 2, 1), inside, dtype=dtype))
+
+
 def test_without_a_layer_features_are_parameters_and_a_location_comes_first():
     law = Family("Laplace", project=False).build(Shape(3, 6)).double()
     features, value = torch.randn(2, 6, dtype=torch.float64), torch.randn(2, 3, dtype=torch.float64)

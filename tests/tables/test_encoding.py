@@ -107,6 +107,17 @@ def test_targets_that_float32_does_not_resolve_are_refused(family, values, said)
         PanelSchema.under(panel, Cut())
 
 
+@pytest.mark.parametrize(("family", "center", "count"), [("real", "6000000", 3), ("positive", "0", 4)])
+def test_levels_of_sequences_that_float32_loses_are_named(family, center, count):
+    levels = [3e6, 5e6, 6e6, 7e6, 9e6]
+    columns = Columns((Column("x", family=family), Column("y")))
+    values = [np.stack([level + 0.1 * np.arange(9), np.arange(9.0)], 1) for level in levels]
+    values[4][:, 0] = levels[4]  # a constant loses nothing
+    series = [Series(f"s{n}", own, split="train") for n, own in enumerate(values)]
+    with pytest.warns(UserWarning, match=rf"column 'x' varies .* from {center}.* in {count} of 5 .* such as 's0'; sub"):
+        PanelSchema.under(Panel(series, columns), Cut())
+
+
 def test_units_are_those_of_the_training_sequences():
     panel = table()
     schema = PanelSchema.under(panel, CUT)
