@@ -338,11 +338,12 @@ def _train(
         return bool(stopped)
 
     begun = time.process_time() - state.processor_seconds
-    unchecked = isinstance(svi.model, DynamicalVAE) and like(svi.model).dtype is not torch.float64
+    model: Any = svi.model
+    unchecked = isinstance(model, DynamicalVAE) and like(model).dtype is not torch.float64
     while state.status == "running":
         batch = source.sample(training.batch_size, svi.generator)
         if unchecked:  # once, as it waits for the device
-            check_scale(batch, {WHOLE, *svi.model.observed})
+            check_scale(batch, {WHOLE, *model.observed})
             unchecked = False
         svi.step(batch)
         if state.step % training.log_every == 0 or state.step == training.steps:
@@ -353,7 +354,6 @@ def _train(
         if due and held_out is not None:
             report(svi.validate(held_out))
             if observed is not None and state.last_value is None and "validation/loss" not in state.row:
-                model: Any = svi.model
                 fed = bool(svi.final_feeding) and isinstance(model.feeding, SelfFeeding)
                 state.last_value = last_value_bound(
                     model, source, held_out, observed, fed=fed, batch_size=training.batch_size

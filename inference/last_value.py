@@ -2,11 +2,11 @@
 
     x_t ~ N(x_s, v_{t-s}),    s: the last step before t at which the coordinate was observed
 
-v_h is the mean square of x_{t+h} - x_t over training windows, for each coordinate. `fit` compares a model that reads the
-true past with this density given all steps before t. A model trained with scheduled sampling reads its own means
-instead. Its reference gives observed steps their mean and variance over training windows, and every future step the
-last observed value. A discrete value has the probability of the interval around it. A class has the probability that
-it does not change.
+v_h is the mean square of x_{t+h} - x_t over training windows, for each coordinate. The reference of a model that reads
+the true past is this density given all steps before t. A model trained with scheduled sampling reads its own means:
+in its reference, observed steps have their mean and variance over training windows, and x_s is the last observed value
+at all future steps. A discrete value has the probability of the interval around it. A class has the probability that it
+does not change.
 """
 
 from __future__ import annotations
