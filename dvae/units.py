@@ -46,7 +46,7 @@ def is_lost(known: ColumnSummary, center: Any) -> np.ndarray:
 
 
 def lost_sequences(values: Tensor | np.ndarray, center: Any) -> np.ndarray:
-    """(N, D), see `is_lost`, of the coordinates of sequences (N, T, D), which are read in blocks."""
+    """Return `is_lost` (N, D) for the coordinates of each sequence (N, T, D), read in blocks."""
     found = []
     for block in blocks(values):
         count, _, size = block.shape
