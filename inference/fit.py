@@ -292,7 +292,10 @@ def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapp
     if run is None or not run.exists:
         return run
     if not resume:
-        raise CheckpointError(f"{out} already holds a run; continue it with resume=True, or choose another directory")
+        lower = " and a lower learning_rate, as it failed" if run.state["status"] == "failed" else ""
+        raise CheckpointError(
+            f"{out} already holds a run; continue it with resume=True{lower}, or choose another directory"
+        )
     before, now = run.config.get("training_data"), record.get("training_data")
     if before is not None and now is not None and before != now:
         raise CheckpointError(

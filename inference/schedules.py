@@ -186,7 +186,7 @@ def levels(value: float | Schedule) -> tuple[float, ...]:
             return ramp.start, ramp.end
 
 
-def clamp(value: Any, steps: int) -> Any:
+def clamp(value: Any, steps: int, name: str = "") -> Any:
     """Return `value` with every schedule in it finished by step `steps`, with a warning for each change.
 
     A schedule that is too long is compressed as a whole, delay and steps in proportion, so that its end value
@@ -197,7 +197,10 @@ def clamp(value: Any, steps: int) -> Any:
         if end <= steps:
             return value
         clamped = _compress(value, steps)
-        warnings.warn(f"{value} would end at step {end}, after the last step {steps}; clamped to {clamped}")
+        warnings.warn(
+            f"the schedule{name and ' of '}{name} needs {end} steps, and training has {steps}: "
+            f"it is shortened to {steps}"
+        )
         return clamped
     if isinstance(value, Mapping):
         items = value
@@ -205,7 +208,9 @@ def clamp(value: Any, steps: int) -> Any:
         items = {field.name: getattr(value, field.name) for field in fields(value) if field.init}
     else:
         return value
-    changes = {name: new for name, item in items.items() if (new := clamp(item, steps)) is not item}
+    changes = {
+        key: new for key, item in items.items() if (new := clamp(item, steps, f"{name}{name and '.'}{key}")) is not item
+    }
     if not changes:
         return value
     return {**value, **changes} if isinstance(value, Mapping) else replace(value, **changes)

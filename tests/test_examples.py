@@ -9,7 +9,7 @@ import dvae
 
 
 @pytest.mark.parametrize("name", dvae.__all__)
-@pytest.mark.filterwarnings("ignore:.*clamped to:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*it is shortened to:UserWarning")
 def test_the_example_of_a_public_name_runs(name, capsys):
     names = {"dvae": dvae, "torch": torch}
     found = doctest.DocTestFinder(recurse=False).find(getattr(dvae, name), name, globs=names)

@@ -83,6 +83,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return _ended(given, debug) or (UNREAD if _is_unread() else 0)
 
 
+def exit_code(run: Callable[[], int]) -> int:
+    """Run the program and return its exit code, which a further Ctrl-C no longer changes."""
+    try:
+        code = run()
+    except KeyboardInterrupt:  # another one, amid what the first one prints
+        code = 128 + signal.SIGINT
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Python ends as a signal does if one comes while it shuts down
+    return code
+
+
 def _is_unread(line: str = "") -> bool:
     """Return whether the reader of the standard output has closed it, after writing a line to it."""
     try:

@@ -149,9 +149,10 @@ class DataOptions(ColumnOptions):
         given = {name: value for name, value in given.items() if name not in columns} | self.given()
         with arguments() if kind == "panel" else nullcontext():  # of which columns are arguments
             opened = DATA[kind].open(given.pop("data", SIMULATED), **given)
-        if isinstance(opened, PanelData):
+        if isinstance(opened, PanelData | motion.MotionData):
             for said in opened.parts().values():
-                ERROR.print(said)
+                ERROR.print(said, markup=False)
+        if isinstance(opened, PanelData):
             warnings.filterwarnings("ignore", "training leaves out")  # which the lines above list
         return opened
 
@@ -192,7 +193,7 @@ def fit(
         ERROR.print(f"{out} holds a run, which goes on")
         return resume(out, tensorboard=tensorboard)
     if Run(out).exists:
-        raise ValueError(f"{out} already holds a run; continue it with: dvae resume {out}, or choose another directory")
+        raise ValueError(f"{out} already holds a run; {runs.advice(out)}; or choose another directory")
     with arguments():
         method.check()  # wrong equations and options are found before the data are read
         how = given_options(training)

@@ -15,6 +15,7 @@ import tyro
 
 from .. import motion
 from ..data import Sequences, each, gapped, past_of
+from ..inference.checkpoints import Run
 from ..models.trajectories import TrajectoryModel
 from ..motion.dataset import SIMULATED
 from ..motion.files.writing import format_of
@@ -51,7 +52,9 @@ def forecast(
     --figure draws their fans.
 
     A name that ends in .bvh gets the first future of the window that moves most, after what was observed of it; one
-    without an ending is a new folder, and gets a BVH file for every window and future: Blender opens these.
+    without an ending is a new folder, and gets a BVH file for every window and future: Blender opens these. They hold
+    the observed frames and then the future, in the place and at the height of the clip if the protocol keeps the root's
+    path. If it removes that, all frames are relative to the root, which stays at the origin.
 
     The npz holds, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
     (windows, frames, joints, 3), NaN where a joint was missing, `split`, `clip` and `start` of each window, the
@@ -93,14 +96,21 @@ def forecast(
     if draw_emission is None and suffix == ".npz":
         draw_emission = loaded.model.is_drawn()
     futures = draw_futures(loaded, windows, chosen, samples, seed, horizon, fix, draw_emission)
+    after, protocol = "", windows.protocol
     if suffix == ".npz":
         futures.save(out)
     else:
-        motion.write_motion(out, (futures.window(0, 1) if suffix else futures).motion(), "bvh")
+        played = futures.window(0, 1) if suffix else futures
+        motion.write_motion(
+            out, (played if protocol.root == "drop" else _in_world(played, windows, chosen)).motion(), "bvh"
+        )
+        after = f", after {futures.observed.shape[1]} observed frames"
     frames = futures.forecasts.shape[2]
     said = f"the first of {samples} futures" if suffix == ".bvh" else f"{samples} futures"
+    dropped = f"; relative to the root: the protocol {protocol.name} removes the root's path"
     ERROR.print(
-        f"wrote {out}: {said} of {frames} frames for each of {len(chosen)} windows, {EMISSIONS[futures.emission]}"
+        f"wrote {out}: {said} of {frames} frames for each of {len(chosen)} windows{after}, "
+        f"{EMISSIONS[futures.emission]}{dropped if protocol.root == 'drop' else ''}"
     )
     _save_futures(futures, figure)
 
@@ -306,6 +316,11 @@ def animate(
     if out.suffix.lower() == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise UsageError("an mp4 needs imageio-ffmpeg: pip install 'pyro-dvae[video]'; or end the name in .gif")
     if Path(source).is_dir():
+        if not Run(source).exists:
+            raise ValueError(
+                f"{source} is a folder, and is no run directory; name a run, or one motion file, such as "
+                f"{source}/FILE.bvh"
+            )
         loaded = load_run(Path(source), data, failed=failed)
         windows = windows_of(loaded, data, clip, missing)
         chosen = _liveliest(windows.positions(gapped(windows.all())).numpy(), window)
@@ -422,6 +437,15 @@ def draw_futures(
     observed_frames, truth = (windows.positions(x).numpy() for x in (gapped(past), future))
     forecasts, emission = np.concatenate(parts, axis=1), "drawn" if drawn else "mean"
     return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], forecasts, observed_frames, truth, emission)
+
+
+def _in_world(futures: motion.Forecasts, windows: motion.Windows, chosen: Sequence[int]) -> motion.Forecasts:
+    """Futures of some of the windows, at the place and height and in the direction that their clips have."""
+    names = ("forecasts", "observed", "truth")
+    placed: dict[str, Any] = {
+        n: windows.to_world(torch.from_numpy(getattr(futures, n)), list(chosen)).numpy() for n in names
+    }
+    return replace(futures, **placed)
 
 
 def _alike(futures: motion.Forecasts) -> list[int]:

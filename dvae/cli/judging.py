@@ -474,7 +474,10 @@ def compare(
     loaded = opening.alike(run, data, kind if kind == "panel" else "motion", failed=True)
     opened = opening.data_of(data, *loaded, missing=missing)
     if stopped := [str(each.path) for each in loaded if each.unfinished]:
-        raise ValueError(f"{', '.join(stopped)} is no whole fit, and cannot be compared; resume it, or leave it out")
+        raise ValueError(
+            f"{', '.join(stopped)} is no whole fit, and cannot be compared; leave it out, or "
+            + "; ".join(runs.advice(path) for path in stopped)
+        )
     windows, judged = _compared(loaded[0], opened, stride)
     shown = opening.rows(loaded)
     result = compare_models(

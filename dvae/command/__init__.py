@@ -18,6 +18,7 @@ def main() -> int:
         signal.signal(signal.SIGINT, _interrupted)  # a KeyboardInterrupt amid an import can come out as anything
     try:
         from dvae.cli import command, main
+        from dvae.cli.app import exit_code
 
         with suppress(ValueError):  # no command, of which main tells
             command(sys.argv[1:])
@@ -26,7 +27,7 @@ def main() -> int:
         return 1
     if handled:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    return main()
+    return exit_code(main)
 
 
 def _interrupted(number: int, _: FrameType | None) -> None:

@@ -77,6 +77,7 @@ class MotionData:
         protocol: how windows are cut from them.
         skip_bad: whether unusable clips were left out.
         onto: whether they were put onto the skeleton of a run.
+        undivided: names of clips that are too short to be divided, so that none of their frames are for test.
     """
 
     kind: ClassVar[str] = "motion"
@@ -88,6 +89,7 @@ class MotionData:
     protocol: Protocol
     skip_bad: bool = False
     onto: bool = False
+    undivided: tuple[str, ...] = ()
 
     @classmethod
     def open(
@@ -119,11 +121,33 @@ class MotionData:
             protocol = named_protocol(protocol)
         protocol = protocol or default_protocol(clips)
         protocol = replace(protocol, representation=representation or protocol.representation)
-        return cls(name, divided(clips, protocol), protocol, skip_bad)
+        split = divided(clips, protocol)
+        tested = {clip.name for clip in split if clip.split == "test"}
+        partly = len(split) > len(clips) > 1  # otherwise whole clips are for test
+        whole = tuple(clip.name for clip in split if partly and clip.name not in tested)
+        return cls(name, split, protocol, skip_bad, undivided=whole)
 
     def windows(self, split: str) -> Windows:
         """The windows of "train", "validation", "test" or "train+validation"."""
         return windows(self.motion, self.protocol, split)
+
+    def parts(self) -> dict[str, str]:
+        """Return for training, validation and test a sentence: the windows, and the clips that have none."""
+        found, protocol = {}, self.protocol
+        for split in ("train", "validation", "test"):
+            try:
+                cut = self.windows(split)
+            except ValueError as error:
+                found[split] = str(error)
+                continue
+            short = [name for _, name, _ in cut.skipped] + [*(self.undivided if split == "test" else ())]
+            more = f" and {len(short) - 3} more" if len(short) > 3 else ""
+            found[split] = (
+                f"{len(cut)} {split} windows of {protocol.observed} + {protocol.predicted} frames, "
+                f"one every {cut.stride} frames of {len(cut.clips)} clips"
+                + (f"; too short for one: {', '.join(short[:3])}{more}" if short else "")
+            )
+        return found
 
     @property
     def location(self) -> str:

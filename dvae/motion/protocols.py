@@ -483,6 +483,22 @@ class Windows:
         """
         clips, starts = self._list(self.stride)
         frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
+        found = torch.from_numpy(np.concatenate(self._frames))
+        for where, made in zip(frames, self.to_world(positions), strict=True):
+            found[where] = torch.where(found[where].isfinite(), found[where], made.to(found))
+        whole = found.split([clip.frames for clip in self.clips])
+        made_whole = [replace(clip, positions=each.numpy()) for clip, each in zip(self.clips, whole, strict=True)]
+        return MotionSet(made_whole, self.skeleton, missing=bool(found.isnan().any()))
+
+    def to_world(self, positions: Tensor, chosen: Sequence[int] | slice = slice(None)) -> Tensor:
+        """Return positions (..., N, T, J, 3) of listed windows where and as their clips have them.
+
+        Args:
+            positions: as `positions` returns them. Where the protocol drops the root, T frames of whole windows;
+                otherwise of any number.
+            chosen: places of the N windows in `keys`; by default all.
+        """
+        clips, starts = (each[chosen] for each in self._list(self.stride))
         joints, root = cut(self._frames, clips, starts, self.length), self.skeleton.root
         if self.protocol.heading:
             heading = self.skeleton.heading_near(joints, self.protocol.observed - 1)[:, None, None]
@@ -490,15 +506,8 @@ class Windows:
         places = joints[:, :, root : root + 1]
         seen = places.isfinite()
         if self.protocol.root == "drop":
-            places = bridged(places.flatten(2), seen.flatten(2))[:, :, None]
-        else:
-            places = places.take_along_dim(seen.all(-1).byte().argmax(1, keepdim=True)[..., None], 1)
-        found = torch.from_numpy(np.concatenate(self._frames))
-        for where, made in zip(frames, positions + places, strict=True):
-            found[where] = torch.where(found[where].isfinite(), found[where], made.to(found))
-        whole = found.split([clip.frames for clip in self.clips])
-        made_whole = [replace(clip, positions=each.numpy()) for clip, each in zip(self.clips, whole, strict=True)]
-        return MotionSet(made_whole, self.skeleton, missing=bool(found.isnan().any()))
+            return positions + bridged(places.flatten(2), seen.flatten(2))[:, :, None]
+        return positions + places.take_along_dim(seen.all(-1).byte().argmax(1, keepdim=True)[..., None], 1)
 
     def given(self, joints: Sequence[str] | float) -> Windows:
         """These windows, whose batches hold trajectories too: {"y": (B, T, D)}, x at given joints and 0 at others.

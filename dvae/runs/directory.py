@@ -106,7 +106,7 @@ class Loaded:
             return ""
         reached = f"{state['status']} at step {state['step']} of {self.config.training.steps}"
         initial = "" if state["step"] else "; its weights are the initial ones"
-        return f"{self.path} has not ended ({reached}){initial}; dvae resume {self.path} goes on"
+        return f"{self.path} has not ended ({reached}){initial}; {advice(self.path)}"
 
     def alike(self, other: Loaded) -> bool:
         """Whether another run was fitted on the same windows of the same data, whatever the models see of them."""
@@ -130,6 +130,16 @@ class Loaded:
             more = f"; and {len(differing) - 3} more" if len(differing) > 3 else ""
             raise ValueError(f"{os.fspath(path)} does not fit {self.path}: {'; '.join(islice(values, 3))}{more}")
         return other
+
+
+def advice(path: str | os.PathLike[str]) -> str:
+    """Return how a run is continued: after a failure, which the same steps would repeat, at a lower learning rate."""
+    run = Run(path)
+    if run.state["status"] != "failed":
+        return f"continue it with: dvae resume {path}"
+    rate = run.config.get("training", {}).get("learning_rate")
+    lower = f"{rate / 10:g}" if isinstance(rate, int | float) else "RATE"
+    return f"continue it at a lower learning rate with: dvae resume {path} --learning-rate {lower}"
 
 
 @alone

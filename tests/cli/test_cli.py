@@ -21,6 +21,7 @@ import tyro
 import dvae
 from dvae import motion
 from dvae.cli import main
+from dvae.cli.app import exit_code
 from dvae.cli.fitting import TrainingOptions, given_options
 from dvae.inference.stein import SteinDiscrepancy
 from dvae.inference.yardstick import ReferencePosterior
@@ -383,7 +384,7 @@ def log(run):
     return [row for row in map(json.loads, (run / "log.jsonl").read_text().splitlines()) if "learning_rate" in row]
 
 
-@pytest.mark.filterwarnings("ignore:.*clamped to:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*it is shortened to:UserWarning")
 def test_a_longer_run_is_laid_out_anew(people, tmp_path):
     """The learning rate falls over the last half of all steps, self-feeding rises over their first half."""
     out, options = tmp_path / "run", ["--width", "8", "--self-feeding", "0.5", *SMALL]
@@ -466,7 +467,10 @@ def test_self_feeding_is_told_by_the_method_alone(people, tmp_path):
 
 def test_a_run_is_neither_overwritten_nor_invented(capsys, run, people, tmp_path):
     again = ["fit", "vae", "--data", str(people), "--out", str(run)]
-    assert f"dvae resume {run}" in failure(capsys, *again)
+    assert f"with: dvae resume {run}; or" in failure(capsys, *again)
+    state = json.loads((run / "state.json").read_text())
+    (run / "state.json").write_text(json.dumps({**state, "status": "failed"}))
+    assert f"dvae resume {run} --learning-rate 0.0001; or" in failure(capsys, *again)
     assert "is no run directory" in failure(capsys, "resume", str(tmp_path / "none"))
     assert "is no run directory" in failure(capsys, "evaluate", str(tmp_path))
 
@@ -660,6 +664,29 @@ def test_ctrl_c_leaves_a_run_that_resumes(people, tmp_path):
     assert stopped["status"] == "interrupted"
     assert main(["resume", str(run), "--steps", str(stopped["step"] + 5)]) == 0
     assert json.loads((run / "state.json").read_text())["step"] == stopped["step"] + 5
+
+
+def test_a_further_ctrl_c_changes_no_exit_code():
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        assert exit_code(lambda: signal.raise_signal(signal.SIGINT)) == 130
+        signal.raise_signal(signal.SIGINT)
+        assert exit_code(lambda: 3) == 3
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_clips_without_a_test_window_are_named(tmp_path, capsys):
+    (long,) = motion.simulate(clips=1, frames=400)
+    clips = [
+        replace(long.between(0, frames), split="all", name=name) for name, frames in (("long", 400), ("short", 90))
+    ]
+    motion.save(tmp_path / "two.npz", motion.MotionSet(clips, motion.WALKER))
+    out = ["--out", str(tmp_path / "run"), "--steps", "1", "--batch-size", "2", "--warm-up", "1"]
+    assert main(["fit", "vae", "--data", str(tmp_path / "two.npz"), *out]) == 0
+    told = capsys.readouterr().err
+    assert "1 test windows of 15 + 60 frames, one every 15 frames of 1 clips; too short for one: short" in told
+    assert "train windows of 15 + 60 frames" in told
 
 
 def test_a_model_of_turns_forecasts_bones_of_one_length(people, tmp_path, capsys):

@@ -865,7 +865,7 @@ def test_a_run_that_has_not_ended_is_no_seed(runs, capsys, tmp_path):
     shutil.copytree(runs / "a1", path)
     state = json.loads((path / "state.json").read_text())
     (path / "state.json").write_text(json.dumps({**state, "status": "interrupted", "step": 2}))
-    sentence = f"{path} has not ended (interrupted at step 2 of 4); dvae resume {path} goes on"
+    sentence = f"{path} has not ended (interrupted at step 2 of 4); continue it with: dvae resume {path}"
     assert main(["compare", str(runs / "a0"), str(path)]) == 1
     assert sentence in capsys.readouterr().err.replace("\n", " ")
     assert main(["evaluate", str(path), "--samples", "1"]) == 0
@@ -891,7 +891,9 @@ def test_a_failed_run_is_refused(runs, capsys, tmp_path, command):
     asked = [command, str(path), "--out", str(out)]
     assert main(asked) == 1
     error = capsys.readouterr().err.replace("\n", " ")
-    assert f"{path} has not ended (failed at step 0 of 4); its weights are the initial ones" in error
+    if command != "compare":
+        assert f"{path} has not ended (failed at step 0 of 4); its weights are the initial ones" in error
+    assert f"at a lower learning rate with: dvae resume {path} --learning-rate 0.0001" in error
     assert not out.exists()
     if command == "forecast":
         assert main([*asked, "--failed", "--samples", "1"]) == 0

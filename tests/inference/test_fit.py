@@ -326,7 +326,7 @@ def test_with_self_feeding_the_best_is_by_the_self_fed_bound_from_its_last_value
 
 
 def test_a_warm_up_longer_than_the_run_is_clamped_with_a_message():
-    with pytest.warns(UserWarning, match="after the last step 10; clamped to Ramp"):
+    with pytest.warns(UserWarning, match="of objective.kl_weight needs 500 steps, and training has 10"):
         run(objective=Evidence(kl_weight=Ramp(0.0, 1.0, 500)), steps=10)
 
 
@@ -598,6 +598,11 @@ def finished(tmp_path):
 def test_a_run_is_neither_overwritten_nor_resumed_by_accident(finished):
     with pytest.raises(CheckpointError, match="already holds a run; continue it with resume=True"):
         run(out=finished)
+    state = json.loads((finished / "state.json").read_text())
+    (finished / "state.json").write_text(json.dumps({**state, "status": "failed"}))
+    with pytest.raises(CheckpointError, match="resume=True and a lower learning_rate, as it failed, or"):
+        run(out=finished)
+    (finished / "state.json").write_text(json.dumps(state))
     with pytest.raises(CheckpointError, match=r"no run to resume in .*elsewhere"):
         run(out=finished / "elsewhere", resume=True)
     with pytest.raises(CheckpointError, match="fitted with optimizer='adam', not 'sgd'"):

@@ -128,7 +128,9 @@ def test_a_clamped_schedule_reaches_its_end_value_within_the_run(value, steps):
 
 def test_clamping_says_what_it_changed_and_leaves_the_rest_alone():
     objective = Evidence(kl_weight={"w": 0.5, "z": Ramp(0.0, 1.0, steps=800, delay=200)})
-    with pytest.warns(UserWarning, match=r"end at step 1000, after the last step 100; clamped to Ramp"):
+    with pytest.warns(
+        UserWarning, match=r"of kl_weight\.z needs 1000 steps, and training has 100: it is shortened to 100"
+    ):
         clamped = clamp(objective, 100)
     assert clamped == Evidence(kl_weight={"w": 0.5, "z": Ramp(0.0, 1.0, steps=80, delay=20)})
     assert clamp(objective, 1000) is objective

@@ -312,7 +312,7 @@ def test_the_command_plays_a_run_and_its_data(run, tmp_path, capsys):
     assert "train/person_0001, 80 frames" in capsys.readouterr().err
     assert "futures" in failure(capsys, data, "--out", page, "--samples", "2", code=2)
     assert "no clip 'nobody'" in failure(capsys, data, "--out", page, "--clip", "nobody")
-    assert "is no run directory" in failure(capsys, tmp_path, "--out", page)
+    assert "is no run directory; name a run, or one motion file" in failure(capsys, tmp_path, "--out", page)
 
 
 @pytest.mark.parametrize(

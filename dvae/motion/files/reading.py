@@ -415,6 +415,28 @@ class Collected:
         return "; ".join(found)
 
 
+def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSet:
+    """Return the clips of several files, each with its path, as one set.
+
+    Raises:
+        ValueError: their joints, frames per second, axes or sizes differ, or two clips have one split and name.
+    """
+    collected, clips = Collected(name), []
+    skipped: list[tuple[str, str, str]] = []
+    first, up = sets[0][0], sets[0][1].skeleton.up
+    for path, motion in sets:
+        if motion.skeleton.up != up:
+            raise ValueError(f"{path}: {motion.skeleton.up} is up, and {up} in {first}; give onto=")
+        skipped += motion.skipped
+        for clip in motion:
+            if reason := collected.add(path, clip, motion.skeleton):
+                raise ValueError(reason)
+            clips.append(clip)
+    clips = clips if collected.skeleton.rest else [replace(clip, rotations=None) for clip in clips]
+    missing = any(motion.missing for _, motion in sets)
+    return MotionSet(clips, collected.skeleton, name, False, skipped=skipped, missing=missing)
+
+
 def chosen(
     motion: MotionSet, joints: Sequence[int | str] | Mapping[str, str] | None = None, onto: Skeleton | None = None
 ) -> MotionSet:

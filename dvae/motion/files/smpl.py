@@ -84,7 +84,8 @@ def read_amass(path: str | Path) -> Recording:
         if not {"poses", "trans"} <= members.keys():
             raise Refused(
                 f"it holds {', '.join(sorted(members)[:6]) or 'nothing'}, expected AMASS's poses and trans; "
-                "an npz of many clips is read by itself, not in a folder"
+                "other npz files of clips are read one by one, not as a folder; "
+                f"`dvae data convert {path.parent}/*.npz --out ALL.npz` joins those that it wrote"
             )
         wanted = ("poses", "trans", "offsets", "betas", *_FPS)
         found = {name: members[name].array() for name in wanted if name in members}

@@ -19,7 +19,7 @@ from ..data import Clip, MotionSet
 from ..skeleton import Skeleton, brief
 from .bvh import write_bvh
 from .plain import LABELS, SKELETON, own_companion, save, save_clips, write_labels, write_table
-from .reading import Collected, File, FileReader, find_files, read_motion, sampled, upwards
+from .reading import Collected, File, FileReader, find_files, joined_motion, read_motion, sampled, upwards
 from .recording import Recording
 from .settled import understand
 from .smpl import write_amass
@@ -40,7 +40,8 @@ def format_of(path: str | Path, format: str | None = None) -> str:
     if format not in FORMATS or suffix not in ("", FORMATS[format]):
         raise ValueError(
             f"{path}: which format? Motion is written as {', '.join(FORMATS)}: end the name in one of "
-            f"{', '.join(dict.fromkeys(FORMATS.values()))}, or say the format of the files in a folder"
+            f"{', '.join(dict.fromkeys(FORMATS.values()))}, or give the format of the files in a folder "
+            "(`--format` of `dvae data convert`, `format=` in Python)"
         )
     if format == "npz" and not suffix:
         raise ValueError(f"{path}: an npz holds all clips in one file; end its name in .npz")
@@ -156,7 +157,7 @@ def convert(
     """Write the motion of files or folders anew, clip by clip, on several cores.
 
     Args:
-        sources: files and folders, see `read_motion`.
+        sources: files and folders, see `read_motion`; archives of clips are joined_motion, and not mixed with others.
         out: a file or a folder, see `write_motion`.
         format: of what is written.
         fps: frames per second of what is written; by default those of the files.
@@ -176,12 +177,17 @@ def convert(
     from joblib import Parallel, delayed
 
     format = format_of(out, format)
-    files = list(chain.from_iterable(_told(source, len(sources) > 1) for source in sources))
-    if not files:  # an archive
-        if len(sources) > 1:
-            raise ValueError(f"{sources[0]} is an archive of many clips, which is converted by itself")
+    found = [_told(source, len(sources) > 1) for source in sources]
+    files = list(chain.from_iterable(found))
+    if archives := [source for source, inner in zip(sources, found, strict=True) if not inner]:
+        if files:
+            raise ValueError(
+                f"{archives[0]} is an archive of clips and {files[0].path} is a recording; give one kind at a time, "
+                "then join the archives"
+            )
         told: Any = {"metres": metres, "up": up, "fps": recorded, "missing": missing}
-        motion = read_motion(sources[0], skip_bad=skip_bad, onto=onto, **told)
+        read = [read_motion(source, skip_bad=skip_bad, onto=onto, **told) for source in sources]
+        motion = read[0] if len(read) == 1 else joined_motion([*zip(sources, read, strict=True)], out.stem)
         motion = motion if fps is None else motion.resampled(fps)
         written = write_motion(out, motion, format)
         return f"{len(motion)} clips in {len(written)} files; {len(motion.skipped)} skipped"

@@ -6,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import dvae
 from dvae.cli import main
 from dvae.motion import (
     HUMAN36M,
+    PROTOCOLS,
     WALKER,
     Clip,
     Forecasts,
+    MotionData,
     MotionSet,
     Skeleton,
     read_motion,
@@ -38,7 +41,7 @@ def recordings(three, tmp_path_factory):
 def test_formats_and_names_fit_each_other_or_are_refused(three, tmp_path):
     for path, format, message in (
         ("a.bvh", None, "holds one clip a file, and there are 3"),
-        ("a", None, "which format"),
+        ("a", None, "which format.*--format"),
         ("a.fbx", None, "which format"),
         ("a.csv", "bvh", "which format"),
         ("a", "npz", "end its name in .npz"),
@@ -251,9 +254,54 @@ def test_what_cannot_be_converted_is_said_or_skipped(recordings, tmp_path, capsy
 
 def test_forecasts_of_a_run_are_bvh(run, tmp_path, capsys):
     assert main(["forecast", str(run), "--out", str(tmp_path / "one.bvh"), "--samples", "2"]) == 0
-    assert "the first of 2 futures of 60 frames for each of 1 windows" in capsys.readouterr().err
+    told = " ".join(capsys.readouterr().err.split())
+    assert "the first of 2 futures of 60 frames for each of 1 windows, after 15 observed frames" in told
+    assert "relative to the root: the protocol simulated removes the root's path" in told
     assert (
         read_motion(tmp_path / "one.bvh", onto=WALKER, metres=0.01).clips[0].frames == 75
     )  # hardly fitted: no person yet
     assert main(["forecast", str(run), "--out", str(tmp_path / "all"), "--samples", "2"]) == 0
     assert len(list((tmp_path / "all").rglob("*.bvh"))) % 2 == 0
+
+
+def test_forecasts_are_bvh_where_the_clip_is_if_the_protocol_keeps_the_root(tmp_path, capsys):
+    people = simulate(clips=6, frames=80, seed=1)
+    save(tmp_path / "people.npz", people)
+    protocol = replace(PROTOCOLS["simulated-trajectories"], observed=3, predicted=5, test_stride=40)
+    data = MotionData.open(tmp_path / "people.npz", protocol)
+    training = dvae.Training(steps=1, batch_size=2, progress=False)
+    dvae.runs.directory.fit_run(dvae.method("vae", latent=2, warm_up=1), data, tmp_path / "run", training)
+    one = ["--samples", "1"]
+    assert main(["forecast", str(tmp_path / "run"), "--out", str(tmp_path / "all"), *one]) == 0
+    assert "removes" not in capsys.readouterr().err
+    assert main(["forecast", str(tmp_path / "run"), "--out", str(tmp_path / "one.bvh"), *one]) == 0
+    written = [*(tmp_path / "all").rglob("*.bvh"), tmp_path / "one.bvh"]
+    roots = [read_motion(path, onto=WALKER, metres=0.01).clips[0].positions[:3, WALKER.root] for path in written]
+    true = {
+        f"{clip}-{start}-0": people[split, clip].positions[start : start + 3, WALKER.root]
+        for split, clip, start in data.windows("test").keys
+    }
+    for path, root in zip(written[:-1], roots, strict=False):
+        np.testing.assert_allclose(root, true[path.stem], atol=1e-4)
+    assert any(np.allclose(roots[-1], each, atol=1e-4) for each in true.values())
+
+
+def test_archives_of_clips_are_joined(three, tmp_path, capsys):
+    folder, out = tmp_path / "in", str(tmp_path / "all.npz")
+    folder.mkdir()
+    paths = [folder / f"{clip.name}.npz" for clip in three]
+    for path, clip in zip(paths, three, strict=True):
+        save(path, replace(three, clips=[clip]))
+    assert main(["data", "info", str(folder)]) == 1
+    assert f"dvae data convert {folder}/*.npz --out ALL.npz" in " ".join(capsys.readouterr().err.split())
+    assert main(["data", "convert", *map(str, paths), "--out", out]) == 0
+    assert read_motion(out).fingerprint() == three.fingerprint()
+    write_motion(tmp_path / "a.bvh", replace(three, clips=[three.clips[0]]))
+    for other, message in (
+        (tmp_path / "a.bvh", "is an archive of clips and"),  # which was left out without a word
+        (paths[0], "is there twice"),
+        (folder / "z.npz", "z is up, and y in"),
+    ):
+        save(folder / "z.npz", MotionSet([three.clips[0]], replace(WALKER, up="z")))
+        assert main(["data", "convert", str(paths[0]), str(other), "--out", out]) == 1
+        assert message in " ".join(capsys.readouterr().err.split())
