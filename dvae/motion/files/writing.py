@@ -157,7 +157,7 @@ def convert(
     """Write the motion of files or folders anew, clip by clip, on several cores.
 
     Args:
-        sources: files and folders, see `read_motion`; archives of clips are joined_motion, and not mixed with others.
+        sources: files and folders, see `read_motion`; archives of clips are joined, and not mixed with others.
         out: a file or a folder, see `write_motion`.
         format: of what is written.
         fps: frames per second of what is written; by default those of the files.
