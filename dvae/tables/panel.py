@@ -354,6 +354,11 @@ def _of_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
     labels = {name: texts(frame[own]).fillna("").to_numpy() for name, own in told.items()}
     rows, names = [np.arange(len(frame))], ["0"]
     if columns.id:
+        if (unnamed := frame[list(columns.id)].isna().all(axis=1)).any():
+            raise ValueError(
+                f"{int(unnamed.sum())} of {len(frame)} rows have no {' and no '.join(columns.id)}, the first of them row "
+                f"{int(np.argmax(unnamed))}; fill in which sequence they belong to, or remove them"
+            )
         found = frame.groupby(list(columns.id), sort=False, observed=True, dropna=False).indices
         rows = [np.sort(places) for places in found.values()]
         keys = frame.iloc[[places[0] for places in rows]][list(columns.id)]

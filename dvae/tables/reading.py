@@ -111,6 +111,13 @@ def _separated(content: bytes, separators: str) -> Any:
                     "`iconv -f latin1 -t utf-8`"
                 ) from error
             raise
+    header = _header(head, separator)
+    if twice := [name for name in dict.fromkeys(header) if name and header.count(name) > 1]:
+        renamed = [name for name in frame.columns if name not in header and not name.startswith("Unnamed: ")]
+        warnings.warn(
+            f"the header has several columns named {', '.join(twice)}; the further ones are read as {', '.join(renamed)}",
+            stacklevel=5,
+        )
     if separator != "," and DECIMAL_COMMA.search(head):
         frame.attrs["decimal"] = ","
     if len(frame) and frame.iloc[:, -1].isna().any():

@@ -394,6 +394,13 @@ def test_sequences_are_told_apart_by_all_their_ids():
     assert next(iter(Panel.of(numbered, Columns((Column("y"),), id=("a", "b"), time="t")))).name == "2/u"
 
 
+def test_rows_without_an_id_are_refused():
+    frame = pd.DataFrame({"shop": ["a", None, "a", None], "t": range(4), "y": np.arange(4) / 8})
+    with pytest.raises(ValueError, match="2 of 4 rows have no shop, the first of them row 1; fill in which sequence"):
+        Panel.of(frame, Columns((Column("y"),), ("shop",), "t"))
+    assert len(Panel.of(frame.assign(city="n"), Columns((Column("y"),), ("city", "shop"), "t"))) == 2
+
+
 def test_groups_and_splits_are_of_sequences():
     told = Columns((Column("y"),), id=("s",), group="g", split="p")
     frame = pd.DataFrame({"s": list("aabb"), "g": [1, 1, 2, 2], "p": ["train"] * 3 + ["test"], "y": range(4)})

@@ -78,6 +78,12 @@ def test_what_other_countries_write_is_read_as_they_mean_it(tmp_path, comment, c
             np.testing.assert_array_equal(read.values if read.is_numeric else found[name], values)
 
 
+def test_columns_of_one_name_are_named_with_their_new_names(tmp_path):
+    with pytest.warns(UserWarning, match="several columns named x; the further ones are read as x.1"):
+        assert [*read_frame(put(tmp_path / "a.csv", "t,x,x\n1,2,3\n"))] == ["t", "x", "x.1"]
+    assert len(read_frame(put(tmp_path / "b.csv", "t,,\n1,2,3\n")).columns) == 3
+
+
 def test_an_npz_is_sequences(tmp_path):
     x = np.arange(24.0).reshape(2, 4, 3)
     np.savez(tmp_path / "a.npz", x=x, other=np.zeros(3))
