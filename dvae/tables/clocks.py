@@ -78,9 +78,11 @@ def time_of(frame: Any, time: str | tuple[str, ...], decimal: str | None = None)
     if isinstance(time, tuple):
         return join_times(frame, time)
     column = frame[time]
-    read = read_numbers(column, (), decimal, column.attrs.get("decimal", "."))
+    read = read_numbers(column, (), decimal, column.attrs.get("decimal"))
     if is_number(column) or not read.is_numeric:
         return column
+    if read.ambiguous:
+        read.check(column, "")
     return type(column)(read.values, column.index, name=time)
 
 

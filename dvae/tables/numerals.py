@@ -77,14 +77,17 @@ class Numbers:
         )
 
 
-def read_numbers(column: Any, na_values: Sequence[str] = (), decimal: str | None = None, hint: str = ".") -> Numbers:
+def read_numbers(
+    column: Any, na_values: Sequence[str] = (), decimal: str | None = None, hint: str | None = None
+) -> Numbers:
     """Read a pandas column as numbers: numbers, Booleans, decimals, and texts of them.
 
     Args:
         column: (N,) of any type.
         na_values: texts or numbers that mark missing values.
         decimal: "." or ",", the decimal sign of texts; None to infer it from the column.
-        hint: decimal sign that the rest of the file suggests.
+        hint: decimal sign that the rest of the file shows; "" if it shows none and 1.234 may be 1234; None if dots are
+            decimal signs.
     """
     import pandas as pd
 
@@ -95,9 +98,10 @@ def read_numbers(column: Any, na_values: Sequence[str] = (), decimal: str | None
         return Numbers(values, np.zeros(len(column), bool), {})
     if column.dtype.kind in "mMc" or isinstance(column.dtype, pd.PeriodDtype | pd.IntervalDtype):
         return Numbers(nothing, column.notna().to_numpy(), {})
-    if decimal != "," and hint == "." and (plain := _plain(column.to_numpy(object, na_value=np.nan))) is not None:
-        plain[np.isin(plain, sentinels)] = np.nan
-        return Numbers(plain, np.zeros(len(column), bool), {})
+    if decimal != "," and (decimal or hint in (".", None)) and (plain := _plain(column.to_numpy(object, na_value=np.nan))) is not None:
+        if decimal or hint is None or not _has_large_whole(plain):
+            plain[np.isin(plain, sentinels)] = np.nan
+            return Numbers(plain, np.zeros(len(column), bool), {})
     try:
         codes, cells = pd.factorize(column.astype(object))  # each different cell is read once
     except TypeError:  # of lists
@@ -120,21 +124,44 @@ def read_numbers(column: Any, na_values: Sequence[str] = (), decimal: str | None
     return Numbers(np.append(found, np.nan)[codes], np.append(wrong, False)[codes], said, ambiguous)
 
 
-def _numbers(cells: list[Any], decimal: str | None, hint: str) -> tuple[np.ndarray, str | None]:
+def decimal_sign(frame: Any) -> str:
+    """Return the decimal sign that the first rows of a frame of texts show, "" if they show none or both.
+
+    A column shows it if all its numbers can be read with one of the signs only.
+    """
+    shown, rows = set(), max(20, 50_000 // max(frame.shape[1], 1))
+    for name in frame:
+        some = frame[name].iloc[:rows].dropna().drop_duplicates()
+        dot, comma = (read_numbers(some, decimal=sign).is_numeric for sign in ".,")
+        if dot != comma and not some.str.match(r"\s*0\d").any():  # 01.2024 is a month
+            shown.add("." if dot else ",")
+    return shown.pop() if len(shown) == 1 else ""
+
+
+def _numbers(cells: list[Any], decimal: str | None, hint: str | None) -> tuple[np.ndarray, str | None]:
     """Return the numbers of different cells, NaN for others, and a cell that two decimal signs read differently."""
     words = [cell for cell in cells if isinstance(cell, str)]
     if words and len(words) == len(cells) and {word.lower() for word in words} <= {"true", "false"}:
         return np.array([word.lower() == "true" for word in words], float), None
     commas = any("," in word for word in words)
-    if decimal is not None or (hint == "." and not commas):
+    if decimal is not None or (hint is None and not commas):
         return _parsed(cells, decimal or "."), None
     dot, comma = _parsed(cells, "."), _parsed(cells, ",")
     differ = ~np.isnan(dot) & (dot != comma)
     if (lost := int(np.isnan(dot).sum() - np.isnan(comma).sum())) or not differ.any():
         return (comma if lost > 0 else dot), None
-    if hint == "," and commas:
-        return comma, None
+    sign = "," if commas else "."
+    if not commas or not any("." in word for word in words):
+        if hint == "." != sign:
+            return dot, None
+        if hint == sign and not _has_large_whole(dot[~differ]):
+            return (dot if sign == "." else comma), None
     return dot, str(cells[int(np.argmax(differ))])
+
+
+def _has_large_whole(values: np.ndarray) -> bool:
+    """Whether some number is whole and of three digits or more: 1.000 after 999 is no fraction."""
+    return bool(((np.abs(values) >= 100) & (values % 1 == 0)).any())
 
 
 def _parsed(cells: list[Any], decimal: str) -> np.ndarray:

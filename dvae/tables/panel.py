@@ -403,6 +403,10 @@ def _ordered(when: np.ndarray, rows: np.ndarray, who: str, calendar: Calendar, c
     """
     if (np.diff(when[rows]) > 0).all():
         return rows
+    if (np.diff(when[rows]) < 0).sum() >= len(rows) / 2:  # newest first
+        rows = rows[::-1]
+        if (np.diff(when[rows]) > 0).all():
+            return rows
     order = np.argsort(when[rows], kind="stable")
     found = rows[order]
     advice = "name the id columns that tell sequences apart"
@@ -412,11 +416,13 @@ def _ordered(when: np.ndarray, rows: np.ndarray, who: str, calendar: Calendar, c
         advice += ", or write the date before clocks that begin again at midnight"
     if (twice := np.diff(when[found]) == 0).any():
         advice += ", or remove the row that is there twice"
-        first, second = found[np.argmax(twice) :][:2]
+        first, second = sorted(found[np.argmax(twice) :][:2])
         raise ValueError(f"{who} has two rows at {column} {calendar.text(when[first])}, {first} and {second}; {advice}")
-    run = np.concatenate([[0], np.cumsum(np.diff(when[rows]) < 0)])  # number of the increasing run that a row is in
+    back = np.concatenate([[False, False, False], np.diff(when[rows]) < 0])
+    ends = np.where(back[2:], ~back[1:-1], back[1:-1] & back[:-2])  # of runs of increasing or decreasing times
+    run = np.cumsum(ends)  # number of the run that a row is in
     overlap = len(rows) >= RUN * (run[-1] + 1) and (np.diff(run[order]) != 0).sum() > CHANGES * run[-1]
-    if overlap or (calendar.kind == "durations" and run[-1] < len(rows) - 1):  # clocks pass midnight
+    if overlap or calendar.kind == "durations":  # clocks pass midnight
         last, row = rows[np.argmax(run) - 1 :][:2]
         raise ValueError(
             f"{who} goes back from {column} {calendar.text(when[last])} in row {last} to {calendar.text(when[row])} in "

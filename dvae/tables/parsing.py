@@ -33,6 +33,7 @@ WRITTEN = [
         r"(?P<year>\d{4})[-/. ](?P<month>\d{1,2})[-/. ](?P<day>\d{1,2})",
         r"(?P<month>\d{1,2})[-/](?P<year>\d{4})",
         r"(?P<year>\d{4})[-/ ]?Q(?P<quarter>[1-4])",
+        r"Q(?P<quarter>[1-4])[-/ ]?(?P<year>\d{4})",
         r"(?P<year>\d{4})-?W(?P<week>\d\d)(?:-?(?P<day>[1-7]))?",
         rf"{_WEEKDAY}{_DAY}[-/.\s]{{0,2}}{_WORD}[-/.,\s]{{0,2}}(?P<year>\d{{4}}|\d\d)",
         rf"{_WEEKDAY}{_WORD}[-/.\s]{{0,2}}{_DAY}[-/.,\s]{{1,2}}(?P<year>\d{{4}})",
@@ -43,6 +44,22 @@ WRITTEN = [
 _OFFSET = re.compile(r"[T :]\d\d[\d:.]*\s?(z|utc|gmt|[-+]\d[\d:]{1,4})$", re.IGNORECASE | re.ASCII)
 """The offset from UTC at the end of a date."""
 _DURATION = re.compile(r"[-+]?(?:\d{1,6} days?,? ?)?[-+]?\d{1,6}:\d\d:\d\d(?:\.\d{1,9})?|[-+]?\d{1,6} days?", re.ASCII)
+
+
+class Unread(ValueError):
+    """Texts of which some are no dates as the others are.
+
+    Args:
+        cells: of a column.
+        wrong: (N,) True where a cell is no date.
+    """
+
+    def __init__(self, cells: Any, wrong: np.ndarray):
+        self.wrong = wrong
+        row = int(np.argmax(wrong))
+        super().__init__(
+            f"{brief(cells.iloc[row])} in row {row} among them; write dates as {WANTED}, durations as 02:30:00"
+        )
 
 
 class Undecided(ValueError):
@@ -125,11 +142,12 @@ def dates(column: Any) -> Any:
         said = pd.Series(held, dtype=object)
         when = pd.to_datetime(said, utc=True, format="ISO8601")
     except (TypeError, ValueError):
-        codes, held = pd.factorize(column.astype(str).str.strip().where(column.notna()))
+        cells = column.astype(str).str.strip().where(column.notna())
+        codes, held = pd.factorize(cells)
         said = _as_iso(pd.Series(held, dtype=object))
         when = pd.to_datetime(said, utc=True, format="ISO8601", errors="coerce")
         if (wrong := when.isna()).any():
-            raise _unread(pd.Series(held)[wrong]) from None
+            raise Unread(cells, np.append(wrong, False)[codes]) from None
     offsets = _offsets(said)
     known = offsets.dropna().unique()
     if len(known) and (naive := offsets.isna()).any():
@@ -170,7 +188,7 @@ def is_duration(column: Any) -> bool:
 
 
 def _as_iso(said: Any) -> Any:
-    """Texts, of which the first is a date in another way, in that of ISO 8601; as they are, where it is in none."""
+    """Texts, of which the first is a date in another way, in that of ISO 8601; others as they are."""
     import pandas as pd
 
     fitting = (way for first in said[:1] if len(first) <= LONGEST for way in WRITTEN if way.fullmatch(first))
@@ -178,8 +196,7 @@ def _as_iso(said: Any) -> Any:
     if way is None:
         return said
     parts = said.str.slice(0, LONGEST + 1).str.extract(f"^{way.pattern}$", flags=way.flags)
-    if (other := parts.year.isna()).any():
-        raise _unread(said[other])
+    parts = parts[parts.year.notna()]
     if "first" in parts:
         parts = parts.rename(columns=_order(parts, said[0]))
     if "word" in parts:
@@ -198,12 +215,7 @@ def _as_iso(said: Any) -> Any:
     hour = (hour % 12 + late).where(late.notna(), hour).astype(int).astype(str)
     date = parts.year + "-" + parts.month + "-" + parts.day
     zone = parts.zone.str.upper().replace({"UTC": "Z", "GMT": "Z"}).fillna("")
-    return date + "T" + hour + parts.rest.fillna(":00") + zone
-
-
-def _unread(said: Any) -> ValueError:
-    """Of texts, the first is no date as others are."""
-    return ValueError(f"{brief(said.iloc[0])} among them; write dates as {WANTED}, durations as 02:30:00")
+    return (date + "T" + hour + parts.rest.fillna(":00") + zone).reindex(said.index).fillna("")  # no date
 
 
 def _order(parts: Any, example: str) -> dict[str, str]:
@@ -325,7 +337,7 @@ def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: s
             f"column {told.name!r} holds {column.dtype}, which are no numbers; leave it out, or give it the family "
             "'category'"
         )
-    read = read_numbers(column, na_values, decimal, column.attrs.get("decimal", "."))
+    read = read_numbers(column, na_values, decimal, column.attrs.get("decimal"))
     read.check(column, "or give the column the family 'category'")
     if read.marks:
         warnings.warn(f"column {told.name!r} {said_of_marks(read.marks)}", stacklevel=2)

@@ -20,6 +20,7 @@ from .numerals import NEARLY_ALL, read_numbers
 from .parsing import (
     MONTHS,
     Undecided,
+    Unread,
     compact,
     dates,
     index_levels,
@@ -206,7 +207,7 @@ class _Proposal:
         families: Mapping[str, str],
     ):
         self.frame, self.index, self.levels = frame, levels, levels if len(levels) > 1 else []
-        self.na_values, hint = told.na_values, frame.attrs.get("decimal", ".")
+        self.na_values, hint = told.na_values, frame.attrs.get("decimal")
         self.numbers = {name: read_numbers(frame[name], told.na_values, told.decimal, hint) for name in frame}
         numerals = {
             name: read.values
@@ -369,10 +370,21 @@ class _Proposal:
             if is_date(self.plain[name]):
                 return True
             cells = self.frame[name]
-            plausible = cells.isna() if is_number(cells) else texts(cells).str.contains(DATE, na=True)
-            known = plausible & cells.notna()
-            if NEARLY_ALL * cells.count() <= known.sum() < cells.count() and is_date(cells[known]):
-                row = int(np.argmin(plausible))
+            if 2 * (~np.isnan(self.numbers[name].values)).sum() >= cells.count():
+                return False
+            known = (cells.notna() & texts(cells).str.contains(DATE, na=False)).to_numpy(bool, copy=True)
+            if known.sum() < NEARLY_ALL * cells.count():
+                return False
+            try:
+                dates(cells[known])
+            except Unread as error:
+                known[known] = ~error.wrong
+            except Undecided:
+                raise
+            except (TypeError, ValueError):
+                return False
+            if NEARLY_ALL * cells.count() <= known.sum() < cells.count():
+                row = int(np.argmax(cells.notna().to_numpy() & ~known))
                 raise ValueError(
                     f"column {name!r}: {known.sum()} of {cells.count()} values are dates; row {row} is "
                     f"{brief(cells.iloc[row])}; correct it, or leave the row out"

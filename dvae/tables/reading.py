@@ -36,13 +36,13 @@ from ..npy import mapped
 from ..options import nearest
 from .columns import MOST, Columns, layout, parsed
 from .domains import DOMAINS, domain
+from .numerals import decimal_sign
 from .panel import SPLITS, Panel, Series, plain_columns
 from .proposing import Told
 from .protocol import Cut
 
-SEPARATORS = {".csv": ",;\t", ".tsv": "\t"}
+SEPARATORS = {".csv": ",;\t|", ".tsv": "\t"}
 """What may stand between entries, the likeliest first: spreadsheets write what their country does."""
-DECIMAL_COMMA = re.compile(r"(?:^|[;\t])\s*[-+]?\d+,\d+\s*(?:[;\t]|$)", re.MULTILINE)
 DECLARED = re.compile(rb'"?sep=([,;:|\t ])"?\r?\n', re.IGNORECASE)
 """A first line that names the separator."""
 BLANK = re.compile(rb"\n[ \t]*\r?\n|\r\r(?!\n)")
@@ -118,8 +118,8 @@ def _separated(content: bytes, separators: str) -> Any:
             f"the header has several columns named {', '.join(twice)}; the further ones are read as {', '.join(renamed)}",
             stacklevel=5,
         )
-    if separator != "," and DECIMAL_COMMA.search(head):
-        frame.attrs["decimal"] = ","
+    if separator != ",":
+        frame.attrs["decimal"] = decimal_sign(frame)
     if len(frame) and frame.iloc[:, -1].isna().any():
         _warn_of_shorter_rows(whole, separator)
     return _without_empty_end(frame, content)

@@ -127,6 +127,18 @@ def test_durations_are_times(spans, tmp_path):
     np.testing.assert_array_equal(wide.series[0].times, SPANS.total_seconds())
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "ends"),
+    [(1, 1, "0.5 in row 20"), (-1, -1, "0 in row 19"), (1, -1, "18.5 in row 21"), (-1, 1, "")],
+)
+def test_recordings_of_either_direction_are_not_mingled(first, second, ends):
+    clock = np.concatenate([np.arange(20.0)[::first], 0.5 + np.arange(20)[::second]])
+    with pytest.raises(ValueError, match=f"goes back from time .* to {ends}.*; name the id columns"):
+        Panel.of(frame_of(clock))
+    one = Panel.of(frame_of(np.arange(20.0)[::-1])).series[0]
+    np.testing.assert_array_equal(one.times, np.arange(20))
+
+
 def test_recordings_whose_clocks_overlap_are_not_mingled():
     clock = np.concatenate([np.arange(20.0), 0.5 + np.arange(20)])
     said = (

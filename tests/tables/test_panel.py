@@ -366,14 +366,15 @@ def test_dates_before_1970_are_times_too():
             ["1/2/2020", "13/2/2020", "2/13/2020"],
             "nor durations: some begin with the day and others with the m",
         ),
-        (["13/1/2020", "n.a.", "15/1/2020"], "nor durations: 'n.a.' among them; write dates as 2024-12-31"),
-        (["30/1/2020", "30/2/2020", "30/3/2020"], "nor durations: '30/2/2020' among them"),
+        (["13/1/2020", "n.a.", "15/1/2020"], "nor durations: 'n.a.' in row 1 among them; write dates as 2024-12-31"),
+        (["30/1/2020", "30/2/2020", "30/3/2020"], "nor durations: '30/2/2020' in row 1 among them"),
         (
             ["1/2/2020", "2/2/2020", "12/2/2020"],
             "column 't' holds dates such as '1/2/2020', .* as 2024-12-31",
         ),
         (["1.2.20", "2.2.20", "13.2.20"], "column 't' holds dates such as '1.2.20'"),
-        (["12:30", "12:40", "12:50"], "nor durations: '12:30' among them; .* durations as 02:30:00"),
+        (["2024-02-28", "2024-02-29", "2024-02-30"], "nor durations: '2024-02-30' in row 2 among"),
+        (["12:30", "12:40", "12:50"], "nor durations: '12:30' in row 0 among them; .* durations as 02:30:00"),
         (
             ["22:00:00", "23:00:00", "00:00:00"],
             "goes back from t 0 days 23:00:00 in row 1 to 0 days .* in row 2; .* midnight",

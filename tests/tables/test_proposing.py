@@ -395,6 +395,40 @@ def test_declared_marks_and_signs_are_read(tmp_path):
     assert again.fingerprint == data.fingerprint
 
 
+@pytest.mark.parametrize("sign", [",", "."])
+@pytest.mark.parametrize("separator", [";", "\t", "|"])
+def test_thousands_are_not_divided(tmp_path, sign, separator):
+    other = {",": ".", ".": ","}[sign]
+    grouped = [f"{n:,}".replace(",", sign) for n in range(700, 2500, 30)]
+    days = pd.date_range("2024-01-01", periods=60).strftime("%Y-%m-%d")
+
+    def read(told=None, **columns):
+        names = ["day", *columns]
+        lines = [separator.join(row) for row in zip(days, *columns.values(), strict=True)]
+        (tmp_path / "a.csv").write_text("\n".join([separator.join(names), *lines]) + "\n")
+        return read_panel(tmp_path / "a.csv", told)
+
+    said = f"'{{}}' holds '1{sign}000', which may be 1000 or a fraction; give the decimal sign"
+    for told in (None, Told(columns=("sales:real",))):
+        with pytest.raises(ValueError, match=said.format("sales")):
+            read(told, sales=grouped)
+    with pytest.raises(ValueError, match=said.format("step")):
+        read(Columns((Column("y"),), time="step"), step=[f"1{sign}{n:03}" for n in range(60)], y=["1"] * 60)
+    prices = [f"1{sign}000{other}5", *(f"{n}{other}25" for n in range(59))]
+    for told in (Told(decimal=other), None) if sign == "," else (Told(decimal=other),):
+        panel = read(told, sales=grouped, price=prices)
+        np.testing.assert_array_equal(panel.series[0].values[:, 0], np.arange(700, 2500, 30))
+
+
+@pytest.mark.parametrize("bad", ["2024-02-30", "2024-13-01", "2024-01-xx", "soon"])
+def test_one_cell_that_is_no_date_is_named(bad):
+    days = [*pd.date_range("2024-01-01", periods=30).strftime("%Y-%m-%d"), bad]
+    for order in (1, -1):
+        frame = pd.DataFrame({"day": days[::order], "y": np.arange(31) / 8})
+        with pytest.raises(ValueError, match=f"'day': 30 of 31 values are dates; row {days[::order].index(bad)} is"):
+            Panel.of(frame)
+
+
 LAYOUTS = {
     "dates as names": (
         "shop,2024-01-01,2024-01-02,2024-01-03\na,1,2,3\nb,4,5,6\n",

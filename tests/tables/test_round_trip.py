@@ -42,6 +42,7 @@ NUMBERS = {
     "large": lambda random, n: random.integers(2**52, 2**53, n).astype(float),
     "halves": lambda random, n: random.integers(-9, 9, n) / 2,
     "constant": lambda random, n: np.full(n, 2.5),
+    "sales": lambda random, n: random.integers(700, 2500, n).astype(float),
 }
 STEPS = {"day": "D", "hour": "h", "month": "MS", "business day": "B", "quarter": "QS", "minute": "min"}
 CLOCKS = {
@@ -131,12 +132,14 @@ def fill(table, random):
             continue
         kind = str(random.choice([*NUMBERS]))
         values = NUMBERS[kind](random, count)
-        group = {".": ",", ",": "."}[table.decimal] if random.random() < 0.2 else ""
+        group = {".": ",", ",": "."}[table.decimal] if random.random() < (0.7 if kind == "sales" else 0.2) else ""
+        whole = f"{table.decimal}0" if kind == "sales" else " "  # sales have no fraction, so only thousands have a sign
         mark = str(random.choice(missing))
         table.marks += mark == "?" and absent.any()
         table.columns.append(Column(f"{kind}{place}", role))
         table.cells[f"{kind}{place}"] = [
-            mark if gone else numeral(value, table.decimal, group) for value, gone in zip(values, absent, strict=True)
+            mark if gone else numeral(value, table.decimal, group).removesuffix(whole)
+            for value, gone in zip(values, absent, strict=True)
         ]
         table.values.append(np.where(absent, np.nan, values))
 
