@@ -175,6 +175,13 @@ def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
                 shown = [f"{number:.4g}" if own.count[place] else "–" for number in numbers]
             table.add_row(column.name, column.role, column.family, column.unit, known, *shown)
         OUT.print(table)
+        if panel.columns.id and not told.given().get("id") and schema_beside(path) == (None, None):
+            OUT.print(
+                f"note: each value of {', '.join(panel.columns.id)} is taken as a sequence of its own, as its name or "
+                "its repeated times suggest; if all rows are one sequence, make it part of the time",
+                markup=False,
+                soft_wrap=True,
+            )
         for said in opened.parts().values():
             OUT.print(said, markup=False, soft_wrap=True)
         text = written_schema(panel.columns, opened.schema.cut)

@@ -98,8 +98,9 @@ def read_numbers(
         return Numbers(values, np.zeros(len(column), bool), {})
     if column.dtype.kind in "mMc" or isinstance(column.dtype, pd.PeriodDtype | pd.IntervalDtype):
         return Numbers(nothing, column.notna().to_numpy(), {})
-    if decimal != "," and (decimal or hint in (".", None)) and (plain := _plain(column.to_numpy(object, na_value=np.nan))) is not None:
-        if decimal or hint is None or not _has_large_whole(plain):
+    if decimal == "." or (decimal is None and hint in (None, ".")):
+        plain = _plain(column.to_numpy(object, na_value=np.nan))
+        if plain is not None and (decimal or hint is None or not _has_large_whole(plain)):
             plain[np.isin(plain, sentinels)] = np.nan
             return Numbers(plain, np.zeros(len(column), bool), {})
     try:
@@ -152,7 +153,7 @@ def _numbers(cells: list[Any], decimal: str | None, hint: str | None) -> tuple[n
         return (comma if lost > 0 else dot), None
     sign = "," if commas else "."
     if not commas or not any("." in word for word in words):
-        if hint == "." != sign:
+        if hint == "." and sign == ",":
             return dot, None
         if hint == sign and not _has_large_whole(dot[~differ]):
             return (dot if sign == "." else comma), None
@@ -161,7 +162,7 @@ def _numbers(cells: list[Any], decimal: str | None, hint: str | None) -> tuple[n
 
 def _has_large_whole(values: np.ndarray) -> bool:
     """Whether some number is whole and of three digits or more: 1.000 after 999 is no fraction."""
-    return bool(((np.abs(values) >= 100) & (values % 1 == 0)).any())
+    return bool(((np.abs(values) >= 100) & (values == np.trunc(values))).any())
 
 
 def _parsed(cells: list[Any], decimal: str) -> np.ndarray:

@@ -245,6 +245,11 @@ class Panel:
             )
         for each in arrays:
             check_real(each, "the table")
+            if (dtype := getattr(each, "dtype", None)) is not None and getattr(dtype, "kind", "") in ("m", "M"):
+                raise TypeError(
+                    f"the table is an array of {dtype}, which are times and no values; give a pandas frame with the "
+                    'times in one column and the values in others, as pandas.DataFrame({"time": times, "x": x})'
+                )
         plain = [each.detach().cpu().double().numpy() if isinstance(each, torch.Tensor) else each for each in arrays]
         found = [
             each.view(np.ndarray)
@@ -356,8 +361,8 @@ def _of_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
     if columns.id:
         if (unnamed := frame[list(columns.id)].isna().all(axis=1)).any():
             raise ValueError(
-                f"{int(unnamed.sum())} of {len(frame)} rows have no {' and no '.join(columns.id)}, the first of them row "
-                f"{int(np.argmax(unnamed))}; fill in which sequence they belong to, or remove them"
+                f"{int(unnamed.sum())} of {len(frame)} rows have no {' and no '.join(columns.id)}, the first of them "
+                f"row {int(np.argmax(unnamed))}; fill in which sequence they belong to, or remove them"
             )
         found = frame.groupby(list(columns.id), sort=False, observed=True, dropna=False).indices
         rows = [np.sort(places) for places in found.values()]

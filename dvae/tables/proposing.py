@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections import Counter
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -49,6 +50,12 @@ MOST_HEADERS = 4
 """Rows of names at the top of a file."""
 DATE = r"\d{4}|\d\W{1,2}\d|\d[-/. ]?[A-Za-z]{3}"
 """What every date has somewhere."""
+PART_OF_TIME = re.compile(r"\d{1,3}:\d\d([:.]\d+)*\s?([ap]\.?m\.?)?", re.IGNORECASE)
+"""Clocks, and minutes with seconds, none of which says a date."""
+QUANTITY = re.compile(r"([^\w\s.,+-]{0,3})\s?[-+−]?[.,]?\d[\d.,'’\s]*([^\d\s]\D{0,11})?")
+"""A number, perhaps with a sign of its unit before or after it."""
+NUMBERED = 5
+"""Columns with one name and a number from which a table may have its steps in columns."""
 DATED_NAME = re.compile(
     r"\d{4}([-/.]\d{1,2}){0,2}([T ]\d.*)?|\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}|\d{4}[-_ ]?[QM]\d{1,2}|"
     rf"({'|'.join(MONTHS)})[a-z]*[-/ .]?\d{{2,4}}",
@@ -241,7 +248,9 @@ class _Proposal:
             changing = groups[[*columns]].nunique().max() > 1
             columns = {name: each if changing[name] else _static(each) for name, each in columns.items()}
         if not columns and not families:
-            raise ValueError(f"none of the columns {', '.join([*frame][:20])} holds numbers or a few classes")
+            reasons = ", ".join(f"{name!r} ({self.reason(name)})" for name in [*frame][:20])
+            single = "; separators are , ; tab and |, others are named by a first line such as sep=:"
+            raise ValueError(f"no column can be a target: {reasons}{single if frame.shape[1] == 1 else ''}")
         self.columns = columns
 
     def _holds_codes(self, name: str) -> bool:
@@ -480,6 +489,8 @@ class _Proposal:
         read, values = self.numbers[name], self.frame[name].dropna()
         if name in self.undecided:
             return f"perhaps the time: {self.undecided[name]}"
+        if name in (*self.time, *self.id):
+            return "the time" if name in self.time else "an id"
         if self._numbers_rows(name):
             return "the numbers of the rows, without a name" if name == "Unnamed: 0" else "the numbers of the rows"
         if name in self.levels:
@@ -489,7 +500,10 @@ class _Proposal:
         if self.is_constant(name):
             return f"constant: {_first(values)}"
         odd = self.frame[name][read.wrong] if read.wrong.any() else values
-        return f"neither numbers nor 2 to {CLASSES} classes, such as {_first(odd)}"
+        if values.astype(str).str.strip().str.fullmatch(PART_OF_TIME).all():
+            return f"perhaps a time, such as {_first(odd)}; write it with its date, or as a duration such as 02:30:00"
+        sign = f"; remove {unit!r}" if (unit := _unit(str(odd.iloc[0]))) else ""
+        return f"neither numbers nor 2 to {CLASSES} classes, such as {_first(odd)}{sign}"
 
     def warn(self, columns: Columns, all_named: bool) -> None:
         """Name what of the frame is not among the columns."""
@@ -498,6 +512,47 @@ class _Proposal:
         said = [f"{name!r} ({self.reason(name)})" for name in aside]
         if said:
             warnings.warn(f"left out of what is proposed: {', '.join(said)}", stacklevel=4)
+        for column in columns.columns:
+            self._warn_of_classes(column.name)
+        if all_named and not columns.time and not self.undecided:
+            self._warn_of_steps_in_columns(columns)
+
+    def _warn_of_classes(self, name: str) -> None:
+        """Warn of a proposed category whose classes may be numbers with a unit or among marks."""
+        if name not in self.columns or self._holds_codes(name):
+            return
+        classes = self.columns[name].classes
+        units = [unit for each in classes if (unit := _unit(each)) is not None]
+        if "" in units or len(units) > len(classes) / 2:
+            signs = "".join(f", remove {unit!r}" for unit in dict.fromkeys(filter(None, units)))
+            warnings.warn(
+                f"column {name!r} is proposed as a category, and some of its classes may be numbers: "
+                f"{', '.join(map(brief, classes[:5]))}; correct them{signs}, list those that mark missing values in "
+                f"na_values (--na-values), or declare {name}:category (--columns)",
+                stacklevel=5,
+            )
+
+    def _warn_of_steps_in_columns(self, columns: Columns) -> None:
+        """Warn of a table without a time whose rows are perhaps sequences, with a column for each step."""
+        stems = Counter(re.sub(r"\d+$", "", name) for name in columns.names if re.search(r"\d$", name))
+        stem, count = max(stems.items(), key=lambda each: each[1], default=("", 0))
+        labels = [name for name in self.frame if self._labels_rows(name)]
+        if count >= NUMBERED and (count > len(self.frame) or labels):
+            numbered = [name for name in columns.names if re.fullmatch(re.escape(stem) + r"\d+", name)]
+            rest = [name for name in self.frame if name not in numbered]
+            warnings.warn(
+                f"there is no time, and {count} columns, {numbered[0]!r} to {numbered[-1]!r}, are numbered; if each "
+                f"row is a sequence, write a row for each step, as frame.melt({rest}, var_name='time', "
+                "value_name='value') does",
+                stacklevel=5,
+            )
+
+    def _labels_rows(self, name: str) -> bool:
+        """Whether a column holds another text in each row."""
+        values = self.frame[name]
+        if is_number(self.plain[name]) or values.isna().any() or not values.is_unique:
+            return False
+        return not values.astype(str).str.strip().str.fullmatch(PART_OF_TIME).all()
 
 
 def _first(values: Any) -> str:
@@ -508,6 +563,12 @@ def _first(values: Any) -> str:
 def _static(column: Column) -> Column:
     family = "category" if column.family == "category" else "real"
     return replace(column, role="static", family=family)
+
+
+def _unit(cell: str) -> str | None:
+    """Return the sign of the unit of a number in text, "" if it has none; None for other texts."""
+    found = QUANTITY.fullmatch(cell.strip())
+    return None if found is None else (found[1] + (found[2] or "")).strip()
 
 
 def _is_whole(values: Any) -> bool:

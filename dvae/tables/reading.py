@@ -115,7 +115,8 @@ def _separated(content: bytes, separators: str) -> Any:
     if twice := [name for name in dict.fromkeys(header) if name and header.count(name) > 1]:
         renamed = [name for name in frame.columns if name not in header and not name.startswith("Unnamed: ")]
         warnings.warn(
-            f"the header has several columns named {', '.join(twice)}; the further ones are read as {', '.join(renamed)}",
+            f"the header has several columns named {', '.join(twice)}; the further ones are read as "
+            f"{', '.join(renamed)}",
             stacklevel=5,
         )
     if separator != ",":

@@ -144,9 +144,10 @@ def test_dates_in_digits_are_read_or_said_to_be_undecided(tmp_path, capfd, forma
         assert main(["data", "info", str(path)]) == 0
         out, error = (" ".join(each.split()) for each in capfd.readouterr())
         assert f"16 sequences of {count} steps" in out
+        assert "note: each value of shop is taken as a sequence" in out
         assert ('time = "date"' in out) == read
         assert ("write them as 2024-12-31" in error) == (not read)
-        assert "'price' (neither numbers nor 2 to 20 classes, such as '10.00 €')" in error
+        assert "'price' (neither numbers nor 2 to 20 classes, such as '10.00 €'; remove '€')" in error
         assert "'Unnamed: 0' (the numbers of the rows" in error
         assert "Exception ignored" not in error
     assert "column 'date' holds dates such as '01" in failure(

@@ -395,6 +395,15 @@ def test_sequences_are_told_apart_by_all_their_ids():
     assert next(iter(Panel.of(numbered, Columns((Column("y"),), id=("a", "b"), time="t")))).name == "2/u"
 
 
+def test_an_array_of_times_is_refused():
+    times = np.arange(6).astype("datetime64[D]").reshape(6, 1)
+    for each in (times, [times], times - times[0]):
+        with pytest.raises(
+            TypeError, match=r"array of (date|time).*; give a pandas frame with the times in one column"
+        ):
+            Panel.of(each)
+
+
 def test_rows_without_an_id_are_refused():
     frame = pd.DataFrame({"shop": ["a", None, "a", None], "t": range(4), "y": np.arange(4) / 8})
     with pytest.raises(ValueError, match="2 of 4 rows have no shop, the first of them row 1; fill in which sequence"):

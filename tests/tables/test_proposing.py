@@ -155,7 +155,7 @@ def test_the_numbers_of_rows_that_pandas_writes_are_left_out():
 
 def test_numbers_that_are_written_as_texts_are_named():
     prices = [f"{n},234.50 €" for n in range(10, 31)]
-    with pytest.warns(UserWarning, match="left out of what is proposed: 'price' .*, such as '10,234.50 €'"):
+    with pytest.warns(UserWarning, match="left out of what is proposed: 'price' .*, such as '10,234.50 €'; remove '€'"):
         assert "price" not in proposed(panel(price=prices)).names
 
 
@@ -427,6 +427,70 @@ def test_one_cell_that_is_no_date_is_named(bad):
         frame = pd.DataFrame({"day": days[::order], "y": np.arange(31) / 8})
         with pytest.raises(ValueError, match=f"'day': 30 of 31 values are dates; row {days[::order].index(bad)} is"):
             Panel.of(frame)
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [
+        ["1,5", "1.5", "2.5"],
+        ["1.5", "2.5", "<1"],
+        ["1.5", "2.5", "3.5", "off"],
+        ["5 kg", "6 kg"],
+        ["5%", "6%"],
+        ["$5", "$6.50"],
+    ],
+)
+def test_classes_that_may_be_numbers_are_named(cells):
+    frame = pd.DataFrame({"t": range(24), "y": (cells * 24)[:24]})
+    with pytest.warns(
+        UserWarning, match="'y' is proposed as a category, and some of its classes may be numbers"
+    ) as said:
+        assert proposed(frame).columns[0].family == "category"
+    unit = next((unit for unit in ("kg", "%", "$") if unit in cells[0]), None)
+    assert (f"remove '{unit}'" in str(said[0].message)) == (unit is not None)
+    Panel.of(frame, Told(columns=("y:category",)))  # what is declared is not named
+
+
+def test_classes_that_only_contain_digits_are_no_numbers():
+    for cells in (["07", "12"], ["09:30", "10:00"], ["20-30", "30-40"], ["sun", "4 by 4", "rain"]):
+        proposed(pd.DataFrame({"t": range(12), "y": (cells * 12)[:12]}))
+
+
+@pytest.mark.parametrize(
+    ("cells", "said"),
+    [
+        ([f"{n // 60:02}:{n % 60:02}" for n in range(90)], r"perhaps a time, such as '00:00'; write it with its date"),
+        ([f"{n:02}:05.{n % 10}" for n in range(90)], "perhaps a time, such as '00:05.0'"),
+        ([f"{n // 8 % 12 + 1}:{n % 60:02} AM" for n in range(90)], "perhaps a time, such as '1:00 AM'"),
+        ([f"€ {n}.3" for n in range(90)], "such as '€ 0.3'; remove '€'"),
+        ([f"{n} %" for n in range(90)], "such as '0 %'; remove '%'"),
+        ([None] * 90, "empty: all its values are missing"),
+    ],
+)
+def test_every_column_has_the_reason_why_it_is_no_target(cells, said):
+    frame = pd.DataFrame({"t": cells, "y": np.arange(90) / 8})
+    with pytest.warns(UserWarning, match=rf"left out .*'t' \(.*{said}"):
+        proposed(frame)
+    with pytest.raises(ValueError, match=rf"no column can be a target: 't' \(.*{said}.*, 'u' \(constant"):
+        proposed(pd.DataFrame({"t": cells, "u": "same"}))
+
+
+def test_separators_that_are_not_found_are_named(tmp_path):
+    (tmp_path / "a.csv").write_text("day x y\n" + "".join(f"{n} {n}.5 3\n" for n in range(30)))
+    with pytest.raises(
+        ValueError, match=r"'day x y' \(neither .*; separators are , ; tab and [|], others are named by"
+    ):
+        read_panel(tmp_path / "a.csv")
+
+
+def test_steps_in_columns_are_named():
+    wide = pd.DataFrame({f"d_{n}": np.arange(5) + n / 8 for n in range(60)})
+    with pytest.warns(UserWarning, match=r"60 columns, 'd_0' to 'd_59', are numbered; .* frame.melt\(\[\], var_name"):
+        proposed(wide)
+    labelled = wide[[f"d_{n}" for n in range(5)]].assign(country=list("abcde"))
+    with pytest.warns(UserWarning, match=r"5 columns, .* frame.melt\(\['country'\]"):
+        proposed(labelled)
+    proposed(wide.assign(t=range(5)))
 
 
 LAYOUTS = {
