@@ -29,6 +29,7 @@ from torch import Tensor
 from typing_extensions import Protocol, runtime_checkable  # typing's own, in Python 3.11, evaluates properties
 
 from .blocks import hash_values, ranges
+from .options import Count, require
 from .units import exceeds_float32
 
 Batch = Mapping[str, Any]
@@ -500,8 +501,9 @@ class ArrayWindows:
         season: a period of the data, in frames.
 
     Raises:
-        ValueError: x that is not `(N, T, D)`, a mask of another shape, as many clip names as windows or columns as
-            coordinates are not given, or a season below 1.
+        TypeError: observed steps that are no whole number.
+        ValueError: x that is not `(N, T, D)`, observed steps that leave none to predict, a mask of another shape, as
+            many clip names as windows or columns as coordinates are not given, or a season below 1.
 
     Example:
         >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=5, clips=["a", "a", "a", "b", "b", "b"])
@@ -519,12 +521,17 @@ class ArrayWindows:
 
     def __post_init__(self) -> None:
         check_real(self.x, "x")
+        require(Count, observed=self.observed)
         x, mask = unmasked(self.x)
         if mask is not None:
             object.__setattr__(self, "x", x)
             object.__setattr__(self, "mask", mask if self.mask is None else mask & np.asarray(self.mask, bool))
         if self.x.ndim != 3:
             raise ValueError(f"windows must be (N, T, D), but x has shape {tuple(self.x.shape)}")
+        if self.observed >= self.x.shape[1]:
+            raise ValueError(
+                f"observed is {self.observed} of {self.x.shape[1]} steps of x, which leaves none to predict; give fewer"
+            )
         if self.mask is not None and self.mask.shape != self.x.shape:
             raise ValueError(f"the mask has shape {tuple(self.mask.shape)}, expected that of x, {tuple(self.x.shape)}")
         if self.clips is not None and len(self.clips) != len(self.x):

@@ -86,6 +86,17 @@ def check(options: Any) -> None:
             raise error
 
 
+def require(hint: Any, **values: Any) -> None:
+    """Refuse arguments that are not of a type or out of its range.
+
+    Raises:
+        TypeError, ValueError: see `check`.
+    """
+    for name, value in values.items():
+        if (error := problem(name, value, hint)) is not None:
+            raise error
+
+
 def problem(name: str, value: Any, hint: Any) -> Exception | None:
     """What is wrong with a value; None if it is of the type."""
     origin, arguments = get_origin(hint), get_args(hint)
@@ -119,6 +130,8 @@ def problem(name: str, value: Any, hint: Any) -> Exception | None:
         whole = isinstance(value, Integral) and abs(int(value)) > sys.float_info.max
         return ValueError(f"{given}; it must be a number that a float holds") if whole or value != value else None
     kind = origin or hint
+    if getattr(kind, "_is_protocol", False):  # which most objects meet without being of its type
+        return None
     if isinstance(kind, type) and kind is not Any and not isinstance(value, kind):
         return TypeError(f"{given}; it must be {'true or false' if kind is bool else 'of type ' + kind.__name__}")
     if isinstance(value, str | Mapping) and len(value) > LONGEST:
@@ -161,7 +174,8 @@ def kind_of(value: Any) -> str:
 
 def _problem_of_entries(name: str, value: Any, hints: tuple[Any, ...]) -> Exception | None:
     if not isinstance(value, tuple | list):
-        return TypeError(f"{name} is {reprlib.repr(value)}; it must be a tuple")
+        one = hints[1:] == (Ellipsis,) and problem(name, value, hints[0]) is None
+        return TypeError(f"{name} is {reprlib.repr(value)}; it must be a tuple{f', such as {(value,)}' if one else ''}")
     if hints[1:] == (Ellipsis,):
         longest = LONGEST if hints[0] is str else DEEPEST
         if len(value) > longest:

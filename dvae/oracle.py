@@ -28,6 +28,7 @@ from .laws.family import Family
 from .networks.base import indicator, valid_steps
 from .networks.linear import Linear, LinearNetwork
 from .notation import Factor, Factorization
+from .options import Count, kind_of, require
 from .program.conditional import Conditional, like
 from .program.groups import GROUP
 from .program.model import DynamicalVAE
@@ -110,6 +111,7 @@ class Oracle:
         steps: T.
 
     Raises:
+        TypeError: no model, or steps that are no whole number.
         ValueError: a model that is not linear-Gaussian, given the states of what is summed out, or has context or
             energies; a batch of another length, without all data, or with groups.
 
@@ -120,6 +122,9 @@ class Oracle:
     """
 
     def __init__(self, model: DynamicalVAE, steps: int):
+        if not isinstance(model, DynamicalVAE):
+            raise TypeError(f"the model is {kind_of(model)}; expected a DynamicalVAE, such as dvae.twin(...)")
+        require(Count, steps=steps)
         if model.context:
             raise ValueError(f"the oracle knows no law of the context {', '.join(model.context)}")
         if type(model).penalties is not DynamicalVAE.penalties:

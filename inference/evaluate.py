@@ -15,12 +15,14 @@ same windows, and windows of one clip overlap, so that standard errors are clust
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from reprlib import repr as brief
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from ..data import HeldOutWindows, called, columns_of
+from ..options import Count, Delay, require
 from ..program.model import DynamicalVAE
 from ..program.protocols import Emitting, Forecasting
 from ..turns import alone
@@ -165,13 +167,9 @@ def evaluate(
 
 
 def _check(models: Mapping[str, Any], samples: int, batch_size: int, *particles: int) -> None:
-    if samples < 1:
-        raise ValueError(f"every method needs at least 1 forecast per window, not samples={samples}")
-    if batch_size < 1 or min(particles) < 0:
-        raise ValueError(
-            "batch_size is at least 1, and bound_particles and log_score_particles are at least 0, not "
-            f"{batch_size} and {' and '.join(map(str, particles))}"
-        )
+    require(Count, samples=samples, batch_size=batch_size)
+    for name, count in zip(("bound_particles", "log_score_particles"), particles, strict=True):
+        require(Delay, **{name: count})
     for name, each in models.items():
         if not isinstance(each, Forecasting):
             raise TypeError(
@@ -181,6 +179,8 @@ def _check(models: Mapping[str, Any], samples: int, batch_size: int, *particles:
 
 
 def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
+    if not callable(scores):
+        raise TypeError(f"scores is {brief(scores)}; expected a function of the windows, such as dvae.motion.scores")
     measures = list(scores(windows))
     names = [measure.name for measure in measures]
     if twice := {name for name in names if names.count(name) > 1}:

@@ -444,6 +444,9 @@ def test_a_learned_normal_prior_is_part_of_the_evidence():
 def test_models_that_the_oracle_does_not_know():
     with pytest.raises(ValueError, match=r"q\(z_t .* is not linear-Gaussian: the oracle needs networks.Linear"):
         Oracle(DynamicalVAE(*PAIRS["dkf"], {"z": 1, "x": 1}).double(), T).gap()
+    for call, said in (((build("dkf"), "4"), "steps is .4."), ((DynamicalVAE, 4), "is the class DynamicalVAE")):
+        with pytest.raises(TypeError, match=said):
+            Oracle(*call)
     driven = ("p(z_t | z_{t-1}, c_t) p(x_t | z_t)", "q(z_t | x_{1:T})")
     with pytest.raises(ValueError, match="no law of the context c"):
         Oracle(twin(*driven, {"z": 1, "x": 1, "c": 1}, T), T)

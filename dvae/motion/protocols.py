@@ -222,12 +222,12 @@ def _said(representation: str) -> str:
     return "positions of joints" if representation == "positions" else f"turns of joints as {representation}"
 
 
-def windows(motion: MotionSet, protocol: Protocol, split: str, length: int | None = None) -> Windows:
+def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int | None = None) -> Windows:
     """The windows of a split.
 
     Args:
         motion: the clips.
-        protocol: how to cut them.
+        protocol: how to cut them, or the name of one of `PROTOCOLS`.
         split: "train", "validation", "test", or "train+validation".
         length: frames in a window, when it should differ from the protocol's observed + predicted.
 
@@ -235,6 +235,8 @@ def windows(motion: MotionSet, protocol: Protocol, split: str, length: int | Non
         ValueError: the frame rates differ, the split has no clip, no clip is long enough, or a clip lacks the
             label by which the protocol splits.
     """
+    if isinstance(protocol, str):
+        protocol = named_protocol(protocol)
     if motion.skeleton.fps != protocol.fps:
         raise ValueError(
             f"protocol {protocol.name} counts frames at {protocol.fps:g} a second, {motion.name!r} has "
@@ -243,7 +245,9 @@ def windows(motion: MotionSet, protocol: Protocol, split: str, length: int | Non
     parts = _divide(motion, protocol)
     unknown = [name for name in split.split("+") if name not in parts]
     if unknown:
-        raise ValueError(f"no split {unknown[0]!r}: expected train, validation, test or train+validation")
+        raise ValueError(
+            f"no split {unknown[0]!r}{nearest(unknown[0], parts)}: expected train, validation, test or train+validation"
+        )
     chosen = {clip.key for name in split.split("+") for clip in parts[name]}
     return Windows([clip for clip in motion if clip.key in chosen], motion, protocol, split, length or protocol.length)
 

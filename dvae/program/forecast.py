@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..data import refuse_table
 from ..networks.base import computing_once
+from ..options import Count, require
 from ..views import WHOLE
 from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like
@@ -37,13 +38,12 @@ def forecast(
     Where the view has the whole past as context (`views.Past`), there are no data for the guide to read, and latents
     are from the prior.
     """
+    require(Count, horizon=horizon, samples=samples, chunk=chunk)
     data = model.read(batch)
     told: Any = batch if isinstance(batch, Mapping) else {}
     redrawn = [name for name in model.shared if name not in told]  # for every sample anew
     if "lengths" in data:
         raise ValueError("forecast continues sequences of one length; cut the batch to it, or forecast them in turn")
-    if horizon < 1 or samples < 1:
-        raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
     first = data.get(model.view.history or model.observed[0])
     size, past = (len(next(v for v in data.values() if isinstance(v, Tensor))), 0) if first is None else first.shape[:2]
     given = {

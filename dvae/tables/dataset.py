@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
-from ..options import check
+from ..options import check, require
 from .ahead import ahead
 from .columns import Columns
 from .encoding import PanelSchema
@@ -72,8 +72,10 @@ class PanelData:
 
         Raises:
             FileNotFoundError: there is no such file.
+            TypeError: `cut` that is no `Cut`.
             ValueError: a file or a schema that cannot be read.
         """
+        require(Cut | None, cut=cut)
         name = os.fspath(path)
         how = {field.name: told.pop(field.name) for field in fields(Cut) if field.name in told}
         beside, beside_cut = schema_beside(name)
@@ -87,6 +89,7 @@ class PanelData:
     @classmethod
     def of(cls, data: Any, columns: Any = None, cut: Cut | None = None, name: str = "panel") -> Self:
         """A panel in memory, see `Panel.of`; a run that is fitted to it cannot find it again by a path."""
+        require(Cut | None, cut=cut)
         panel = Panel.of(data, columns, name)
         return cls(name, panel, PanelSchema.under(panel, cut or suited(panel)))
 

@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from copy import copy
 from functools import cached_property
 from itertools import islice
-from typing import Any, Self
+from reprlib import repr as brief
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from ..blocks import cut, hash_list, row_blocks
 from ..data import Sequences, columns_of, gapped, past_of
 from ..inference.held import on_device_of, reproducibly
+from ..options import Count, require
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from .calendar import Calendar
@@ -33,6 +35,14 @@ NAMED = 10
 """Sequences without a window that are named."""
 
 
+Split = Literal["train", "validation", "test", "train+validation", "all", "last"]
+
+
+def _require_model(model: Any) -> None:
+    if not isinstance(model, torch.nn.Module):
+        raise TypeError(f"the model is {brief(model)}; expected a fitted model, such as dvae.load(RUN).model")
+
+
 class PanelWindows:
     """The windows of one split; a `Source`, and `HeldOutWindows` where forecasts have a horizon.
 
@@ -44,10 +54,11 @@ class PanelWindows:
         split: "train", "validation", "test" or "train+validation"; "all", or "last" for the end of each sequence.
 
     Raises:
-        ValueError: a split without windows.
+        ValueError: an unknown split, or one without windows.
     """
 
     def __init__(self, panel: Panel, schema: PanelSchema, split: str):
+        require(Split, split=split)
         self.panel, self.schema, self.split = panel, schema, split
         self._ranges = schema.cut.starts(panel, split)
         if schema.columns.group:  # those of a group are drawn together
@@ -230,6 +241,8 @@ class PanelWindows:
         Raises:
             ValueError: whole sequences, which have no future.
         """
+        _require_model(model)
+        require(Count, samples=samples)
         observed, horizon = self.protocol.observed, self.protocol.horizon
         if observed is None or horizon is None:
             raise ValueError("whole sequences have no future; cut them, with observed and horizon steps, to forecast")
@@ -258,6 +271,8 @@ class PanelWindows:
         Raises:
             ValueError: nothing is missing.
         """
+        _require_model(model)
+        require(Count, samples=samples, particles=particles)
         batch = self.all()
         if "mask" not in batch:
             raise ValueError(f"nothing is missing in {self.panel.name}")

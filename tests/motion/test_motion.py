@@ -608,8 +608,10 @@ class TestWindows:
             windows(motion(), TINY, "train", 99)
         with pytest.raises(ValueError, match="counts frames at 50 a second, 'people' has 30"):
             windows(motion(), PROTOCOLS["h36m"], "train")
-        with pytest.raises(ValueError, match="expected train, validation, test"):
+        with pytest.raises(ValueError, match=r"did you mean 'test'\?\): expected train, validation, test"):
             windows(motion(), TINY, "tests")
+        with pytest.raises(ValueError, match=r"unknown protocol 'h36' \(did you mean 'h36m'"):
+            windows(motion(), "h36", "train")
         with pytest.raises(ValueError, match="wants split S1 for training and S2 for test; 'people' has train, test"):
             windows(motion(), replace(TINY, train=("S1",), test=("S2",)), "train")
         with pytest.raises(ValueError, match="stride is -1"):

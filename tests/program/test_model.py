@@ -726,12 +726,13 @@ def test_models_that_cannot_be(change, message):
             lambda m: m.forecast({"x": X, "lengths": torch.tensor([5, 5, 5])}, 2),
             "forecast continues sequences of one length",
         ),
-        (lambda m: m.forecast(X, 0), "horizon and samples are at least 1, got 0 and 1"),
-        (lambda m: m.forecast(X, 1, 0), "horizon and samples are at least 1, got 1 and 0"),
+        (lambda m: m.forecast(X, "3"), "horizon is '3'; it must be a whole number"),
+        (lambda m: m.forecast(X, 0), "horizon is 0; it must be at least 1"),
+        (lambda m: m.forecast(X, 1, 0), "samples is 0; it must be at least 1"),
     ],
 )
 def test_batches_and_calls_that_cannot_be(run, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         run(build("dkf"))
 
 

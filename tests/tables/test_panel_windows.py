@@ -317,6 +317,21 @@ def test_a_panel_of_other_columns_is_refused():
         data.on(Panel(panel.series, second))
 
 
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda panel: PanelData.of(panel, cut={"observed": 3}), "cut is {'observed': 3}; it must be of type Cut"),
+        (lambda panel: PanelData.of(panel).windows("tests"), r"unknown split 'tests' \(did you mean 'test'\?\)"),
+        (lambda panel: PanelData.of(panel).ahead().forecast("run"), "the model is 'run'; expected a fitted model"),
+        (lambda panel: PanelData.of(panel).ahead().forecast(torch.nn.Identity(), "4"), "samples is '4'; it must be a"),
+    ],
+)
+def test_arguments_of_another_type_are_named(call, said):
+    panel = Panel([Series("s", np.ones((9, 1)))], Columns((Column("a"),)))
+    with pytest.raises((TypeError, ValueError), match=said):
+        call(panel)
+
+
 def test_a_season_that_is_told_is_repeated():
     days = np.tile(np.arange(7.0), 12)[:, None]
     columns = Columns((Column("y"),))
