@@ -18,10 +18,10 @@ def main() -> int:
         signal.signal(signal.SIGINT, _interrupted)  # a KeyboardInterrupt amid an import can come out as anything
     try:
         from dvae.cli import command, main
-        from dvae.cli.app import exit_code
 
         with suppress(ValueError):  # no command, of which main tells
             command(sys.argv[1:])
+        from dvae.cli.app import exit_code
     except ImportError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -6,7 +6,7 @@ These are the bodies of `DynamicalVAE.forecast`, `reconstruct` and `impute`, whi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from pyro import poutine
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..data import refuse_table
 from ..networks.base import computing_once
-from ..options import Count, require
+from ..options import Count, Range, require
 from ..views import WHOLE
 from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like
@@ -38,7 +38,8 @@ def forecast(
     Where the view has the whole past as context (`views.Past`), there are no data for the guide to read, and latents
     are from the prior.
     """
-    require(Count, horizon=horizon, samples=samples, chunk=chunk)
+    require(Count, horizon=horizon, samples=samples)
+    require(Annotated[int, Range(1)], chunk=chunk)
     data = model.read(batch)
     told: Any = batch if isinstance(batch, Mapping) else {}
     redrawn = [name for name in model.shared if name not in told]  # for every sample anew

@@ -233,7 +233,7 @@ def test_chunks_change_no_shape_and_no_order(windows, name):
     noise = {"fix": {"e": torch.ones(4, 4)}} if name == "dlow" else {}
     whole, parts = (model.forecast(past, FUTURE, 6, chunk=chunk, **noise)["x"] for chunk in (2048, 1))
     torch.testing.assert_close(whole, parts)
-    with pytest.raises(ValueError, match="samples are at least 1, got 7 and 0"):
+    with pytest.raises(ValueError, match="samples is 0; it must be at least 1"):
         model.forecast(past, FUTURE, 0)
 
 

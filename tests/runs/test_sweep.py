@@ -167,7 +167,7 @@ def test_the_command_fails_if_a_run_does(people, tmp_path, capsys):
 
 
 def test_what_a_run_warns_of_is_told_once(data, tmp_path):
-    with pytest.warns(UserWarning, match="clamped") as caught:
+    with pytest.warns(UserWarning, match="shortened to 2") as caught:
         sweep([replace(VAE, warm_up=50)], data, tmp_path, [0, 1], replace(TRAINING, steps=2))
     assert len(caught) == 1
 
