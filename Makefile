@@ -20,8 +20,9 @@ export OMP_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 # Numerical tests, for the second run: other instructions round otherwise.
-NUMERICAL := laws/test_laws.py networks/test_networks.py networks/test_graphconv.py test_oracle.py program/test_model.py \
-	models/test_trajectories.py motion/test_control.py motion/test_forecasts.py $(addprefix inference/test_,bounds.py metrics.py particles.py)
+NUMERICAL := distributions/test_laws.py networks/test_networks.py networks/test_graphconv.py factorization/test_oracle.py \
+	program/test_model.py models/motion/test_trajectories.py motion/test_control.py motion/test_forecasts.py \
+	inference/bounds/test_bounds.py inference/bounds/test_particles.py inference/evaluation/test_metrics.py
 
 # Torch comes first, or another build may come along. Its build for CUDA brings gigabytes that only a GPU uses, so without
 # one the build for the CPU is taken where pip finds it: on its own index or on TORCH_INDEX.
@@ -98,7 +99,7 @@ dist: venv
 	$(call torch,$(CLEAN)/python)
 	$(CLEAN)/python -m pip install -q -c constraints.txt dist/*.whl
 	cd build && clean/bin/dvae --help > /dev/null && clean/bin/dvae list > /dev/null
-	cd build && clean/bin/python -c 'import dvae, dvae.models.srnn, dvae.inference.fit; print(dvae.__version__, dvae.__file__)'
+	cd build && clean/bin/python -c 'import dvae, dvae.models.family.srnn, dvae.inference.training.fit; print(dvae.__version__, dvae.__file__)'
 
 clean:
 	rm -rf .venv build dist *.egg-info demo runs docs/_build docs/_reference docs/notebooks .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -27,8 +27,8 @@ from torch import Tensor, nn
 import dvae
 from dvae import motion
 from dvae.compiled import compiling, require_compiler
-from dvae.models.gsps import PRESETS
-from dvae.models.motion_latent import MotionLatent
+from dvae.models.motion.gsps import PRESETS
+from dvae.models.motion.motion_latent import MotionLatent
 from dvae.motion import bodies
 from dvae.motion.segments.embodied import Segments
 from dvae.networks.attention import Layer

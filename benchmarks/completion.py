@@ -17,7 +17,7 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.models.motion_latent import MotionLatent
+from dvae.models.motion.motion_latent import MotionLatent
 from dvae.motion import bodies
 from dvae.motion.segments.completion import complete, glimpsed
 from dvae.motion.segments.embodied import Segments

@@ -21,7 +21,7 @@ from pathlib import Path
 import torch
 
 import dvae
-from dvae.motion.dataset import MotionData
+from dvae.motion.data.dataset import MotionData
 from dvae.runs import directory as runs
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

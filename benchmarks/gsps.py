@@ -21,8 +21,8 @@ import torch
 import dvae
 from dvae import motion
 from dvae.compiled import compiling
-from dvae.laws.flow import QRFlowLaw
-from dvae.models.gsps import PRESETS, GSPSModel
+from dvae.distributions.flow import QRFlowLaw
+from dvae.models.motion.gsps import PRESETS, GSPSModel
 
 from .speed import moved, products, seconds, training_step
 

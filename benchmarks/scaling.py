@@ -28,7 +28,7 @@ from torch import Tensor
 
 import dvae
 from dvae import motion
-from dvae.inference import processes
+from dvae.inference.training import processes
 
 from .speed import seconds
 

@@ -32,10 +32,10 @@ from torch.utils._pytree import tree_leaves
 
 import dvae
 from dvae import motion
-from dvae.data import each
-from dvae.laws import scan
-from dvae.laws.chain import gaussian_chain
-from dvae.laws.kalman import LinearGaussianChain
+from dvae.data.sequences import each
+from dvae.distributions import scan
+from dvae.distributions.chain import gaussian_chain
+from dvae.distributions.kalman import LinearGaussianChain
 from dvae.networks.base import shift
 
 BATCH, STEPS, SIZE = 32, 125, 48
@@ -181,7 +181,7 @@ def training_step(model: nn.Module, loss: Callable[[], Tensor]) -> Callable[[], 
 
 
 class ByHand(nn.Module):
-    """The SRNN of `models/srnn.py` as a page of torch, with nothing but what one training step needs."""
+    """The SRNN of `models/family/srnn.py` as a page of torch, with nothing but what one training step needs."""
 
     def __init__(self, x: int, z: int, width: int = 64):
         super().__init__()

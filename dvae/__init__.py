@@ -24,35 +24,36 @@ if sys.flags.optimize > 1:  # Pyro fills in its docstrings as it is imported
     raise ImportError("dvae needs Pyro, which needs docstrings: run python without -OO (PYTHONOPTIMIZE=2); -O is fine")
 
 if TYPE_CHECKING:
-    from . import laws, motion, networks, tables, views
-    from .data import ArrayWindows
-    from .graph import Alternatives, Audit, alternatives, audit
-    from .inference import schedules
-    from .inference.annealing import annealed_bound
-    from .inference.bounds import SequenceELBO, Terms, importance_bound
-    from .inference.bracket import Bracket, bracket
-    from .inference.calibration import calibrate
-    from .inference.checks import predictive_checks
-    from .inference.compare import compare
-    from .inference.comparison import Comparison
-    from .inference.conformal import Tubes, conformal
-    from .inference.evaluate import evaluate
-    from .inference.evaluation import Evaluation
-    from .inference.fit import Fit, fit
-    from .inference.gradnorm import GradNorm
-    from .inference.local import local_guide
-    from .inference.objectives import Evidence
-    from .inference.particles import particle_bound
-    from .inference.posteriors import Descent, Posterior, posterior
-    from .inference.stein import stein_discrepancy
-    from .inference.svi import SVI
-    from .inference.training import Stage, Training
-    from .inference.traversal import traverse
-    from .inference.yardstick import reference_posterior
-    from .inversion import faithful
+    from . import distributions, motion, networks, tables
+    from .data import views
+    from .data.sequences import ArrayWindows
+    from .factorization.graph import Alternatives, Audit, alternatives, audit
+    from .factorization.inversion import faithful
+    from .factorization.notation import Factorization
+    from .factorization.oracle import Oracle, arrow_prices, model_arrow_prices, model_price, price, twin
+    from .inference.bounds.annealing import annealed_bound
+    from .inference.bounds.elbo import SequenceELBO, Terms, importance_bound
+    from .inference.bounds.local import local_guide
+    from .inference.bounds.particles import particle_bound
+    from .inference.diagnostics.bracket import Bracket, bracket
+    from .inference.diagnostics.calibration import calibrate
+    from .inference.diagnostics.checks import predictive_checks
+    from .inference.diagnostics.posteriors import Descent, Posterior, posterior
+    from .inference.diagnostics.stein import stein_discrepancy
+    from .inference.diagnostics.traversal import traverse
+    from .inference.diagnostics.yardstick import reference_posterior
+    from .inference.evaluation.compare import compare
+    from .inference.evaluation.comparison import Comparison
+    from .inference.evaluation.conformal import Tubes, conformal
+    from .inference.evaluation.evaluate import evaluate
+    from .inference.evaluation.evaluation import Evaluation
+    from .inference.training import schedules
+    from .inference.training.fit import Fit, fit
+    from .inference.training.gradnorm import GradNorm
+    from .inference.training.objectives import Evidence
+    from .inference.training.options import Stage, Training
+    from .inference.training.svi import SVI
     from .models.registry import method, methods
-    from .notation import Factorization
-    from .oracle import Oracle, arrow_prices, model_arrow_prices, model_price, price, twin
     from .program.model import DynamicalVAE
     from .program.rollout import InputNoise, SelfFeeding
     from .program.summed import Discrete
@@ -93,11 +94,11 @@ __all__ = [
     "calibrate",
     "compare",
     "conformal",
+    "distributions",
     "evaluate",
     "faithful",
     "fit",
     "importance_bound",
-    "laws",
     "load",
     "local_guide",
     "method",
@@ -122,34 +123,35 @@ __all__ = [
 _PLACES = {
     name: module
     for module, names in {
-        "data": "ArrayWindows",
-        "graph": "Alternatives Audit alternatives audit",
-        "inference": "schedules",
-        "inference.annealing": "annealed_bound",
-        "inference.bounds": "SequenceELBO Terms importance_bound",
-        "inference.bracket": "Bracket bracket",
-        "inference.calibration": "calibrate",
-        "inference.checks": "predictive_checks",
-        "inference.compare": "compare",
-        "inference.comparison": "Comparison",
-        "inference.conformal": "Tubes conformal",
-        "inference.evaluate": "evaluate",
-        "inference.evaluation": "Evaluation",
-        "inference.fit": "Fit fit",
-        "inference.gradnorm": "GradNorm",
-        "inference.objectives": "Evidence",
-        "inference.local": "local_guide",
-        "inference.particles": "particle_bound",
-        "inference.posteriors": "Descent Posterior posterior",
-        "inference.stein": "stein_discrepancy",
-        "inference.svi": "SVI",
-        "inference.training": "Stage Training",
-        "inference.traversal": "traverse",
-        "inference.yardstick": "reference_posterior",
+        "data": "views",
+        "data.sequences": "ArrayWindows",
+        "factorization.graph": "Alternatives Audit alternatives audit",
+        "factorization.inversion": "faithful",
+        "factorization.notation": "Factorization",
+        "factorization.oracle": "Oracle arrow_prices model_arrow_prices model_price price twin",
+        "inference.bounds.annealing": "annealed_bound",
+        "inference.bounds.elbo": "SequenceELBO Terms importance_bound",
+        "inference.bounds.local": "local_guide",
+        "inference.bounds.particles": "particle_bound",
+        "inference.diagnostics.bracket": "Bracket bracket",
+        "inference.diagnostics.calibration": "calibrate",
+        "inference.diagnostics.checks": "predictive_checks",
+        "inference.diagnostics.posteriors": "Descent Posterior posterior",
+        "inference.diagnostics.stein": "stein_discrepancy",
+        "inference.diagnostics.traversal": "traverse",
+        "inference.diagnostics.yardstick": "reference_posterior",
+        "inference.evaluation.compare": "compare",
+        "inference.evaluation.comparison": "Comparison",
+        "inference.evaluation.conformal": "Tubes conformal",
+        "inference.evaluation.evaluate": "evaluate",
+        "inference.evaluation.evaluation": "Evaluation",
+        "inference.training": "schedules",
+        "inference.training.fit": "Fit fit",
+        "inference.training.gradnorm": "GradNorm",
+        "inference.training.objectives": "Evidence",
+        "inference.training.options": "Stage Training",
+        "inference.training.svi": "SVI",
         "models.registry": "method methods",
-        "notation": "Factorization",
-        "inversion": "faithful",
-        "oracle": "Oracle arrow_prices model_arrow_prices model_price price twin",
         "program.model": "DynamicalVAE",
         "program.rollout": "InputNoise SelfFeeding",
         "program.summed": "Discrete",

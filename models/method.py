@@ -10,21 +10,21 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import torch
 from typing_extensions import override
 
-from ..data import Hiding, bridged
-from ..inference.objectives import Evidence, Objective
-from ..inference.recipe import Recipe, Trainable
-from ..inference.schedules import Cosine, Logistic, Ramp, Schedule
-from ..inference.training import Stage
-from ..inversion import guide
-from ..laws import FixedNormal, Flow, LawSpec, Mixture, Normal, StudentT, Vamp
-from ..laws.priors import VampLaw
+from ..data.schema import Schema
+from ..data.sequences import Hiding, bridged
+from ..data.views import WHOLE, View
+from ..distributions import FixedNormal, Flow, LawSpec, Mixture, Normal, StudentT, Vamp
+from ..distributions.priors import VampLaw
+from ..factorization.inversion import guide
+from ..factorization.notation import Factorization
+from ..inference.training.objectives import Evidence, Objective
+from ..inference.training.options import Stage
+from ..inference.training.recipe import Recipe, Trainable
+from ..inference.training.schedules import Cosine, Logistic, Ramp, Schedule
 from ..networks import NetworkSpec
-from ..notation import Factorization
 from ..options import Amount, Delay, Range, Share, Size
 from ..program.model import DynamicalVAE
 from ..program.rollout import SelfFeeding
-from ..schema import Schema
-from ..views import WHOLE, View
 
 SHAPES: dict[str, type[Ramp | Cosine | Logistic]] = {"linear": Ramp, "cosine": Cosine, "logistic": Logistic}
 

@@ -13,11 +13,11 @@ import networkx as nx
 import numpy as np
 import torch
 
-from dvae.inference.bounds import SequenceELBO
-from dvae.laws import Law
-from dvae.notation import Factorization
+from dvae.distributions import Law
+from dvae.factorization.notation import Factorization
+from dvae.factorization.relations import Relation
+from dvae.inference.bounds.elbo import SequenceELBO
 from dvae.program.conditional import CONSTANT
-from dvae.relations import Relation
 
 
 def exact_bound(model, x, *, length=None, seen=None, fed=None, detach=False):

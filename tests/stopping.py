@@ -1,6 +1,6 @@
 """Stops a run at a step, or does something else there."""
 
-from dvae.inference.fit import Callback
+from dvae.inference.training.fit import Callback
 
 
 class At(Callback):

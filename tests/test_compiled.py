@@ -16,9 +16,10 @@ from stopping import At, interrupt
 import dvae
 from dvae import motion
 from dvae.compiled import MARKED, compiled, compiling, requested, require_compiler
-from dvae.inference.checkpoints import Run
-from dvae.models.mix_and_match import _aligned
-from dvae.motion import HUMAN36M, WALKER, bodies, energies, estimate_angle_limits
+from dvae.inference.training.checkpoints import Run
+from dvae.models.motion.mix_and_match import _aligned
+from dvae.motion import HUMAN36M, WALKER, bodies, estimate_angle_limits
+from dvae.motion.scoring import energies
 from dvae.networks import Dense
 from dvae.program.model import DynamicalVAE
 
@@ -132,8 +133,8 @@ def check_runs(tmp_path):
 
 def test_a_run_asks_for_what_is_marked_and_says_where_there_is_nothing(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr("dvae.inference.svi.require_compiler", asked.append)
-    monkeypatch.setattr("dvae.inference.svi.compiling", partial(compiling, "eager"))
+    monkeypatch.setattr("dvae.inference.training.svi.require_compiler", asked.append)
+    monkeypatch.setattr("dvae.inference.training.svi.compiling", partial(compiling, "eager"))
     check_runs(tmp_path)
     assert asked == [torch.device("cpu")] * 3
     with pytest.warns(

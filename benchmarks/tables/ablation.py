@@ -7,7 +7,7 @@ import torch
 import tyro
 
 import dvae
-from dvae.inference.estimates import number
+from dvae.inference.evaluation.estimates import number
 from dvae.runs.ablation import Arrow
 
 from .audits import FAMILY, spread

@@ -7,7 +7,7 @@ import torch
 import tyro
 
 import dvae
-from dvae.inference.estimates import number
+from dvae.inference.evaluation.estimates import number
 
 from .pages import DOCS, code, write
 

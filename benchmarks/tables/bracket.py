@@ -11,7 +11,7 @@ import torch
 import tyro
 
 import dvae
-from dvae.inference.bracket import told
+from dvae.inference.diagnostics.bracket import told
 
 from .bounds import GUIDES, fitted
 from .pages import DOCS, code, loaded, table, write

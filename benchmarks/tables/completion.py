@@ -32,12 +32,14 @@ from torch import Tensor
 
 import dvae
 from dvae import motion
-from dvae.inference.checkpoints import LAST, load_weights
-from dvae.inference.estimates import Crossed, Estimate
-from dvae.inference.held import plain
-from dvae.inference.result import canvas
+from dvae.data.views import WHOLE
+from dvae.inference.evaluation.estimates import Crossed, Estimate
+from dvae.inference.evaluation.held import plain
+from dvae.inference.evaluation.result import canvas
+from dvae.inference.training.checkpoints import LAST, load_weights
 from dvae.motion import bodies
-from dvae.motion.rotations import to_matrix
+from dvae.motion.geometry.rotations import to_matrix
+from dvae.motion.geometry.skeleton import rotate_about_up
 from dvae.motion.segments.completion import (
     Completed,
     Deviations,
@@ -50,8 +52,6 @@ from dvae.motion.segments.completion import (
 )
 from dvae.motion.segments.dataset import SegmentData, thinned
 from dvae.motion.segments.embodied import SHAPE, Segments
-from dvae.motion.skeleton import rotate_about_up
-from dvae.views import WHOLE
 
 from .pages import DOCS, table, write
 

@@ -20,10 +20,10 @@ from rich import print
 
 import dvae
 from dvae.cli import main as command
-from dvae.inference.checkpoints import Run
-from dvae.inference.fit import Fit
-from dvae.inference.recipe import Trainable
-from dvae.motion.plot import futures
+from dvae.inference.training.checkpoints import Run
+from dvae.inference.training.fit import Fit
+from dvae.inference.training.recipe import Trainable
+from dvae.motion.drawing.plot import futures
 from dvae.runs.directory import fit_run, read_config, resume
 from dvae.runs.kinds import Dataset
 

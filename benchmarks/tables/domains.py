@@ -22,12 +22,12 @@ import tyro
 from torch import Tensor
 
 import dvae
-from dvae.data import each
-from dvae.inference.checkpoints import Run
-from dvae.inference.estimates import Crossed, Estimate
-from dvae.inference.evaluation import Row
-from dvae.inference.scores import CRPS, ENERGY, LEVELS, Measure, coverage_at
-from dvae.inference.uncertainty import decimals
+from dvae.data.sequences import each
+from dvae.inference.evaluation.estimates import Crossed, Estimate
+from dvae.inference.evaluation.evaluation import Row
+from dvae.inference.evaluation.scores import CRPS, ENERGY, LEVELS, Measure, coverage_at
+from dvae.inference.evaluation.uncertainty import decimals
+from dvae.inference.training.checkpoints import Run
 from dvae.runs.directory import Config
 from dvae.tables.dataset import PanelData
 from dvae.tables.domains import speech

@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 
 import dvae
-from dvae.inference.estimates import Estimate
+from dvae.inference.evaluation.estimates import Estimate
 
 from .pages import DOCS, table, write
 

@@ -19,14 +19,14 @@ import torch
 import tyro
 
 import dvae
-from dvae import laws
-from dvae.data import gaps
-from dvae.inference.checkpoints import Run, load_weights
-from dvae.inference.estimates import Crossed
+from dvae import distributions
+from dvae.data.sequences import gaps
+from dvae.data.units import Coordinate
+from dvae.inference.evaluation.estimates import Crossed
+from dvae.inference.training.checkpoints import Run, load_weights
 from dvae.networks import Dense, LinearSDE, LinearSDEGuide, Recurrent
 from dvae.networks.base import share_modules
 from dvae.tables.domains import domain
-from dvae.units import Coordinate
 
 from .domains import said
 from .pages import DOCS, table, write
@@ -86,7 +86,11 @@ def built(train: Mapping[str, torch.Tensor], latent: int) -> dvae.DynamicalVAE:
             "p(x)": Dense(decoder),
             "q(z)": LinearSDEGuide(Recurrent(width, hidden=(width,)), TIMES),
         },
-        {"p(z)": laws.Triangular(), "p(x)": laws.FixedNormal(0.5, learned=True), "q(z)": laws.Triangular()},
+        {
+            "p(z)": distributions.Triangular(),
+            "p(x)": distributions.FixedNormal(0.5, learned=True),
+            "q(z)": distributions.Triangular(),
+        },
     )
     share_modules([model.generator["z"].network, model.encoder["z"].network], "equation")
     known = frames(train)

@@ -23,15 +23,15 @@ from torch.distributions import Normal
 
 import dvae
 from dvae import motion
-from dvae.data import past_of
-from dvae.inference.checkpoints import LAST, load_weights
-from dvae.inference.estimates import Crossed, Estimate
-from dvae.inference.held import reproducibly
-from dvae.inference.probe import Redrawn
-from dvae.inference.result import canvas
-from dvae.inference.scores import Measure
-from dvae.models.codes import CodeDiversity, code_diversity
-from dvae.motion.euler import COUNTS, TIMES, euler_errors
+from dvae.data.sequences import past_of
+from dvae.inference.bounds.probe import Redrawn
+from dvae.inference.evaluation.estimates import Crossed, Estimate
+from dvae.inference.evaluation.held import reproducibly
+from dvae.inference.evaluation.result import canvas
+from dvae.inference.evaluation.scores import Measure
+from dvae.inference.training.checkpoints import LAST, load_weights
+from dvae.models.motion.codes import CodeDiversity, code_diversity
+from dvae.motion.geometry.euler import COUNTS, TIMES, euler_errors
 from dvae.motion.judges.quality import STILL, RealOrMade, quality
 from dvae.program.batch import rows
 

@@ -21,12 +21,12 @@ import tyro
 
 import dvae
 from dvae import motion
-from dvae.data import each
-from dvae.inference.checkpoints import Run
-from dvae.inference.estimates import Crossed, Estimate
-from dvae.inference.held import clip_places, plain
-from dvae.inference.result import canvas
-from dvae.inference.scores import clip_means
+from dvae.data.sequences import each
+from dvae.inference.evaluation.estimates import Crossed, Estimate
+from dvae.inference.evaluation.held import clip_places, plain
+from dvae.inference.evaluation.result import canvas
+from dvae.inference.evaluation.scores import clip_means
+from dvae.inference.training.checkpoints import Run
 from dvae.motion.segments.dataset import SegmentData
 from dvae.motion.segments.embodied import Segments
 from dvae.motion.segments.interpolation import falls, interpolate

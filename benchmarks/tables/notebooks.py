@@ -140,7 +140,7 @@ def _kept(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
 
 
 def _still(figure: Any) -> str:
-    """A figure of `dvae.motion.plot`, seen from the front, of an animation the last frame, as a PNG in base64."""
+    """Draw a figure from the front, of an animation the last frame, as a PNG in base64."""
     scene = figure["layout"]["scene"]
     width, height = (np.ptp(scene[axis]["range"]) for axis in ("xaxis", "zaxis"))
     still = Figure(figsize=(9, min(9 * height / width, 6)), dpi=72, layout="constrained")

@@ -16,10 +16,10 @@ from torch import Tensor
 
 import dvae
 from dvae import motion
-from dvae.data import bridged
-from dvae.inference.held import clip_places
-from dvae.inference.references import distances
-from dvae.inference.uncertainty import clustered_variance, linearised
+from dvae.data.sequences import bridged
+from dvae.inference.evaluation.held import clip_places
+from dvae.inference.evaluation.references import distances
+from dvae.inference.evaluation.uncertainty import clustered_variance, linearised
 
 from .pages import DOCS, table, write
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 import dvae
-from dvae.inference.checkpoints import CheckpointError
+from dvae.inference.training.checkpoints import CheckpointError
 
 DOCS = Path(__file__).parents[2] / "docs"
 BEGIN, END = "<!-- tables -->\n", "<!-- end of tables -->\n"

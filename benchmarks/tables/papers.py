@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from dvae.inference.result import canvas
+from dvae.inference.evaluation.result import canvas
 
 from .pages import DOCS, refuse_unknown, table, write
 from .ranking import (

@@ -19,7 +19,7 @@ import tyro
 from torch import Tensor
 
 from dvae import motion
-from dvae.models.trajectories import FIRST, GIVEN
+from dvae.models.motion.trajectories import FIRST, GIVEN
 from dvae.program.batch import CHUNK, rows
 
 from .pages import DOCS, loaded, table, write

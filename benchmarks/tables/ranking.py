@@ -25,15 +25,15 @@ from torch import nn
 
 import dvae
 from dvae import Evaluation, Training, files, motion
-from dvae.inference.checkpoints import Run
-from dvae.inference.estimates import Crossed, Estimate
-from dvae.inference.many import confidence_set
-from dvae.inference.metrics import average_pairwise_distance
-from dvae.inference.result import canvas
-from dvae.inference.scores import Measure
+from dvae.inference.evaluation.estimates import Crossed, Estimate
+from dvae.inference.evaluation.metrics import average_pairwise_distance
+from dvae.inference.evaluation.result import canvas
+from dvae.inference.evaluation.scores import Measure
+from dvae.inference.training.checkpoints import Run
+from dvae.inference.training.many import confidence_set
 from dvae.models import registry
-from dvae.motion.dataset import MotionData
-from dvae.motion.parts import UNIONS, body_parts
+from dvae.motion.data.dataset import MotionData
+from dvae.motion.geometry.parts import UNIONS, body_parts
 from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 

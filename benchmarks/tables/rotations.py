@@ -10,7 +10,7 @@ import tyro
 from torch import Tensor
 
 from dvae import motion
-from dvae.motion import kinematics, rotations
+from dvae.motion.geometry import kinematics, rotations
 
 from .pages import DOCS, table, write
 

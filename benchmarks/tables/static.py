@@ -21,9 +21,9 @@ import tyro
 from torch import Tensor
 from torch.nn import functional
 
-from dvae.inference.checks import decode
-from dvae.inference.held import clip_places, on_device_of, reproducibly
-from dvae.inference.uncertainty import clustered_variance, linearised
+from dvae.inference.diagnostics.checks import decode
+from dvae.inference.evaluation.held import clip_places, on_device_of, reproducibly
+from dvae.inference.evaluation.uncertainty import clustered_variance, linearised
 from dvae.motion import Windows
 from dvae.program.batch import rows
 

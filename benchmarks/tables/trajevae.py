@@ -12,9 +12,9 @@ import numpy as np
 import torch
 import tyro
 
-from dvae.inference.estimates import Crossed
-from dvae.inference.held import clip_places
-from dvae.models.trajectories import Completion, TrajectoryModel
+from dvae.inference.evaluation.estimates import Crossed
+from dvae.inference.evaluation.held import clip_places
+from dvae.models.motion.trajectories import Completion, TrajectoryModel
 
 from .pages import DOCS, loaded, table, write
 from .ranking import JOINTS

@@ -18,12 +18,12 @@ import tyro
 
 import dvae
 from dvae import Training, motion
-from dvae.inference.conformal import REGIONS, quantile, standardised, worst
-from dvae.inference.evaluate import forecaster_of, forecasts_of
-from dvae.inference.held import Held, clip_places, hold, reproducibly
-from dvae.inference.references import References
-from dvae.inference.scores import clip_means, over_horizon
-from dvae.motion.dataset import MotionData
+from dvae.inference.evaluation.conformal import REGIONS, quantile, standardised, worst
+from dvae.inference.evaluation.evaluate import forecaster_of, forecasts_of
+from dvae.inference.evaluation.held import Held, clip_places, hold, reproducibly
+from dvae.inference.evaluation.references import References
+from dvae.inference.evaluation.scores import clip_means, over_horizon
+from dvae.motion.data.dataset import MotionData
 from dvae.runs.directory import fit_run
 
 from .pages import DOCS, table, write

@@ -21,8 +21,8 @@ import tyro
 import dvae
 from dvae import Training, motion
 from dvae.models import registry
-from dvae.motion.dataset import MotionData
-from dvae.motion.energies import pose_prior_energy
+from dvae.motion.data.dataset import MotionData
+from dvae.motion.scoring.energies import pose_prior_energy
 from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ..inversion import FAITHFUL
+from ..factorization.inversion import FAITHFUL
 from ..models import registry
-from ..models.equations import Equations
+from ..models.family.equations import Equations
 from ..models.method import LatentMethod
 from ..runs.ablation import ablate as ablate_method
 from ..runs.ablation import as_equations

@@ -19,7 +19,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import tyro
 
 from .. import __version__
-from ..inference.result import Plain, reason
+from ..inference.evaluation.result import Plain, reason
 from ..options import nearest
 from .console import ERROR, OUT, UsageError, note, speaks
 

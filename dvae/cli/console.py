@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from .. import files
-from ..inference.result import Plain
+from ..inference.evaluation.result import Plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

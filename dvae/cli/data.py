@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from .. import motion
-from ..motion.dataset import SIMULATED
+from ..motion.data.dataset import SIMULATED
 from ..motion.files import reading, writing
 from . import tables
 from .console import ERROR, OUT, Missing, UsageError

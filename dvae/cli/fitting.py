@@ -15,19 +15,19 @@ import tyro
 from joblib import parallel_config
 
 from .. import motion
-from ..inference.checkpoints import Run
-from ..inference.fit import Fit, Interrupted
-from ..inference.processes import restartable
-from ..inference.recipe import Trainable
-from ..inference.schedules import Schedule
-from ..inference.trackers import TensorBoard
-from ..inference.training import Accelerator, Training
+from ..inference.training.checkpoints import Run
+from ..inference.training.fit import Fit, Interrupted
+from ..inference.training.options import Accelerator, Training
+from ..inference.training.processes import restartable
+from ..inference.training.recipe import Trainable
+from ..inference.training.schedules import Schedule
+from ..inference.training.trackers import TensorBoard
 from ..models import registry
 from ..models.method import LatentMethod
+from ..models.motion.trajectories import TrajectoryMethod
 from ..models.registry import judges, methods
-from ..models.trajectories import TrajectoryMethod
-from ..motion.dataset import SIMULATED
-from ..motion.protocols import Representation
+from ..motion.data.dataset import SIMULATED
+from ..motion.data.protocols import Representation
 from ..motion.segments.dataset import Segmentation
 from ..options import Amount, Frames, Share
 from ..runs import directory as runs

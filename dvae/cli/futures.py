@@ -14,10 +14,10 @@ import torch
 import tyro
 
 from .. import motion
-from ..data import Sequences, each, gapped, past_of
-from ..inference.checkpoints import Run
-from ..models.trajectories import TrajectoryModel
-from ..motion.dataset import SIMULATED
+from ..data.sequences import Sequences, each, gapped, past_of
+from ..inference.training.checkpoints import Run
+from ..models.motion.trajectories import TrajectoryModel
+from ..motion.data.dataset import SIMULATED
 from ..motion.files.writing import format_of
 from ..options import nearest
 from ..runs import directory as runs
@@ -363,11 +363,11 @@ def _play_clip(source: str, name: str | None, missing: bool, every: int | None, 
 
 def _play(out: Path, *motions: Any, **options: Any) -> None:
     if out.suffix.lower() in (".gif", ".mp4"):
-        from ..motion.film import save_film
+        from ..motion.drawing.film import save_film
 
         save_film(out, *motions, **options)
     else:
-        from ..motion.plot import animate, save_html
+        from ..motion.drawing.plot import animate, save_html
 
         save_html(animate(*motions, **options), out)
 
@@ -476,7 +476,7 @@ def _save_futures(futures: motion.Forecasts, path: Path | None, paths: Mapping[s
         return
     from matplotlib.figure import Figure
 
-    from ..motion.plot import futures as draw
+    from ..motion.drawing.plot import futures as draw
 
     drawing = Figure(figsize=(9, 2.6), layout="constrained")
     window = futures.observed[0], futures.forecasts[:, 0], futures.truth[0]

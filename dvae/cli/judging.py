@@ -13,17 +13,17 @@ import numpy as np
 import tyro
 
 from .. import files, motion
-from ..data import each as of_each
-from ..inference.bracket import bracket as bracketed
-from ..inference.calibration import calibrate
-from ..inference.checkpoints import CheckpointError, Run
-from ..inference.checks import predictive_checks
-from ..inference.compare import compare as compare_models
-from ..inference.conformal import conformal
-from ..inference.evaluate import evaluate as evaluate_models
-from ..inference.stein import stein_discrepancy
-from ..inference.yardstick import reference_posterior
-from ..models.trajectories import TrajectoryModel
+from ..data.sequences import each as of_each
+from ..inference.diagnostics.bracket import bracket as bracketed
+from ..inference.diagnostics.calibration import calibrate
+from ..inference.diagnostics.checks import predictive_checks
+from ..inference.diagnostics.stein import stein_discrepancy
+from ..inference.diagnostics.yardstick import reference_posterior
+from ..inference.evaluation.compare import compare as compare_models
+from ..inference.evaluation.conformal import conformal
+from ..inference.evaluation.evaluate import evaluate as evaluate_models
+from ..inference.training.checkpoints import CheckpointError, Run
+from ..models.motion.trajectories import TrajectoryModel
 from ..motion.judges.pose_prior import PosePriorModel
 from ..runs import directory as runs
 from ..tables.scoring import panel_scores

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ..graph import alternatives, audit
-from ..inference.result import Table
-from ..inversion import guide
+from ..factorization.graph import alternatives, audit
+from ..factorization.inversion import guide
+from ..factorization.notation import Factorization
+from ..inference.evaluation.result import Table
 from ..models import registry
 from ..models.registry import judges, methods
-from ..notation import Factorization
 from .console import OUT, UsageError, arguments, at_least, check_figure, save_figure
 
 if TYPE_CHECKING:
-    from ..inference.training import Training
+    from ..inference.training.options import Training
 
 
 def list_methods() -> None:

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..inference.checkpoints import Run
-from ..models.equations import Equations
+from ..data.views import View
+from ..inference.training.checkpoints import Run
+from ..models.family.equations import Equations
 from ..models.registry import judges
 from ..options import flat
 from ..runs import directory as runs
-from ..views import View
 from .console import UsageError, note
 
 USES = {

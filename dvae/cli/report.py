@@ -10,10 +10,10 @@ import tyro
 from markupsafe import Markup
 
 from .. import files
-from ..inference.checkpoints import CheckpointError
-from ..inference.result import progress_bar, reason
-from ..motion.player import SCRIPT, player
-from ..motion.plot import staged
+from ..inference.evaluation.result import progress_bar, reason
+from ..inference.training.checkpoints import CheckpointError
+from ..motion.drawing.player import SCRIPT, player
+from ..motion.drawing.plot import staged
 from ..report import Section, document, lacking, sections
 from ..report.page import beside, picture
 from ..runs import directory as runs

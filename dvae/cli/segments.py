@@ -13,9 +13,10 @@ import torch
 import tyro
 
 from .. import motion
-from ..data import Batch
-from ..inference.checkpoints import CheckpointError
-from ..inference.posteriors import Descent
+from ..data.sequences import Batch
+from ..data.views import WHOLE
+from ..inference.diagnostics.posteriors import Descent
+from ..inference.training.checkpoints import CheckpointError
 from ..motion.segments.completion import Deviations, glimpsed
 from ..motion.segments.dataset import thinned
 from ..motion.segments.embodied import SHAPE
@@ -26,7 +27,6 @@ from ..motion.segments.recovery import Recovered, read_seen
 from ..motion.segments.recovery import recover as recover_segments
 from ..options import Positive, Range, check
 from ..runs import directory as runs
-from ..views import WHOLE
 from . import opening
 from .console import ERROR, OUT, Failed, UsageError, at_least, check_files, note
 
@@ -100,7 +100,7 @@ def _write(out: Path, found: Interpolation, fps: float | None) -> None:
 
 def _save_page(out: Path, made: motion.MotionSet, names: Sequence[str], truth: motion.MotionSet | None = None) -> None:
     """Clips that move side by side; who is done stays as it ends."""
-    from ..motion.plot import animate, save_html
+    from ..motion.drawing.plot import animate, save_html
 
     clips = [*made, *(truth or ())]
     frames = max(clip.frames for clip in clips)

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .. import files
-from ..blocks import ColumnSummary, row_blocks
-from ..inference.result import Table
-from ..inference.scores import reaching
+from ..data.blocks import ColumnSummary, row_blocks
+from ..inference.evaluation.result import Table
+from ..inference.evaluation.scores import reaching
 from ..runs import directory as runs
 from ..tables.dataset import PanelData
 from ..tables.forecasts import BANDS, FORMATS, QUANTILES, column_of, needed

@@ -7,26 +7,26 @@ torch.Size([75, 48])
 """
 
 from . import bodies
-from .angles import AngleLimits, estimate_angle_limits
-from .criticism import draw_traversal, statistics
-from .data import Clip, MotionSet
-from .dataset import MotionData
-from .exchange import Exchanged
+from .data.clips import Clip, MotionSet
+from .data.dataset import MotionData
+from .data.exchange import Exchanged
+from .data.occlusion import occlude
+from .data.protocols import PROTOCOLS, Poses, Protocol, Windows, windows
+from .data.simulator import simulate
 from .files import read_motion, read_paths, save, write_motion
 from .forecasts import Forecasts, Imputed, is_forecasts
-from .occlusion import occlude
-from .protocols import PROTOCOLS, Poses, Protocol, Windows, windows
-from .scoring import displacements, scores
+from .geometry.angles import AngleLimits, estimate_angle_limits
+from .geometry.skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
+from .geometry.views import Bones, Heading, Rotations
+from .scoring.criticism import draw_traversal, statistics
+from .scoring.scores import displacements, scores
+from .scoring.truths import PseudoTruths, WithPseudoTruths
 from .segments.dataset import SegmentData
 from .segments.embodied import Segments
 from .segments.frames import TimedFrames
 from .segments.gait import Cycles, gait_cycles, reference_cycles
 from .segments.interpolation import Interpolation, falls, interpolate, latent_map, transferred
 from .segments.reconstruction import reconstruct_segments
-from .simulator import simulate
-from .skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
-from .truths import PseudoTruths, WithPseudoTruths
-from .views import Bones, Heading, Rotations
 
 __all__ = [
     "HUMAN36M",

@@ -20,9 +20,9 @@ from math import sqrt
 import torch
 from torch import Tensor
 
-from ..inference.result import progress_bar
+from ..inference.evaluation.result import progress_bar
 from . import Skeleton
-from .skeleton import SHORTEST
+from .geometry.skeleton import SHORTEST
 
 STRETCH = 0.02
 """Standard deviation of a bone's length, relative."""

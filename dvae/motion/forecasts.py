@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
-from .data import Clip, MotionSet
+from .data.clips import Clip, MotionSet
 from .files.archive import archive, write_arrays
 from .files.plain import read_arrays
-from .skeleton import FIELDS, Skeleton
+from .geometry.skeleton import FIELDS, Skeleton
 
 
 def is_forecasts(path: str | Path) -> bool:

@@ -19,7 +19,7 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..constants import constant, indices, visible
-from ..relations import Relation
+from ..factorization.relations import Relation
 from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, at, part, valid_steps
 from .extract import Extract, Extractors
 from .rows import Rows, select

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from ..relations import ALL
+from ..factorization.relations import ALL
 from .base import AtOnce, Input, Network, once_valid
 from .dct import cosine_basis
 

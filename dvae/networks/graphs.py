@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from ..relations import ALL
+from ..factorization.relations import ALL
 from .base import Input, Network
 from .extract import Extract, Extractors
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ..laws.families import KnownNoise
+from ..distributions.families import KnownNoise
 from .base import Input, Network, NetworkSpec, valid_steps
 from .recurrent import Recurrent
 from .rows import select
@@ -32,7 +32,7 @@ class WithNoise:
     Example:
         >>> networks = {"p(x)": dvae.networks.WithNoise("s", dvae.networks.Dense((8,)))}
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t, s_t)", "q(z_t | z_{t-1}, x_{1:T}, s_{1:T})"
-        >>> sizes, laws = {"z": 2, "x": 3, "s": 3}, {"p(x)": dvae.laws.KnownNoise()}
+        >>> sizes, laws = {"z": 2, "x": 3, "s": 3}, {"p(x)": dvae.distributions.KnownNoise()}
         >>> model = dvae.DynamicalVAE(*pair, sizes, networks, laws)
         >>> model.sample(batch={"s": torch.full((2, 5, 3), 0.1)})["x"].shape
         torch.Size([2, 5, 3])

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..laws.subset import Subset
+from ..distributions.subset import Subset
 
 
 class Residual(nn.Module):

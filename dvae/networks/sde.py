@@ -34,7 +34,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from ..laws.triangular import InverseCholesky, Triangular, refuse_half
+from ..distributions.triangular import InverseCholesky, Triangular, refuse_half
 from .base import Input, Network, NetworkSpec, at, once, shift, valid_steps
 from .recurrent import Recurrent
 from .rows import select
@@ -52,7 +52,7 @@ class LinearSDE:
 
     Example:
         >>> networks = {"p(z)": dvae.networks.LinearSDE(), "q(z)": dvae.networks.LinearSDEGuide()}
-        >>> laws = {"p(z)": dvae.laws.Triangular(), "q(z)": dvae.laws.Triangular()}
+        >>> laws = {"p(z)": dvae.distributions.Triangular(), "q(z)": dvae.distributions.Triangular()}
         >>> pair = "p(z_t | z_{t-1}, d_t) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T}, d_{1:T})"
         >>> model = dvae.DynamicalVAE(*pair, {"z": 4, "x": 3, "d": 1}, networks, laws)
         >>> model.sample(batch={"d": 10 * torch.rand(5, 20, 1) + 0.1})["x"].shape

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..data import BESIDE, Batch, mask_of, refuse_table, tensor_of
-from ..laws.product import ProductSupport
+from ..data.sequences import BESIDE, Batch, mask_of, refuse_table, tensor_of
+from ..data.units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, exceeds_float32
+from ..data.views import LOG_DET, WHOLE, View
+from ..distributions.product import ProductSupport
+from ..factorization.notation import Factorization
 from ..networks.base import again, once, valid_steps
-from ..notation import Factorization
-from ..units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, exceeds_float32
-from ..views import LOG_DET, WHOLE, View
 from .conditional import Conditional
 from .groups import GROUP, Groups
 from .rollout import Rollout

@@ -13,10 +13,12 @@ from torch import Tensor, nn
 from torch.distributions import constraints
 
 from ..constants import constant
-from ..laws.base import LawSpec, Parameters, Shape
-from ..laws.chain import DERIVATIVES, gaussian_chain
-from ..laws.families import NormalLaw
-from ..laws.precise import Offset
+from ..data.units import Units
+from ..distributions.base import LawSpec, Parameters, Shape
+from ..distributions.chain import DERIVATIVES, gaussian_chain
+from ..distributions.families import NormalLaw
+from ..distributions.precise import Offset
+from ..factorization.notation import Factor
 from ..networks.base import (
     Input,
     Network,
@@ -32,8 +34,6 @@ from ..networks.base import (
     valid_steps,
 )
 from ..networks.rows import Rows, select
-from ..notation import Factor
-from ..units import Units
 from .groups import Groups
 
 CONSTANT = "1"

@@ -12,10 +12,10 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from ..data import refuse_table
+from ..data.sequences import refuse_table
+from ..data.views import WHOLE
 from ..networks.base import computing_once
 from ..options import Count, Range, require
-from ..views import WHOLE
 from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like
 from .groups import GROUP, Groups

@@ -21,19 +21,19 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
-from ..inversion import guide
-from ..laws.base import LawSpec
-from ..laws.families import Normal, StandardNormal
-from ..laws.family import FAMILIES
-from ..laws.subset import Subset
+from ..data.units import Coordinate, Units, exceeds_float32
+from ..data.views import LOG_DET, View, volume
+from ..distributions.base import LawSpec
+from ..distributions.families import Normal, StandardNormal
+from ..distributions.family import FAMILIES
+from ..distributions.subset import Subset
+from ..factorization.inversion import guide
+from ..factorization.notation import Factor, Factorization, check_pair
+from ..factorization.relations import MaskFunction
 from ..networks import NetworkSpec, Recurrent
 from ..networks.base import once
-from ..notation import Factor, Factorization, check_pair
 from ..options import Range, kind_of, problem
-from ..relations import MaskFunction
 from ..turns import alone
-from ..units import Coordinate, Units, exceeds_float32
-from ..views import LOG_DET, View, volume
 from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
 from .forecast import forecast, impute, reconstruct, states
@@ -56,13 +56,13 @@ class DynamicalVAE(nn.Module):
         sizes: dimension of every variable, context included; `Discrete` of a latent that is categorical and summed out.
         network: description of the networks, or a mapping from factors to descriptions. Its keys are "p(x)" for one
             factor, "p" for all generative ones, "q" for the guide's, and "default".
-        laws: the same for the laws; `laws.Normal()` where nothing is said. A generative factor without parents is
-            N(0, I) unless "p(w)" itself is a key, such as of `laws.Mixture()`.
+        laws: the same for the laws; `distributions.Normal()` where nothing is said. A generative factor without parents
+            is N(0, I) unless "p(w)" itself is a key, such as of `distributions.Mixture()`.
         observed: names of the data variables; every other variable with a generative factor is a latent.
         masks: relations of one's own, name to function of T (see `Factorization.parse`).
-        view: what the model sees of the data, such as their parts; as it is where nothing is said (see `dvae.views`).
-        shared: static context that the programs draw themselves, once for all sequences of a batch, where it does not
-            hold it: name to law. A forecast draws it once for each sample.
+        view: what the model sees of the data, such as their parts; as it is where nothing is said (see
+        `dvae.data.views`). shared: static context that the programs draw themselves, once for all sequences of a batch,
+            where it does not hold it: name to law. A forecast draws it once for each sample.
         grouped: static latents that the sequences of a group share, of which a batch says "group" (B,); see
             `dvae.program.groups`. Without that every sequence is a group.
         indicators: data variables of which the guide reads which entries were observed, beside their values: each
@@ -110,7 +110,7 @@ class DynamicalVAE(nn.Module):
         self.generative = Factorization.parse(generative, masks)
         self.feeding: SelfFeeding | InputNoise = SelfFeeding(0.0)
         if not isinstance(view, View | None):
-            raise TypeError(f"the view is {kind_of(view)}; expected an instance such as dvae.views.View()")
+            raise TypeError(f"the view is {kind_of(view)}; expected an instance such as dvae.data.views.View()")
         self.view = view or View()
         observed = tuple(self.view.parts or observed)
         self.sizes = _checked_sizes(sizes)
@@ -253,7 +253,7 @@ class DynamicalVAE(nn.Module):
 
     @property
     def likelihood(self) -> bool:
-        """Whether the data have a density given the latents; without it there is no bound (see `laws.Delta`)."""
+        """Whether the data have a density given the latents; without one there is no bound (`distributions.Delta`)."""
         return not any(self.generator[name].law.deterministic for name in self.observed)
 
     @property
@@ -305,7 +305,7 @@ class DynamicalVAE(nn.Module):
                 or a number, the probability or the share of the noise, in the way of the model's attribute `feeding`.
             draws: latent to a number n: from there on the program goes on n times for each sequence, with a draw
                 of this variable each. Later variables have n times as many rows, draw by draw.
-            curriculum: how far the draws of what sequences share have come, see `laws.Subset`.
+            curriculum: how far the draws of what sequences share have come, see `distributions.Subset`.
 
         Returns:
             Name to value of every variable.

@@ -12,7 +12,7 @@ from typing import Any
 from torch import Tensor
 from typing_extensions import Protocol, runtime_checkable
 
-from ..notation import Factorization
+from ..factorization.notation import Factorization
 
 
 @runtime_checkable

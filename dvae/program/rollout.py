@@ -19,9 +19,9 @@ from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
-from ..laws.base import Parameters
+from ..distributions.base import Parameters
+from ..factorization.notation import Block, Factorization
 from ..networks.base import again, computing_once, indicator, presence, steps_of, valid_steps
-from ..notation import Block, Factorization
 from .conditional import Conditional, like
 from .groups import Grouped, Groups
 from .summed import Summation, Sums
@@ -90,7 +90,7 @@ class InputNoise:
     The data that are scored have none. Source: Fragkiadaki et al., 2015, arXiv 1508.00271.
 
     Args:
-        scale: standard deviation, in the unit in which networks read the variable (`dvae.units`).
+        scale: standard deviation, in the unit in which networks read the variable (`dvae.data.units`).
 
     Example:
         >>> model = dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2})

@@ -24,8 +24,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from ..laws.scan import BLOCK
-from ..notation import Factor, Factorization
+from ..distributions.scan import BLOCK
+from ..factorization.notation import Factor, Factorization
 from .conditional import like
 
 LARGEST = 4096

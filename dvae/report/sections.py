@@ -22,21 +22,21 @@ from rich.text import Text
 from torch import Tensor
 
 from .. import files
-from ..data import Batch, HeldOutWindows, each
-from ..graph import audit
-from ..inference.bracket import Bracket
-from ..inference.calibration import Calibration
-from ..inference.checkpoints import CheckpointError, Run
-from ..inference.compare import compare
-from ..inference.comparison import KHAT, Comparison
-from ..inference.conformal import Tubes
-from ..inference.evaluation import ARROWS, Evaluation
-from ..inference.fit import Fit
-from ..inference.held import on_device_of, plain, reproducibly
-from ..inference.result import Table, as_they_are, canvas, progress_bar, reason
-from ..inference.stein import SteinDiscrepancy
-from ..inference.trackers import JSONLines
-from ..inference.yardstick import ReferencePosterior
+from ..data.sequences import Batch, HeldOutWindows, each
+from ..factorization.graph import audit
+from ..inference.diagnostics.bracket import Bracket
+from ..inference.diagnostics.calibration import Calibration
+from ..inference.diagnostics.stein import SteinDiscrepancy
+from ..inference.diagnostics.yardstick import ReferencePosterior
+from ..inference.evaluation.compare import compare
+from ..inference.evaluation.comparison import KHAT, Comparison
+from ..inference.evaluation.conformal import Tubes
+from ..inference.evaluation.evaluation import ARROWS, Evaluation
+from ..inference.evaluation.held import on_device_of, plain, reproducibly
+from ..inference.evaluation.result import Table, as_they_are, canvas, progress_bar, reason
+from ..inference.training.checkpoints import CheckpointError, Run
+from ..inference.training.fit import Fit
+from ..inference.training.trackers import JSONLines
 from ..options import flat
 from ..program.batch import repeat
 from ..program.protocols import Program

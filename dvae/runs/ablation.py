@@ -1,9 +1,10 @@
 """Ablations: every arrow of a model and of its guide left out in turn, and what each is worth.
 
-Two prices, which answer two questions. On linear-Gaussian twins (`dvae.oracle`) it is computed: the evidence that a
-model loses without an arrow, and how much wider the gap of a guide becomes. It says which arrows can matter. On data it
-is measured: the whole and every reduced pair of equations are fitted with the same seeds (`sweep`) and compared on the
-test windows (`compare`), with errors over clips and seeds, and p-values for all arrows at once (Holm, 1979).
+Two prices, which answer two questions. On linear-Gaussian twins (`dvae.factorization.oracle`) it is computed: the
+evidence that a model loses without an arrow, and how much wider the gap of a guide becomes. It says which arrows can
+matter. On data it is measured: the whole and every reduced pair of equations are fitted with the same seeds (`sweep`)
+and compared on the test windows (`compare`), with errors over clips and seeds, and p-values for all arrows at once
+(Holm, 1979).
 
 Both prices are of the same: of a model's arrow the evidence, on data the importance-weighted bound, which is near it
 whatever the guide; of a guide's arrow the evidence lower bound, from which an importance-weighted one is made to hide
@@ -28,21 +29,21 @@ import networkx as nx
 import numpy as np
 from typing_extensions import override
 
-from ..data import called
-from ..drawing import draw_slice
-from ..inference.checkpoints import ENDED
-from ..inference.compare import compare
-from ..inference.comparison import Comparison
-from ..inference.estimates import Estimate, number
-from ..inference.held import plain
-from ..inference.many import holm
-from ..inference.result import Result, Table, canvas, progress_bar
-from ..inference.training import Training
-from ..models.equations import Equations
+from ..data.schema import Schema
+from ..data.sequences import called
+from ..factorization.drawing import draw_slice
+from ..factorization.notation import Factorization, Parent, check_pair
+from ..factorization.oracle import model_price, ones, price
+from ..inference.evaluation.compare import compare
+from ..inference.evaluation.comparison import Comparison
+from ..inference.evaluation.estimates import Estimate, number
+from ..inference.evaluation.held import plain
+from ..inference.evaluation.result import Result, Table, canvas, progress_bar
+from ..inference.training.checkpoints import ENDED
+from ..inference.training.many import holm
+from ..inference.training.options import Training
+from ..models.family.equations import Equations
 from ..models.method import Method
-from ..notation import Factorization, Parent, check_pair
-from ..oracle import model_price, ones, price
-from ..schema import Schema
 from .directory import load, training_of
 from .kinds import Dataset
 from .sweep import sweep

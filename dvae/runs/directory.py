@@ -18,15 +18,15 @@ from pathlib import Path
 from reprlib import repr as brief
 from typing import Any
 
-from ..inference.checkpoints import CONFIG, ENDED, CheckpointError, Run, at_most, load_weights
-from ..inference.fit import Callback, Fit
-from ..inference.recipe import Trainable
-from ..inference.schedules import from_config as option_from_config
-from ..inference.trackers import Tracker
-from ..inference.training import Training
+from ..data.schema import Schema
+from ..inference.training.checkpoints import CONFIG, ENDED, CheckpointError, Run, at_most, load_weights
+from ..inference.training.fit import Callback, Fit
+from ..inference.training.options import Training
+from ..inference.training.recipe import Trainable
+from ..inference.training.schedules import from_config as option_from_config
+from ..inference.training.trackers import Tracker
 from ..models.registry import configured
 from ..options import flat
-from ..schema import Schema
 from ..turns import alone
 from .kinds import DATA, SCHEMAS, Dataset, opened
 from .migrations import FORMAT, upgraded

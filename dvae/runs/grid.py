@@ -33,7 +33,7 @@ from itertools import product
 from typing import Any, Self
 
 from .. import files
-from ..inference.training import Training
+from ..inference.training.options import Training
 from ..models import registry
 from ..models.method import Method
 from ..options import nearest, tuples

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from typing import Any, ClassVar, Protocol, Self
 
-from ..inference.checkpoints import CheckpointError
+from ..data.schema import Schema
+from ..inference.training.checkpoints import CheckpointError
 from ..models.registry import Registry
-from ..schema import Schema
 
 SCHEMAS = Registry(
     {
-        "sequences": "dvae.schema:Schema",
-        "poses": "dvae.motion.protocols:Poses",
+        "sequences": "dvae.data.schema:Schema",
+        "poses": "dvae.motion.data.protocols:Poses",
         "segments": "dvae.motion.segments.embodied:SegmentSchema",
         "panel": "dvae.tables.encoding:PanelSchema",
     },
@@ -20,7 +20,7 @@ SCHEMAS = Registry(
 )
 DATA = Registry(
     {
-        "motion": "dvae.motion.dataset:MotionData",
+        "motion": "dvae.motion.data.dataset:MotionData",
         "segments": "dvae.motion.segments.dataset:SegmentData",
         "panel": "dvae.tables.dataset:PanelData",
     },

@@ -12,7 +12,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ..inference.checkpoints import CheckpointError
+from ..inference.training.checkpoints import CheckpointError
 from ..models.method import LatentMethod
 from ..models.registry import judges, methods
 from .kinds import DATA, opened

@@ -32,19 +32,19 @@ from rich.live import Live
 from typing_extensions import override
 
 from .. import files
-from ..inference.checkpoints import ENDED, Run
-from ..inference.fit import Callback, Fit, Interrupted
-from ..inference.processes import by_torchrun
-from ..inference.recipe import Trainable
-from ..inference.result import Plain, Table, reason
-from ..inference.schedules import clamp
-from ..inference.signals import Signals
-from ..inference.svi import State
-from ..inference.trackers import LARGEST_LOG, JSONLines, row_of
-from ..inference.training import Training
+from ..data.schema import Schema
+from ..inference.evaluation.result import Plain, Table, reason
+from ..inference.training.checkpoints import ENDED, Run
+from ..inference.training.fit import Callback, Fit, Interrupted
+from ..inference.training.options import Training
+from ..inference.training.processes import by_torchrun
+from ..inference.training.recipe import Trainable
+from ..inference.training.schedules import clamp
+from ..inference.training.signals import Signals
+from ..inference.training.svi import State
+from ..inference.training.trackers import LARGEST_LOG, JSONLines, row_of
 from ..models.method import Method
 from ..options import flat
-from ..schema import Schema
 from ..turns import alone
 from .directory import fit_run, read_config, resume, training_of
 from .kinds import Dataset

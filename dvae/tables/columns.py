@@ -8,7 +8,7 @@ group = "region"                      # of sequences, for panels
 split = "part"                        # train, validation or test, where the data say it
 
 [columns.riders]                      # a target, if not told otherwise
-family = "count"                      # one of dvae.laws.FAMILIES
+family = "count"                      # one of dvae.distributions.FAMILIES
 unit = "people"
 
 [columns.temperature]
@@ -35,7 +35,7 @@ from dataclasses import dataclass, field, fields, replace
 from reprlib import repr as brief
 from typing import Any, Literal, Self
 
-from ..laws.family import FAMILIES
+from ..distributions.family import FAMILIES
 from ..options import check, nearest, tuples
 from .calendar import check_zone
 
@@ -56,7 +56,7 @@ class Column:
         name: of the column.
         role: "target" for data that are modelled, "known" or "past" for covariates that are known in the future too or
             end with the present, "static" for one value a sequence.
-        family: of the values, one of `dvae.laws.FAMILIES`; of covariates "category" or "real".
+        family: of the values, one of `dvae.distributions.FAMILIES`; of covariates "category" or "real".
         unit: in which the values are, for tables and pictures.
         classes: of a category, in the order of its coordinates.
         other: one of the classes, which stands for every value that is none of them; "" refuses such values.

@@ -22,14 +22,14 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from typing_extensions import override
 
-from ..blocks import ColumnSummary, blocks, row_blocks
-from ..laws.base import LawSpec
-from ..laws.family import FAMILIES
-from ..laws.product import Product
+from ..data.blocks import ColumnSummary, blocks, row_blocks
+from ..data.schema import Schema
+from ..data.units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_lost
+from ..data.views import Offered, View
+from ..distributions.base import LawSpec
+from ..distributions.family import FAMILIES
+from ..distributions.product import Product
 from ..options import Amount, Positive, Range, tuples
-from ..schema import Schema
-from ..units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_lost
-from ..views import Offered, View
 from .calendar import NUMBERS, Calendar
 from .columns import WHOLE_STEPS, Column, Columns
 from .panel import COUNTS, Panel, Series

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import files
-from ..inference.result import canvas
-from ..inference.scores import reaching
+from ..inference.evaluation.result import canvas
+from ..inference.evaluation.scores import reaching
 from ..options import nearest
 from .calendar import NUMBERS, Calendar
 

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..blocks import hash_values, ranges, row_blocks
-from ..data import check_real
-from ..npy import is_mapped
+from ..data.blocks import hash_values, ranges, row_blocks
+from ..data.npy import is_mapped
+from ..data.sequences import check_real
 from ..options import nearest
 from .calendar import NUMBERS, Calendar
 from .clocks import time_of

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ..data.units import RESOLVED
 from ..options import nearest
-from ..units import RESOLVED
 from .clocks import PERIOD, is_clock, join_times, parts_of, unit_of
 from .columns import Column, Columns, Role
 from .numerals import NEARLY_ALL, read_numbers

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from .. import files
-from ..npy import mapped
+from ..data.npy import mapped
 from ..options import nearest
 from .columns import MOST, Columns, layout, parsed
 from .domains import DOMAINS, domain

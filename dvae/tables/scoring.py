@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ..data import HeldOutWindows, columns_of
-from ..inference.scores import CRPS, Measure, by_column, calibrated
+from ..data.sequences import HeldOutWindows, columns_of
+from ..inference.evaluation.scores import CRPS, Measure, by_column, calibrated
 
 FEW = 12
 """Columns up to which each has a score of its own."""

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..blocks import cut, hash_list, row_blocks
-from ..data import Sequences, columns_of, gapped, past_of
-from ..inference.held import on_device_of, reproducibly
+from ..data.blocks import cut, hash_list, row_blocks
+from ..data.sequences import Sequences, columns_of, gapped, past_of
+from ..inference.evaluation.held import on_device_of, reproducibly
 from ..options import Count, require
 from ..program.groups import GROUP
 from ..program.model import DynamicalVAE

@@ -23,12 +23,12 @@ from pyro import poutine
 from pyro.infer import Trace_ELBO
 from torch import Tensor
 
-from ..graph import audit
-from ..inference.annealing import annealed_bound
-from ..inference.bounds import SequenceELBO
-from ..inference.checkpoints import load_weights, save_weights
-from ..inference.fit import fit
-from ..oracle import Oracle, twin
+from ..factorization.graph import audit
+from ..factorization.oracle import Oracle, twin
+from ..inference.bounds.annealing import annealed_bound
+from ..inference.bounds.elbo import SequenceELBO
+from ..inference.training.checkpoints import load_weights, save_weights
+from ..inference.training.fit import fit
 from ..program.batch import AnyBatch, repeat
 from ..program.conditional import Conditional
 from ..program.model import DynamicalVAE

@@ -45,7 +45,7 @@ from scipy import stats
 from torch import Tensor, nn
 
 from .. import files
-from ..inference.bounds import SequenceELBO
+from ..inference.bounds.elbo import SequenceELBO
 from ..program.conditional import evaluating
 
 Floats = NDArray[np.float64]

@@ -23,9 +23,9 @@ from dvae import motion
 from dvae.cli import main
 from dvae.cli.app import exit_code
 from dvae.cli.fitting import TrainingOptions, given_options
-from dvae.inference.stein import SteinDiscrepancy
-from dvae.inference.yardstick import ReferencePosterior
-from dvae.motion.dataset import MotionData
+from dvae.inference.diagnostics.stein import SteinDiscrepancy
+from dvae.inference.diagnostics.yardstick import ReferencePosterior
+from dvae.motion.data.dataset import MotionData
 from dvae.runs import directory as runs
 
 SMALL = ["--batch-size", "4", "--warm-up", "4", "--latent", "3", "--validate-every", "5"]
@@ -715,7 +715,7 @@ def test_motion_is_the_same_in_every_format_and_to_models_of_everything(people, 
     def table(*arguments):
         out = tmp_path / "evaluation.json"
         assert main(["evaluate", *arguments, "--samples", "3", "--out", str(out)]) == 0
-        return dvae.inference.evaluation.Evaluation.load(out)
+        return dvae.inference.evaluation.evaluation.Evaluation.load(out)
 
     forms = table(runs[npz, "positions"], runs[npz, "6d"])
     assert any("bounds of all-6d: densities of turns" in note for note in forms.notes)

@@ -13,14 +13,14 @@ from rich.console import Console
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.data import ArrayWindows
-from dvae.inference.calibration import Calibration
-from dvae.inference.checks import Statistic, predictive_checks
-from dvae.inference.evaluate import evaluate
-from dvae.inference.fit import Fit
-from dvae.inference.result import progress_bar
-from dvae.inference.trackers import Terminal
-from dvae.motion.plot import animate
+from dvae.data.sequences import ArrayWindows
+from dvae.inference.diagnostics.calibration import Calibration
+from dvae.inference.diagnostics.checks import Statistic, predictive_checks
+from dvae.inference.evaluation.evaluate import evaluate
+from dvae.inference.evaluation.result import progress_bar
+from dvae.inference.training.fit import Fit
+from dvae.inference.training.trackers import Terminal
+from dvae.motion.drawing.plot import animate
 from dvae.networks import Dense
 
 NAMES = (

@@ -294,5 +294,5 @@ def test_a_config_out_of_range_is_refused(run, keys, value, message):
         content = content[key]
     content[keys[-1]] = value
     (run / "config.json").write_text(json.dumps(config))
-    with pytest.raises(dvae.inference.checkpoints.CheckpointError, match=message):
+    with pytest.raises(dvae.inference.training.checkpoints.CheckpointError, match=message):
         dvae.load(run)

@@ -14,10 +14,10 @@ from markupsafe import Markup
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.inference.evaluation import Evaluation
-from dvae.motion.dataset import MotionData
-from dvae.motion.player import SCRIPT, player
-from dvae.motion.plot import staged
+from dvae.inference.evaluation.evaluation import Evaluation
+from dvae.motion.data.dataset import MotionData
+from dvae.motion.drawing.player import SCRIPT, player
+from dvae.motion.drawing.plot import staged
 from dvae.report import Section, document, lacking, sections
 from dvae.report.sections import Few
 from dvae.runs import directory as runs

@@ -12,7 +12,7 @@ from dvae import motion
 from dvae.cli import main
 from dvae.cli.fitting import DataOptions
 from dvae.cli.tables import is_table
-from dvae.inference.training import Training
+from dvae.inference.training.options import Training
 from dvae.models.registry import judges, methods
 from dvae.runs import directory
 from dvae.tables import Cut, PanelData

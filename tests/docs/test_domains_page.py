@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.tables import domains
 from dvae import tables
-from dvae.inference.estimates import Crossed
+from dvae.inference.evaluation.estimates import Crossed
 from dvae.tables import Column, Columns, Panel, Series, reading
 from dvae.tables.protocol import Cut
 

@@ -14,8 +14,8 @@ from PIL import Image
 from rich import console
 
 from benchmarks.tables import notebooks
-from dvae.inference import result
-from dvae.motion.plot import surfaces
+from dvae.inference.evaluation import result
+from dvae.motion.drawing.plot import surfaces
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dvae.motion import WALKER, Clip, MotionSet, is_forecasts, read_motion, read_paths, save
 from dvae.motion.files.plain import read_arrays
-from dvae.motion.skeleton import is_name
+from dvae.motion.geometry.skeleton import is_name
 
 from .engine import Isolated, fuzz, limited
 

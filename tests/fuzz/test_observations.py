@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 from hypothesis import strategies as st
 
-from dvae.models.motion_latent import MotionLatent
+from dvae.models.motion.motion_latent import MotionLatent
 from dvae.motion import bodies, simulate
 from dvae.motion.segments.completion import FRAMES, POINTS, SPOTS, SURFACES, TIMES
 from dvae.motion.segments.embodied import SHAPE, SegmentSchema

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dvae.motion import MotionSet, read_motion, simulate, write_motion
 from dvae.motion.files.amc import SUBJECT_02
-from dvae.motion.skeleton import is_name
+from dvae.motion.geometry.skeleton import is_name
 
 from .engine import Isolated, fuzz, limited
 from .test_tables import edited

@@ -22,8 +22,8 @@ from safetensors.torch import load, save
 import dvae
 from dvae import motion
 from dvae.cli import futures, judging, segments
-from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE
-from dvae.motion.dataset import MotionData
+from dvae.inference.training.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE
+from dvae.motion.data.dataset import MotionData
 from dvae.motion.segments.dataset import SegmentData
 from dvae.runs import directory as runs
 

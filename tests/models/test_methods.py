@@ -14,10 +14,10 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.data import Sequences
-from dvae.inference.checkpoints import CheckpointError
+from dvae.data.sequences import Sequences
+from dvae.inference.training.checkpoints import CheckpointError
 from dvae.models import registry
-from dvae.models.dkf import Gated, GatedNormal
+from dvae.models.family.dkf import Gated, GatedNormal
 from dvae.models.method import LatentMethod
 from dvae.models.registry import configured
 from dvae.testing import FactorizationContract
@@ -204,7 +204,7 @@ class Peeking(dvae.networks.Dense):
     """Reads every parent at t, whatever its relation."""
 
     def build(self, inputs, local, size):
-        now = dvae.relations.Relation.parse("t")
+        now = dvae.factorization.relations.Relation.parse("t")
         return super().build([dvae.networks.Input(p.name, p.size, p.relation and now) for p in inputs], local, size)
 
 
@@ -289,7 +289,7 @@ def test_a_recipe_refuses_what_it_cannot_do_before_it_prepares_the_model(tmp_pat
 
 
 def test_options_of_the_loss_reach_it():
-    schedules = dvae.inference.schedules
+    schedules = dvae.inference.training.schedules
     method = dvae.method("hit-dvae", loss="evidence", warm_up=7, warm_up_shape="cosine", free_bits=0.3)
     assert method.objective() == dvae.Evidence(kl_weight=schedules.Cosine(0.0, 1.0, steps=7), free_bits=0.3)
     assert dvae.method("vae", warm_up=0).objective() == dvae.Evidence()
@@ -583,7 +583,7 @@ def test_entry_points_add_methods_and_cannot_replace_any(monkeypatch):
 
     dvae.methods.cache_clear()
     try:
-        monkeypatch.setattr(registry, "entry_points", points("dvae.models.dkf:DKF", "other"))
+        monkeypatch.setattr(registry, "entry_points", points("dvae.models.family.dkf:DKF", "other"))
         assert dvae.methods()["other"].name == "dkf"
         dvae.methods.cache_clear()
         monkeypatch.setattr(registry, "entry_points", points("elsewhere:DKF", "dkf"))

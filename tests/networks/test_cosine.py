@@ -8,10 +8,10 @@ import torch
 from scipy.fft import dct, idct
 from scipy.stats import binomtest
 
+from dvae.factorization.relations import Relation
 from dvae.networks import CosineDecoder, CosineEncoder
 from dvae.networks.base import Input, share_modules
 from dvae.networks.cosine import Dropout, TransformerLayer, positions
-from dvae.relations import Relation
 
 ALL, LENGTH = Relation.parse("1:T"), 7
 SMALL = {"width": 6, "feedforward": 10, "heads": 2, "layers": 2}

@@ -6,11 +6,11 @@ import torch
 from scipy.fft import dct
 
 import dvae
+from dvae.data.views import History, Parts, Views
+from dvae.factorization.relations import Relation
 from dvae.networks import GraphConv
 from dvae.networks.base import Input
 from dvae.networks.dct import cosine_basis
-from dvae.relations import Relation
-from dvae.views import History, Parts, Views
 
 OBSERVED, LENGTH, JOINTS = 4, 9, 5
 EVERYTHING = {"h": range(JOINTS), "lower": (0, 3), "upper": (1, 2, 4)}
@@ -158,9 +158,9 @@ def test_it_generates_in_a_model_of_ones_own():
         {"a": 2, "h": 15, "lower": 6, "upper": 9},
         {f"p({name})": GraphConv(EVERYTHING, name, LENGTH, 3, 6, 1) for name in ("lower", "upper")},
         {
-            "default": dvae.laws.Normal(),
-            "p(lower)": dvae.laws.FixedNormal(0.1),
-            "p(upper)": dvae.laws.FixedNormal(0.1),
+            "default": dvae.distributions.Normal(),
+            "p(lower)": dvae.distributions.FixedNormal(0.1),
+            "p(upper)": dvae.distributions.FixedNormal(0.1),
         },
         view=PARTS,
         masks={"1:O": lambda T: np.arange(T)[None] < OBSERVED},
@@ -181,7 +181,7 @@ def generator(**options):
         None,
         {"a": 2, "h": 15, "lower": 6, "upper": 9},
         {f"p({name})": GraphConv(EVERYTHING, name, LENGTH, 3, 6, 1) for name in ("lower", "upper")},
-        {f"p({name})": dvae.laws.FixedNormal(0.1) for name in ("lower", "upper")},
+        {f"p({name})": dvae.distributions.FixedNormal(0.1) for name in ("lower", "upper")},
         view=PARTS,
         masks={"1:O": lambda T: np.arange(T)[None] < OBSERVED},
         **options,

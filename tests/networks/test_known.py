@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import dvae
-from dvae.laws import FixedNormal, KnownNoise
+from dvae.distributions import FixedNormal, KnownNoise
 from dvae.networks import Dense, Linear, Recurrent, WithNoise
 from dvae.testing import FactorizationContract
 

@@ -9,10 +9,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dvae.factorization.relations import Relation
 from dvae.networks import Attention, Dense, FrameGraph, Input, Linear, NodeGraph, Recurrent, SelfAttention
 from dvae.networks.base import again, computing_once, once_valid, shift, steps_of, whole_of
 from dvae.networks.recurrent import tie
-from dvae.relations import Relation
 
 T = 6
 NETWORKS = {

@@ -13,13 +13,13 @@ from torch.autograd import gradcheck
 from torch.distributions import MultivariateNormal, kl_divergence
 
 import dvae
-from dvae import DynamicalVAE, laws
-from dvae.laws.kalman import LinearGaussianChain
-from dvae.laws.triangular import TriangularNormal
+from dvae import DynamicalVAE, distributions
+from dvae.distributions.kalman import LinearGaussianChain
+from dvae.distributions.triangular import TriangularNormal
+from dvae.factorization.relations import Relation
 from dvae.networks import Dense, Input, LinearSDE, LinearSDEGuide, Network, Recurrent
 from dvae.networks.base import computing_once, share_modules
 from dvae.networks.sde import Equation, transition
-from dvae.relations import Relation
 from dvae.testing import FactorizationContract
 
 PAIR = "p(z_t | z_{t-1}, d_t) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T}, d_{1:T})"
@@ -43,7 +43,7 @@ def network(size=3, dtype=torch.float64):
 
 def model(guide=PAIR[1], scale=0.3):
     networks = {"p(z)": LinearSDE((0.5, 8.0)), "p(x)": Dense(()), "q": Recurrent(4)}
-    given = {"p(z)": laws.Triangular(), "p(x)": laws.FixedNormal(scale)}
+    given = {"p(z)": distributions.Triangular(), "p(x)": distributions.FixedNormal(scale)}
     return DynamicalVAE(PAIR[0], guide, {"z": 2, "x": 3, "d": 1}, networks, given).double()
 
 
@@ -246,7 +246,7 @@ class TestModel(FactorizationContract):
 
     missing: ClassVar = {}
     networks: ClassVar = {"p(z)": LinearSDE((0.5, 8.0)), "p(x)": Dense((4,)), "q": Recurrent(4)}
-    given: ClassVar = {"p(z)": laws.Triangular()}
+    given: ClassVar = {"p(z)": distributions.Triangular()}
 
     def build(self, size):
         return DynamicalVAE(*PAIR, {"z": size, "x": size, "d": 1}, self.networks, self.given)
@@ -267,7 +267,7 @@ class TestGuide(TestModel):
     """With a guide that has a transition too."""
 
     networks: ClassVar = {**TestModel.networks, "q": LinearSDEGuide(Recurrent(4), (0.5, 8.0))}
-    given: ClassVar = {"p(z)": laws.Triangular(), "q": laws.Triangular()}
+    given: ClassVar = {"p(z)": distributions.Triangular(), "q": distributions.Triangular()}
 
 
 class TestShared(TestGuide):
@@ -448,7 +448,7 @@ def test_the_guide_of_a_linear_model_s_messages_is_its_posterior(steps):
     with torch.no_grad():
         features = exact(built, times, x)
     spec = LinearSDEGuide(Told(features), (0.5, 8.0))
-    networks, given = {**built.networks, "q": spec}, {**built.laws, "q": laws.Triangular()}
+    networks, given = {**built.networks, "q": spec}, {**built.laws, "q": distributions.Triangular()}
     guided = DynamicalVAE(*PAIR, {"z": 2, "x": 3, "d": 1}, networks, given).double()
     guided.generator.load_state_dict(built.generator.state_dict())
     share_modules([guided.generator["z"].network, guided.encoder["z"].network], "equation")

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import dvae
-from dvae.laws import FixedNormal
+from dvae.distributions import FixedNormal
 from dvae.networks import WholeDecoder, WholeEncoder
 from dvae.networks.base import computing_once, share_modules
 from dvae.testing import FactorizationContract

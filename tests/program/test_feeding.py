@@ -7,7 +7,7 @@ import torch
 from pyro import poutine
 
 from dvae import DynamicalVAE, InputNoise, SelfFeeding
-from dvae.inference.bounds import SequenceELBO
+from dvae.inference.bounds.elbo import SequenceELBO
 from dvae.networks import Attention, Recurrent
 from dvae.networks.base import Network
 from dvae.networks.recurrent import RecurrentNetwork

@@ -9,7 +9,7 @@ from pyro import poutine
 from pyro.infer import Trace_ELBO
 
 import dvae
-from dvae.laws import FixedNormal
+from dvae.distributions import FixedNormal
 from dvae.networks import Linear, Recurrent
 from dvae.program.groups import Groups
 from dvae.testing import FactorizationContract
@@ -98,7 +98,7 @@ def linear(count, steps, exact=True):
     """A linear-Gaussian panel of one group, and its evidence as one dense normal."""
     laws = {
         "default": FixedNormal(0.7, project=False),
-        "p(g)": dvae.laws.StandardNormal(),
+        "p(g)": dvae.distributions.StandardNormal(),
         "q": FixedNormal(1.0, learned=True, project=False),
     }
     pair = "p(g) p(w | g) p(x_t | w)", "q(g | x_{1:T}) q(w | x_{1:T}, g)"

@@ -3,13 +3,15 @@
 import torch
 
 import dvae
-from dvae.laws import Family
+from dvae.distributions import Family
 from dvae.networks import Linear, Recurrent
 
 
 def test_draws_of_a_gap_are_of_the_model_that_goes_on():
     """Of an autoregression x_t = a x_{t-1} + b + noise, a gap of two has the moments of two steps."""
-    model = dvae.DynamicalVAE("p(x_t | x_{t-1})", None, {"x": 1}, Linear(), dvae.laws.FixedNormal(0.5, project=False))
+    model = dvae.DynamicalVAE(
+        "p(x_t | x_{t-1})", None, {"x": 1}, Linear(), dvae.distributions.FixedNormal(0.5, project=False)
+    )
     model = model.double()
     with torch.no_grad():
         for parameter in model.parameters():

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import dvae
-from dvae.laws import FixedNormal
+from dvae.distributions import FixedNormal
 from dvae.networks import Linear
 
 T = 5

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import dvae
-from dvae.data import Hiding, Sequences
-from dvae.laws import FixedNormal, Law, Vamp
+from dvae.data.sequences import Hiding, Sequences
+from dvae.distributions import FixedNormal, Law, Vamp
 from dvae.networks import Attention, Linear, Recurrent
 from dvae.networks.base import indicator
 from dvae.testing import FactorizationContract

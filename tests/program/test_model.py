@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from pyro import poutine
 from pyro.infer import Predictive, Trace_ELBO
 
-from dvae import DynamicalVAE, laws, views
-from dvae.inference.bounds import SequenceELBO
+from dvae import DynamicalVAE, distributions
+from dvae.data import views
+from dvae.inference.bounds.elbo import SequenceELBO
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.program.batch import Reader, in_chunks, rows
 from dvae.program.reference import reference
@@ -177,7 +178,7 @@ def per_step(model, data, latents):
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("pair", PAIRS)
 def test_the_vectorised_joint_is_that_of_the_per_step_program(pair, network):
-    model = build(pair, network, laws={"p(w)": laws.FixedNormal(learned=True)} if pair == "dsae" else None)
+    model = build(pair, network, laws={"p(w)": distributions.FixedNormal(learned=True)} if pair == "dsae" else None)
     data = draw(model)
     latents = {name: value.detach() for name, value in model.guide(data).items()}
     close(per_step(model, data, latents), model.log_joint(data, latents))
@@ -253,7 +254,7 @@ def test_the_value_of_a_missing_entry_changes_nothing(pair, network):
 
 
 def test_the_likelihood_is_that_of_the_observed_entries():
-    model = build("dkf", laws={"p(x)": laws.FixedNormal(scale=1.0)})
+    model = build("dkf", laws={"p(x)": distributions.FixedNormal(scale=1.0)})
     x, seen = draw(model)["x"], torch.rand(B, T, 3) < 0.5
     z = torch.randn(B, T, 2, dtype=torch.float64)
     mean = model.generator["x"]({"z": z}, B, T)[0]
@@ -307,7 +308,11 @@ def test_latents_of_the_past_of_a_forecast_are_the_guides(pair):
 
 @pytest.mark.parametrize(
     ("law", "drawn"),
-    [(laws.Normal(), True), (laws.FixedNormal(1.0), True), (laws.FixedNormal(1.0, error_weight=True), False)],
+    [
+        (distributions.Normal(), True),
+        (distributions.FixedNormal(1.0), True),
+        (distributions.FixedNormal(1.0, error_weight=True), False),
+    ],
 )
 def test_a_seed_repeats_a_forecast_which_draws_the_emission_but_the_weight_of_an_error(law, drawn):
     model = build("srnn", laws={"p(x)": law})
@@ -324,14 +329,14 @@ def test_a_seed_repeats_a_forecast_which_draws_the_emission_but_the_weight_of_an
 
 
 def test_forecasts_cover_the_future_as_often_as_their_levels_say():
-    model = DynamicalVAE("p(w) p(x_t | w)", None, {"w": 1, "x": 1}, Linear(), laws.FixedNormal(1.0))
+    model = DynamicalVAE("p(w) p(x_t | w)", None, {"w": 1, "x": 1}, Linear(), distributions.FixedNormal(1.0))
     truth = model.sample(400, length=2)["x"]
     futures = model.forecast({"x": truth[:, :1]}, 1, 199)["x"]
     low, high = futures.quantile(0.05, 0), futures.quantile(0.95, 0)
     assert abs(((low < truth[:, 1:]) & (truth[:, 1:] < high)).double().mean() - 0.9) < 0.06
 
 
-class Bits(laws.Law):
+class Bits(distributions.Law):
     """A law of binary data, as one writes it."""
 
     def __init__(self, features, size):
@@ -468,7 +473,7 @@ def test_sampling_draws_every_variable_and_leaves_the_training_mode(pair):
 @pytest.mark.parametrize("pair", ["storn", "srnn", "hit-dvae", "body parts", "context"])
 @pytest.mark.parametrize("residual", [False, True])
 def test_feeding_on_ones_own_means(pair, network, residual):
-    model = build(pair, network, laws={"p(x)": laws.Normal(residual=residual)})
+    model = build(pair, network, laws={"p(x)": distributions.Normal(residual=residual)})
     data = draw(model)
     latents = {name: value.detach() for name, value in model.guide(data).items()}
     program = poutine.condition(model.model, data=latents)
@@ -610,7 +615,7 @@ def test_networks_and_laws_are_chosen_by_factor():
     model = build(
         "dkf",
         {"p": Dense((3,)), "q(z)": Attention(8, heads=2), "default": Recurrent(4)},
-        laws={"p(x)": laws.StudentT(), "q": laws.FixedNormal(scale=0.5)},
+        laws={"p(x)": distributions.StudentT(), "q": distributions.FixedNormal(scale=0.5)},
     )
     assert type(model.generator["z"].network).__name__ == "DenseNetwork"
     assert type(model.encoder["z"].network).__name__ == "AttentionNetwork"
@@ -620,7 +625,7 @@ def test_networks_and_laws_are_chosen_by_factor():
 
 
 def test_a_guides_factor_without_parents_has_a_law_of_its_own():
-    model = build(("p(w) p(x_t | w)", "q(w)"), laws={"q": laws.FixedNormal(scale=0.25)})
+    model = build(("p(w) p(x_t | w)", "q(w)"), laws={"q": distributions.FixedNormal(scale=0.25)})
     values = model.encoder["w"]({}, B, T)
     assert torch.allclose(values[1], torch.tensor(0.25, dtype=torch.float64))
     Trace_ELBO()(model, model.guide)(draw(model)).backward()
@@ -660,20 +665,23 @@ X = torch.zeros(B, T, 3, dtype=torch.float64)
         ({"sizes": 3}, "sizes is 3; expected the size of every variable by name"),
         ({"network": Dense}, "the network of 'default' is the class Dense; expected a description such as Recurrent"),
         ({"network": {"p(z)": Dense}}, r"the network of 'p\(z\)' is the class Dense; expected a description"),
-        ({"laws": laws.StudentT}, "the law of 'default' is the class StudentT; expected a description such as Normal"),
-        ({"view": views.View}, r"the view is the class View; expected an instance such as dvae.views.View\(\)"),
+        (
+            {"laws": distributions.StudentT},
+            "the law of 'default' is the class StudentT; expected a description such as Normal",
+        ),
+        ({"view": views.View}, r"the view is the class View; expected an instance such as dvae.data.views.View\(\)"),
         (
             {"network": {"p(y)": Dense()}},
             r"no factor 'p\(y\)'; keys are p\(x\), p\(z\), q\(z\), 'p', 'q' and 'default'",
         ),
-        ({"laws": {"p(y)": laws.Normal()}}, r"no factor 'p\(y\)'"),
+        ({"laws": {"p(y)": distributions.Normal()}}, r"no factor 'p\(y\)'"),
         ({"network": "gru"}, "the network of 'default' is 'gru'; expected a description such as Recurrent"),
         (
             {"laws": {"p(x)": torch.nn.Linear(2, 2)}},
             r"the law of 'p\(x\)' is Linear.*; expected a description such as Normal",
         ),
         (
-            {"laws": {"p(z)": laws.Mixture()}},
+            {"laws": {"p(z)": distributions.Mixture()}},
             r"static latents .* but z has parents and has a value at every step",
         ),
         (

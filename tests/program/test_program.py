@@ -15,13 +15,13 @@ import torch
 from pyro.infer import SVI, Trace_ELBO
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO, laws, twin
-from dvae.inference.particles import Filter
+from dvae import DynamicalVAE, SequenceELBO, distributions, twin
+from dvae.data.views import History
+from dvae.inference.bounds.particles import Filter
 from dvae.models.method import LatentMethod
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.testing import FactorizationContract
 from dvae.turns import alone
-from dvae.views import History
 
 SRNN = ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})")
 
@@ -55,7 +55,7 @@ def test_the_model_reads_its_own_mean_in_place_of_a_missing_entry():
 
 
 def test_a_gap_does_not_wreck_the_next_frame_of_a_residual_model():
-    model = srnn(laws={"p(x)": dvae.laws.FixedNormal(residual=True)})
+    model = srnn(laws={"p(x)": dvae.distributions.FixedNormal(residual=True)})
     with torch.no_grad():
         for parameter in model.generator["x"].law.parameters():
             parameter.zero_()
@@ -68,7 +68,7 @@ def test_a_gap_does_not_wreck_the_next_frame_of_a_residual_model():
 
 def test_removing_frames_of_a_well_predicted_sequence_raises_no_alarm():
     """A missing frame takes its own log-likelihood along, and little of its neighbours'."""
-    model = srnn(laws={"p(x)": dvae.laws.FixedNormal(scale=0.05, residual=True)})
+    model = srnn(laws={"p(x)": dvae.distributions.FixedNormal(scale=0.05, residual=True)})
     with torch.no_grad():
         for parameter in model.generator["x"].law.parameters():
             parameter.zero_()
@@ -178,7 +178,7 @@ def test_a_residual_law_is_held_to_a_custom_mask_at_every_length():
         "q(z_t | x_t)",
         {"z": 1, "x": 1},
         Attention(8, 2),
-        laws={"p(x)": laws.Normal(residual=0.5)},
+        laws={"p(x)": distributions.Normal(residual=0.5)},
         masks={"near": near},
     )
     model.sample(2, length=11)

@@ -158,7 +158,7 @@ def test_nuts_finds_the_moments_of_the_mixture():
     x = pair.sample(1, 2)["x"]
     exact = dvae.reference_posterior(pair, x, guide_draws=100, progress=False)
     assert exact.exact
-    with mock.patch("dvae.inference.yardstick._exact", return_value=None):
+    with mock.patch("dvae.inference.diagnostics.yardstick._exact", return_value=None):
         drawn = dvae.reference_posterior(pair, x, draws=80, warmup=40, guide_draws=100, progress=False)
     away = (drawn.reference.mean - exact.reference.mean) / drawn.reference.mean_error
     assert (abs(away) < 4.5).all()
@@ -313,7 +313,7 @@ def test_refusals_of_runs():
     with pytest.raises(ValueError, match="at least two states"):
         Discrete(1)
     with pytest.raises(ValueError, match="is Normals; leave it to be that of categories"):
-        build(HMM, {"k": 2}, laws={"p(k)": dvae.laws.Normal()})
+        build(HMM, {"k": 2}, laws={"p(k)": dvae.distributions.Normal()})
     with pytest.raises(ValueError, match="nothing is summed out"):
         build(("p(x_t | x_{<t})", ""), {}).states(data)
     with pytest.raises(ValueError, match=r"sizes=\{'k': dvae.Discrete\(states\)\}"):

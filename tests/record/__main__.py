@@ -171,7 +171,7 @@ def options_of(name: str, data: Any) -> list[dict[str, Any]]:
 
 def data_of(name: str, cache: dict[str, Any]) -> Any:
     """Simulated motion, as the method reads it."""
-    from dvae.models.trajectories import TrajectoryMethod
+    from dvae.models.motion.trajectories import TrajectoryMethod
     from dvae.motion.segments.dataset import SegmentData
 
     method = dvae.methods()[name]
@@ -274,7 +274,7 @@ def numbers(name: str, options: Mapping[str, Any], data: Any, whole: bool) -> di
 
 def record(names: list[str]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Every case with its numbers."""
-    from dvae.models import energies
+    from dvae.models.motion import energies
 
     energies.fit_pose_prior = partial(energies.fit_pose_prior, steps=2, progress=False)  # a thousand take a minute
     cache: dict[str, Any] = {}

@@ -12,10 +12,10 @@ from matplotlib.patches import FancyArrowPatch
 
 import dvae
 from dvae.cli import main
-from dvae.notation import Factorization
+from dvae.data.schema import Schema
+from dvae.factorization.notation import Factorization
 from dvae.runs.ablation import FAMILY, WHOLE, Ablation, arrows_of, as_equations
 from dvae.runs.grid import NAME
-from dvae.schema import Schema
 from dvae.testing.strategies import factorizations
 
 matplotlib.use("Agg")

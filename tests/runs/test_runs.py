@@ -22,11 +22,20 @@ from safetensors.torch import load_file, save
 import dvae
 from dvae import files, motion
 from dvae.cli import main
-from dvae.inference import trackers
-from dvae.inference.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE, CheckpointError, Run, at_most
-from dvae.inference.result import reason
-from dvae.inference.trackers import JSONLines
-from dvae.motion.dataset import MotionData
+from dvae.inference.evaluation.result import reason
+from dvae.inference.training import trackers
+from dvae.inference.training.checkpoints import (
+    BEST,
+    CONFIG,
+    LAST,
+    OPTIMISER,
+    STATE,
+    CheckpointError,
+    Run,
+    at_most,
+)
+from dvae.inference.training.trackers import JSONLines
+from dvae.motion.data.dataset import MotionData
 from dvae.options import Range
 from dvae.runs import directory as runs
 from dvae.runs.sweep import sweep

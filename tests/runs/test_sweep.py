@@ -22,8 +22,8 @@ from stopping import At, interrupt
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.inference.checkpoints import Run
-from dvae.motion.dataset import MotionData
+from dvae.inference.training.checkpoints import Run
+from dvae.motion.data.dataset import MotionData
 from dvae.motion.judges.action_classifier import ActionClassifier
 from dvae.runs import directory as runs
 from dvae.runs import sweep as sweeps

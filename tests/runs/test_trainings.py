@@ -8,10 +8,10 @@ import dvae
 from dvae import Training, motion
 from dvae.cli.app import main
 from dvae.models import registry
-from dvae.models.poses import PoseMethod
+from dvae.models.motion.poses import PoseMethod
 from dvae.motion import HUMAN36M, PROTOCOLS
-from dvae.motion.dataset import MotionData
-from dvae.motion.protocols import Poses
+from dvae.motion.data.dataset import MotionData
+from dvae.motion.data.protocols import Poses
 from dvae.runs import directory
 from dvae.runs.sweep import sweep
 

@@ -8,7 +8,7 @@ import pytest
 
 import dvae
 from benchmarks.tables import papers, ranking, tuning
-from dvae.models.poses import PoseMethod
+from dvae.models.motion.poses import PoseMethod
 from dvae.motion import WALKER
 
 FOLDERS = sorted({file.parent for file in ranking.SCORES.rglob("scores*.json.gz")})

@@ -38,7 +38,7 @@ from benchmarks.tables import (
 )
 from dvae import Descent, Training, alternatives, method, motion
 from dvae.cli import main as command
-from dvae.inference.checkpoints import Run
+from dvae.inference.training.checkpoints import Run
 from dvae.motion.segments import dataset
 from dvae.runs.directory import fit_run, load
 from dvae.tables import Column, Columns, Panel, Series

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvae.laws.family import FAMILIES
+from dvae.distributions.family import FAMILIES
 from dvae.tables import Column, Columns
 from dvae.tables.columns import MOST, parsed
 from dvae.tables.protocol import Cut

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import dvae
+from dvae.data.schema import SchemaError
+from dvae.data.units import Coordinate, Units
+from dvae.data.views import Offered
+from dvae.factorization.notation import Factorization
 from dvae.models.registry import methods
-from dvae.notation import Factorization
-from dvae.schema import SchemaError
 from dvae.tables import Column, Columns, Panel, Series
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
-from dvae.units import Coordinate, Units
-from dvae.views import Offered
 
 WITHOUT_LATENTS = ["autoregressive", "moglow"]
 METHODS = ["vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae", *WITHOUT_LATENTS]

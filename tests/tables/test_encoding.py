@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from dvae.laws import FAMILIES
-from dvae.laws.product import Product
+from dvae.distributions import FAMILIES
+from dvae.distributions.product import Product
 from dvae.tables import Column, Columns, Panel, Series
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut

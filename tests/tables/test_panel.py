@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvae.laws.family import FAMILIES
+from dvae.distributions.family import FAMILIES
 from dvae.tables import Column, Columns, Cut, Panel, PanelData, Series, Told, proposed
 
 pd = pytest.importorskip("pandas")

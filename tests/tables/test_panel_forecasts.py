@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import dvae
-from dvae.data import past_of
-from dvae.inference.checkpoints import CheckpointError
+from dvae.data.sequences import past_of
+from dvae.inference.training.checkpoints import CheckpointError
 from dvae.models.registry import methods
 from dvae.runs import directory as runs
 from dvae.tables import Column, Columns, Panel

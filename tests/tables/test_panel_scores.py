@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import dvae
-from dvae.inference import metrics
-from dvae.inference.scores import proper
+from dvae.inference.evaluation import metrics
+from dvae.inference.evaluation.scores import proper
 from dvae.tables import Column, Columns, Cut, PanelData, panel_scores
 
 UNITS = {"shared": ("m", "m"), "mixed": ("people", "°C"), "unsaid": ("", "")}

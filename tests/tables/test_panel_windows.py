@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import dvae
-from dvae.data import HeldOutWindows, Source
-from dvae.inference.held import hold
+from dvae.data.sequences import HeldOutWindows, Source
+from dvae.inference.evaluation.held import hold
 from dvae.tables import Column, Columns, Panel, PanelData, Series
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut

@@ -12,12 +12,12 @@ from torch.utils._pytree import tree_leaves
 
 import dvae
 from dvae import motion
-from dvae.inference.held import on_device_of
-from dvae.laws.chain import gaussian_chain
-from dvae.laws.kalman import LinearGaussianChain
-from dvae.models.motion_latent import MotionLatent
+from dvae.distributions.chain import gaussian_chain
+from dvae.distributions.kalman import LinearGaussianChain
+from dvae.inference.evaluation.held import on_device_of
+from dvae.models.motion.motion_latent import MotionLatent
+from dvae.models.motion.trajectories import TrajectoryMethod
 from dvae.models.registry import METHODS
-from dvae.models.trajectories import TrajectoryMethod
 from dvae.motion import bodies
 from dvae.motion.segments.embodied import Segments
 from dvae.testing.device import OnDevice, SameNoise, move, on_device
@@ -43,17 +43,20 @@ SMALL = {
 }
 STEP = {
     "program/batch.py": 1,  # one verdict on the whole batch: finite, in the laws' supports, of lengths that there are
-    "inference/svi.py": 1,  # loss and norm of the gradient, by which a step is taken, clipped or refused
+    "inference/training/svi.py": 1,  # loss and norm of the gradient, by which a step is taken, clipped or refused
 }
 """For what any step waits, and how often."""
 BESIDE = {
     "moglow": {"laws/conditional_flow.py": 2},  # zuko looks up both halves of a coupling, once for each of them
     "hit-dvae": {"motion/energies.py": 1},  # how many futures are admissible is a shape
     "gsps": {"motion/energies.py": 1},
-    "dlow": {"program/groups.py": 1, "models/modes.py": 1},  # how many windows there are, and that histories recur
-    "dsf": {"models/modes.py": 1},
+    "dlow": {
+        "program/groups.py": 1,
+        "models/motion/modes.py": 1,
+    },  # how many windows there are, and that histories recur
+    "dsf": {"models/motion/modes.py": 1},
     "mix-and-match": {"program/rollout.py": 1},  # which frames chance has fed, so that a loop passes over the others
-    "motion-latent": {"inference/gradnorm.py": 1},  # losses and gradients' norms, by which the weights adapt
+    "motion-latent": {"inference/training/gradnorm.py": 1},  # losses and gradients' norms, by which the weights adapt
 }
 BROUGHT = {"mix-and-match": 1}
 """Tensors brought to the device in a step, beside the batch: the indices that all sequences share."""

@@ -30,14 +30,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ...data import tensor_of
-from ..data import Clip, MotionSet
-from ..kinematics import forward, swing
-from ..matching import parts
+from ...data.sequences import tensor_of
+from ..data.clips import Clip, MotionSet
+from ..geometry.kinematics import forward, swing
+from ..geometry.rotations import continuous, from_matrix, to_matrix
+from ..geometry.skeleton import Skeleton
 from ..naming import sides
-from ..rotations import continuous, from_matrix, to_matrix
+from ..scoring.matching import parts
 from ..segments.frames import AT_ONCE, resting_offsets
-from ..skeleton import Skeleton
 from .skinning import Body
 
 WITHIN = 0.01

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ...compiled import compiled
 from ...constants import indices
-from ..kinematics import forward
+from ..geometry.kinematics import forward
 
 UNTOLD = 1e-5
 """Share of what joints move by the parameters that move them most, below which they do not tell one."""

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..rotations import from_matrix, to_matrix
+from ..geometry.rotations import from_matrix, to_matrix
 from .recording import END, Recording, check_joints, check_size, numbers, read_lines
 
 INCH = 0.0254

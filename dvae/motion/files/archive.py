@@ -1,8 +1,9 @@
 """Reading npz archives that anybody may have made.
 
-Nothing in one is believed before it is checked, and no native object is built from what it says. Headers (`dvae.npy`)
-and the pickle of an archive are read by few rules, into names, shapes and bytes; when these fit each other, arrays are
-made of the bytes. numpy's own readers evaluate headers, and fill arrays and dtypes with whatever a pickle holds.
+Nothing in one is believed before it is checked, and no native object is built from what it says. Headers
+(`dvae.data.npy`) and the pickle of an archive are read by few rules, into names, shapes and bytes; when these fit each
+other, arrays are made of the bytes. numpy's own readers evaluate headers, and fill arrays and dtypes with whatever a
+pickle holds.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ...npy import LONGEST, Refused, check_bytes, dtype_of, header
-from ..skeleton import is_name
+from ...data.npy import LONGEST, Refused, check_bytes, dtype_of, header
+from ..geometry.skeleton import is_name
 
 LARGEST = 4 * 2**30
 """Bytes that a file may unpack to."""

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ...files import written
-from ..rotations import from_matrix, to_matrix
+from ..geometry.rotations import from_matrix, to_matrix
 from .recording import END, Recording, check_joints, check_size, numbers, read_lines
 
 _WORD = re.compile(r"[{}]|[^\s{}]+")

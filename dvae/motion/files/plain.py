@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from ... import files
-from ...npy import is_mapped
-from ..data import Clip, MotionSet
-from ..skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, text_of
+from ...data.npy import is_mapped
+from ..data.clips import Clip, MotionSet
+from ..geometry.skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, text_of
 from .archive import LARGEST, archive, write_arrays
 from .recording import MOST_PLACES, MOST_TEXT, Recording, check_joints
 from .settled import doubt

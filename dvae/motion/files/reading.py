@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data import Clip, MotionSet, defect, extents, fullest
-from ..matching import RIGID, Kept
+from ..data.clips import Clip, MotionSet, defect, extents, fullest
+from ..geometry.skeleton import Skeleton
 from ..naming import sides
-from ..skeleton import Skeleton
+from ..scoring.matching import RIGID, Kept
 from .amc import read_amc, read_expmap
 from .archive import LARGEST
 from .bvh import read_bvh

@@ -11,10 +11,10 @@ import numpy as np
 from torch import Tensor
 
 from ... import files
-from ..kinematics import forward
-from ..matching import offsets_of
-from ..rotations import continuous, from_matrix
-from ..skeleton import MOST_JOINTS, Skeleton
+from ..geometry.kinematics import forward
+from ..geometry.rotations import continuous, from_matrix
+from ..geometry.skeleton import MOST_JOINTS, Skeleton
+from ..scoring.matching import offsets_of
 
 MOST_TEXT = 2**28
 """Bytes of a text file of motion: an hour of sixty joints at 60 Hz."""

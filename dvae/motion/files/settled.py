@@ -11,8 +11,8 @@ from math import log
 import numpy as np
 import torch
 
-from ..data import extents, fullest
-from ..rotations import continuous, from_matrix, to_matrix
+from ..data.clips import extents, fullest
+from ..geometry.rotations import continuous, from_matrix, to_matrix
 from .recording import Recording
 
 HEIGHT = 1.65

@@ -17,13 +17,13 @@ import numpy as np
 import torch
 
 from ... import files
-from ...npy import Refused
-from ..data import Clip, MotionSet
-from ..kinematics import inverse
-from ..matching import Kept, against_world, parts
+from ...data.npy import Refused
+from ..data.clips import Clip, MotionSet
+from ..geometry.kinematics import inverse
+from ..geometry.rotations import from_matrix, to_matrix
+from ..geometry.skeleton import Skeleton
 from ..naming import sides
-from ..rotations import from_matrix, to_matrix
-from ..skeleton import Skeleton
+from ..scoring.matching import Kept, against_world, parts
 from .archive import archive, write_arrays
 from .recording import Recording, check_size
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from ... import files
-from ...inference.result import progress_bar
-from ..data import Clip, MotionSet
-from ..skeleton import Skeleton, brief
+from ...inference.evaluation.result import progress_bar
+from ..data.clips import Clip, MotionSet
+from ..geometry.skeleton import Skeleton, brief
 from .bvh import write_bvh
 from .plain import LABELS, SKELETON, own_companion, save, save_clips, write_labels, write_table
 from .reading import Collected, File, FileReader, find_files, joined_motion, read_motion, sampled, upwards

@@ -25,14 +25,14 @@ import torch
 from pyro import distributions
 from torch import Tensor, nn
 
-from ...data import Batch
-from ...inference.recipe import Recipe, Trainable
-from ...inference.training import Stage, Training
+from ...data.schema import SchemaError
+from ...data.sequences import Batch
+from ...inference.training.options import Stage, Training
+from ...inference.training.recipe import Recipe, Trainable
 from ...networks.cells import GRU
 from ...options import Layers, Size
-from ...schema import SchemaError
-from ..protocols import Poses, Protocol, Windows
-from ..skeleton import Skeleton
+from ..data.protocols import Poses, Protocol, Windows
+from ..geometry.skeleton import Skeleton
 
 CLASS = "c"
 IN_CACHE = 512

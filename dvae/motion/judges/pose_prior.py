@@ -5,7 +5,7 @@
 It has no latents and no time: every frame is a pose of its own, and the flow's density is exact, so that the bound is
 the log evidence. Others are trained with it: poses that it finds unlikely cost energy (`energies.pose_prior_energy`).
 
-Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the flow of its public code (see `dvae.laws.flow`). Ours:
+Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the flow of its public code (see `dvae.distributions.flow`). Ours:
 
 * Training poses get noise of 2 mm. Where a body part is rigid, as the hips are, its limbs' directions hardly vary, and
   the density rises without bound as a flow narrows down on them. In bandai2 eight of sixty dimensions have no more than
@@ -30,17 +30,17 @@ import pyro
 import torch
 from torch import Tensor, nn
 
-from ...data import Batch, bridged
-from ...inference.checkpoints import Run, load_weights
-from ...inference.recipe import Recipe, Trainable
-from ...inference.trackers import Bar
-from ...inference.training import Stage, Training
-from ...laws import QRFlow, Shape
+from ...data.sequences import Batch, bridged
+from ...distributions import QRFlow, Shape
+from ...inference.training.checkpoints import Run, load_weights
+from ...inference.training.options import Stage, Training
+from ...inference.training.recipe import Recipe, Trainable
+from ...inference.training.trackers import Bar
 from ...options import Layers, Range
 from ...turns import alone
-from ..protocols import Poses, Windows
-from ..skeleton import HUMAN36M, HUMANEVA, Skeleton, rotate_about_up
-from ..views import Heading
+from ..data.protocols import Poses, Windows
+from ..geometry.skeleton import HUMAN36M, HUMANEVA, Skeleton, rotate_about_up
+from ..geometry.views import Heading
 
 
 @dataclass(frozen=True)

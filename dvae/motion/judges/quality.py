@@ -43,23 +43,23 @@ from pyro import distributions
 from torch import Tensor, nn
 from typing_extensions import override
 
-from ...data import Batch
-from ...inference.estimates import Crossed, Estimate
-from ...inference.held import Held, clip_places, hold, on_device_of, plain, refuse_non_finite, reproducibly
-from ...inference.recipe import Recipe, Trainable
-from ...inference.references import zero_velocity
-from ...inference.result import Result, Table, progress_bar
-from ...inference.scores import clip_means
-from ...inference.trackers import Bar
-from ...inference.training import Stage
+from ...data.schema import Schema
+from ...data.sequences import Batch
+from ...data.units import Units
+from ...inference.evaluation.estimates import Crossed, Estimate
+from ...inference.evaluation.held import Held, clip_places, hold, on_device_of, plain, refuse_non_finite, reproducibly
+from ...inference.evaluation.references import zero_velocity
+from ...inference.evaluation.result import Result, Table, progress_bar
+from ...inference.evaluation.scores import clip_means
+from ...inference.training.options import Stage
+from ...inference.training.recipe import Recipe, Trainable
+from ...inference.training.trackers import Bar
 from ...networks.cells import GRU
 from ...options import Size, nearest
-from ...schema import Schema
 from ...turns import alone
-from ...units import Units
-from ..protocols import Poses, Windows
-from ..skeleton import Skeleton
-from ..views import Heading
+from ..data.protocols import Poses, Windows
+from ..geometry.skeleton import Skeleton
+from ..geometry.views import Heading
 
 REAL = "c"
 TRAINING: Mapping[str, Any] = {
@@ -209,7 +209,7 @@ class Qualities(Result):
     """The quality of models on the same held-out windows, in per cent.
 
     Indexing gives the scores of a model, `found["srnn"]["quality"].interval()`: estimates over clips and over seeds of
-    the classifier, crossed (see `dvae.inference.comparison`).
+    the classifier, crossed (see `dvae.inference.evaluation.comparison`).
 
     Attributes:
         rows: `{model: {score: (S, C)}}`, by seed of the classifier and clip.

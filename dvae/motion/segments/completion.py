@@ -37,9 +37,9 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from ...data import Batch
-from ...inference.bounds import ImportanceBound
-from ...inference.posteriors import Descent, Posterior, posterior
+from ...data.sequences import Batch
+from ...inference.bounds.elbo import ImportanceBound
+from ...inference.diagnostics.posteriors import Descent, Posterior, posterior
 from ...options import Positive, check
 from ...program.conditional import evaluating, like
 from ...turns import alone
@@ -92,7 +92,7 @@ class SegmentCompletion:
     """The Pyro program of what was seen, for `dvae.posterior` and for Pyro's own guides (`AutoDelta`, ...).
 
     Args:
-        model: of segments, such as `dvae.models.motion_latent.MotionLatentModel`, of which `decode`, `decoder`,
+        model: of segments, such as `dvae.models.motion.motion_latent.MotionLatentModel`, of which `decode`, `decoder`,
             `guide`, `timed` and `body` are used.
         deviations: of what was seen.
         markers: the vertices of markers (L,); `bodies.MARKERS` by default.

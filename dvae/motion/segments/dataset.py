@@ -13,11 +13,11 @@ import numpy as np
 
 from ...options import Amount, check, nearest
 from ..bodies import fitted, human
-from ..data import Clip, MotionSet
-from ..dataset import SIMULATED
+from ..data.clips import Clip, MotionSet
+from ..data.dataset import SIMULATED
+from ..data.protocols import held_out
+from ..data.simulator import simulate
 from ..files import read_motion
-from ..protocols import held_out
-from ..simulator import simulate
 from .embodied import Segments, SegmentSchema
 from .frames import TimedFrames
 from .gait import Cycles, gait_cycles, reference_cycles

@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ...data import Batch, each
+from ...data.schema import Schema
+from ...data.sequences import Batch, each
+from ...data.views import WHOLE, Parts
 from ...options import tuples
-from ...schema import Schema
-from ...views import WHOLE, Parts
 from ..bodies import Body, human, shapes_of
 from ..bodies.fitting import MOST, standing
-from ..data import MotionSet
-from ..skeleton import Skeleton, brief
-from ..views import HEADING
+from ..data.clips import MotionSet
+from ..geometry.skeleton import Skeleton, brief
+from ..geometry.views import HEADING
 from .frames import OFFSETS, ORIGIN, TimedFrames
 from .gait import Reference
 

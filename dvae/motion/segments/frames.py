@@ -27,14 +27,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ...constants import constant, indices
-from ...data import Batch
+from ...data.sequences import Batch
+from ...data.views import WHOLE
 from ...options import Positive, Size, check
-from ...views import WHOLE
-from .. import kinematics
-from ..data import Clip, MotionSet
-from ..rotations import continuous, from_matrix, normalised, to_matrix
-from ..skeleton import Skeleton, rotate_about_up
-from ..views import HEADING
+from ..data.clips import Clip, MotionSet
+from ..geometry import kinematics
+from ..geometry.rotations import continuous, from_matrix, normalised, to_matrix
+from ..geometry.skeleton import Skeleton, rotate_about_up
+from ..geometry.views import HEADING
 from .gait import Reference, stamps
 
 OFFSETS = "offsets"

@@ -26,12 +26,12 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import torch
 
-from ...data import tensor_of
+from ...data.sequences import tensor_of
 from ...options import Amount, Positive, Range, Share, check
-from ..data import Clip, MotionSet
-from ..kinematics import forward
-from ..rotations import continuous, from_matrix, to_matrix
-from ..skeleton import Skeleton, rotate_about_up
+from ..data.clips import Clip, MotionSet
+from ..geometry.kinematics import forward
+from ..geometry.rotations import continuous, from_matrix, to_matrix
+from ..geometry.skeleton import Skeleton, rotate_about_up
 from .warping import alignment, subsequence_costs
 
 MOST_CYCLES = 400

@@ -16,13 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...data import Batch
-from ...inference.held import on_device_of, reproducibly
-from ...inference.result import Table, as_they_are, canvas
+from ...data.sequences import Batch
+from ...data.views import WHOLE
+from ...inference.evaluation.held import on_device_of, reproducibly
+from ...inference.evaluation.result import Table, as_they_are, canvas
 from ...turns import alone
-from ...views import WHOLE
 from ..bodies import Body
-from ..data import MotionSet
+from ..data.clips import MotionSet
 from .embodied import SHAPE
 from .frames import OFFSETS, TimedFrames
 

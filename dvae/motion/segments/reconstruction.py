@@ -20,16 +20,16 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ...data import Batch, each
-from ...inference.bounds import SequenceELBO, importance_bound
-from ...inference.evaluation import ARROWS, Score
-from ...inference.held import clip_places, on_device_of, plain, reproducibly
-from ...inference.result import Result, Table, as_they_are, canvas, progress_bar
-from ...inference.scores import TEACHER_FORCED, Metric, clip_means
-from ...inference.uncertainty import clustered_variance, linearised
+from ...data.sequences import Batch, each
+from ...data.views import WHOLE
+from ...inference.bounds.elbo import SequenceELBO, importance_bound
+from ...inference.evaluation.evaluation import ARROWS, Score
+from ...inference.evaluation.held import clip_places, on_device_of, plain, reproducibly
+from ...inference.evaluation.result import Result, Table, as_they_are, canvas, progress_bar
+from ...inference.evaluation.scores import TEACHER_FORCED, Metric, clip_means
+from ...inference.evaluation.uncertainty import clustered_variance, linearised
 from ...options import nearest
 from ...turns import alone
-from ...views import WHOLE
 from ..bodies import vertex_error
 from .embodied import SHAPE, Segments, SegmentSchema, surfaces_of
 from .frames import TimedFrames

@@ -15,15 +15,15 @@ import torch
 from rich.console import Group
 from torch import Tensor
 
-from ...data import Batch
-from ...inference.posteriors import Descent
-from ...inference.result import Table
-from ...npy import Refused
+from ...data.npy import Refused
+from ...data.sequences import Batch
+from ...data.views import WHOLE
+from ...inference.diagnostics.posteriors import Descent
+from ...inference.evaluation.result import Table
 from ...options import nearest
 from ...turns import alone
-from ...views import WHOLE
 from ..bodies import vertex_error
-from ..data import MotionSet
+from ..data.clips import MotionSet
 from ..files.archive import archive
 from .completion import (
     FRAMES,

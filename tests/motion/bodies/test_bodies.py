@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from dvae.motion import kinematics, rotations
 from dvae.motion.bodies import SHAPE, Body, enclosed_volume, human, read_body, vertex_error, write_body
+from dvae.motion.geometry import kinematics, rotations
 
 B, T = 3, 4
 PERSON = human().double()

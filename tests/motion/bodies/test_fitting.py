@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from dvae.motion import Clip, MotionSet, Skeleton, TimedFrames, gait_cycles, read_motion, rotations, simulate
+from dvae.motion import Clip, MotionSet, Skeleton, TimedFrames, gait_cycles, read_motion, simulate
 from dvae.motion.bodies import SHAPE, Body, betas, fitted, fitting, human, retargeted, shapes_of
-from dvae.motion.matching import parts
+from dvae.motion.geometry import rotations
 from dvae.motion.naming import sides
+from dvae.motion.scoring.matching import parts
 from dvae.motion.segments.frames import OFFSETS
 
 PERSON = human()

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dvae.motion.bodies import human
-from dvae.motion.plot import save_html, surfaces
+from dvae.motion.drawing.plot import save_html, surfaces
 
 PERSON = human()
 

@@ -12,11 +12,11 @@ import torch
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.inference.evaluation import Evaluation, Row, Score
-from dvae.inference.metrics import frechet_distance, frechet_pseudo_values
-from dvae.inference.references import nearest_neighbours
+from dvae.inference.evaluation.evaluation import Evaluation, Row, Score
+from dvae.inference.evaluation.metrics import frechet_distance, frechet_pseudo_values
+from dvae.inference.evaluation.references import nearest_neighbours
 from dvae.models.registry import configured, judge
-from dvae.motion.dataset import MotionData
+from dvae.motion.data.dataset import MotionData
 from dvae.motion.judges.action_classifier import ActionClassifier, ActionClassifierModel
 from dvae.runs import directory as runs
 

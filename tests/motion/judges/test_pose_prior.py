@@ -12,7 +12,7 @@ import dvae
 from dvae import motion
 from dvae.cli import main
 from dvae.models.registry import configured, judge
-from dvae.motion.dataset import MotionData
+from dvae.motion.data.dataset import MotionData
 from dvae.motion.judges.pose_prior import PosePrior, PosePriorModel, fit_pose_prior
 from dvae.runs import directory as runs
 

@@ -6,7 +6,7 @@ from pyro import poutine
 
 import dvae
 from dvae import motion
-from dvae.models.motion_latent import MotionLatent
+from dvae.models.motion.motion_latent import MotionLatent
 from dvae.motion import bodies
 from dvae.motion.segments.completion import (
     Deviations,

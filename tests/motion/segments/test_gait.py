@@ -6,17 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from dvae.motion import (
-    Clip,
-    Cycles,
-    MotionSet,
-    Skeleton,
-    gait_cycles,
-    kinematics,
-    reference_cycles,
-    rotations,
-    simulate,
-)
+from dvae.motion import Clip, Cycles, MotionSet, Skeleton, gait_cycles, reference_cycles, simulate
+from dvae.motion.geometry import kinematics, rotations
 from dvae.motion.segments.gait import alike, find_cycles
 
 SKELETON = simulate(clips=4, frames=60).with_rotations().skeleton

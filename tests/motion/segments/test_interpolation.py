@@ -7,7 +7,7 @@ import torch
 import dvae
 from dvae import motion
 from dvae.motion import Interpolation, falls, interpolate, latent_map, transferred
-from dvae.motion.rotations import from_matrix, to_matrix
+from dvae.motion.geometry.rotations import from_matrix, to_matrix
 from dvae.motion.segments.dataset import SegmentData
 from dvae.motion.segments.embodied import SHAPE
 

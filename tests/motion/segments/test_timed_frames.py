@@ -7,9 +7,10 @@ import pytest
 import torch
 from scipy.interpolate import CubicSpline
 
-from dvae.motion import MotionSet, TimedFrames, kinematics, reference_cycles, rotations, simulate
+from dvae.motion import MotionSet, TimedFrames, reference_cycles, simulate
+from dvae.motion.geometry import kinematics, rotations
+from dvae.motion.geometry.skeleton import rotate_about_up
 from dvae.motion.segments.frames import HEADING, OFFSETS, _cubic, resting_offsets
-from dvae.motion.skeleton import rotate_about_up
 
 
 @pytest.fixture(scope="module")

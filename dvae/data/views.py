@@ -1,0 +1,341 @@
+"""Views: bijections between the data and what a model sees of them.
+
+A model has one view. A batch goes through it where it is read (`DynamicalVAE.read`), and what the model makes of the
+data goes back through it where it is handed out (`DynamicalVAE.shown`): between the two, everything is as the model
+sees it. Views of one kind of data are with that data, as `dvae.motion.Heading` is.
+
+Densities and bounds are of the data as they are given: where a view changes volume, its log-determinant is added to
+what a model says of what it sees. All views here keep volume. Two elsewhere are no bijections of positions: with
+`dvae.motion.Bones`, of which `log_det` refuses, a model has no density; with `dvae.motion.Rotations` densities are of
+turns, and the view says so (`View.measured`).
+
+>>> view = dvae.data.views.Parts({"legs": [0, 2], "arms": [1]})
+>>> {name: value.tolist() for name, value in view({"x": torch.tensor([[[1.0, 2.0, 3.0]]])}).items()}
+{'legs': [[[1.0, 3.0]]], 'arms': [[[2.0]]]}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from ..constants import indices
+from ..factorization.notation import Factorization
+from ..networks.base import valid_steps
+from .sequences import Batch
+
+WHOLE = "x"
+"""Name of the data where a view makes several variables of them."""
+LOG_DET = "log_det"
+"""Name, in batches that were seen and among the terms of a bound, of the log-determinant of a view."""
+
+
+class View:
+    """What a model sees of the data; this view, all as it is.
+
+    What a view finds in the data and needs for the way back, as a heading, it adds under a name of its own. Values
+    that were seen are seen as they are; `LOG_DET` is among them, where a view changes volume.
+    """
+
+    names: tuple[str, ...] = ()
+    """Names in batches, beside those of the variables: what the view reads, and what it adds."""
+    parts: Mapping[str, Sequence[int]] | None = None
+    """Data variables that are coordinates of x, in place of it."""
+    history: str | None = None
+    """Name of the context that is the data themselves."""
+    past: int = 0
+    """Frames of x that are context, in place of data."""
+    measured: str = ""
+    """What densities are of, where it is not the data as they are given; bounds of other things do not compare."""
+
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        """Refuses a model that cannot have this view.
+
+        Raises:
+            ValueError: saying why.
+        """
+
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        """The data as they are seen.
+
+        Args:
+            data: values (B, ...) by name.
+            beside: a batch that was seen, where the data are more of the same sequences.
+
+        Raises:
+            ValueError: data that cannot be seen so.
+        """
+        return dict(data)
+
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        """The data that are seen so; values (..., B, T, D) of these and of what the view added, (B, ...)."""
+        return dict(seen)
+
+    def log_det(self, data: Batch) -> Tensor:
+        """Log of the absolute determinant of the Jacobian: (B,), 0 of a view that keeps volume.
+
+        A view that changes each entry of x by itself gives it by entry, (B, T, D), of which those that are missing or
+        padding do not count; with any other that changes volume, data have to be complete.
+        """
+        some = next(iter(data.values()))
+        found: Tensor = some.new_zeros(len(some))
+        return found
+
+    @property
+    def keeps_volume(self) -> bool:
+        """Whether there is no other log-determinant than 0."""
+        return type(self).log_det is View.log_det
+
+    def counted(self, data: Batch) -> Tensor:
+        """`log_det` over the entries that were observed: by step (B, T) where it is by entry, else (B,).
+
+        Raises:
+            ValueError: one of whole sequences, some of whose entries are missing or padding, or one of another shape.
+        """
+        log_det, partial = self.log_det(data), {"lengths", "mask"} & data.keys()
+        if log_det.dim() == 1 and not partial:
+            return log_det
+        if WHOLE not in data or log_det.shape != data[WHOLE].shape:
+            raise ValueError(
+                f"{self} changes volume by a log_det {tuple(log_det.shape)}, of data with "
+                f"{' and '.join(sorted(partial)) or 'all their entries'}; it is (B,) of complete sequences, or "
+                "(B, T, D) by entry of x, of which those that are missing or padding do not count"
+            )
+        if WHOLE in data.get("mask", {}):
+            log_det = torch.where(data["mask"][WHOLE], log_det, 0.0)
+        if "lengths" in data:
+            log_det = log_det.masked_fill(~valid_steps(data["lengths"], log_det.shape[1])[..., None], 0)
+        return log_det.sum(-1)
+
+
+@dataclass(frozen=True)
+class Offered(View):
+    """The data as they are, beside context that a model need not read.
+
+    Args:
+        names: of the context, which batches may hold whether the model has such variables or not.
+    """
+
+    names: tuple[str, ...] = ()
+
+    @override
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        return {name: value for name, value in seen.items() if name not in self.names}
+
+
+class Views(View):
+    """Views one after the other.
+
+    Args:
+        *views: the first sees the data, the last one shows the model.
+
+    Raises:
+        ValueError: a `Past`, which nothing scores, behind a view that changes its volume.
+    """
+
+    def __init__(self, *views: View):
+        self.views = views
+        self.names = tuple(name for view in views for name in view.names)
+        self.parts = next((view.parts for view in views if view.parts), None)
+        self.history = next((view.history for view in views if view.history), None)
+        self.past = sum(view.past for view in views)
+        self.measured = ", ".join(view.measured for view in views if view.measured)
+        pasts = [place for place, view in enumerate(views) if isinstance(view, Past)]
+        if not all(view.keeps_volume for view in views[: max(pasts, default=0)]):
+            raise ValueError(f"{self} changes the volume of frames that nothing scores; let Past be the first")
+
+    def __repr__(self) -> str:
+        return f"Views({', '.join(map(repr, self.views))})"
+
+    @override
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        for view in self.views:
+            view.check(sizes, context, generative)
+
+    @override
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        for view in self.views:
+            data = view(data, beside)
+        return dict(data)
+
+    @override
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        for view in reversed(self.views):
+            seen = view.inverse(seen)
+        return dict(seen)
+
+    @override
+    def log_det(self, data: Batch) -> Tensor:
+        return super().log_det(data) if self.keeps_volume else volume({LOG_DET: self.counted(data)})
+
+    @property
+    @override
+    def keeps_volume(self) -> bool:
+        return all(view.keeps_volume for view in self.views)
+
+    @override
+    def counted(self, data: Batch) -> Tensor:
+        found = []
+        for view in self.views:
+            found += [] if view.keeps_volume else [view.counted(data)]
+            data = view(data)
+        whole = any(each.dim() == 1 for each in found)
+        return torch.stack([volume({LOG_DET: each}) if whole else each for each in found]).sum(0)
+
+
+def volume(seen: Batch) -> Tensor:
+    """(B,) the log-determinant in a batch that was seen through a view that changes volume."""
+    found: Tensor = seen[LOG_DET]
+    return found.sum(-1) if found.dim() == 2 else found
+
+
+@dataclass(frozen=True)
+class Parts(View):
+    """Data variables that are coordinates of one array x, which stands for all of them in batches and forecasts.
+
+    Args:
+        parts: variable to its coordinates. Every coordinate belongs to one of them.
+
+    Example:
+        >>> view = Parts({"legs": [0, 2], "arms": [1]})
+        >>> view({"x": torch.tensor([[[1.0, 2.0, 3.0]]])})["legs"]
+        tensor([[[1., 3.]]])
+    """
+
+    parts: Mapping[str, Sequence[int]] = field()
+    names = (WHOLE,)
+
+    @override
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        places = sorted(place for part in self.parts.values() for place in part)
+        if places != list(range(len(places))):
+            raise ValueError(f"the parts must share the coordinates 0, 1, ... of x among them, once each; got {places}")
+        for name, part in self.parts.items():
+            if len(part) != sizes[name]:
+                raise ValueError(f"the part {name} has {len(part)} coordinates, but its size is {sizes[name]}")
+        if WHOLE in sizes:
+            raise ValueError(f"with parts, {WHOLE!r} is the name of the whole; no variable can have it")
+
+    @override
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        if WHOLE not in data:
+            return dict(data)
+        seen, masks = dict(data), dict(data.get("mask", {}))
+        whole, mask = seen.pop(WHOLE), masks.pop(WHOLE, None)
+        size = sum(map(len, self.parts.values()))
+        if whole.dim() < 2 or whole.shape[-1] != size:
+            raise ValueError(f"{WHOLE} has shape {tuple(whole.shape)}, expected (B, T, {size})")
+        for name, part in self.parts.items():
+            own = indices(part, whole)
+            seen.setdefault(name, whole.index_select(-1, own))
+            if mask is not None:
+                masks[name] = mask.index_select(-1, own)
+        return {**seen, "mask": masks} if mask is not None else seen
+
+    @override
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        if not self.parts.keys() <= seen.keys():
+            return dict(seen)
+        order = [place for part in self.parts.values() for place in part]
+        whole = torch.cat([seen[name] for name in self.parts], dim=-1)
+        return {**seen, WHOLE: whole.index_select(-1, indices(map(order.index, range(len(order))), whole))}
+
+
+@dataclass(frozen=True)
+class History(View):
+    """The data once more, as a context variable.
+
+    Its relation is a mask of one's own, such as h_{1:O}, that hides the frames to be generated.
+
+    Args:
+        history: name of the context variable.
+        of: name of the data.
+    """
+
+    history: str = field()
+    of: str = WHOLE
+
+    @override
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        name = self.history
+        if name not in context:
+            raise ValueError(f"the history is {name!r}, but the context is {', '.join(context) or 'none'}")
+        for factor in generative.factors:
+            read = factor.parent(name)
+            if read is not None and (read.relation is None or read.relation.intervals is not None):
+                raise ValueError(
+                    f"{factor} reads {read}, but {name} is the data themselves, of which a forecast has the past "
+                    f"alone; give {name} a mask of your own that hides the frames to be made, such as "
+                    f'{name}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
+                )
+
+    @override
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        if self.of not in data or self.history in data or beside is not None:
+            return dict(data)
+        masks = data.get("mask", {})
+        seen = {**data, self.history: data[self.of]}
+        return {**seen, "mask": {**masks, self.history: masks[self.of]}} if self.of in masks else seen
+
+
+@dataclass(frozen=True)
+class Past(View):
+    """The first frames of x as a static variable, from which the others go on.
+
+    A model that reads its past so makes the future alone: bounds are of the future given the past, and forecasts, which
+    know nothing else, have latents from the prior.
+
+    Args:
+        name: of the past, (B, O D), frame after frame.
+        frames: O.
+        also: names of context over the same frames, of which the past says nothing more.
+
+    Example:
+        >>> {name: tuple(value.shape) for name, value in Past("s")({"x": torch.zeros(2, 5, 3)}).items()}
+        {'x': (2, 4, 3), 's': (2, 3)}
+    """
+
+    name: str
+    frames: int = 1
+    also: tuple[str, ...] = ()
+
+    @property
+    def past(self) -> int:  # type: ignore[override]
+        """All of them."""
+        return self.frames
+
+    @override
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        if WHOLE not in data or self.name in data or beside is not None:
+            return dict(data)
+        if "lengths" in data:
+            raise ValueError("windows that go on from their first frames have one length; leave 'lengths' out")
+        whole, masks, now = data[WHOLE], data.get("mask", {}), self.frames
+        if whole.shape[1] < now:
+            raise ValueError(f"this model goes on from {now} frames, and was given {whole.shape[1]}")
+        for name in self.also:
+            if name in data and data[name].shape[1] != whole.shape[1] > now:
+                raise ValueError(
+                    f"beside x {tuple(whole.shape)}, whose first frames are {self.name}, {name} is as long as the "
+                    f"whole window, (B, {now} + T, D); got {tuple(data[name].shape)}"
+                )
+        later = {name: data[name][:, now:] for name in (WHOLE, *self.also) if name in data}
+        seen = {**data, **later, self.name: whole[:, :now].flatten(1)}
+        if WHOLE in masks:
+            seen["mask"] = {**masks, WHOLE: masks[WHOLE][:, now:], self.name: masks[WHOLE][:, :now].flatten(1)}
+        if whole.shape[1] == now:
+            del seen[WHOLE]
+            seen.get("mask", {}).pop(WHOLE, None)
+        return seen
+
+    @override
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        if self.name not in seen:
+            return dict(seen)
+        first = seen[self.name].unflatten(-1, (self.frames, -1))
+        return {**seen, WHOLE: torch.cat([first, seen[WHOLE]], -2) if WHOLE in seen else first}

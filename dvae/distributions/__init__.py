@@ -1,0 +1,42 @@
+"""Laws: distributions of a variable given features, and what they are made of.
+
+>>> laws = {"p(x)": dvae.distributions.StudentT(df=4), "p(w)": dvae.distributions.Mixture(components=3)}
+>>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, laws=laws)
+"""
+
+from .base import Law, LawSpec, Shape, renamed
+from .conditional_flow import ConditionalFlow
+from .families import Delta, Directions, FixedNormal, KnownNoise, Normal, StandardNormal, StudentT
+from .family import FAMILIES, Family, LowRankNormal, NormalMixture
+from .flow import FlowDistribution, QRFlow
+from .priors import Flow, Mixture, Vamp
+from .product import Product
+from .subset import Subset
+from .triangular import Triangular
+
+__all__ = [
+    "FAMILIES",
+    "ConditionalFlow",
+    "Delta",
+    "Directions",
+    "Family",
+    "FixedNormal",
+    "Flow",
+    "FlowDistribution",
+    "KnownNoise",
+    "Law",
+    "LawSpec",
+    "LowRankNormal",
+    "Mixture",
+    "Normal",
+    "NormalMixture",
+    "Product",
+    "QRFlow",
+    "Shape",
+    "StandardNormal",
+    "StudentT",
+    "Subset",
+    "Triangular",
+    "Vamp",
+    "renamed",
+]

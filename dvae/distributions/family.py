@@ -1,0 +1,451 @@
+"""Family: any distribution of Pyro's as a law, and the families of observations by name.
+
+A distribution says which values its parameters may have (`arg_constraints`), and `biject_to` leads there from what a
+linear layer makes of features: a rate is an exponential of it, a matrix of scales has a positive diagonal.
+
+| family | observations | distribution |
+|---|---|---|
+| real | numbers | `Normal` |
+| fixed | numbers, with one scale for each coordinate whatever the parents | `FixedNormal` |
+| robust, laplace | numbers with outliers | `StudentT`, Laplace |
+| mixture | numbers with several modes | `NormalMixture` |
+| correlated | numbers that vary together | `LowRankNormal` |
+| angle | radians from -pi to pi | von Mises |
+| positive, log-normal | positive numbers, and such over orders of magnitude | Gamma, LogNormal |
+| power | squared magnitudes of a spectrum | Exponential |
+| share | above 0 and below 1 | Beta |
+| binary | 0 or 1 | Bernoulli |
+| category | one of D classes, in D coordinates of which one is 1 | OneHotCategorical |
+| count, overdispersed | whole numbers from 0, and such that vary more than Poisson's | Poisson, negative binomial |
+| sparse, sparse-overdispersed | the same with more zeros | zero-inflated Poisson, negative binomial |
+
+Of a power spectrum, minus the log density is the Itakura-Saito divergence from its mean, but for what the data alone
+decide: that of complex normals, whose variance is the mean (Févotte, Bertin and Durrieu 2009; the speech models of the
+review of Girin et al. 2021, arXiv 2008.12595).
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import pyro.distributions as dist
+import torch
+from pyro.distributions.torch_distribution import TorchDistribution
+from torch import Tensor, nn
+from torch import distributions as plain
+from torch.distributions import Distribution, biject_to, constraints, transform_to
+from typing_extensions import override
+
+from ..constants import constant
+from ..options import nearest
+from .base import Law, LawSpec, Parameters, Shape
+from .families import FixedNormal, Normal, StudentT
+from .precise import Bounded, InDouble
+
+ALTERNATIVES = (("logits", "probs"), ("gate_logits", "gate"), ("scale_tril", "covariance_matrix", "precision_matrix"))
+"""Parameters that say the same: the first is read."""
+
+Moved = Callable[[Tensor, Tensor, Tensor], Tensor]  # a parameter, mean and scale -> that of mean + scale * variable
+
+
+def _location(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
+    return torch.addcmul(mean, value, scale)
+
+
+def _scale(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
+    return value * scale
+
+
+def _rate(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
+    return value / scale
+
+
+def _logarithm(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
+    return value + scale.log()
+
+
+def _square(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
+    return value * scale.square()
+
+
+def _rows(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
+    scale = scale.expand_as(mean)
+    return (value.unflatten(-1, (len(scale), -1)) * scale[:, None]).flatten(-2)
+
+
+UNITS: Mapping[str, Mapping[str, Moved]] = {
+    name: moves
+    for names, moves in (
+        ("Cauchy Gumbel Laplace Logistic Normal SoftLaplace StudentT", {"loc": _location, "scale": _scale}),
+        ("HalfCauchy HalfNormal Weibull", {"scale": _scale}),
+        ("Exponential Gamma GammaPoisson", {"rate": _rate}),
+        ("InverseGamma Poisson ZeroInflatedPoisson", {"rate": _scale}),
+        ("NegativeBinomial ZeroInflatedNegativeBinomial", {"logits": _logarithm}),
+        ("LogNormal", {"loc": _logarithm}),
+        ("LowRankMultivariateNormal", {"loc": _location, "cov_factor": _rows, "cov_diag": _square}),
+        ("MultivariateNormal", {"loc": _location, "scale_tril": _rows}),
+    )
+    for name in names.split()
+}
+"""How parameters move with the unit of the variable, by distribution. Rates of counts become those of counts whose mean
+is a multiple; what has a scale alone heeds no mean."""
+
+
+class Inside(constraints.Constraint):
+    """The unit interval or the simplex without its edges.
+
+    Args:
+        closed: the constraint with its edges.
+    """
+
+    def __init__(self, closed: Any):
+        self.closed, self.event_dim = closed, closed.event_dim
+
+    def check(self, value: Tensor) -> Tensor:
+        """Whether values are inside."""
+        inside = self.closed.check(value)
+        return inside & (value > 0).all(-1) if self.event_dim else inside & (value > 0) & (value < 1)
+
+    def __repr__(self) -> str:
+        return f"Inside({self.closed})"
+
+
+class VonMises(dist.VonMises):  # type: ignore[misc]
+    """A von Mises distribution at any concentration; torch's has gradients between 3e-6 and 4e4 alone in float32."""
+
+    @override
+    def log_prob(self, value: Tensor) -> Tensor:
+        concentration, apart = self.concentration.double(), value.double() - self.loc.double()
+        kernel = -2 * concentration * (apart / 2).sin().square()  # cos - 1, whose terms cancel
+        return (kernel - (2 * math.pi * torch.special.i0e(concentration)).log()).to(value.dtype)
+
+    @override
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        """Draws; rejection sampling never ends at concentrations near 1e16."""
+        narrow = dist.VonMises(self.loc, self.concentration.clamp(max=1e12), validate_args=False)
+        return narrow.sample(torch.Size(sample_shape))  # type: ignore[no-any-return]
+
+
+OPEN: Mapping[type[Distribution], Any] = {
+    plain.Gamma: constraints.positive,
+    **dict.fromkeys((plain.Beta, plain.Kumaraswamy, plain.RelaxedBernoulli), Inside(constraints.unit_interval)),
+    **dict.fromkeys((plain.Dirichlet, plain.RelaxedOneHotCategorical), Inside(constraints.simplex)),
+}
+"""Supports of distributions that torch declares closed, although the density on their edge is 0 or infinite."""
+
+PLAIN = {"Bernoulli", "Categorical", "Cauchy", "Delta", "Exponential", "HalfCauchy", "HalfNormal", "Laplace"}
+PLAIN |= {"LogNormal", "Normal", "OneHotCategorical", "Uniform", "VonMises"}
+"""Distributions whose log densities do not subtract large terms; those of all others are evaluated in float64."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """Any distribution of `pyro.distributions`, its parameters read from features, or learned without any.
+
+    Of parameters that say the same, as probs and logits, the first of `ALTERNATIVES` is read. Whole numbers, as a
+    total count, cannot be read and are given.
+
+    Args:
+        distribution: its name, such as "Poisson", or a class, which a run directory cannot keep.
+        given: parameters that are numbers, such as {"total_count": 12}.
+        learned: names of parameters that are learned, and not read from features.
+        shapes: of parameters of a distribution of vectors, where they are not D or (D, D), with -1 for D: such as
+            {"cov_factor": (-1, 2)}.
+        min_scale: scales, and roots of diagonals, stay above it; a likelihood whose scale can vanish has no maximum.
+        residual: see `Law`; of a distribution with a location.
+        project: a linear layer from features to the parameters; False takes the features themselves, in their order,
+            the location first.
+        error_weight: see `Law`.
+
+    Example:
+        >>> pair, sizes = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"), {"z": 2, "x": 3}
+        >>> model = dvae.DynamicalVAE(*pair, sizes, laws={"p(x)": dvae.distributions.Family("Poisson")})
+        >>> model.sample(1, length=4)["x"].frac().any()
+        tensor(False)
+    """
+
+    distribution: str | type[Distribution]
+    given: Mapping[str, float] = field(default_factory=dict)
+    learned: tuple[str, ...] = ()
+    shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    min_scale: float = 1e-3
+    residual: float = False
+    project: bool = True
+    error_weight: bool = False
+
+    @property
+    def kind(self) -> type[Distribution]:
+        """The class.
+
+        Raises:
+            ValueError: a name that Pyro has no distribution of.
+        """
+        if not isinstance(self.distribution, str):
+            return self.distribution
+        found = vars(dist).get(self.distribution)
+        if isinstance(found, type) and issubclass(found, Distribution):
+            return found
+        known = [name for name, value in vars(dist).items() if isinstance(value, type)]
+        raise ValueError(f"Pyro has no distribution {self.distribution!r}{nearest(self.distribution, known)}")
+
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
+        return FamilyLaw(self, shape)
+
+
+class FamilyLaw(Law):
+    """What `Family` describes; its parameters are the distribution's, flat behind the batch."""
+
+    def __init__(self, spec: Family, shape: Shape):
+        super().__init__(spec.residual)
+        self.error_weight = spec.error_weight
+        self.kind: Any = VonMises if spec.kind is dist.VonMises else spec.kind
+        self.given: dict[str, Any] = dict(spec.given)
+        self.floors = {"scale": spec.min_scale, "cov_diag": spec.min_scale**2}
+        if "validate_args" in inspect.signature(self.kind.__init__).parameters:
+            self.given["validate_args"] = False
+        self.forms = _forms(spec, shape)
+        self.moves = UNITS.get(self.kind.__name__, {})
+        self.location_scale = bool(self.moves.keys() & self.forms.keys())
+        self.centred = "loc" in self.forms and self.moves.get("loc") is _location
+        if self.residual and "loc" not in self.forms:
+            raise ValueError(f"{self.kind.__name__} has no location, to which a previous value could be added")
+        widths = {name: math.prod(free) for name, (free, _, _) in self.forms.items()}
+        read = [name for name in widths if name not in spec.learned]
+        self.read = sorted(read, key=lambda name: name != "loc")  # the location first
+        self.widths = [widths[name] for name in self.read]
+        self.learned = nn.ParameterDict({name: torch.zeros(widths[name]) for name in spec.learned})
+        self.out: Any = nn.Identity()
+        if spec.project:
+            self.out = self.projection(shape.features, sum(self.widths), widths.get("loc", 0)) if self.read else None
+        elif shape.features != sum(self.widths):
+            raise ValueError(
+                f"a {self.kind.__name__} without projection takes {sum(self.widths)} features, as many as the "
+                f"parameters that are read ({', '.join(self.read) or 'none'}), but the network gives {shape.features}"
+            )
+        with torch.no_grad():
+            probe = torch.ones(1, shape.features), torch.zeros(1, shape.size) if self.residual else None
+            with _refusing(spec, AttributeError, TypeError):
+                self.centre = _centre(self.distribution(self(*probe)))
+
+    @override
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        raw: dict[str, Tensor] = {name: p.expand(*features.shape[:-1], -1) for name, p in self.learned.items()}
+        if self.out is not None:
+            raw |= dict(zip(self.read, self.out(features).split(self.widths, -1), strict=True))
+        found = []
+        for name, (free, to, shape) in self.forms.items():
+            value = to(raw[name].unflatten(-1, free)).flatten(-len(shape)) if shape else to(raw[name])  # (..., P)
+            value = value + self.floors.get(name, 0)
+            found.append(self.moved(value, previous) if name == "loc" else value)
+        return tuple(found)
+
+    @override
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        if not parameters or parameters[0].dtype is torch.float64 or self.kind.__name__ in PLAIN:
+            return self._bounded(parameters)
+        return InDouble(self._made(parameters), lambda: self._bounded(tuple(p.double() for p in parameters)))
+
+    def _bounded(self, parameters: Parameters) -> TorchDistribution:
+        made = self._made(parameters)
+        return Bounded(made) if constraints.is_dependent(self.kind.support) else made
+
+    def _made(self, parameters: Parameters) -> TorchDistribution:
+        shaped = {
+            name: value.unflatten(-1, shape) if len(shape) > 1 else value if shape else value[..., 0]
+            for (name, (_, _, shape)), value in zip(self.forms.items(), parameters, strict=True)
+        }
+        given = self.given
+        if parameters:  # numbers, which torch would bring to the device each time
+            numbers = {name: value for name, value in given.items() if isinstance(value, float)}
+            given = given | {name: constant(value, parameters[0]) for name, value in numbers.items()}
+        made = self.kind(**shaped, **given)
+        for kind, support in OPEN.items():
+            if isinstance(made, kind):
+                made.support = support  # type: ignore[misc]
+        return made  # type: ignore[no-any-return]
+
+    @override
+    def mean(self, parameters: Parameters) -> Tensor:
+        if not self.centre:
+            raise ValueError(f"{self.kind.__name__} has no mean, to stand for entries that are missing or not drawn")
+        return getattr(self.distribution(parameters), self.centre)  # type: ignore[no-any-return]
+
+    @override
+    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+        named = zip(self.forms, parameters, strict=True)
+        return tuple(self.moves[name](value, mean, scale) if name in self.moves else value for name, value in named)
+
+
+Form = tuple[tuple[int, ...], Any, tuple[int, ...]]
+"""Of a parameter: its shape before it is mapped to where it may be, that map, and its shape there."""
+
+
+def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
+    """The form of every parameter that is not given.
+
+    Raises:
+        ValueError: parameters that are none, or whole numbers that are not given.
+    """
+    kind, name = spec.kind, spec.kind.__name__
+    constraints = kind.arg_constraints
+    if not isinstance(constraints, Mapping):
+        raise ValueError(f"{name} does not say what its parameters may be; write a law of your own")
+    taken = inspect.signature(kind.__init__).parameters
+    if unknown := [own for own in (*spec.given, *spec.learned, *spec.shapes) if own not in taken]:
+        raise ValueError(
+            f"{name} has no parameter {unknown[0]!r}{nearest(unknown[0], taken)}; it has {', '.join(constraints)}"
+        )
+    left = {own: constraint for own, constraint in constraints.items() if own in taken and own not in spec.given}
+    for same in ALTERNATIVES:
+        for own in [own for own in same if own in left or own in spec.given][1:]:
+            left.pop(own, None)
+    forms: dict[str, Form] = {}
+    for own, constraint in left.items():
+        with _refusing(spec, NotImplementedError):
+            whole = constraint.is_discrete
+        if whole:
+            raise ValueError(
+                f"{own} of {name} is a whole number, which no network makes; give it: given={{{own!r}: 10}}"
+            )
+        if own in spec.shapes:
+            size: tuple[int, ...] = tuple(shape.size if n == -1 else n for n in spec.shapes[own])
+        else:  # of a distribution of numbers each has one for each coordinate
+            size = (shape.size,) * (constraint.event_dim if kind.support.event_dim else 1)  # type: ignore[union-attr]
+        to = _to(constraint)
+        forms[own] = tuple(to.inverse_shape(torch.Size(size))), to, size
+    if not forms:
+        raise ValueError(f"nothing of {name} is left to be read or learned; it has {', '.join(constraints)}")
+    return forms
+
+
+@contextmanager
+def _refusing(spec: Family, *errors: type[Exception]) -> Iterator[None]:
+    """Has a distribution that cannot be made of its parameters refused in a sentence."""
+    try:
+        yield
+    except errors as error:
+        raise ValueError(
+            f"{spec.kind.__name__} with given={dict(spec.given)} cannot be made of numbers that a network reads "
+            f"({error}); give what it needs, or write a law of your own"
+        ) from error
+
+
+def _to(constraint: Any) -> Any:
+    try:
+        return biject_to(constraint)
+    except NotImplementedError:  # torch has no bijection to matrices of scales, but a map onto them
+        return transform_to(constraint)
+
+
+def _centre(law: Any) -> str:
+    """What stands for a value that is not there: the mean, or the mode of what has none, as Cauchy's; else nothing."""
+    for name in ("mean", "mode"):
+        with suppress(NotImplementedError, AttributeError):
+            if torch.isfinite(getattr(law, name)).all():
+                return name
+    return ""
+
+
+@dataclass(frozen=True)
+class NormalMixture:
+    """Each coordinate from a mixture of normals of its own, whose weights, locations and scales are read from features.
+
+    Args:
+        components: K.
+        min_scale: scales stay above it.
+    """
+
+    components: int = 5
+    min_scale: float = 1e-3
+
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
+        if self.components < 1:
+            raise ValueError(f"a mixture has at least one component, got {self.components}")
+        return NormalMixtureLaw(self, shape)
+
+
+class NormalMixtureLaw(Law):
+    """What `NormalMixture` describes; its parameters are logits, locations and scales, (..., D K) each."""
+
+    location_scale = True
+    centred = True
+
+    def __init__(self, spec: NormalMixture, shape: Shape):
+        super().__init__()
+        self.components, self.min_scale = spec.components, spec.min_scale
+        self.out = self.projection(shape.features, 3 * shape.size * spec.components, 0)
+        spread = torch.linspace(-1.0, 1.0, spec.components) if spec.components > 1 else torch.zeros(1)
+        with torch.no_grad():  # components that are alike at first would stay so without features
+            self.out.bias.unflatten(0, (3, shape.size, -1))[1] += spread
+
+    @override
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        logits, loc, raw = self.out(features).chunk(3, dim=-1)
+        return logits, loc, nn.functional.softplus(raw.contiguous()) + self.min_scale
+
+    @override
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        logits, loc, scale = (value.unflatten(-1, (-1, self.components)) for value in parameters)
+        parts = dist.Normal(loc, scale, validate_args=False)
+        return dist.MixtureSameFamily(dist.Categorical(logits=logits, validate_args=False), parts, validate_args=False)
+
+    @override
+    def mean(self, parameters: Parameters) -> Tensor:
+        return self.distribution(parameters).mean
+
+    @override
+    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+        logits, loc, own = (value.unflatten(-1, (-1, self.components)) for value in parameters)
+        mean, scale = mean[:, None], scale.expand_as(mean)[:, None]
+        return logits.flatten(-2), torch.addcmul(mean, loc, scale).flatten(-2), (own * scale).flatten(-2)
+
+
+@dataclass(frozen=True)
+class LowRankNormal:
+    """A normal of whole steps whose covariance is that of a few factors, and a variance of each coordinate beside it.
+
+    Args:
+        rank: factors.
+        min_scale: deviation that the variances stay above.
+        residual: see `Law`.
+    """
+
+    rank: int = 2
+    min_scale: float = 1e-3
+    residual: float = False
+
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape."""
+        family = Family(
+            "LowRankMultivariateNormal", {}, (), {"cov_factor": (-1, self.rank)}, self.min_scale, self.residual
+        )
+        return family.build(shape)
+
+
+FAMILIES: Mapping[str, LawSpec] = {
+    "real": Normal(),
+    "fixed": FixedNormal(scale=0.1, learned=True),
+    "robust": StudentT(),
+    "laplace": Family("Laplace"),
+    "mixture": NormalMixture(),
+    "correlated": LowRankNormal(),
+    "angle": Family("VonMises"),
+    "positive": Family("Gamma"),
+    "log-normal": Family("LogNormal"),
+    "power": Family("Exponential"),
+    "share": Family("Beta"),
+    "binary": Family("Bernoulli"),
+    "category": Family("OneHotCategorical"),
+    "count": Family("Poisson"),
+    "overdispersed": Family("NegativeBinomial"),
+    "sparse": Family("ZeroInflatedPoisson"),
+    "sparse-overdispersed": Family("ZeroInflatedNegativeBinomial"),
+}
+"""Families of observations by name."""

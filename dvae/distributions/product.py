@@ -1,0 +1,198 @@
+"""Product: coordinates of one variable with a law each, independent given the parents, such as columns of a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any, ClassVar
+
+import torch
+from pyro.distributions.torch_distribution import TorchDistribution
+from torch import Tensor, nn
+from torch.distributions import constraints
+from torch.nn import functional
+from typing_extensions import override
+
+from ..constants import indices
+from .base import Law, LawSpec, Parameters, Shape
+
+
+@dataclass(frozen=True)
+class Product:
+    """Laws of parts of a variable: pairs of coordinates and a law.
+
+    The density is by coordinate, of what is one event (see `Law.distribution`) at its first coordinate. So single
+    entries may be missing, but of an event all of them.
+
+    Example:
+        >>> law = Product((((0, 2), dvae.distributions.Normal()), ((1,), dvae.distributions.Family("Poisson"))))
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
+        >>> model = dvae.DynamicalVAE(*pair, {"z": 2, "x": 3}, laws={"p(x)": law})
+        >>> model.sample(1, length=4)["x"][..., 1].frac().any()
+        tensor(False)
+    """
+
+    parts: Sequence[tuple[Sequence[int], LawSpec]]
+
+    def build(self, shape: Shape) -> Law:
+        """The law of a variable of this shape.
+
+        Raises:
+            ValueError: coordinates that are of no part, or of two.
+        """
+        given = sorted(place for places, _ in self.parts for place in places)
+        if given != list(range(shape.size)):
+            raise ValueError(
+                f"the parts of a Product share the coordinates 0 to {shape.size - 1} of {shape.name} among them, once "
+                f"each; got {given}"
+            )
+        return ProductLaw(self, shape)
+
+
+class ProductLaw(Law):
+    """What `Product` describes; its parameters are those of the parts, one after the other."""
+
+    order: Tensor
+
+    def __init__(self, spec: Product, shape: Shape):
+        parts = [law.build(Shape(len(places), shape.features, *_rest(shape))) for places, law in spec.parts]
+        super().__init__(max(part.residual for part in parts))
+        self.parts = nn.ModuleList(parts)
+        self.places = [list(places) for places, _ in spec.parts]
+        for place, part in enumerate(parts):
+            if part.deterministic:
+                raise ValueError(f"the part {self.places[place]} of {shape.name} has no density; in a Product all have")
+        self.register_buffer("order", _order(self.places), persistent=False)
+        self.location_scale = any(part.location_scale for part in parts)
+        own = {place: bool(parts[n].centred) for n, places in enumerate(self.places) for place in places}
+        self.centred = any(own.values()) and tuple(own[place] for place in range(shape.size))
+        with torch.no_grad():
+            probe, before = torch.randn(1, shape.features), torch.zeros(1, shape.size)
+            made = [self._part(n, probe, before, None) for n in range(len(parts))]
+        self.counts = [len(parameters) for parameters in made]
+        whole = [bool(part.distribution(p).event_shape) for part, p in zip(parts, made, strict=True)]
+        self.events = [
+            *(places for places, one in zip(self.places, whole, strict=True) if one),
+            *([part[n] for n in event] for law, part in zip(parts, self.places, strict=True) for event in law.events),
+        ]
+
+    def _part(self, n: int, features: Tensor, previous: Tensor | None, t: int | None) -> Parameters:
+        law: Any = self.parts[n]
+        own = None
+        if law.residual and previous is not None:
+            own = previous.index_select(-1, indices(self.places[n], previous))
+        return law(features, own, t)  # type: ignore[no-any-return]
+
+    @override
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        return sum((self._part(n, features, previous, t) for n in range(len(self.parts))), ())
+
+    def each(self, parameters: Parameters) -> list[tuple[Any, list[int], Parameters]]:
+        """Law, places and parameters of every part."""
+        split, start = [], 0
+        for count in self.counts:
+            split.append(parameters[start : start + count])
+            start += count
+        return list(zip(self.parts, self.places, split, strict=True))
+
+    def _whole(self, parts: list[Tensor]) -> Tensor:
+        return torch.cat(parts, -1)[..., self.order]
+
+    @override
+    def distribution(self, parameters: Parameters) -> TorchDistribution:
+        return ProductDistribution([(places, law.distribution(own)) for law, places, own in self.each(parameters)])
+
+    @override
+    def mean(self, parameters: Parameters) -> Tensor:
+        return self._whole([law.mean(own) for law, _, own in self.each(parameters)])
+
+    @override
+    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+        scale, found = scale.expand_as(mean), ()
+        for law, places, own in self.each(parameters):
+            found += law.in_units(own, mean[places], scale[places]) if law.location_scale else own
+        return found
+
+    @override
+    def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
+        return self._whole([law.draw(own, noise[..., places]) for law, places, own in self.each(parameters)])
+
+
+def _order(parts: Iterable[Sequence[int]]) -> Tensor:
+    """Where each coordinate is among those of the parts, one after the other."""
+    return torch.tensor(list(chain.from_iterable(parts))).argsort()
+
+
+def _rest(shape: Shape) -> tuple[Any, ...]:
+    return shape.local, shape.name, shape.data, shape.guide
+
+
+class ProductDistribution(TorchDistribution):
+    """Independent distributions of parts of a value: batch (..., D), no event.
+
+    Args:
+        parts: pairs of coordinates and their distribution, of batch (..., n), or of events (n,).
+    """
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    def __init__(self, parts: Sequence[tuple[list[int], Any]]):
+        self.parts = parts
+        self.order = _order(places for places, _ in parts).tolist()
+        first = parts[0][1]
+        batch = first.batch_shape if first.event_shape else first.batch_shape[:-1]
+        self.has_rsample = all(law.has_rsample for _, law in parts)
+        super().__init__(torch.Size([*batch, len(self.order)]), torch.Size(), validate_args=False)
+
+    def _whole(self, parts: list[Tensor]) -> Tensor:
+        return torch.cat(parts, -1).index_select(-1, indices(self.order, parts[0]))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """(..., D); of an event at its first coordinate, 0 at its others."""
+        found = []
+        for places, law in self.parts:
+            own = law.log_prob(value.index_select(-1, indices(places, value)))
+            found.append(functional.pad(own[..., None], (0, len(places) - 1)) if law.event_shape else own)
+        return self._whole(found)
+
+    def rsample(self, sample_shape: Any = ()) -> Tensor:
+        """A reparameterised draw (..., D)."""
+        return self._whole([law.rsample(torch.Size(sample_shape)) for _, law in self.parts])
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        """A draw (..., D)."""
+        return self._whole([law.sample(torch.Size(sample_shape)) for _, law in self.parts])
+
+    @property
+    def mean(self) -> Tensor:
+        """(..., D)."""
+        return self._whole([law.mean for _, law in self.parts])
+
+    @property
+    def variance(self) -> Tensor:
+        """(..., D)."""
+        return self._whole([law.variance for _, law in self.parts])
+
+    @property
+    def support(self) -> constraints.Constraint:  # type: ignore[override]
+        """That of the parts."""
+        return ProductSupport([(places, law.support) for places, law in self.parts])
+
+
+class ProductSupport(constraints.Constraint):
+    """Constraints of parts of a value; `check` gives (..., D)."""
+
+    def __init__(self, parts: Sequence[tuple[list[int], Any]]):
+        self.parts = parts
+        self.is_discrete = any(own.is_discrete for _, own in parts)
+        self.event_dim = 0
+
+    def check(self, value: Tensor) -> Tensor:
+        """Whether each coordinate is where it may be."""
+        found = []
+        for places, own in self.parts:
+            right = own.check(value.index_select(-1, indices(places, value)))
+            found.append(right[..., None].expand(*right.shape, len(places)) if own.event_dim else right)
+        order = _order(places for places, _ in self.parts).tolist()
+        return torch.cat(found, -1).index_select(-1, indices(order, value))

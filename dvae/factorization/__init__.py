@@ -1,0 +1,8 @@
+"""Factorizations: equations, their masks and graphs, audits, faithful guides and the exact oracle."""
+
+from typing import TYPE_CHECKING
+
+from ..lazy import importing
+
+if not TYPE_CHECKING:
+    __getattr__ = importing(__name__)

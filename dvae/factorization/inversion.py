@@ -1,0 +1,287 @@
+"""Faithful inversion: the guide that a model's own graph asks for, in a stated order of drawing.
+
+Latents that are drawn one after the other have the posterior prod_i p(v_i | v_{<i}, data). Each factor depends on its
+Markov boundary among what is given there, and on nothing else; d-separation is a compositional graphoid, so that this
+boundary is unique: v is in it where it is not separated from v_i by all the rest (Pearl, 1988). A guide that reads
+exactly that misses nothing, and every arrow of it is needed; another order has another such guide (Webb, Golinski,
+Zinkov, Siddharth, Rainforth, Teh and Wood, 2018, arXiv 1712.00287). Boundaries are found in the graph unrolled over
+time, by the moral-graph criterion (Lauritzen, Dawid, Larsen and Leimer, 1990), and folded back into relations.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+from itertools import permutations
+
+import networkx as nx
+import numpy as np
+
+from .drawing import Node
+from .notation import Block, Factor, Factorization, Parent, unrolled
+from .relations import ALL, MaskFunction, Relation
+
+FAITHFUL = "faithful"
+"""In the place of a guide's equations: the one that `faithful` derives."""
+Order = tuple[Block, ...]
+"""Blocks of latents as they are drawn, each at all of its steps before the next one."""
+
+
+class MarkovBoundaries:
+    """The Markov boundaries of the nodes of a graph, whose sets of nodes are the bits of integers here.
+
+    Args:
+        dag: directed acyclic graph, edges from parent to child.
+    """
+
+    def __init__(self, dag: nx.DiGraph):
+        self.nodes: list[Node] = list(dag)
+        self.bits = {node: 1 << place for place, node in enumerate(self.nodes)}
+        self.parents = [self._joined(dag.pred[node]) for node in self.nodes]
+        self.children = [self._joined(dag.succ[node]) for node in self.nodes]
+
+    def of(self, node: Node, given: AbstractSet[Node]) -> set[Node]:
+        """Return the smallest part of `given` that makes `node` independent of the rest of `given`.
+
+        u is in it exactly when node and u are not d-separated by the others. What is not given is integrated out.
+
+        Args:
+            node: a node that is not in given.
+            given: nodes whose values are known.
+        """
+        start, known = self.bits[node], self._joined(given)
+        kept = frontier = start | known
+        while frontier:
+            above = 0
+            for place in _places(frontier):
+                above |= self.parents[place]
+            frontier = above & ~kept
+            kept |= frontier
+        # In the moral graph of these a child and its parents, a family, are neighbours; given nodes stop a path.
+        boundary, families, walked, frontier = 0, 0, start, start
+        while frontier:
+            reached = frontier
+            for place in _places(frontier):
+                reached |= self.children[place]
+            families |= (new := reached & kept & ~families)
+            found = new
+            for place in _places(new):
+                found |= self.parents[place]
+            boundary |= found & known
+            frontier = found & ~known & ~walked
+            walked |= frontier
+        return {self.nodes[place] for place in _places(boundary)}
+
+    def _joined(self, nodes: Iterable[Node]) -> int:
+        return sum(self.bits[node] for node in nodes)
+
+
+def _places(bits: int) -> Iterator[int]:
+    while bits:
+        lowest = bits & -bits
+        yield lowest.bit_length() - 1
+        bits ^= lowest
+
+
+@dataclass(frozen=True)
+class Unrolled:
+    """Variables over the inner steps of a graph, with as many on either side that count for nothing.
+
+    Args:
+        local: name to whether there is one value a step.
+        width: inner steps.
+        margin: steps on either side.
+    """
+
+    local: Mapping[str, bool]
+    width: int
+    margin: int
+
+    @property
+    def length(self) -> int:
+        """T."""
+        return self.width + 2 * self.margin
+
+    def nodes(self, name: str) -> list[Node]:
+        """Of a variable."""
+        return unrolled(name, self.local[name], self.length)
+
+    def inner(self, name: str) -> list[Node]:
+        """Of a variable, those that count; that of a static one does."""
+        return self.nodes(name)[self.margin : self.margin + self.width] or self.nodes(name)
+
+    def drawn(self, order: Sequence[Block]) -> Iterator[Node]:
+        """Latents one after the other; those of a block that is drawn at all steps at once, forward in time."""
+        for block in order:
+            for step in zip(*(self.nodes(name)[:: block.direction or 1] for name in block.names), strict=True):
+                yield from step
+
+    def offsets(self, edges: Mapping[Node, Iterable[Node]], child: str, parent: str) -> np.ndarray:
+        """Whether an inner step of the child has an inner one of the parent at offset s - t = -(W-1), ..., W-1.
+
+        (1,), whether there is any at all, where one of the two is static.
+        """
+        rows, columns = map(self.inner, (child, parent))
+        arrows = np.array([[column in edges[row] for column in columns] for row in rows])
+        if not self.in_time(child, parent):
+            return np.array([arrows.any()])
+        return np.array([arrows.diagonal(offset).any() for offset in range(1 - self.width, self.width)])
+
+    def parent(self, child: str, name: str, offsets: np.ndarray) -> Parent:
+        """What reads these offsets; one that reaches the last offset in view has no end."""
+        relation = ALL if self.local[name] else None
+        if self.in_time(child, name):
+            far = self.width - 1
+            steps = [int(place) - far for place in np.flatnonzero(offsets)]
+            relation = Relation.of((-math.inf if k == -far else k, math.inf if k == far else k) for k in steps)
+        return Parent(name, self.local[name], relation)
+
+    def in_time(self, child: str, parent: str) -> bool:
+        """Whether the arrows between two variables have offsets."""
+        return self.local[child] and self.local[parent]
+
+
+def faithful(
+    generative: Factorization | str,
+    observed: Iterable[str] = ("x",),
+    order: Sequence[Block] | None = None,
+    summed: Iterable[str] = (),
+) -> Factorization:
+    """The smallest guide that misses nothing of what the exact posterior depends on, drawn in this order.
+
+    Without one of its arrows it could not be exact, with one exception: a pattern that is periodic in time (a lag of 2
+    without one of 1) has no end in this notation, and far away, beyond twice the sum of the model's lags for each
+    latent, the guide reads all steps, more than it needs.
+
+    Args:
+        generative: p, a factorization or its text.
+        observed: names of the observed variables.
+        order: of the latents, see `orders`; by default static ones first, then step by step forward in time, within a
+            step as the model draws them.
+        summed: names of latents that are summed out (`Discrete`), which no guide draws.
+
+    Raises:
+        ValueError: an observed variable that the model lacks; an order that is not of its latents, each once, or mixes
+            static and local ones; a mask of the user's own, which is known at one length alone.
+        TypeError: an order of something else than blocks.
+
+    >>> print(dvae.faithful("p(z_t | z_{t-1}) p(x_t | z_t)").text)
+    q(z_t | z_{t-1}, x_{>=t})
+    """
+    generative = Factorization.parse(generative)
+    data = tuple(observed)
+    latents = _latents(generative, data, summed := tuple(summed))
+    order = tuple(order) if order is not None else next(iter(orders(generative, data, summed)))
+    if not all(isinstance(block, Block) for block in order):
+        raise TypeError(f"an order is of blocks, such as those of dvae.factorization.inversion.orders, not {order!r}")
+    if mixed := [b for b in order if len({generative.local(n) for n in b.names if n in latents}) > 1]:
+        raise ValueError(f"{spelled(mixed)} mixes static and local latents; give static ones a block of their own")
+    if sorted(name for block in order for name in block.names) != sorted(latents):
+        raise ValueError(f"the order '{spelled(order)}' is not one of the latents {', '.join(latents)}, each once")
+    relations = [p.relation for f in generative.factors for p in f.parents if p.relation is not None]
+    if own := [relation for relation in relations if relation.intervals is None]:
+        raise ValueError(
+            f"{own[0]} is a mask of your own, known at one length at a time, and a derived guide is for every length; "
+            "write the guide, and see what it misses at yours with audit(..., steps=T)"
+        )
+    reach = sum({relation.lag for relation in relations}) * max(1, len(latents))
+    names = (*latents, *data, *generative.context)
+    view = Unrolled({name: generative.local(name) for name in names}, width=4 * reach + 3, margin=2 * reach + 2)
+    boundaries = MarkovBoundaries(generative.dag(view.length))
+    given = {node for name in (*data, *generative.context) for node in view.nodes(name)}
+    inner = {node for name in latents for node in view.inner(name)}
+    needs = {}
+    for node in view.drawn(order):
+        if node in inner:
+            needs[node] = boundaries.of(node, given)
+        given.add(node)
+
+    def factor(child: str) -> Factor:
+        found = []
+        for name in sorted(names, key=lambda name: not view.local[name]):  # static parents last, as papers write them
+            offsets = view.offsets(needs, child, name)
+            if view.in_time(child, name):  # what is so far away comes again and again
+                far = np.flatnonzero(offsets) - (view.width - 1)
+                for side in (-1, 1):
+                    if (beyond := far[side * far > 2 * reach]).size:
+                        start = side * int(abs(beyond).min())
+                        places = range(start, side * view.width, side)
+                        offsets[[place + view.width - 1 for place in places]] = True
+            if offsets.any():
+                found.append(view.parent(child, name, offsets))
+        return Factor("q", child, view.local[child], tuple(found))
+
+    return Factorization("q", tuple(factor(name) for block in order for name in block.names))
+
+
+def orders(
+    generative: Factorization | str, observed: Iterable[str] = ("x",), summed: Iterable[str] = ()
+) -> Iterator[Order]:
+    """In which latents may be drawn: static ones first or last, the others forward or backward in time.
+
+    Several local latents are drawn together, step by step, in every order within a step, or one at all of its steps
+    after the other.
+
+    Args:
+        generative: p, a factorization or its text.
+        observed: names of the observed variables.
+        summed: see `faithful`.
+
+    >>> [spelled(order) for order in orders("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")]
+    ['w, z forward', 'w, z backward', 'z forward, w', 'z backward, w']
+    """
+    generative = Factorization.parse(generative)
+    latents = _latents(generative, tuple(observed), tuple(summed))
+    statics = tuple(Block((name,), 0) for name in latents if not generative.local(name))
+    local = [name for name in latents if generative.local(name)]
+    for last in (False, True) if statics and local else (False,):
+        for names in permutations(local):
+            for apart in (False, True) if len(names) > 1 else (False,):
+                for direction in (1, -1) if names else (1,):
+                    drawn = [(name,) for name in names] if apart else [names] if names else []
+                    locals_ = tuple(Block(each, 1 if direction > 0 else -1) for each in drawn)
+                    yield (*locals_, *statics) if last else (*statics, *locals_)
+
+
+def spelled(order: Sequence[Block]) -> str:
+    """An order in words."""
+    ways = {1: " forward", -1: " backward", 0: ""}
+    return ", ".join(" with ".join(block.names) + ways[block.direction] for block in order)
+
+
+def _latents(generative: Factorization, observed: tuple[str, ...], summed: tuple[str, ...]) -> list[str]:
+    """As the model draws them, but for what is summed out."""
+    for name in (*observed, *summed):
+        generative.factor(name)
+    return [name for block in generative.blocks for name in block.names if name not in (*observed, *summed)]
+
+
+def guide(
+    generative: Factorization,
+    inference: Factorization | str | None,
+    observed: Iterable[str] = ("x",),
+    masks: Mapping[str, Relation | MaskFunction] | None = None,
+    summed: Iterable[str] = (),
+) -> Factorization:
+    """The guide that is meant.
+
+    Args:
+        generative: the model.
+        inference: a factorization or its text; "faithful" for the one that `faithful` derives, None for the prior, or
+            "" where nothing is latent.
+        observed: names of the observed variables.
+        masks: see `Factorization.parse`.
+        summed: see `faithful`.
+
+    Raises:
+        NotationError, ValueError, TypeError: as in `Factorization.parse` and `faithful`.
+    """
+    if inference is None:
+        return generative.prior_guide((*observed, *summed))
+    if isinstance(inference, str) and not inference.strip():
+        return Factorization("q", ())
+    if isinstance(inference, str) and inference.strip() == FAITHFUL:
+        return faithful(generative, observed, summed=summed)
+    return Factorization.parse(inference, masks)

@@ -1,0 +1,664 @@
+"""Protocols: how motion is cut into windows, and which windows are for training, validation and test.
+
+Sources of the presets: DLow (Yuan and Kitani 2020) and GSPS (Mao, Liu and Salzmann 2021) for Human3.6M and
+HumanEva-I, TrajeVAE (Kania et al. 2021), and the data's own README for bandai2 and cmu8.
+
+Decisions, where papers and code differ:
+
+* A window may start at every frame from 0 to F - T *inclusive*. The public code of DLow and GSPS draws and
+  lists starts below F - T, so it never uses a clip's last frame and drops clips of exactly T frames.
+* Validation clips are every k-th training clip in file order, chosen by clip (windows of a clip overlap) and
+  before clips that are too short are left out, so that they are the same clips for every window length. In
+  bandai2 neighbouring takes are near copies and all validation takes have seen styles: validation there is no
+  substitute for the test.
+* References that remember the training data (nearest neighbours) should remember all of it:
+  `"train+validation"`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import asdict, astuple, dataclass, field, replace
+from math import pi
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from ...data.blocks import blocks, cut, hash_list, hash_values
+from ...data.schema import Schema, SchemaError
+from ...data.sequences import BESIDE, bridged, tensor_of
+from ...data.views import View
+from ...options import Amount, Frames, Range, check, nearest, tuples
+from ..geometry.rotations import continuous, from_matrix, to_matrix
+from ..geometry.skeleton import Skeleton, rotate_about_up
+from ..geometry.views import TURNS, Rotations
+from .clips import Clip, MotionSet
+
+Representation = Literal["positions", "6d", "quaternion", "vector"]
+"""What models see of motion: positions of joints, or rotations in a form of `dvae.motion.geometry.rotations`."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How windows are cut, represented and divided.
+
+    Args:
+        name: what to call it in results.
+        observed, predicted: frames before and after the present; a window is both.
+        fps: frames per second the numbers of frames refer to.
+        train_stride, test_stride: frames between the starts of listed training and test windows.
+        root: "drop": every frame relative to its own pelvis, which is then left out, D = 3 (J - 1).
+            "relative": relative to the pelvis of the window's first frame (that has it), D = 3 J; global motion is
+            kept.
+        multimodal_threshold: metres; test windows whose last observed poses are closer are each other's
+            futures.
+        split_by: "split", or the label, by which clips are assigned.
+        train, test: its values that mean training and test.
+        validation: the part of the training clips held out.
+        sampling: how training windows are drawn. "clip": uniform clip, uniform start. "length": every window
+            alike. "subject": uniform split of the archive (a subject, in Human3.6M), then clip, then start.
+        heading: turn every window about the up axis so that the last observed frame has heading zero.
+        rotate: turn every drawn window about the up axis by a uniform angle.
+        representation: what models see of a window: positions, or the turns of joints in one of the forms of
+            `dvae.motion.geometry.rotations`. On their other side stand positions in either case.
+
+    Raises:
+        ValueError: a number of frames or a stride is below 1, or heading and rotate contradict each other.
+    """
+
+    name: str
+    observed: Frames
+    predicted: Frames
+    fps: Annotated[float, Range(0.001, 100_000)]
+    train_stride: Frames
+    test_stride: Frames
+    root: Literal["drop", "relative"] = "drop"
+    multimodal_threshold: Amount = 0.5
+    split_by: str = "split"
+    train: tuple[str, ...] = ("train",)
+    test: tuple[str, ...] = ("test",)
+    validation: Annotated[float, Range(0, 1, below=True)] = 0.1
+    sampling: Literal["clip", "length", "subject"] = "clip"
+    heading: bool = False
+    rotate: bool = False
+    representation: Representation = "positions"
+
+    def __post_init__(self) -> None:
+        try:
+            check(self)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"protocol {self.name}: {error}") from None
+        if self.heading and self.rotate:
+            raise ValueError(f"protocol {self.name}: heading fixes the direction that rotate would draw; choose one")
+
+    @property
+    def length(self) -> int:
+        """Frames in a window, T."""
+        return self.observed + self.predicted
+
+
+_HUMAN36M: dict[str, Any] = {"train": ("S1", "S5", "S6", "S7", "S8"), "test": ("S9", "S11"), "sampling": "subject"}
+_STYLES: dict[str, Any] = {"split_by": "file_group", "train": ("A", "B"), "test": ("C",)}
+_TRAJECTORIES: dict[str, Any] = {"root": "relative", "rotate": True}
+
+PROTOCOLS = {
+    protocol.name: protocol
+    for protocol in (
+        Protocol("h36m", 25, 100, 50, train_stride=20, test_stride=25, **_HUMAN36M),
+        Protocol(
+            "humaneva",
+            *(15, 60, 60),
+            train_stride=15,
+            test_stride=15,
+            train=("Train/S1", "Train/S2", "Train/S3"),
+            test=("Validate/S1", "Validate/S2", "Validate/S3"),
+            sampling="subject",
+        ),
+        Protocol("trajevae", 1, 100, 50, train_stride=25, test_stride=25, **_TRAJECTORIES, **_HUMAN36M),
+        Protocol("bandai2-by-style", 15, 60, 30, train_stride=5, test_stride=15, **_STYLES),
+        Protocol(
+            "bandai2-tuning", 15, 60, 30, train_stride=5, test_stride=15, **{**_STYLES, "train": ("A",), "test": ("B",)}
+        ),
+        Protocol("bandai2-trajectories", 1, 60, 30, train_stride=5, test_stride=15, **_TRAJECTORIES, **_STYLES),
+        Protocol("bandai2-by-take", 15, 60, 30, train_stride=5, test_stride=15),
+        Protocol("cmu8", 15, 60, 30, train_stride=5, test_stride=15),
+        Protocol("cmu8-trajectories", 1, 60, 30, train_stride=5, test_stride=15, **_TRAJECTORIES),
+        Protocol("simulated", 15, 60, 30, train_stride=5, test_stride=15),
+        Protocol("simulated-trajectories", 1, 60, 30, train_stride=5, test_stride=15, **_TRAJECTORIES),
+    )
+}
+"""The presets by name. In `bandai2-by-style` all clips of groups A and B train, all of C test, whatever the
+file's own split; this reading gives the reference figures of the data's README. Options are chosen on `bandai2-tuning`,
+of groups A and B alone, so that group C stays unseen."""
+
+
+def named_protocol(name: str) -> Protocol:
+    """A preset protocol.
+
+    Raises:
+        ValueError: an unknown name, with the nearest known one.
+    """
+    if name not in PROTOCOLS:
+        raise ValueError(f"unknown protocol {name!r}{nearest(name, PROTOCOLS)}; known: {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]
+
+
+@dataclass(frozen=True)
+class Poses(Schema):
+    """The schema of windows of motion, x (B, T, D) in metres.
+
+    Args:
+        skeleton: of the poses.
+        protocol: under which windows are cut.
+    """
+
+    kind: ClassVar[str] = "poses"
+
+    skeleton: Skeleton = field(kw_only=True)
+    protocol: Protocol = field(kw_only=True)
+
+    @classmethod
+    def under(cls, protocol: Protocol, skeleton: Skeleton, length: int | None = None) -> Self:
+        """The schema of windows that a protocol cuts, or of others of this length."""
+        view = cls._view(protocol, skeleton)
+        size = view.size if isinstance(view, Rotations) else 3 * (skeleton.joints - (protocol.root == "drop"))
+        return cls({"x": size}, length or protocol.length, protocol.observed, skeleton=skeleton, protocol=protocol)
+
+    @classmethod
+    @override
+    def of(cls, data: Any, who: str = "this method", representation: str = "positions") -> Self:
+        """The schema of poses of which a model sees this representation.
+
+        Raises:
+            SchemaError: nothing of which that is known, or poses of another one.
+        """
+        found = super().of(data, who)
+        if (shown := found.protocol.representation) != representation:
+            raise SchemaError(
+                f"{who} reads {_said(representation)}, and under this protocol models see {_said(shown)}; choose one "
+                f"whose representation is {representation} (--representation)"
+            )
+        return found
+
+    @staticmethod
+    def _view(protocol: Protocol, skeleton: Skeleton) -> View:
+        if protocol.representation == "positions":
+            return View()
+        return Rotations(skeleton, protocol.representation, protocol.root == "relative")
+
+    @property
+    @override
+    def view(self) -> View:
+        return self._view(self.protocol, self.skeleton)
+
+    @property
+    @override
+    def windows(self) -> Poses:
+        protocol, skeleton = replace(self.protocol, representation="positions"), replace(self.skeleton, rest=())
+        return self.under(protocol, skeleton, self.length)
+
+    @property
+    def frames(self) -> int:
+        """T, of a window."""
+        return self.length or self.protocol.length
+
+    def config(self) -> dict[str, Any]:
+        """The schema in JSON's types; `from_config` reads it."""
+        return {"skeleton": asdict(self.skeleton), "protocol": asdict(self.protocol), "length": self.length}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """The schema that `config` wrote."""
+        return cls.under(Protocol(**tuples(config["protocol"])), Skeleton(**config["skeleton"]), config["length"])
+
+
+def _said(representation: str) -> str:
+    return "positions of joints" if representation == "positions" else f"turns of joints as {representation}"
+
+
+def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int | None = None) -> Windows:
+    """The windows of a split.
+
+    Args:
+        motion: the clips.
+        protocol: how to cut them, or the name of one of `PROTOCOLS`.
+        split: "train", "validation", "test", or "train+validation".
+        length: frames in a window, when it should differ from the protocol's observed + predicted.
+
+    Raises:
+        ValueError: the frame rates differ, the split has no clip, no clip is long enough, or a clip lacks the
+            label by which the protocol splits.
+    """
+    if isinstance(protocol, str):
+        protocol = named_protocol(protocol)
+    if motion.skeleton.fps != protocol.fps:
+        raise ValueError(
+            f"protocol {protocol.name} counts frames at {protocol.fps:g} a second, {motion.name!r} has "
+            f"{motion.skeleton.fps:g}: choose another protocol or make one with dataclasses.replace"
+        )
+    parts = _divide(motion, protocol)
+    unknown = [name for name in split.split("+") if name not in parts]
+    if unknown:
+        raise ValueError(
+            f"no split {unknown[0]!r}{nearest(unknown[0], parts)}: expected train, validation, test or train+validation"
+        )
+    chosen = {clip.key for name in split.split("+") for clip in parts[name]}
+    return Windows([clip for clip in motion if clip.key in chosen], motion, protocol, split, length or protocol.length)
+
+
+def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
+    def value(clip: Clip) -> str:
+        if protocol.split_by == "split":
+            return clip.split
+        if protocol.split_by not in clip.labels:
+            raise ValueError(
+                f"protocol {protocol.name} splits by the label {protocol.split_by!r}, which clip "
+                f"{'/'.join(clip.key)} lacks: is labels.csv beside the file?"
+            )
+        return clip.labels[protocol.split_by]
+
+    values = [(clip, value(clip)) for clip in motion]
+    train = [clip for clip, found in values if found in protocol.train]
+    test = [clip for clip, found in values if found in protocol.test]
+    if not train and not test:
+        found = ", ".join(dict.fromkeys(found for _, found in values))
+        raise ValueError(
+            f"protocol {protocol.name} wants {protocol.split_by} {'/'.join(protocol.train)} for training and "
+            f"{'/'.join(protocol.test)} for test; {motion.name!r} has {found}"
+        )
+    aside = held_out(len(train), protocol.validation)
+    return {
+        "train": [clip for i, clip in enumerate(train) if i not in aside],
+        "validation": [clip for i, clip in enumerate(train) if i in aside],
+        "test": test,
+    }
+
+
+def held_out(count: int, part: float) -> set[int]:
+    """Which of so many clips are held out for validation: of as many blocks as that part of them are, the middles."""
+    blocks = round(count * part)
+    if part and count > 1:
+        blocks = max(blocks, 1)
+    return {int((block + 0.5) * count / blocks) for block in range(blocks)}
+
+
+class Windows:
+    """Windows of T frames cut from clips, as tensors (…, T, D) in metres.
+
+    Made by `windows`. `sample` draws windows, `all` lists them every few frames, `batches` some at a time. Clips stay
+    as they are, perhaps mapped from a disk: windows are put to their root and turned when they are cut.
+
+    Attributes:
+        protocol, skeleton, split: what they were made from.
+        length: frames in a window, T.
+        missing: whether joints may be missing.
+        clips: the clips that are long enough.
+        skipped: (split, clip, frames) of those that are not.
+    """
+
+    def __init__(self, clips: list[Clip], motion: MotionSet, protocol: Protocol, split: str, length: int) -> None:
+        if length < 1 or (protocol.heading and length < protocol.observed):
+            raise ValueError(f"windows of {length} frames: expected at least {protocol.observed} (the observed frames)")
+        turned = motion if protocol.representation == "positions" else motion.with_rotations()
+        self.protocol, self.skeleton, self.split, self.length = protocol, turned.skeleton, split, length
+        self.missing, self._rest = motion.missing, motion.skeleton.rest
+        self.clips = [clip for clip in clips if clip.frames >= length]
+        self.skipped = [(*clip.key, clip.frames) for clip in clips if clip.frames < length]
+        if not self.clips:
+            longest = max((clip.frames for clip in clips), default=0)
+            raise ValueError(
+                f"{split} split of {motion.name!r} has no window of {length} frames: {len(clips)} clips, "
+                f"the longest of {longest} frames"
+            )
+        if protocol.heading:
+            self.skeleton.heading(torch.zeros(self.skeleton.joints, 3))  # says now if the skeleton has no sides
+
+        self._frames = [clip.positions for clip in self.clips]
+        self._turns: list[Any] | None = None
+        if protocol.representation != "positions":
+            self._turns = [turned[clip.key].rotations for clip in self.clips]
+        frames = torch.tensor([clip.frames for clip in self.clips])
+        self._first = frames.cumsum(0) - frames
+        self._classes: dict[str, Tensor] = {}  # by variable, the class of every clip
+        self._given: Tensor | float | None = None  # see `given`
+        self._starts = frames - length + 1
+        if self.missing:
+            seen = (np.isfinite(block).all(-1) for frames in self._frames for block in blocks(frames))
+            told = (each[:, self.skeleton.root] & (each.sum(-1) > 1) for each in seen)
+            before = np.concatenate([[False], *told]).cumsum(dtype=np.int32)
+            self._told = torch.from_numpy(before)  # frames before each that tell
+            if not len(self):
+                raise ValueError(
+                    f"{split} split of {motion.name!r} has no window that has the root beside another joint in some "
+                    "observed and in some predicted frame"
+                )
+        self._weights = self._draw_weights().cumsum(0)
+
+    def _draw_weights(self) -> Tensor:
+        if self.protocol.sampling == "length":
+            return self._starts.double()
+        if self.protocol.sampling == "clip":
+            return torch.ones(len(self.clips), dtype=torch.float64)
+        clips_of = Counter(clip.split for clip in self.clips)
+        return torch.tensor([1 / clips_of[clip.split] for clip in self.clips], dtype=torch.float64)
+
+    @property
+    def stride(self) -> int:
+        """Frames between listed windows, the protocol's; validation windows are listed like test windows."""
+        return self.protocol.train_stride if self.split.startswith("train") else self.protocol.test_stride
+
+    @property
+    def keys(self) -> list[tuple[str, str, int]]:
+        """(split, clip, first frame) of the windows that `all()` lists."""
+        return self.index(self.stride)
+
+    def index(self, stride: int) -> list[tuple[str, str, int]]:
+        """(split, clip, first frame) of the windows that `all(stride)` lists."""
+        return list(self._keys(stride))
+
+    def __len__(self) -> int:
+        return len(self._list(self.stride)[0])
+
+    def __repr__(self) -> str:
+        return (
+            f"Windows({self.protocol.name} {self.split}: {len(self)} of {self.length} frames from "
+            f"{len(self.clips)} clips, {len(self.skipped)} too short)"
+        )
+
+    @property
+    def schema(self) -> Poses:
+        """What is known of these windows without their data."""
+        return Poses.under(self.protocol, self.skeleton, self.length)
+
+    @property
+    def size(self) -> int:
+        """Numbers per frame, D = 3 J, or 3 (J - 1) without the root."""
+        return 3 * len(self.joints)
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Any]:
+        """Draw windows with replacement, as the protocol's `sampling` says: {"x": (B, T, D)} float32.
+
+        Of a set that may lack joints there is a "mask" too, see `all`. The same generator state gives the same windows.
+        """
+        which, where, turn = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
+        clips = torch.searchsorted(self._weights, which * self._weights[-1], right=True)
+        starts = (where * self._starts[clips]).long()
+        x = self._cut(clips, starts)
+        if self.protocol.rotate:
+            joints = x.unflatten(-1, (-1, 3))
+            angle = (2 * pi * turn).float()[:, None, None]
+            x = rotate_about_up(joints, angle, self.skeleton.up).flatten(-2)
+        batch = self._batch(x, clips, generator)
+        if self._turns is not None:
+            batch[BESIDE] = {TURNS: self._turned(clips, starts, angle if self.protocol.rotate else None)}
+        return batch
+
+    def all(self, stride: int | None = None) -> dict[str, Any]:
+        """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32.
+
+        Of a set that may lack joints there is a "mask" too, (N, T, D), False where nothing was observed; x is 0 there.
+        Poses are relative to a root, so that where this is missing they are (with root="relative", where it is missing
+        throughout). Listed are windows of which something was observed, both before the present and after.
+        """
+        return self._listed(*self._list(stride or self.stride), torch.Generator().manual_seed(0))
+
+    def batches(self, batch_size: int) -> Iterator[dict[str, Any]]:
+        """The windows that `all()` lists, so many at a time."""
+        clips, starts = self._list(self.stride)
+        generator = torch.Generator().manual_seed(0)
+        for some in torch.arange(len(clips)).split(batch_size):
+            yield self._listed(clips[some], starts[some], generator)
+
+    def _listed(self, clips: Tensor, starts: Tensor, generator: torch.Generator) -> dict[str, Any]:
+        x = torch.empty(len(clips), self.length, self.size)
+        for block in torch.arange(len(clips)).split(512):  # so that memory holds the windows little more than once
+            x[block] = self._cut(clips[block], starts[block])
+        batch = self._batch(x, clips, generator)
+        if self._turns is not None:
+            batch[BESIDE] = {TURNS: self._turned(clips, starts)}
+        return batch
+
+    def poses(self) -> Tensor:
+        """Every frame of the clips, once, as a window that starts there has it: (N, D) float32; whole poses alone."""
+        parts = (tensor_of(block) for frames in self._frames for block in blocks(frames))
+        poses = torch.cat([self._represented(part[:, None], 0)[:, 0] for part in parts])
+        return poses[poses.isfinite().all(-1)] if self.missing else poses
+
+    def labels(self, name: str) -> list[str]:
+        """The label of every listed window's clip; empty text where a clip lacks it.
+
+        Raises:
+            KeyError: no clip has such a label.
+        """
+        if not any(name in clip.labels for clip in self.clips):
+            known = sorted({label for clip in self.clips for label in clip.labels})
+            raise KeyError(f"no label {name!r}; there are {', '.join(known) or 'none'}")
+        return [self.clips[c].labels.get(name, "") for c in self._list(self.stride)[0].tolist()]
+
+    def classified(self, variable: str, label: str, classes: Sequence[str]) -> Windows:
+        """These windows, whose batches hold the class of each one too: {variable: (B,)} int64, indices of `classes`.
+
+        Args:
+            variable: its name in batches.
+            label: the label of the clips that is the class.
+            classes: what the label may be.
+
+        Raises:
+            ValueError: a clip lacks the label, or has one that is none of the classes.
+        """
+        for clip in self.clips:
+            if (found := clip.labels.get(label)) not in classes:
+                has = "has no label" if found is None else f"has {found!r} for"
+                raise ValueError(
+                    f"clip {'/'.join(clip.key)} ({self.split}) {has} {label!r}, expected one of {', '.join(classes)}: "
+                    "is labels.csv beside the file, with every clip in it and no class among held-out clips alone?"
+                )
+        windows = copy(self)
+        found_in = [classes.index(clip.labels[label]) for clip in self.clips]
+        windows._classes = {**self._classes, variable: torch.tensor(found_in)}
+        return windows
+
+    def positions(self, x: Tensor) -> Tensor:
+        """Joint positions (..., T, J, 3) of frames (..., T, D), for drawing and bone lengths.
+
+        A root that was dropped is put back at the origin.
+        """
+        if x.shape[-1] != self.size:
+            raise ValueError(
+                f"frames have {x.shape[-1]} numbers, expected {self.size}: {self.skeleton.joints} joints, "
+                f"root {self.protocol.root}"
+            )
+        return self.skeleton.with_root(x.unflatten(-1, (-1, 3)))
+
+    def filled(self, positions: Tensor) -> MotionSet:
+        """The clips as they were read, and where they lack joints, with those of the listed windows.
+
+        Windows are put back where they were cut, turned and moved as the clip is: the root where it was, or on the
+        straight line across its own gap. What several windows fill is the first one's; gaps that none covers stay.
+
+        Args:
+            positions: (N, T, J, 3) of the windows, whole ones, see `positions`.
+        """
+        clips, starts = self._list(self.stride)
+        frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
+        found = torch.from_numpy(np.concatenate(self._frames))
+        for where, made in zip(frames, self.to_world(positions), strict=True):
+            found[where] = torch.where(found[where].isfinite(), found[where], made.to(found))
+        whole = found.split([clip.frames for clip in self.clips])
+        made_whole = [replace(clip, positions=each.numpy()) for clip, each in zip(self.clips, whole, strict=True)]
+        return MotionSet(made_whole, self.skeleton, missing=bool(found.isnan().any()))
+
+    def to_world(self, positions: Tensor, chosen: Sequence[int] | slice = slice(None)) -> Tensor:
+        """Return positions (..., N, T, J, 3) of listed windows where and as their clips have them.
+
+        Args:
+            positions: as `positions` returns them. Where the protocol drops the root, T frames of whole windows;
+                otherwise of any number.
+            chosen: places of the N windows in `keys`; by default all.
+        """
+        clips, starts = (each[chosen] for each in self._list(self.stride))
+        joints, root = cut(self._frames, clips, starts, self.length), self.skeleton.root
+        if self.protocol.heading:
+            heading = self.skeleton.heading_near(joints, self.protocol.observed - 1)[:, None, None]
+            positions = rotate_about_up(positions, heading, self.skeleton.up)
+        places = joints[:, :, root : root + 1]
+        seen = places.isfinite()
+        if self.protocol.root == "drop":
+            return positions + bridged(places.flatten(2), seen.flatten(2))[:, :, None]
+        return positions + places.take_along_dim(seen.all(-1).byte().argmax(1, keepdim=True)[..., None], 1)
+
+    def given(self, joints: Sequence[str] | float) -> Windows:
+        """These windows, whose batches hold trajectories too: {"y": (B, T, D)}, x at given joints and 0 at others.
+
+        Args:
+            joints: names of the given ones, see `Skeleton.find`; or the probability with which each one is given over
+                a whole window, one draw for a window and joint. `all` draws the same ones every time.
+
+        Raises:
+            ValueError: an unknown joint, one that the protocol has dropped, or no probability.
+        """
+        windows = copy(self)
+        if isinstance(joints, float | int):
+            if not 0 <= joints <= 1:
+                raise ValueError(f"joints are given with a probability between 0 and 1, not {joints}")
+            windows._given = float(joints)
+            return windows
+        if isinstance(joints, str):
+            raise ValueError(f"joints are a list of names, [{joints!r}]")
+        found = {self.skeleton.names[self.skeleton.find(joint)] for joint in joints}
+        if dropped := found - set(self.joints):
+            raise ValueError(f"the protocol {self.protocol.name} drops {dropped.pop()}")
+        windows._given = torch.tensor([float(name in found) for name in self.joints])
+        return windows
+
+    @property
+    def joints(self) -> list[str]:
+        """Names of the joints of a frame; all but the root, if the protocol drops that."""
+        names, root = self.skeleton.names, self.skeleton.root
+        return [name for j, name in enumerate(names) if self.protocol.root != "drop" or j != root]
+
+    @property
+    def given_joints(self) -> tuple[str, ...] | None:
+        """Names of the joints whose trajectories batches hold, if these are the same ones in every window."""
+        if not isinstance(self._given, Tensor):
+            return None
+        return tuple(name for name, given in zip(self.joints, self._given.tolist(), strict=True) if given)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """What a record says of these windows: joints, and those whose paths are given."""
+        said = {"joints": list(self.skeleton.names), "title": []}
+        if (given := self.given_joints) is not None:
+            said |= {"given": list(given), "title": [f"given {', '.join(given) or 'no paths'}"]}
+        return said
+
+    def with_protocol(self, protocol: Protocol) -> Windows:
+        """These windows, drawn and cut as another protocol says, which divides clips and frames alike."""
+        windows = copy(self)
+        windows.protocol = protocol
+        return windows
+
+    def _batch(self, x: Tensor, clips: Tensor, generator: torch.Generator) -> dict[str, Any]:
+        """Windows with what is to go with them."""
+        seen, x = x.isfinite(), x.nan_to_num(0.0)
+        batch = {"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}}
+        if self.missing:
+            batch["mask"] = seen
+        if self._given is not None:
+            mask = self._given
+            if not isinstance(mask, Tensor):
+                mask = (torch.rand(len(x), self.size // 3, generator=generator) < mask).float()
+            mask = mask.repeat_interleave(3, dim=-1)
+            batch["y"] = x * (mask if mask.dim() == 1 else mask[:, None])
+        return batch
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the protocol, the skeleton, the listed windows and what is read of the data they are cut from."""
+        protocol = astuple(self.protocol)  # with its last field where that is not what it always was
+        protocol = protocol if self._turns is not None else protocol[:-1]
+        digest = hashlib.sha256(repr((protocol, self.split, self.length)).encode())
+        names, parents, up = self.skeleton.names, self.skeleton.parents, self.skeleton.up
+        digest.update(f"({names!r}, {parents!r}, {up!r}, ".encode())
+        hash_list(digest, self._keys(self.stride))
+        digest.update(b")")
+        for frames in self._frames:
+            hash_values(digest, frames, "<f4")
+        if (
+            self._turns is not None and self._rest
+        ):  # turns of files: those that are found each machine rounds in its way
+            digest.update(repr(self._rest).encode())
+            for clip in self.clips:
+                if clip.rotations is not None:
+                    hash_values(digest, clip.rotations, "<f4")
+        for variable, classes in self._classes.items():
+            digest.update(repr((variable, classes.tolist())).encode())
+        if self._given is not None:
+            given = self._given.tolist() if isinstance(self._given, Tensor) else self._given
+            digest.update(repr(("given", given)).encode())
+        return digest.hexdigest()
+
+    def _keys(self, stride: int) -> Iterator[tuple[str, str, int]]:
+        """Keys of the listed windows, one at a time: those for training may be as many as frames."""
+        for clip, first, count in zip(self.clips, self._first.tolist(), self._starts.tolist(), strict=True):
+            for some in torch.arange(0, count, _at_least_one(stride)).split(4096):
+                kept = some[self._tells(first + some)] if self.missing else some
+                yield from ((*clip.key, start) for start in kept.tolist())
+
+    def _list(self, stride: int) -> tuple[Tensor, Tensor]:
+        """Clip index and first frame of every listed window."""
+        stride = _at_least_one(stride)
+        counts = (self._starts + stride - 1) // stride
+        clips = torch.repeat_interleave(counts)
+        starts = stride * (torch.arange(len(clips)) - (counts.cumsum(0) - counts)[clips])
+        if not self.missing:
+            return clips, starts
+        kept = self._tells(self._first[clips] + starts)
+        return clips[kept], starts[kept]
+
+    def _tells(self, first: Tensor) -> Tensor:
+        """Whether windows that start at these frames, counted over all clips, have something observed in both parts."""
+        before, now, after = (self._told[first + n] for n in (0, min(self.protocol.observed, self.length), self.length))
+        return (before < now) & ((now < after) | (self.length <= self.protocol.observed))
+
+    def _cut(self, clips: Tensor, starts: Tensor) -> Tensor:
+        """(B,), (B,) -> (B, T, D): copied, and then as the protocol represents them."""
+        return self._represented(cut(self._frames, clips, starts, self.length), self.protocol.observed - 1)
+
+    def _represented(self, joints: Tensor, now: int) -> Tensor:
+        """Frames (B, T, D) of joints (B, T, J, 3), of whose frame `now` the heading is zero, if it is fixed."""
+        root = self.skeleton.root
+        if self.protocol.heading:
+            heading = self.skeleton.heading_near(joints, now)[:, None, None]
+        if self.protocol.root == "drop":
+            joints = self.skeleton.without_root(joints - joints[:, :, root : root + 1])
+        else:
+            origin = joints[:, :, root].isfinite().all(-1).byte().argmax(1)  # the first frame, unless it lacks it
+            joints = joints - joints[:, :, root : root + 1].take_along_dim(origin[:, None, None, None], 1)
+        if self.protocol.heading:
+            joints = rotate_about_up(joints, -heading, self.skeleton.up)
+        return joints.flatten(-2)
+
+    def _turned(self, clips: Tensor, starts: Tensor, angle: Tensor | None = None) -> Tensor:
+        """Turns (B, T, 4 J) of the joints in windows, whose root turns as the windows do."""
+        assert self._turns is not None
+        turns, root = cut(self._turns, clips, starts, self.length), self.skeleton.root
+        if self.protocol.heading:
+            angle = -self.skeleton.heading(cut(self._frames, clips, starts + self.protocol.observed - 1, 1)[:, 0])
+        if angle is not None:
+            axes = rotate_about_up(torch.eye(3).expand(len(turns), 3, 3), angle.reshape(-1, 1), self.skeleton.up).mT
+            world = to_matrix(turns[:, :, root], "quaternion")
+            turns[:, :, root] = continuous(from_matrix(axes[:, None] @ world, "quaternion"), dim=1)
+        return turns.flatten(-2)
+
+
+def _at_least_one(stride: int) -> int:
+    if stride < 1:
+        raise ValueError(f"stride is {stride}, expected 1 or more")
+    return stride

@@ -1,0 +1,331 @@
+"""Views of motion: people who face one way, bones that keep their lengths, and turns in place of positions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from ...constants import constant, indices
+from ...data.sequences import BESIDE, Batch
+from ...data.views import WHOLE, View
+from ...networks.base import valid_steps
+from . import kinematics
+from .rotations import in_time, size, to_matrix
+from .skeleton import Skeleton, inverse_lengths, rotate_about_up
+
+HEADING = "heading"
+"""Name in batches of the angles (B,) by which windows were turned, in radians."""
+LENGTHS = "bone_lengths"
+"""Name in batches of the lengths (B, J - 1) of windows' bones, in metres, in the order of `Skeleton.edges`."""
+TURNS = "turns"
+"""Name beside windows of the turns (B, T, 4 J) of all joints, quaternions w x y z one after the other."""
+
+
+@dataclass(frozen=True)
+class Heading(View):
+    """Windows turned about the up axis so that one of their poses has heading zero.
+
+    Given the heading, a window and its turned one are a rotation apart: volumes, lengths and angles stay. The heading
+    itself nothing scores, so that bounds are those of turned windows: they compare with those of models that turn
+    windows by the same pose, and with no others.
+
+    Missing entries stay missing, of every joint both horizontal coordinates or neither, as a turn mixes them. Where
+    hips and shoulders lack in that pose, the nearest earlier one that has some of them tells the heading; a window none
+    of whose poses up to that one does stays as it is (`Skeleton.heading_near`), and so does its past in a forecast.
+
+    Args:
+        skeleton: with left and right.
+        frames: O; the pose is the last of the first O frames, or of a window that is shorter.
+        pose: variable (B, D) that is the pose; None for a frame of x.
+        turned: names of what turns, (..., B, T, D) with D = 3 J, or 3 (J - 1) without the root, which is the origin.
+    """
+
+    skeleton: Skeleton
+    frames: int = 1
+    pose: str | None = None
+    turned: tuple[str, ...] = (WHOLE,)
+    names = (HEADING,)
+
+    @override
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        source = self.pose or WHOLE
+        found = (beside or {}).get(HEADING)
+        if HEADING in data or (source not in data if beside is None else found is None):
+            return dict(data)
+        seen = dict(data)
+        for name in data.get("mask", {}).keys() & {*self.turned} & data.keys():
+            self._check_mask(name, data["mask"][name])
+            seen[name] = torch.where(data["mask"][name], data[name], 0.0)
+        if found is None:
+            if self.pose is None and "lengths" in data:
+                shortest, needed = data["lengths"].min(), min(self.frames, data[WHOLE].shape[-2])
+                if shortest < needed:
+                    raise ValueError(
+                        f"this model turns every window by its frame {needed}, but a sequence has {shortest}; leave it "
+                        "out, or fit with heading=False"
+                    )
+            found = self._observed(seen)
+        return self._turn(seen, -found) | {HEADING: found}
+
+    @override
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        data = dict(seen)
+        heading = data.pop(HEADING, None)
+        return data if heading is None else self._turn(data, heading)
+
+    def of(self, x: Tensor) -> Tensor:
+        """Headings (...) of windows (..., T, D), or of poses (..., D); NaN where a joint was not observed."""
+        frames = x[..., None, :] if self.pose else x
+        return self.skeleton.heading_near(self._joints(frames), min(self.frames, frames.shape[-2]) - 1)
+
+    def face(self, x: Tensor) -> Tensor:
+        """Windows (..., T, D) turned each by its own heading."""
+        return self._rotated(x, -self.of(x), 2)
+
+    def _turn(self, values: Batch, angle: Tensor) -> dict[str, Any]:
+        found = {n: self._rotated(values[n], angle, 2 - (n == self.pose)) for n in self.turned if n in values}
+        return {**values, **found}
+
+    def _rotated(self, x: Tensor, angle: Tensor, dims: int) -> Tensor:
+        return rotate_about_up(x.unflatten(-1, (-1, 3)), angle[(..., *[None] * dims)], self.skeleton.up).flatten(-2)
+
+    def _observed(self, data: Batch) -> Tensor:
+        """Headings (B,) of what was observed of the data."""
+        source = self.pose or WHOLE
+        x, seen = data[source], data.get("mask", {}).get(source)
+        return self.of(x if seen is None else torch.where(seen, x, torch.nan))
+
+    def _joints(self, poses: Tensor) -> Tensor:
+        """Joints (..., J, 3) of poses (..., D), with the root where that was dropped."""
+        sizes = 3 * self.skeleton.joints, 3 * self.skeleton.joints - 3
+        if poses.shape[-1] not in sizes:
+            raise ValueError(
+                f"{self.pose or WHOLE} has shape {tuple(poses.shape)}; poses of the skeleton {self.skeleton.name!r} "
+                f"have {sizes[0]} coordinates, or {sizes[1]} without the root"
+            )
+        return self.skeleton.with_root(poses.unflatten(-1, (-1, 3)))
+
+    def _check_mask(self, name: str, mask: Tensor) -> None:
+        """Refuses missing entries that leave half of what a turn mixes."""
+        skeleton, joints = self.skeleton, mask.unflatten(-1, (-1, 3))
+        across = [axis for axis in range(3) if axis != skeleton.vertical]
+        mixed = joints[..., across[0]] != joints[..., across[1]]
+        if mixed.any():
+            window, *_, joint = mixed.nonzero()[0].tolist()
+            held = [n for j, n in enumerate(skeleton.names) if j != skeleton.root or mixed.shape[-1] == skeleton.joints]
+            raise ValueError(
+                f"window {window} lacks one horizontal coordinate of {held[joint]} and has the other, but this model "
+                "turns windows, which mixes them; hide both in 'mask', or fit with heading=False"
+            )
+
+
+@dataclass(frozen=True)
+class Bones(View):
+    """Unit vectors along the bones in place of positions; on the way back bones have the lengths they were seen with.
+
+    The direction of the bone that ends at a joint has that joint's place among the coordinates; a root that the
+    protocol keeps stays where it is. Whatever a model makes in place of directions is put to length, so that bones are
+    those of the person by construction.
+
+    This is no bijection. Lengths are taken as given, one for a bone and window, so that what they vary by within a
+    window is lost; and a direction has two degrees of freedom in three numbers, so that no density of positions follows
+    from one of directions: `log_det` refuses. A model sees so whose x is a function of its parents, as with
+    `laws.Directions`, and which learns from energies.
+
+    Args:
+        skeleton: of the poses.
+        frames: O; lengths are the means over the first O frames, or over those that there are.
+        pieces: coordinates of x that batches and forecasts hold under names of their own, as positions too.
+    """
+
+    skeleton: Skeleton
+    frames: int = 1
+    pieces: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    names = (LENGTHS,)
+
+    @override
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        held = {name: places for name, places in self.pieces.items() if name in data}
+        if LENGTHS in data or (WHOLE not in data and not held):
+            return dict(data)
+        self._check_complete(data)
+        x = data[WHOLE] if WHOLE in data else self._joined(data, held)
+        limbs = self.skeleton.limbs(x)
+        seen = self._rooted(limbs * inverse_lengths(limbs)[..., None], x)
+        found = self._named(data, seen)
+        if beside is not None:
+            return found
+        return found | {LENGTHS: self._mean(limbs[:, : self.frames].norm(dim=-1), data.get("lengths"))}
+
+    @override
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        data = dict(seen)
+        lengths = data.pop(LENGTHS, None)
+        if lengths is None or WHOLE not in data:
+            return data
+        made = data[WHOLE].unflatten(-1, (-1, 3))
+        kept = made.shape[-2] == self.skeleton.joints
+        bones = self.skeleton.without_root(made) if kept else made
+        bones = bones * (inverse_lengths(bones) * lengths[:, None])[..., None]
+        joints = self.skeleton.ends(bones).unflatten(-1, (-1, 3))
+        if kept:
+            joints = joints + made[..., self.skeleton.root, None, :]
+        return self._named(data, self._rooted(joints, data[WHOLE]))
+
+    @override
+    def log_det(self, data: Batch) -> Tensor:
+        raise ValueError(
+            "there is no density of positions where a model sees the directions of bones: lengths are taken as given, "
+            "and a direction has two degrees of freedom in three numbers; make x a function of its parents, with "
+            "laws.Directions(), and train by energies, or let the model see positions"
+        )
+
+    def _rooted(self, joints: Tensor, x: Tensor) -> Tensor:
+        """What all joints but the root have (..., J - 1, 3) as (..., D), with the root of x where it has one."""
+        if x.shape[-1] == 3 * self.skeleton.joints:
+            root = self.skeleton.root
+            own = x.unflatten(-1, (-1, 3))[..., root : root + 1, :]
+            joints = torch.cat([joints[..., :root, :], own, joints[..., root:, :]], -2)
+        return joints.flatten(-2)
+
+    def _named(self, values: Batch, x: Tensor) -> dict[str, Any]:
+        """The values, with this x wherever they hold x or a piece of it."""
+        pieces = {name: x[..., list(places)] for name, places in self.pieces.items() if name in values}
+        return {**values, **pieces, **({WHOLE: x} if WHOLE in values else {})}
+
+    def _joined(self, data: Batch, held: Mapping[str, Sequence[int]]) -> Tensor:
+        """The whole of pieces, 0 elsewhere; every bone of theirs begins at the root or in one of them."""
+        size = 1 + max(place for places in self.pieces.values() for place in places)
+        joints = [j for j in range(self.skeleton.joints) if j != self.skeleton.root or size == 3 * self.skeleton.joints]
+        there = {joints[place // 3] for places in held.values() for place in places} | {self.skeleton.root}
+        if loose := [joint for joint in there - {self.skeleton.root} if self.skeleton.parents[joint] not in there]:
+            names, parent = self.skeleton.names, self.skeleton.parents[loose[0]]
+            raise ValueError(
+                f"this model sees the directions of bones, but {', '.join(held)} alone does not tell that of "
+                f"{names[loose[0]]}, which hangs from {names[parent]}; give the part with {names[parent]} too"
+            )
+        some: Tensor = data[next(iter(held))]
+        whole = some.new_zeros(*some.shape[:-1], size)
+        for name, places in held.items():
+            whole[..., list(places)] = data[name]
+        return whole
+
+    def _mean(self, lengths: Tensor, steps: Tensor | None) -> Tensor:
+        """(B, J - 1) of (B, O, J - 1), over the frames that are no padding."""
+        if steps is None:
+            return lengths.mean(1)
+        valid = valid_steps(steps, lengths.shape[1])[..., None]
+        found: Tensor = (lengths * valid).sum(1) / valid.sum(1)
+        return found
+
+    def _check_complete(self, data: Batch) -> None:
+        for name, mask in data.get("mask", {}).items():
+            if name in (WHOLE, *self.pieces) and not mask.all():
+                window, frame, *_ = (~mask).nonzero()[0].tolist()
+                raise ValueError(
+                    f"window {window} lacks entries of frame {frame + 1}, but this model sees the directions of bones, "
+                    "of which both ends have to be there; fill them in before, or fit with bones=False"
+                )
+
+
+@dataclass(frozen=True)
+class Rotations(View):
+    """Turns of joints in place of positions, and bones that keep their lengths.
+
+    x is positions (B, T, D) in metres on either side of a model; what the model sees is first the root's place, where
+    x has it, then the turn of every joint from which others hang, in `form`, without jumps (`rotations.in_time`). The
+    turns are those that lie beside the data; of data without they are found (`kinematics.inverse`), with twists of
+    their own. Bones have the lengths that they have in the data, on average, or in the rest pose, where there are none.
+
+    Densities are of these numbers, not of positions, which have other volumes and one dimension for each bone more:
+    bounds compare with those of models that see the same.
+
+    Args:
+        skeleton: with a rest pose.
+        form: of the turns: "6d", "quaternion" or "vector", of which any numbers are turns; see
+            `dvae.motion.geometry.rotations`.
+        root: whether x has the root, D = 3 J; otherwise it is the origin, and D = 3 (J - 1).
+
+    Raises:
+        ValueError: an unknown form, or a skeleton without rest pose.
+    """
+
+    skeleton: Skeleton
+    form: str = "6d"
+    root: bool = False
+    names = (LENGTHS,)
+    _offsets: tuple[tuple[float, ...], ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        size(self.form)
+        offsets = self.skeleton.offsets  # which says what to do where there are none
+        object.__setattr__(self, "_offsets", tuple(map(tuple, offsets.tolist())))
+
+    @property
+    def measured(self) -> str:  # type: ignore[override]
+        """What densities are of."""
+        return f"turns of joints ({self.form})"
+
+    @property
+    def turning(self) -> list[int]:
+        """The joints from which others hang; the turns of all others cannot be seen."""
+        return sorted({parent for parent, _ in self.skeleton.edges})
+
+    @property
+    def size(self) -> int:
+        """Numbers of a frame that the model sees."""
+        return 3 * self.root + size(self.form) * len(self.turning)
+
+    @override
+    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+        seen = dict(data)
+        if WHOLE not in data or LENGTHS in data:
+            return seen
+        x, skeleton = data[WHOLE], self.skeleton
+        if x.shape[-1] != 3 * (skeleton.joints - (not self.root)):
+            raise ValueError(
+                f"x has shape {tuple(x.shape)}; positions of the skeleton {skeleton.name!r} have "
+                f"{3 * (skeleton.joints - (not self.root))} numbers"
+            )
+        if WHOLE in data.get("mask", {}):
+            raise ValueError(
+                "a joint that is missing leaves the turns of others open; fit under a protocol whose representation is "
+                "positions, which may be masked"
+            )
+        positions = skeleton.with_root(x.unflatten(-1, (-1, 3)))
+        turns = data.get(BESIDE, {}).get(TURNS)
+        if turns is None:
+            matrices = kinematics.inverse(skeleton, positions, constant(self._offsets, x))[..., self.turning, :, :]
+            found = in_time(matrices, self.form)
+        else:
+            turns = turns[:, : x.shape[1]].unflatten(-1, (-1, 4))  # of a past, no more than that
+            found = in_time(turns.index_select(-2, indices(self.turning, turns)).to(x), self.form, "quaternion")
+        place = [positions[..., skeleton.root, :]] if self.root else []
+        seen[WHOLE] = torch.cat([*place, found.flatten(-2)], -1)
+        seen[LENGTHS] = (beside or {}).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
+        return seen
+
+    @override
+    def inverse(self, seen: Batch) -> dict[str, Any]:
+        data = dict(seen)
+        bones = data.pop(LENGTHS, None)
+        if WHOLE not in seen:
+            return data
+        x, skeleton = seen[WHOLE], self.skeleton
+        offsets = constant(self._offsets, x)
+        if bones is not None:
+            children = [child for _, child in skeleton.edges]
+            lengths = bones.new_zeros(*bones.shape[:-1], skeleton.joints)
+            lengths = lengths.index_copy(-1, indices(children, bones), bones)
+            offsets = lengths[..., None, :, None] * torch.nn.functional.normalize(offsets, dim=-1)  # (B, 1, J, 3)
+        place = x[..., :3] if self.root else torch.zeros_like(x[..., :3])
+        turns = torch.eye(3, dtype=x.dtype, device=x.device).repeat(*x.shape[:-1], skeleton.joints, 1, 1)
+        told = to_matrix(x[..., 3 * self.root :].unflatten(-1, (len(self.turning), -1)), self.form)
+        turns = turns.index_copy(-3, indices(self.turning, turns), told)
+        positions, _ = kinematics.forward(skeleton.parents, turns, offsets, place)
+        return {**data, WHOLE: (positions if self.root else skeleton.without_root(positions)).flatten(-2)}

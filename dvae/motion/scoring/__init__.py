@@ -1,0 +1,8 @@
+"""Scores and energies of motion."""
+
+from typing import TYPE_CHECKING
+
+from ...lazy import importing
+
+if not TYPE_CHECKING:
+    __getattr__ = importing(__name__)

@@ -1,0 +1,102 @@
+"""Criticism of models of motion: statistics for `dvae.predictive_checks`, and pictures of a `dvae.traverse`."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from torch import Tensor
+
+from ...data.sequences import mean_of_known
+from ...inference.diagnostics.checks import Statistic, variance
+from ...inference.diagnostics.traversal import Traversal
+from ...inference.evaluation.result import canvas
+from ..data.exchange import Exchanged
+from ..data.protocols import Windows
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def statistics(windows: Windows | Exchanged) -> dict[str, Statistic]:
+    """What predictive checks compare of motion.
+
+    * speed: mean over frames and joints, by first differences.
+    * acceleration: the same by second differences.
+    * bone length: mean over frames and bones.
+    * bone stretch: standard deviation of a bone's length over time by its mean, mean over bones; 0 for real bones.
+    * foot height: of the feet above the lowest joint in the same frame, mean over frames and feet. Where one foot
+      stands it is the height above the ground; it needs no ground, so that it means the same with and without the
+      pelvis's own motion. Feet are the ends of the chains whose names say foot, toe, ankle or heel; a skeleton without
+      such names has no foot height.
+
+    Where joints are missing, means are over the differences, bones and feet that are known, and the lowest joint is
+    that of those that are.
+    """
+    skeleton = windows.skeleton
+    up, fps = skeleton.vertical, skeleton.fps
+    ends = set(range(skeleton.joints)) - set(skeleton.parents)
+    feet = [j for j in sorted(ends) if re.search("foot|toe|ankle|heel", skeleton.names[j], re.IGNORECASE)]
+
+    def bone_stretch(positions: Tensor) -> Tensor:
+        lengths = skeleton.bone_lengths(positions)
+        return 100 * mean_of_known(variance(lengths).sqrt() / mean_of_known(lengths, -2), -1)
+
+    def foot_height(positions: Tensor) -> Tensor:
+        heights = positions[..., up]
+        lowest = heights.nan_to_num(math.inf).amin(-1, keepdim=True)
+        return mean_of_known(heights[..., feet] - lowest, (-2, -1))
+
+    def of(unit: str, function: Callable[[Tensor], Tensor]) -> Statistic:
+        return Statistic(lambda x: function(windows.positions(x)), unit)
+
+    return {
+        "speed": of("m/s", lambda found: fps * mean_of_known(found.diff(dim=-3).norm(dim=-1), (-2, -1))),
+        "acceleration": of(
+            "m/s²", lambda found: fps**2 * mean_of_known(found.diff(n=2, dim=-3).norm(dim=-1), (-2, -1))
+        ),
+        "bone length": of("m", lambda found: mean_of_known(skeleton.bone_lengths(found), (-2, -1))),
+        "bone stretch": of("%", bone_stretch),
+        **({"foot height": of("m", foot_height)} if feet else {}),
+    }
+
+
+def draw_traversal(
+    found: Traversal, windows: Windows | Exchanged, frame: int = -1, sequence: int = 0, rows: int = 6
+) -> Figure:
+    """Poses of one sequence at one frame: a row for each coordinate, that of most effect first.
+
+    Args:
+        found: by `dvae.traverse`.
+        windows: of the skeleton, whose `positions` turn x into poses.
+        frame: which frame of the sequence, the last by default.
+        sequence: which sequence of the batch.
+        rows: how many coordinates to draw.
+    """
+    from ..drawing.plot import SPACING, bare, facing, pose
+
+    order = found.effect.argsort(descending=True, stable=True)[:rows]
+    skeleton = windows.skeleton
+    poses = windows.positions(found.frames[order, :, sequence])[:, :, frame].double().cpu()
+    poses = poses - poses[..., skeleton.root : skeleton.root + 1, :]
+    middle = int(found.offsets.abs().argmin())
+    azimuth = math.pi / 5 - facing(skeleton, poses[0, middle : middle + 1])
+    figure = canvas(0.5 + 0.95 * len(found.offsets), 0.6 + 1.9 * len(order))
+    panels = figure.subplots(len(order), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+    for panel, chosen, row in zip(panels, order.tolist(), poses, strict=True):
+        for column, drawn in enumerate(row):
+            at = (column * SPACING, 0.0)
+            pose(panel, row[middle], skeleton, at=at, azimuth=azimuth, colors="0.8", linewidths=1.6)
+            pose(panel, drawn, skeleton, at=at, azimuth=azimuth, colors="C0", linewidths=1.4)
+        bare(panel)
+        moved = f"{found.latent}[{found.coordinates[chosen]}], which moves x by {float(found.effect[chosen]):.2g} m"
+        panel.set_title(moved, loc="left", fontsize=8)
+        panel.tick_params(labelsize=8)
+    panels[-1].set_xticks(
+        SPACING * np.arange(len(found.offsets)), [f"{o:+.2g}" if o else "0" for o in found.offsets.tolist()]
+    )
+    panels[-1].set_xlabel(f"offset of {found.latent}, {found.unit} standard deviations", fontsize=9)
+    return figure

@@ -1,0 +1,380 @@
+"""Energies: what makes samples of motion bad, as pure functions, lower where samples are better.
+
+They are no likelihoods: a model takes them in through `pyro.factor`, and an objective weighs them (`Evidence`'s
+`energy_weights`). Source: GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422), with the normalisation of its public
+code, where nothing else is said.
+
+Shapes everywhere: samples (S, B, T, D), S samples for each of B sequences, T frames of D coordinates in metres; the
+result is (B,), and its mean over the batch is the paper's term. Which frames count is up to the caller, who passes
+these frames alone. What is NaN in a truth, a history or a reference was not observed, and does not count. Gradients
+flow to the samples. Every function raises ValueError for shapes that do not fit.
+"""
+
+from collections.abc import Callable
+from math import log, pi
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import Function, once_differentiable
+
+from ...compiled import compiled, requested
+from ...constants import constant
+from ..geometry.angles import AngleLimits, Places, angle_names, angle_places, cosines, cosines_one_by_one
+from ..geometry.skeleton import Skeleton, differences
+
+BLOCK = 2**18
+"""Numbers that are worked on at once on a CPU, so that what is made of them stays in cache."""
+
+
+def best_of_many(samples: Tensor, truth: Tensor) -> Tensor:
+    """Squared error of the best sample: min_s sum_{t,d} (x_s - x)^2. GSPS's reconstruction term L_r.
+
+    Args:
+        samples: (S, B, T, D).
+        truth: (B, T, D).
+
+    Returns:
+        (B,), square metres.
+    """
+    _check(samples, truth=(truth, samples.shape[1:]))
+    with torch.no_grad():
+        best = torch.stack([_errors(sample, truth).sum((1, 2)) for sample in samples]).argmin(0)
+    return _errors(_chosen(samples, best, torch.arange(len(best), device=best.device)), truth).sum((1, 2))
+
+
+def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> Tensor:
+    """Squared error of the best sample for each admissible future: min_s sum_{t,d} (x_s - y_m)^2, pooled.
+
+    e_b = (B / M) sum over the valid futures of b, with M valid futures in the whole batch, so that the mean over
+    the batch is the mean over all valid futures. GSPS's multimodal reconstruction term L_mm.
+
+    Args:
+        samples: (S, B, T, D).
+        pseudo: (B, M, T, D), the admissible futures; invalid ones are not read.
+        valid: (B, M) bool.
+
+    Returns:
+        (B,), square metres; zeros where no future is valid.
+    """
+    _check(samples)
+    _, sequences, *frame_shape = samples.shape
+    futures = pseudo.shape[1] if pseudo.dim() == 4 else "M"
+    _check(samples, pseudo=(pseudo, (sequences, futures, *frame_shape)), valid=(valid, (sequences, futures)))
+    if valid.dtype != torch.bool:
+        raise ValueError(f"valid has dtype {valid.dtype}, expected torch.bool")
+    sequence, future = valid.nonzero(as_tuple=True)
+    truths = pseudo[sequence, future]
+    with torch.no_grad():  # ||x - y||^2 - ||y||^2 = ||x||^2 - 2 x y, relative to one sample lest digits cancel
+        offsets = (samples - samples[:1]).transpose(0, 1).flatten(2)
+        targets = (pseudo - samples[0, :, None]).masked_fill(~valid[..., None, None], 0).flatten(2)
+        distances = offsets.square().sum(2)[:, None] - 2 * targets @ offsets.mT
+        best = distances[sequence, future].argmin(1)
+    errors = (_chosen(samples, best, sequence) - truths).square().sum((1, 2))
+    return errors.new_zeros(sequences).index_add(0, sequence, errors) * (sequences / max(len(sequence), 1))
+
+
+def _errors(samples: Tensor, truth: Tensor) -> Tensor:
+    """Squared errors, 0 where the truth is NaN."""
+    return torch.where(truth.isnan(), 0.0, samples - truth).square()
+
+
+def _chosen(samples: Tensor, sample: Tensor, sequence: Tensor) -> Tensor:
+    """samples[sample, sequence], (N, T, D)."""
+    return samples.flatten(0, 1).index_select(0, sample * samples.shape[1] + sequence)
+
+
+def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
+    """How alike the samples are: mean over the pairs i < j of exp(-||vec(x_i) - vec(x_j)||_1 / scale).
+
+    GSPS's diversity term L_div takes it of each body part alone, among samples that share the earlier parts.
+
+    Args:
+        samples: (S, B, T, D).
+        scale: alpha, metres; the distance is the sum over all T D coordinates.
+
+    Returns:
+        (B,), from 0 to 1 (all samples equal); zeros where there is no pair.
+    """
+    _check(samples)
+    if not scale > 0:
+        raise ValueError(f"scale is {scale}, expected a distance above 0, in metres")
+    if requested() and len(samples) > 1:
+        return _likeness(samples, scale)
+    first, second = torch.triu_indices(len(samples), len(samples), 1, device=samples.device)
+    one = torch.eye(len(samples), dtype=samples.dtype, device=samples.device)
+    pairs = one[first] - one[second]  # as a matrix product, a third faster than by indices
+
+    def energy(x: Tensor) -> Tensor:
+        with torch.autocast(x.device.type, enabled=False):
+            apart = (pairs @ x.flatten(1)).view(len(first), *x.shape[1:])
+        return (-apart.abs().sum((2, 3)) / scale).exp().sum(0) / max(len(first), 1)
+
+    diversity: Tensor = _InBlocks.apply(energy, samples)
+    return diversity
+
+
+@compiled
+def _likeness(samples: Tensor, scale: float) -> Tensor:
+    """By one sample after the other, beside those behind it: compiled, with no room for the differences."""
+    apart = torch.cat([(samples[i] - samples[i + 1 :]).abs().sum((2, 3)) for i in range(len(samples) - 1)])
+    likeness: Tensor = (-apart / scale).exp().mean(0)
+    return likeness
+
+
+def gaussian_diversity(samples: Tensor, scale: float) -> Tensor:
+    """How alike the samples are: mean over the pairs i < j of exp(-||vec(x_i) - vec(x_j)||^2 / scale). DLow's E_d.
+
+    Yuan and Kitani, 2020, arXiv 2003.08386, with the normalisation of its public code.
+
+    Args:
+        samples: (S, B, T, D).
+        scale: square metres.
+
+    Returns:
+        (B,), from 0 to 1 (all samples equal); zeros where there is no pair.
+    """
+    if not scale > 0:
+        raise ValueError(f"scale is {scale}, expected a squared distance above 0, in square metres")
+    _check(samples)
+    first, second = torch.triu_indices(len(samples), len(samples), 1, device=samples.device)
+    likeness = (-_squared_distances(samples)[:, first, second] / scale).exp()
+    return likeness.sum(1) / max(len(first), 1)
+
+
+def determinantal_diversity(samples: Tensor, quality: Tensor, scale: float) -> Tensor:
+    """Minus the expected number of samples that a determinantal point process chooses: -tr(I - (L + I)^-1).
+
+    L_ij = r_i r_j exp(-||vec(x_i) - vec(x_j)||^2 / scale). Samples that are alike are seldom chosen together, and
+    one of low quality seldom at all. The loss of DSF (Yuan and Kitani, 2020, arXiv 1907.04967).
+
+    Args:
+        samples: (S, B, T, D).
+        quality: (S, B), r.
+        scale: square metres.
+
+    Returns:
+        (B,), from -S to 0.
+    """
+    _check(samples, quality=(quality, samples.shape[:2]))
+    if not scale > 0:
+        raise ValueError(f"scale is {scale}, expected a squared distance above 0, in square metres")
+    distances = _squared_distances(samples)
+    r = quality.T.to(distances)
+    one = torch.eye(len(samples), dtype=distances.dtype, device=distances.device)
+    with torch.autocast(samples.device.type, enabled=False):
+        kernel = r[:, :, None] * r[:, None] * (-distances / scale).exp()
+        left: Tensor = torch.linalg.inv_ex(kernel + one)[0]  # that of inv is waited for
+    return left.diagonal(dim1=1, dim2=2).sum(1) - len(samples)
+
+
+def _squared_distances(samples: Tensor) -> Tensor:
+    """||vec(x_i) - vec(x_j)||^2 of all pairs of samples, over all T D coordinates.
+
+    Args:
+        samples: (S, B, T, D).
+
+    Returns:
+        (B, S, S), square metres, in single precision at least.
+    """
+    with torch.autocast(samples.device.type, enabled=False):
+        x = samples.to(torch.promote_types(samples.dtype, torch.float32)).transpose(0, 1).flatten(2)
+        x = x - x.mean(1, keepdim=True)  # lest digits cancel below
+        squares = x.square().sum(2)
+        return squares[:, :, None] + squares[:, None] - 2 * x @ x.mT
+
+
+def history_error(samples: Tensor, history: Tensor) -> Tensor:
+    """Squared error of the observed frames as samples repeat them: mean_{t,s} sum_d (x_s - x)^2. GSPS's L_x.
+
+    Args:
+        samples: (S, B, O, D), the O observed frames.
+        history: (B, O, D).
+
+    Returns:
+        (B,), square metres.
+    """
+    _check(samples, history=(history, samples.shape[1:]))
+    return _errors(samples, history).sum(3).mean((0, 2))
+
+
+def limb_length(samples: Tensor, reference: Tensor, skeleton: Skeleton) -> Tensor:
+    """Squared errors of limb lengths: mean_{t,s} sum_limbs (length - reference length)^2. GSPS's L_limb.
+
+    GSPS takes all frames, the repeated history too, and the first observed pose for reference.
+
+    Args:
+        samples: (S, B, T, D).
+        reference: (B, D), a pose of each sequence; a constant. Limbs that it lacks have any length.
+        skeleton: the joints; D = 3 J, or 3 (J - 1) without the root.
+
+    Returns:
+        (B,), square metres.
+    """
+    _check(samples, reference=(reference, (*samples.shape[1:2], *samples.shape[3:])))
+
+    limbs = differences(skeleton, tuple(skeleton.edges), samples.shape[-1], samples.dtype, samples.device)
+    pose = reference.detach()
+    lacking = skeleton.bone_lengths(skeleton.with_root(pose.unflatten(-1, (-1, 3)))).isnan()
+    expected = torch.where(lacking, torch.nan, _lengths(pose.nan_to_num(0.0), limbs))
+    if requested():
+        return _limb_errors(samples, expected, limbs)
+    error: Tensor = _InBlocks.apply(lambda block, other: _limb_errors(block, other, limbs), samples, expected)
+    return error
+
+
+@compiled
+def _limb_errors(samples: Tensor, expected: Tensor, limbs: Tensor) -> Tensor:
+    return _errors(_lengths(samples, limbs), expected[:, None]).sum(3).mean((0, 2))
+
+
+def _lengths(poses: Tensor, limbs: Tensor) -> Tensor:
+    """Of the limbs, vectors as `Skeleton.limbs` has them."""
+    with torch.autocast(poses.device.type, enabled=False):
+        vectors: Tensor = (poses @ limbs).unflatten(-1, (-1, 3))
+    return vectors.square().sum(-1).clamp_min(1e-30).sqrt()  # the gradient at 0 is 0, not NaN
+
+
+class _InBlocks(Function):
+    """energy(samples, *constants) of a few sequences at a time, and its gradient in the same pass.
+
+    What is made of the samples on the way to an energy is several times their size: in blocks it stays in cache and
+    takes no memory (measured: half the time of limb lengths, a fifth of pairwise distances).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, energy: Callable[..., Tensor], samples: Tensor, *constants: Tensor) -> Tensor:
+        differentiate = ctx.needs_input_grad[1]
+        numbers = max(samples[:, :1].numel(), 1)
+        size = max(BLOCK // numbers, 1) if samples.device.type == "cpu" else samples.shape[1]
+        values, gradients = [], []
+        for block, *others in zip(samples.split(size, 1), *(c.split(size) for c in constants), strict=True):
+            with torch.set_grad_enabled(differentiate):
+                block = block.detach().requires_grad_(differentiate)
+                value = energy(block, *others)
+                if differentiate:
+                    gradients += torch.autograd.grad(value.sum(), block)
+            values.append(value.detach())
+        ctx.constants = len(constants)
+        ctx.save_for_backward(*([torch.cat(gradients, 1)] if differentiate else []))
+        return torch.cat(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        return None, gradient * outputs[0][:, None, None], *[None] * ctx.constants
+
+
+def joint_angles(samples: Tensor, limits: AngleLimits, skeleton: Skeleton) -> Tensor:
+    """Squared excess of the joint angles over their limits, in cosines. GSPS's L_a.
+
+    sum_angles [mean_{cos < low} (cos - low)^2 if low >= -.98] + [mean_{cos > high} (cos - high)^2 if high <= .98]
+
+    where a mean is over the violating entries of the whole batch, left and right, and not over all. A sequence's
+    energy is its share of that, times B.
+
+    Args:
+        samples: (S, B, T, D), of GSPS the predicted frames.
+        limits: as `motion.estimate_angle_limits` returns them.
+        skeleton: one of `motion.angles.ANGLES`; D = 3 J, or 3 (J - 1) without the root.
+
+    Returns:
+        (B,), without unit; zeros where no limit is exceeded.
+    """
+    _check(samples)
+    names = angle_names(skeleton)
+    if limits.names != names:
+        raise ValueError(
+            f"limits of the angles {', '.join(dict.fromkeys(limits.names))}; expected those of skeleton "
+            f"{skeleton.name!r}, {', '.join(dict.fromkeys(names))}: estimate them from its poses"
+        )
+    low, high = limits.low.to(samples), limits.high.to(samples)
+    low, high = low.masked_fill(low < -0.98, -torch.inf), high.masked_fill(high > 0.98, torch.inf)
+    same = constant(tuple(tuple(float(name == other) for other in names) for name in names), samples)
+    if requested():
+        places = angle_places(skeleton)
+        matrix = differences(skeleton, places.differences, samples.shape[-1], samples.dtype, samples.device)
+        return _excess(samples, low, high, same, matrix, places)
+    excess: Tensor = _JointAngles.apply(samples, low, high, same, skeleton)
+    return excess
+
+
+@compiled
+def _excess(samples: Tensor, low: Tensor, high: Tensor, same: Tensor, matrix: Tensor, places: Places) -> Tensor:
+    _, sequences, frames, size = samples.shape
+    cos = torch.stack(cosines_one_by_one(samples.reshape(-1, size), matrix, places))
+    low, high = low[:, None], high[:, None]
+    over = torch.where(cos < low, cos - low, torch.where(cos > high, cos - high, 0))
+    below, above = ((same @ side.sum(1).to(same)).clamp_min(1)[:, None] for side in (over < 0, over > 0))
+    share = sequences * over.square() / torch.where(over < 0, below, above)
+    return share.sum(0).view(-1, sequences, frames).sum((0, 2))
+
+
+class _JointAngles(Function):
+    """In blocks; and differentiates only the poses that exceed a limit, which are few once a model has learnt."""
+
+    @staticmethod
+    def forward(ctx: Any, samples: Tensor, low: Tensor, high: Tensor, same: Tensor, skeleton: Skeleton) -> Tensor:
+        sequences, frames = samples.shape[1:3]
+        excess = []
+        for block in samples.flatten(0, 2).split(_poses_at_once(samples)):
+            cos = cosines(block, skeleton)
+            excess.append(torch.where(cos < low, cos - low, torch.where(cos > high, cos - high, 0)))
+        over = torch.cat(excess)
+        below, above = ((side.sum(0).to(same) @ same).clamp_min(1) for side in (over < 0, over > 0))
+        share = sequences * over / torch.where(over < 0, below, above)
+        ctx.skeleton = skeleton
+        ctx.save_for_backward(samples, 2 * share)
+        return (over * share).sum(1).view(-1, sequences, frames).sum((0, 2))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
+        samples, slopes = ctx.saved_tensors
+        _, sequences, frames, _ = samples.shape
+        poses = samples.flatten(0, 2)
+        gradient = torch.zeros_like(poses)
+        every = torch.arange(len(poses), device=poses.device)
+        # which they are would be waited for on a GPU
+        chosen = slopes.any(1).nonzero()[:, 0] if poses.device.type == "cpu" else every
+        for rows in chosen.split(_poses_at_once(samples)):
+            slope = slopes[rows] * outputs[0][rows // frames % sequences, None]
+            with torch.enable_grad():
+                some = poses[rows].requires_grad_()
+                (gradient[rows],) = torch.autograd.grad(cosines(some, ctx.skeleton), some, slope)
+        return gradient.view(samples.shape), None, None, None, None
+
+
+def _poses_at_once(samples: Tensor) -> int:
+    return max(BLOCK // samples.shape[3], 1) if samples.device.type == "cpu" else max(samples[..., 0].numel(), 1)
+
+
+def pose_prior_energy(samples: Tensor, prior: Callable[[Tensor], tuple[Tensor, Tensor]], skeleton: Skeleton) -> Tensor:
+    """How far the poses are from a prior's centre: -mean_{t,s} sum log N(z; 0, 1), z of unit limb directions.
+
+    GSPS's L_nf. The log-determinant of the prior's flow is left out, as there, so that this is no density.
+
+    Args:
+        samples: (S, B, T, D); GSPS takes every third predicted frame, from a random one of the first three.
+        prior: a function of directions (..., 3 (J - 1)), zeros for limbs without length, that returns z of the same
+            shape and a log-determinant (...).
+        skeleton: the joints; D = 3 J, or 3 (J - 1) without the root.
+
+    Returns:
+        (B,), nats.
+    """
+    _check(samples)
+    z, _ = prior(skeleton.directions(samples))
+    return 0.5 * (z.square().sum(3).mean((0, 2)) + z.shape[3] * log(2 * pi))
+
+
+def _check(samples: Tensor, **others: tuple[Tensor, tuple[Any, ...]]) -> None:
+    if samples.dim() != 4 or not samples.numel():
+        raise ValueError(f"samples have shape {tuple(samples.shape)}, expected (S, B, T, D) with no size 0")
+    for name, (tensor, expected) in others.items():
+        if tensor.shape != tuple(expected):
+            raise ValueError(
+                f"{name} has shape {tuple(tensor.shape)}, expected ({', '.join(map(str, expected))}) beside samples "
+                f"{tuple(samples.shape)}"
+            )

@@ -1,0 +1,458 @@
+"""Scores of forecast motion, for `dvae.evaluate(models, windows, scores=dvae.motion.scores)`.
+
+The motion papers compare K futures with the true one in metres (`displacements`; definitions in
+`dvae.inference.evaluation.metrics`). Their futures are means of the emission. Forecasts are therefore means by default
+(`Measure.of_means`), and the table says "mean emission"; `draw_emission=True` adds the noise of the emission. Where
+windows move through space (a protocol with root="relative"), these are of poses relative to their own root, as in
+TrajeVAE's evaluation; "global ADE" and "global FDE" are of all joints where they are in the world. Where the same
+joints' paths are given in all windows, "path error" is the mean distance of these joints from their paths, over all K
+futures.
+
+Two scores ask for as much diversity and motion as there really is (BeLFusion: Barquero, Escalera and Palmero 2023,
+arXiv:2211.14304). *APDE* is |APD of the futures - APD of the multimodal ground truth|, the mean over windows that share
+their last pose with another one. *CMD* (`metrics.cumulative_motion_distance`) is of what joints move by from frame to
+frame, for each class of motion and averaged by the classes' shares of the windows, as in the public code. A class is
+the label "content" of a clip; where clips have none, all windows are one class. The pace of a class is that of the true
+futures of the windows at hand, in the public code a constant for each of its data sets. CMD is a number of the whole
+set, with a jackknife over clips, and real motion, which has no steady pace, is not at 0. Where joints are missing, a
+joint counts in the steps at both ends of which it was observed, of futures as of the truth.
+
+Bodies have limb stretch, limb jitter and limb-angle errors (SkeletonDiffusion: Curreli et al. 2025, arXiv:2501.06035,
+equation 13). With l_t the length of a limb in frame t of a future, and m that in the true one, its mean over frames,
+*limb stretch* is mean_t |l_t - m| / m and *limb jitter* mean_t |l_{t+1} - l_t| / m, and with "RMS" the root of the mean
+square; all are means over limbs and futures. The public code has |mean_t l_t - m| / m for the mean stretch, in which
+what lengths vary by about their mean does not count; ours is the paper's. The *limb-angle error* is the mean over
+frames and joints of the error of the angle between a limb and the next one, of the future with the least, in degrees:
+the mean angle error (MAE) of the public code. Ours: shares and not hundredths, of all limbs, where the code leaves out
+those at the pelvis and has angles along chains of its own choice. The *bone-length error* compares with the observed
+frames. Bones that are shorter than `SHORTEST` in some window, whose ends some files have at one place, are in none of
+these, and a note says how many.
+
+*Jerk* is the mean over frames, joints and futures of the length of the third derivative of a joint's place, by third
+differences, in m/s³: that of a motion that shakes, or that does not go on as it was, is high, and that of one without
+movement low. The last three observed frames belong to it; that of real motion is in the table's notes.
+
+A classifier adds two scores under its name (Bie et al. 2022, arXiv:2204.01565). *ACC* is the share of the K futures
+that it gives the window's true class. *FID* is the Fréchet distance between its features of the true futures and of all
+K generated ones of all windows together, a number of the whole set, whose standard error is a jackknife over clips
+(`metrics.frechet_pseudo_values`).
+"""
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ...constants import indices
+from ...data.sequences import Batch, HeldOutWindows, bridged, gapped, mask_of, mean_of_known
+from ...inference.evaluation import metrics
+from ...inference.evaluation.held import clip_places, on_device_of, reproducibly
+from ...inference.evaluation.references import multimodal_note, multimodal_truths
+from ...inference.evaluation.scores import ENERGY, VARIOGRAM, Measure, means_of_those_that_count, paired
+from ..data.exchange import Exchanged
+from ..data.protocols import Windows
+from ..geometry.skeleton import SHORTEST, Skeleton
+from .energies import pose_prior_energy
+
+SEAM = 3
+"""Observed frames of which the jerk of a future is, too, so that it has that of the seam."""
+TOGETHER = 64
+"""Windows, one after the other, whose multimodal ground truths are compared together: they have many in common."""
+
+
+def scores(
+    windows: HeldOutWindows, pose_prior: Any = None, classifiers: Mapping[str, Any] | None = None
+) -> list[Measure]:
+    """The scores of the motion papers, for these windows alone.
+
+    What they rest on (the ground truth of the multimodal errors, the features of the true futures) is found here, once
+    for all models.
+
+    Args:
+        windows: those that are evaluated on.
+        pose_prior: a fitted pose prior, to score single poses of the forecasts: minus the mean log density of the
+            flow's z, without the log-determinant (the NLL of GSPS, arXiv:2108.08422).
+        classifiers: `{name: fitted action classifier}`, to score futures by what they show: "ACC name" and "FID name",
+            and a reference row of real motion. Fitted under the same protocol, they saw no test clip.
+
+    Raises:
+        TypeError: windows of no skeleton.
+        ValueError: windows whose skeleton, frames or labels are not those of a classifier, or too few for normal fits
+            to its features; or whose observed frames are not those of the pose prior.
+    """
+    if not isinstance(windows, Windows | Exchanged):
+        raise TypeError(
+            f"scores of motion need windows of dvae.motion, which have a skeleton, not {type(windows).__name__}; for "
+            "errors in metres alone take dvae.motion.displacements"
+        )
+    moves = windows.protocol.root == "relative"
+    found = displacements(windows, _body(windows.skeleton) if moves else lambda x: x)
+    if moves:
+        found += [replace(measure, name=f"global {measure.name}", headline=False) for measure in (_ADE, _FDE)]
+    if windows.given_joints:
+        found.append(_path_error(windows))
+    bones = _bones(windows)
+    found += _limbs(windows, *bones)
+    if windows.protocol.predicted > 1:
+        found.append(_cumulative_motion(windows))
+    if windows.protocol.observed + windows.protocol.predicted > SEAM:
+        found.append(_jerk(windows))
+    if pose_prior is not None:
+        found.append(_pose_nll(pose_prior, windows.protocol.observed))
+    judged = [_judged(name, classifier, windows) for name, classifier in sorted((classifiers or {}).items())]
+    found += [*(accuracy for accuracy, _ in judged if accuracy), *(distance for _, distance in judged)]
+    return [replace(measure, of_means=True) for measure in found]
+
+
+_ADE = Measure("ADE", paired(metrics.average_displacement_error), "m", headline=True)
+_FDE = Measure("FDE", paired(metrics.final_displacement_error), "m", headline=True)
+_MEDIAN = (
+    Measure("ADEm", paired(metrics.median_average_displacement_error), "m"),
+    Measure("FDEm", paired(metrics.median_final_displacement_error), "m"),
+)
+_MULTIMODAL = ("MMADE", "MMFDE", "MMADEm", "MMFDEm")
+"""In the order of `metrics.multimodal_errors`."""
+
+
+def displacements(windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = lambda x: x) -> list[Measure]:
+    """Diversity, errors of the best and of the median future, and proper scores, in metres; of arrays, too.
+
+    Args:
+        windows: among which multimodal ground truth is found, unless poses were exchanged: windows that begin like
+            such a pose go on from others.
+        body: what of frames (..., T, D) is compared.
+    """
+
+    def of_body(measure: Measure) -> Measure:
+        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+            return measure.function(body(forecasts), body(truth), past, index)
+
+        return replace(measure, function=function, unit="m", of_means=True)
+
+    diversity = lru_cache(maxsize=1)(metrics.average_pairwise_distance)  # for all scores of a batch
+
+    def energy(forecasts: Tensor, truth: Tensor, *_: Any) -> Tensor:
+        return metrics.energy_score(forecasts, truth, None if truth.isnan().any() else diversity(forecasts))
+
+    apd = Measure("APD", lambda forecasts, *_: diversity(forecasts), "m", "higher")
+    several = [] if isinstance(windows, Exchanged) else _multimodal(windows, body, diversity)
+    proper = [replace(ENERGY, function=energy), VARIOGRAM]
+    return list(map(of_body, [apd, _ADE, _FDE, *several[:2], *_MEDIAN, *several[2:], *proper]))
+
+
+def _multimodal(
+    windows: HeldOutWindows, body: Callable[[Tensor], Tensor], diversity: Callable[[Tensor], Tensor]
+) -> list[Measure]:
+    """Errors averaged over the futures of all windows in almost the same pose, and the APDE."""
+    truths = multimodal_truths(windows)
+    futures = body(gapped(windows.all())[:, windows.protocol.observed :])
+    lonely = sum(len(found) == 1 for found in truths)
+    said = {"threshold": windows.protocol.multimodal_threshold, "itself": True, "alone": lonely}
+    shared: Any = {"unit": "m", "note": multimodal_note(**said, windows=len(truths)), "basis": {"multimodal": said}}
+
+    @lru_cache(maxsize=1)  # for all scores of a batch
+    def errors(forecasts: Tensor, index: Tensor) -> Tensor:
+        pairs = zip(forecasts, index.tolist(), strict=True)
+        return torch.stack([metrics.multimodal_errors(window, futures[truths[n]]) for window, n in pairs])
+
+    def error(place: int) -> Callable[..., Tensor]:
+        return lambda forecasts, truth, past, index: errors(forecasts, index)[:, place]
+
+    @cache
+    def real() -> Tensor:
+        together = range(0, len(truths), TOGETHER)
+        return torch.cat([_diversities(futures, truths[start : start + TOGETHER]) for start in together])
+
+    def diversity_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        return (diversity(forecasts) - real()[index]).abs()
+
+    found = [
+        Measure(name, error(place), headline=name in ("MMADE", "MMFDE"), **shared)
+        for place, name in enumerate(_MULTIMODAL)
+    ]
+    apde = Measure("APDE", diversity_error, pool=means_of_those_that_count, **shared)
+    return [*found, *([apde] if lonely < len(truths) else [])]
+
+
+def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
+    """The APD of each of some sets of futures; sets have many pairs in common, whose distance is found once.
+
+    Args:
+        futures: (N, T, D).
+        sets: which of them; of one future alone the diversity is NaN.
+    """
+    among = torch.cat([*sets]).unique()
+    rows = futures[among].flatten(1).double()
+    centre = rows.mean(0)
+    if centre.isnan().any():
+        apds = [metrics.average_pairwise_distance(futures[held]) if len(held) > 1 else None for held in sets]
+        return torch.stack([futures.new_tensor(math.nan) if apd is None else apd for apd in apds])
+    rows = rows - centre  # or distances that are small beside the rows would blur in products
+    products = rows @ rows.T
+    squares = products.diagonal()
+    apart = (squares[:, None] + squares).sub_(products, alpha=2).clamp_(min=0).sqrt_().fill_diagonal_(0.0)
+    chosen = torch.stack([torch.isin(among, held) for held in sets]).to(apart)
+    sums, counts = (chosen @ apart * chosen).sum(1), chosen.sum(1)
+    return (sums / (counts * (counts - 1))).to(futures)
+
+
+def _body(skeleton: Skeleton) -> Callable[[Tensor], Tensor]:
+    """Frames (..., T, D) relative to their own root, which is left out."""
+
+    @lru_cache(maxsize=2)  # of forecasts and futures, for all scores of a batch
+    def body(x: Tensor) -> Tensor:
+        joints = x.unflatten(-1, (-1, 3))
+        return skeleton.without_root(joints - joints[..., skeleton.root, None, :]).flatten(-2)
+
+    return body
+
+
+def _path_error(windows: Windows | Exchanged) -> Measure:
+    places = [windows.joints.index(name) for name in windows.given_joints or ()]
+
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        paths = past["y"][:, None, windows.protocol.observed :]
+        paths = torch.where(truth[:, None].isnan(), torch.nan, paths)
+        distances = (forecasts - paths).unflatten(-1, (-1, 3)).norm(dim=-1)
+        return mean_of_known(distances[..., places], (1, 2, 3))
+
+    return Measure("path error", function, "m")
+
+
+def _bones(windows: Windows | Exchanged) -> tuple[list[int], str]:
+    """The bones that have a length in every window, as places among `Skeleton.edges`, and a note on the others."""
+    lengths = mean_of_known(windows.skeleton.bone_lengths(windows.positions(gapped(windows.all()))), 1)
+    short = (lengths < SHORTEST).any(0)
+    note = f"limbs and bone lengths: {int(short.sum())} of {len(short)} bones are shorter than {SHORTEST:g} m; left out"
+    return (~short).nonzero()[:, 0].tolist(), note if short.any() else ""
+
+
+def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Measure]:
+    """Errors of bone lengths, stretch and jitter of limbs, and errors of the angles between them."""
+    skeleton = windows.skeleton
+
+    edges = [skeleton.edges[bone] for bone in bones]
+    starts, ends = (list(joints) for joints in zip(*edges, strict=True))
+    pairs = [(ends.index(parent), ends.index(child)) for parent, child in edges if parent in ends]
+    first, second = ([pair[side] for pair in pairs] for side in (0, 1))
+
+    def limbs(x: Tensor) -> Tensor:
+        """(3, limbs, ..., T) of frames (..., T, D)."""
+        joints = _coordinates(windows.positions(x).flatten(-2))
+        return joints.index_select(1, indices(ends, x)) - joints.index_select(1, indices(starts, x))
+
+    @lru_cache(maxsize=1)  # of forecasts, for all scores of a batch
+    def lengths(x: Tensor) -> Tensor:
+        """(B, limbs, ..., T)."""
+        return torch.stack([_norm(limbs(window)) for window in x])
+
+    @lru_cache(maxsize=1)
+    def relative(forecasts: Tensor, truth: Tensor) -> Tensor:
+        """Errors (B, limbs, K, T) of lengths, in those of the truth."""
+        return lengths(forecasts) / mean_of_known(lengths(truth), -1)[..., None, None] - 1
+
+    def of_errors(score: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
+        """The mean over limbs and futures of a score (B, limbs, K) of relative errors."""
+        return lambda forecasts, truth, past, index: mean_of_known(score(relative(forecasts, truth)), (1, 2))
+
+    scores: dict[str, Callable[[Tensor], Tensor]] = {
+        "limb stretch": lambda errors: errors.abs().mean(-1),
+        "limb stretch RMS": lambda errors: errors.square().mean(-1).sqrt(),
+    }
+    if windows.protocol.predicted > 1:
+        scores["limb jitter"] = lambda errors: errors.diff(dim=-1).abs().mean(-1)
+        scores["limb jitter RMS"] = lambda errors: errors.diff(dim=-1).square().mean(-1).sqrt()
+
+    def bone_length_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        reference = mean_of_known(lengths(gapped(past)), -1)
+        return mean_of_known((lengths(forecasts) / reference[..., None, None] - 1).abs(), (1, 2, 3))
+
+    shared: Any = {"partial": windows.missing, "note": note}
+    functions = {"bone-length error": bone_length_error, **{name: of_errors(score) for name, score in scores.items()}}
+    found = [Measure(name, function, "relative", **shared) for name, function in functions.items()]
+
+    def angles(x: Tensor) -> Tensor:
+        """(pairs, ..., T)."""
+        vectors = limbs(x)
+        u, v = (vectors.index_select(1, indices(each, x)) for each in (first, second))
+        return torch.atan2(_norm(_cross(u, v)), (u * v).sum(0)).rad2deg()
+
+    def angle_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        errors = ((angles(x) - angles(y)[:, None]).abs() for x, y in zip(forecasts, truth, strict=True))
+        return torch.stack([mean_of_known(each, (0, 2)).amin() for each in errors])
+
+    angular = Measure("limb-angle error", angle_error, "degrees", **shared)
+    return [*found, *([angular] if pairs else [])]
+
+
+def _coordinates(x: Tensor) -> Tensor:
+    """Joints (..., T, D) with their coordinates first, (3, D / 3, ..., T): numbers that are alike lie side by side."""
+    found: Tensor = x.unflatten(-1, (-1, 3)).movedim((-1, -2), (0, 1)).contiguous()
+    return found
+
+
+def _norm(vectors: Tensor) -> Tensor:
+    """(...) of vectors (3, ...): in a third of the time of torch's norm over a first dimension, or less."""
+    x, y, z = vectors
+    found: Tensor = (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
+    return found
+
+
+def _cross(first: Tensor, second: Tensor) -> Tensor:
+    """Cross products of vectors (3, ...)."""
+    (a, b, c), (x, y, z) = first, second
+    return torch.stack([b * z - c * y, c * x - a * z, a * y - b * x])
+
+
+def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
+    """CMD, class by class."""
+    label = "content"
+    try:
+        labels = windows.labels(label)
+    except KeyError:
+        label, labels = "", [""] * len(windows)
+    names = sorted(set(labels))
+    classes = torch.tensor([names.index(each) for each in labels])
+    body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
+
+    def moved(x: Tensor) -> Tensor:
+        """What joints move by, (B, ..., T - 1), of frames (B, ..., T, D)."""
+        steps = (_norm(_coordinates(window).diff(dim=-1)) for window in body(x))
+        return torch.stack([mean_of_known(each, 0) for each in steps]).double()
+
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        return mean_of_known(moved(_where_true(forecasts, truth)), 1)
+
+    real = mean_of_known(moved(gapped(windows.all())[:, windows.protocol.observed :]), -1)
+    what = f"of the windows of each {label}, {len(names)} in all" if label else "of all windows as one class"
+    return Measure(
+        "CMD",
+        function,
+        "m",
+        partial=windows.missing,
+        pool=lambda motion, clips: metrics.motion_pseudo_values(motion, real, classes, clips),
+        note=f"CMD: {what}, against the pace of their true futures",
+        basis={"CMD": {"label": label, "classes": names}},
+    )
+
+
+def _jerk(windows: Windows | Exchanged) -> Measure:
+    """How joints shake, the seam included."""
+    body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
+    start = max(windows.protocol.observed - SEAM, 0)
+
+    def jerk(x: Tensor) -> Tensor:
+        """(B, ...) of frames (B, ..., T, D)."""
+        changes = (_norm(_coordinates(window).diff(n=3, dim=-1)) for window in body(x))
+        return torch.stack([mean_of_known(each, (0, -1)) for each in changes]) * windows.protocol.fps**3
+
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        seen = gapped(past)[:, None, start:].expand(-1, forecasts.shape[1], -1, -1)
+        return mean_of_known(jerk(torch.cat([seen, _where_true(forecasts, truth)], 2)), 1)
+
+    real = mean_of_known(jerk(gapped(windows.all())[:, start:]), 0)
+    note = f"jerk: {real:.1f} m/s³ of real motion"
+    return Measure("jerk", function, "m/s³", "", partial=windows.missing, note=note)
+
+
+def _where_true(forecasts: Tensor, truth: Tensor) -> Tensor:
+    """Forecasts (B, K, T, D), NaN where the truth (B, T, D) was not observed."""
+    missing = truth.isnan()
+    return forecasts.masked_fill(missing[:, None], torch.nan) if missing.any() else forecasts
+
+
+def _pose_nll(prior: Any, observed: int) -> Measure:
+    if prior.forward_at not in (None, observed - 1):
+        raise ValueError(
+            f"the pose prior reads windows turned at their frame {prior.forward_at + 1}, but here "
+            f"{observed} frames are observed; fit one under this protocol"
+        )
+
+    @torch.no_grad()
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        seen = bridged(past["x"], mask_of(past))[:, None].expand(-1, forecasts.shape[1], -1, -1)
+        motion = prior.facing(torch.cat([seen, forecasts], 2))[:, :, observed:]
+        return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)
+
+    return Measure("pose NLL", function, "nats", basis={"pose prior": _hash(prior)})
+
+
+def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[Measure | None, Measure]:
+    """ACC, where a class of some window is known, and FID."""
+    if windows.missing:
+        raise ValueError(
+            f"ACC and FID {name} are of features of whole futures, but these windows lack joints; leave the classifier "
+            "out, or fill the gaps first (`dvae impute RUN --filled FILE`)"
+        )
+    labels = _labels(name, classifier, windows)
+    classes = torch.tensor([classifier.classes.index(label) if label in classifier.classes else -1 for label in labels])
+    unknown = int((classes < 0).sum())
+    described = {"label": classifier.label, "classes": list(classifier.classes)}
+    basis = {f"classifier {name}": {**described, "weights": _hash(classifier), "unknown": unknown}}
+    note = f"ACC, FID {name}: classifier {_hash(classifier)[:12]}"
+    note += f"; {unknown} of {len(labels)} windows are of no class it knows" if unknown else ""
+    shared: Any = {"truth": "real motion", "note": note, "basis": basis}
+
+    @lru_cache(maxsize=1)  # for both scores of a batch
+    def features(futures: Tensor) -> Tensor:
+        with reproducibly(classifier, 0):
+            found: Tensor = classifier.features(on_device_of(classifier, {"x": futures})["x"])
+            return found
+
+    def accuracy(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        right = (classifier.logits(features(forecasts)).cpu().argmax(-1) == classes[index, None]).double().mean(1)
+        found: Tensor = right.masked_fill(classes[index] < 0, math.nan)
+        return found
+
+    x = windows.all()["x"][:, windows.protocol.observed :]
+    real = torch.cat([features(futures) for futures in x.split(32)]).double().cpu()
+    distance = Measure(
+        f"FID {name}",
+        lambda forecasts, *_: features(forecasts).double().cpu(),
+        pool=lambda generated, clips: metrics.frechet_pseudo_values(real, generated, clips),
+        **shared,
+    )
+    known = unknown < len(labels)
+    return Measure(f"ACC {name}", accuracy, "share", "higher", partial=True, **shared) if known else None, distance
+
+
+def _labels(name: str, classifier: Any, windows: Windows | Exchanged) -> list[str]:
+    """The true labels of windows that suit a classifier.
+
+    Raises:
+        ValueError: windows that do not.
+    """
+    size = 3 * len(windows.joints)
+    if windows.skeleton != classifier.skeleton or size != classifier.size:
+        raise ValueError(
+            f"the classifier {name} was fitted to the skeleton {classifier.skeleton.name!r} and frames of "
+            f"{classifier.size} numbers; these windows have the skeleton {windows.skeleton.name!r} and {size}"
+        )
+    fitted, asked = ((p.predicted, p.fps) for p in (classifier.protocol, windows.protocol))
+    if fitted != asked:
+        raise ValueError(
+            f"the classifier {name} was fitted to {fitted[0]} predicted frames at {fitted[1]:g} fps; these windows "
+            f"have {asked[0]} at {asked[1]:g}"
+        )
+    clips = clip_places(windows.keys).bincount()
+    if len(windows.keys) - (int(clips.max()) if len(clips) > 1 else 0) < 2:
+        raise ValueError(
+            f"FID {name} needs normal fits to the features of at least two windows, also without any one clip; these "
+            f"are {len(windows.keys)} windows of {len(clips)} clips"
+        )
+    try:
+        return windows.labels(classifier.label)
+    except KeyError as error:
+        raise ValueError(f"the classifier {name} tells {classifier.label}s apart, but {error.args[0]}") from error
+
+
+def _hash(module: nn.Module) -> str:
+    digest = hashlib.sha256()
+    for name, value in module.state_dict().items():
+        digest.update(name.encode() + value.cpu().numpy().tobytes())
+    return digest.hexdigest()

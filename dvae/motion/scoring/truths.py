@@ -1,0 +1,202 @@
+"""Pseudo ground truth: futures of other people that a window in almost the same pose might have had as well.
+
+Mao, Liu and Salzmann, 2021, "Generating smooth pose sequences for diverse human motion prediction" (GSPS),
+arXiv:2108.08422. The candidates are windows of the training clips, kept as unit limb directions d and posed with the
+limb lengths of the window x that asks. Of these,
+
+    |last observed pose of candidate - last observed pose of x| < threshold          over all coordinates
+    mean joint distance of candidate's future from x's          >= minimum           so that near copies drop out
+
+at most `most`, drawn without replacement, follow the observed frames of x.
+
+Candidates are tried in random order until enough of them meet the conditions. Matrix products with candidates of
+average limb lengths sort out most of the others beforehand: a mean of distances over frames is at most their root mean
+square, and other limb lengths move a joint by no more than the sum of the differences on its way to the root.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...data.sequences import bridged
+from ..data.protocols import Windows
+from ..geometry.views import Heading
+
+_ROUNDING = 1e-3  # of |x|, by which a distance from matrix products may be off in single precision
+
+
+class PseudoTruths:
+    """Further futures of training windows, found among the training clips.
+
+    Args:
+        windows: whose clips they are taken from, and whose protocol says what is observed.
+        threshold: metres, distance of last observed poses, as vectors, below which futures are shared.
+        minimum: metres, mean joint distance that a future keeps from the window's own.
+        most: M, the largest number of futures of a window.
+        stride: frames between the starts of candidates in a clip; the paper has 20, on HumanEva-I 15.
+        heading: compare people as if all faced the same way when the future begins: candidates are turned about the
+            up axis so that their last observed frame has heading zero, and windows are expected as `turn` gives them.
+
+    Raises:
+        ValueError: numbers out of range, windows without a future, or a heading that the skeleton does not tell.
+    """
+
+    def __init__(
+        self,
+        windows: Windows,
+        threshold: float = 0.5,
+        minimum: float = 0.1,
+        most: int = 10,
+        stride: int = 20,
+        heading: bool = False,
+    ) -> None:
+        if not threshold > 0 or not minimum >= 0 or most < 1 or stride < 1:
+            raise ValueError(
+                "threshold is a distance above 0, minimum a distance from 0, most and stride are numbers from 1; given "
+                f"{threshold}, {minimum}, {most} and {stride}"
+            )
+        self._observed = windows.protocol.observed
+        if windows.length <= self._observed:
+            raise ValueError(
+                f"windows of {windows.length} frames, {self._observed} of them observed, have no future to exchange; "
+                "make them longer"
+            )
+        self.threshold, self.minimum, self.most, self.heading = threshold, minimum, most, heading
+        self._skeleton, self._windows = windows.skeleton, windows
+
+        parents, root = windows.skeleton.parents, windows.skeleton.root
+        nodes = [joint for joint in range(len(parents)) if windows.protocol.root != "drop" or joint != root]
+        self._root = nodes.index(root) if root in nodes else None
+        self._limbs = torch.eye(len(nodes))  # limb vectors = _limbs @ joints; the root's is its own position
+        for node, joint in enumerate(nodes):
+            if parents[joint] in nodes:
+                self._limbs[node, nodes.index(parents[joint])] = -1
+        self._chains = torch.linalg.inv(self._limbs).round()
+
+        listed = windows.all(stride)
+        x = bridged(listed["x"], listed.get("mask"))[:, self._observed - 1 :]
+        self._average = self._lengths(x[:, 0].unflatten(-1, (-1, 3))).mean(0)
+        self._last = torch.empty(len(x), len(nodes) * 3)
+        self._futures = torch.empty(len(nodes), len(x), 3, x.shape[1] - 1)  # so that products and sums run over rows
+        for block in torch.arange(len(x)).split(512):
+            joints = (Heading(self._skeleton).face(x[block]) if heading else x[block]).unflatten(-1, (-1, 3))
+            lengths = self._lengths(joints)
+            joints = self._chains @ ((self._average / lengths.clamp(min=1e-9))[..., None] * (self._limbs @ joints))
+            self._last[block] = joints[:, 0].flatten(1)
+            self._futures[:, block] = joints[:, 1:].permute(2, 0, 3, 1)
+        self._squares = self._futures.square().sum((2, 3))
+
+    def __len__(self) -> int:
+        """The number of candidates."""
+        return len(self._last)
+
+    def turn(self, x: Tensor) -> Tensor:
+        """Windows (..., T, D), turned about the up axis so that the last observed frame has heading zero."""
+        return Heading(self._skeleton, self._observed).face(x)
+
+    def of(self, x: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Further futures of windows.
+
+        Args:
+            x: (B, T, D) float32, drawn from the windows; with `heading` turned as `turn` does.
+            generator: its state decides which are taken where there are more than M, and stays as it is, so that the
+                windows drawn next are the same with and without this.
+
+        Returns:
+            (B, M, T, D), the observed frames of x followed by another future, and (B, M) whether there is one; zeros
+            where there is none.
+
+        Raises:
+            ValueError: x of another shape.
+        """
+        expected = (self._windows.length, self._windows.size)
+        if x.ndim != 3 or x.shape[1:] != expected:
+            raise ValueError(f"x must be windows (B, {expected[0]}, {expected[1]}), but has shape {tuple(x.shape)}")
+        now = x[:, self._observed - 1]
+        future = x[:, self._observed :].unflatten(-1, (-1, 3)).permute(0, 2, 3, 1)  # (B, n, 3, F)
+        lengths = self._lengths(x[:, 0].unflatten(-1, (-1, 3)))
+        own = torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator.clone_state())))
+        order = torch.rand(len(x), len(self), generator=own)
+        order.masked_fill_(~self._possible(now, future, lengths), torch.inf)
+        # Limb vectors of average lengths, stretched, and put together again.
+        posing = self._chains @ ((lengths / self._average.clamp(min=1e-9))[:, :, None] * self._limbs)
+
+        pseudo = x.new_zeros(len(x), self.most, *expected)
+        valid = torch.zeros(len(x), self.most, dtype=torch.bool)
+        count = torch.zeros(len(x), dtype=torch.long)
+        rows = order.isfinite().any(1).nonzero()[:, 0]
+        while len(rows):
+            rank, index = order[rows].topk(min(2 * self.most, len(self)), largest=False)
+            order[rows[:, None], index] = torch.inf
+            last = posing[rows, None] @ self._last[index].unflatten(-1, (-1, 3))
+            close = (last.flatten(2) - now[rows, None]).norm(dim=-1) < self.threshold
+            others = self._futures[:, index.flatten()].flatten(2).unflatten(1, index.shape).transpose(0, 1)
+            others = (posing[rows] @ others.flatten(2)).unflatten(2, (*index.shape[1:], 3, -1))  # (R, n, k, 3, F)
+            far = (others - future[rows, :, None]).square().sum(3).sqrt().mean((1, 3)) >= self.minimum
+            found = rank.isfinite() & close & far
+            slot = count[rows, None] + found.cumsum(1) - 1
+            row, place = (found & (slot < self.most)).nonzero().T
+            chosen = rows[row], slot[row, place]
+            valid[chosen] = True
+            pseudo[*chosen, : self._observed] = x[rows[row], : self._observed]
+            pseudo[*chosen, self._observed :] = others[row, :, place].permute(0, 3, 1, 2).flatten(2)
+            count[rows] += found.sum(1)
+            rows = rows[(count[rows] < self.most) & order[rows].isfinite().any(1)]
+        return pseudo, valid
+
+    def _possible(self, now: Tensor, future: Tensor, lengths: Tensor) -> Tensor:
+        """(B, N) candidates that may meet the conditions; no other one does."""
+        off = (lengths - self._average).abs() @ self._chains.T
+        size = now.unflatten(-1, (-1, 3)).norm(dim=-1)
+        slack = (off + _ROUNDING * size).norm(dim=-1, keepdim=True)
+        close = torch.cdist(now, self._last) < self.threshold + slack
+
+        frames = future.shape[-1]
+        squares = future.square().sum((2, 3))
+        products = future.transpose(0, 1).flatten(2) @ self._futures.flatten(2).mT  # (n, B, N)
+        distances = (squares.T[:, :, None] + self._squares[:, None] - 2 * products).clamp_(min=0).sqrt_()
+        slack = off + _ROUNDING * (squares / frames).sqrt()
+        far = distances.mean(0) / frames**0.5 + slack.mean(1, keepdim=True) >= self.minimum
+        possible: Tensor = close & far
+        return possible
+
+    def _lengths(self, joints: Tensor) -> Tensor:
+        """Limb lengths (..., n) of poses (..., n, 3); one for a root, which keeps its place."""
+        lengths: Tensor = (self._limbs @ joints).norm(dim=-1)
+        if self._root is not None:
+            lengths[..., self._root] = 1
+        return lengths
+
+
+@dataclass(frozen=True, eq=False)
+class WithPseudoTruths:
+    """Training windows drawn together with their pseudo ground truth.
+
+    Args:
+        windows: to draw from.
+        truths: where further futures come from.
+    """
+
+    windows: Windows
+    truths: PseudoTruths
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the windows."""
+        return self.windows.fingerprint
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw windows as `Windows.sample` does, turned to heading zero where `truths.heading` says so.
+
+        Returns:
+            "x" (B, T, D), "pseudo" (B, M, T, D) and "valid" (B, M), as of `PseudoTruths.of`; "mask" where joints may be
+            missing, whose gaps are bridged before futures are exchanged.
+        """
+        batch = self.windows.sample(batch_size, generator)
+        x = bridged(batch["x"], batch.get("mask"))
+        x = self.truths.turn(x) if self.truths.heading else x
+        pseudo, valid = self.truths.of(x, generator)
+        return {**batch, "x": x, "pseudo": pseudo, "valid": valid}

@@ -1,0 +1,254 @@
+"""The evidence from both sides: annealed importance sampling from guide to posterior, and the same run backward.
+
+    f_b(z) = q(z | x)^(1 - b) p(x, z)^b,    0 = b_0 < ... < b_L = 1,
+    log w  = sum_l (b_l - b_{l-1}) (log p(x, z_l) - log q(z_l | x)),   z_1 ~ q,   z_{l+1} by a step that leaves f_{b_l}
+
+The mean weight is unbiased for p(x) (Neal, 2001), so that its logarithm is a lower bound on average, and one that the
+guide's shortcomings reach less and less as L grows; with L = 1 it is the importance-weighted bound. Where data are
+simulated from the model, its own latents are an exact draw from their posterior. Chains that start there and go back to
+the guide give weights whose mean inverse is unbiased for 1 / p(x): an upper bound (bidirectional Monte Carlo: Grosse,
+Ghahramani and Adams, 2015, arXiv 1511.02543). The evidence lies between the two, on average, and their gap on simulated
+data tells how far the lower bound is to be trusted on real ones from a model like it.
+
+Transitions are Hamiltonian, of all chains of all sequences as the rows of one batch. Coordinates are measured in the
+guide's own deviations. Lengths of steps are found by chains of their own, for each sequence and temperature, and then
+held: chains that choose their steps by where they are would not leave f_b as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ...data.sequences import each
+from ...program.batch import AnyBatch, repeat
+from ...program.conditional import like
+from ...program.groups import GROUP
+from ...program.model import DynamicalVAE
+from ...turns import alone
+from ..diagnostics.latents import joined, split
+from ..evaluation.held import reproducibly
+from ..evaluation.result import progress_bar
+from .elbo import joint_and_guide, require_data, require_latents, require_likelihood
+
+ACCEPTED = 0.8
+"""Share of Hamiltonian proposals that lengths of steps are made for."""
+TRIED = 4
+"""Chains that find lengths of steps."""
+DRAWS = 32
+"""From the guide, at least, of which its deviations are told."""
+FIRST, LEAST, MOST = 0.2, 1e-4, 2.0
+"""Length of a step, in the guide's deviations: of the first, and what it stays between."""
+
+
+@dataclass(frozen=True)
+class AnnealedBound:
+    """Bounds of every sequence by annealed importance sampling, and how the chains fared.
+
+    Args:
+        bound: (B,) log of the estimated evidence, in nats; below it on average, or above it where chains ran backward.
+        error: (B,) standard error of that, by the spread of the weights, with K - 1 degrees of freedom for an interval
+            by Student's t. It is the error of the modes that the chains visit: where they all stay in one of two equal
+            modes, the bound is log 2 too low, whatever `error` and `effective` are. The upper bound on simulated data
+            shows such a deficit. With few effective chains the error is too small. NaN of chains that ran backward:
+            those of a sequence start at one draw, and their spread does not include the chance of that draw. The error
+            of a mean over sequences is by the spread of their bounds.
+        effective: (B,) effective number of chains, between 1 and K, or NaN, likewise. It does not see a mode that no
+            chain visits.
+        accepted: (B,) share of the proposals that were accepted.
+        chains: K.
+        temperatures: L.
+    """
+
+    bound: Tensor
+    error: Tensor
+    effective: Tensor
+    accepted: Tensor
+    chains: int
+    temperatures: int
+
+
+@alone
+@torch.inference_mode(False)
+def annealed_bound(
+    model: DynamicalVAE,
+    batch: AnyBatch,
+    temperatures: int = 100,
+    chains: int = 16,
+    *,
+    leaps: int = 5,
+    latents: Mapping[str, Tensor] | None = None,
+    seed: int = 0,
+    chunk: int = 4096,
+    progress: bool = False,
+) -> AnnealedBound:
+    """A bound on the log evidence that comes near to it however bad the guide is, at the price of many evaluations.
+
+    Args:
+        model: the model with its guide.
+        batch: see `DynamicalVAE.model`; ragged batches, missing entries and context included.
+        temperatures: L.
+        chains: K, of each sequence.
+        leaps: leapfrog steps of a transition, each a gradient of model and guide.
+        latents: name to exact draws (B, ...) from the posterior, such as those that the data were simulated with: the
+            chains then go from these to the guide, and the bound is an upper one.
+        seed: of the chains.
+        chunk: sequences times chains to hold at once.
+        progress: whether to show a bar.
+
+    Returns:
+        Bound and what there is to know of it, (B,) each.
+
+    Raises:
+        ValueError: a model without latents or likelihood, or whose sequences share latents; numbers below 1; data or
+            latents missing in the batch.
+
+    Example:
+        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
+        >>> x = model.sample(3, 4)["x"]
+        >>> found = dvae.annealed_bound(model, x, temperatures=50)
+        >>> bool((found.bound - dvae.Oracle(model, 4).evidence(x)).abs().max() < 1.0)
+        True
+    """
+    if min(temperatures, chains, leaps, chunk) < 1:
+        raise ValueError(
+            f"temperatures, chains, leaps and chunk are at least 1, got {temperatures}, {chains}, {leaps} and {chunk}"
+        )
+    require_likelihood(model)
+    data = model.read(batch)
+    require_latents(model)
+    if model.grouped and GROUP in data:
+        raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")
+    size = require_data(model, data)
+    if not size:
+        raise ValueError("the batch holds no sequences")
+    given = None if latents is None else _exact(model, data, latents)
+    at_once = max(1, chunk // chains)
+    found = []
+    with reproducibly(model, seed), progress_bar(progress) as bar:
+        for first in bar.track(range(0, size, at_once), description="annealing"):
+            part = slice(first, first + at_once)
+            start = None if given is None else {name: value[part] for name, value in given.items()}
+            some = each(data, itemgetter(part))
+            lengths = _Annealing(model, some, temperatures, min(chains, TRIED), leaps).lengths()
+            found.append(_Annealing(model, some, temperatures, chains, leaps).run(lengths, start))
+    bound, error, effective, accepted = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return AnnealedBound(bound, error, effective, accepted, chains, temperatures)
+
+
+def _exact(model: DynamicalVAE, data: Mapping[str, Any], latents: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Latents from which chains go back, as the model has them.
+
+    Raises:
+        ValueError: one that is missing, or of another shape.
+    """
+    if lacking := [name for name in model.latents if name not in latents]:
+        raise ValueError(f"chains that go back start from all latents; missing are {', '.join(lacking)}")
+    first = data[model.observed[0]]
+    found = {}
+    for name in model.latents:
+        found[name] = torch.as_tensor(latents[name]).to(like(model))
+        steps = first.shape[1:2] if model.generative.local(name) else ()
+        expected = (len(first), *steps, model.sizes[name])
+        if found[name].shape != expected:
+            raise ValueError(f"the latent {name} has shape {tuple(found[name].shape)}, expected {tuple(expected)}")
+    return found
+
+
+class _Annealing:
+    """Chains of some sequences; row k B + b is chain k of sequence b."""
+
+    def __init__(self, model: DynamicalVAE, data: AnyBatch, temperatures: int, chains: int, leaps: int):
+        self.model, self.chains, self.leaps = model, chains, leaps
+        self.data = repeat(data, chains)
+        # slow at both ends, where little of one law is mixed into the other
+        self.inverse = (1 - torch.cos(math.pi * torch.arange(temperatures + 1) / temperatures)).double() / 2
+        self.levels = range(1, temperatures)
+        draws = [model.guide(self.data) for _ in range(math.ceil(DRAWS / chains))]
+        self.like = {name: draws[0][name] for name in model.latents}
+        drawn = torch.stack([self._joined(each) for each in draws]).unflatten(1, (chains, -1))
+        self.scale = drawn.flatten(0, 1).std(0).clamp(min=1e-6).repeat(chains, 1)
+
+    def lengths(self) -> dict[int, Tensor]:
+        """Of steps at each temperature, (B,), by chains that count for nothing else."""
+        points = self._joined(self.model.guide(self.data))
+        step, found = points.new_full((len(points) // self.chains,), FIRST), {}
+        for level in self.levels:
+            points, accepted, _ = self._move(points, float(self.inverse[level]), step)
+            step = (step * torch.exp(accepted - ACCEPTED)).clamp(LEAST, MOST)
+            found[level] = step
+        return found
+
+    def run(
+        self, lengths: Mapping[int, Tensor], start: Mapping[str, Tensor] | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Bound, error, effective number and acceptance, (B,) each; with a start, of chains that go back."""
+        back = start is not None
+        points = self._joined(self.model.guide(self.data) if start is None else repeat(start, self.chains))
+        weights, rate = points.new_zeros(len(points)), []
+        gaps = self.inverse.diff().to(points)
+        for level in [*reversed(self.levels), 0] if back else [*self.levels, len(gaps)]:
+            if level in lengths:
+                points, accepted, ratio = self._move(points, float(self.inverse[level]), lengths[level])
+                rate.append(accepted)
+            else:  # the last one, after which nothing moves
+                joint, own = self._densities(points)
+                ratio = joint - own
+            weights += gaps[level if back else level - 1] * ratio
+        log_weights = weights.unflatten(0, (self.chains, -1)) * (-1 if back else 1)
+        bound = log_weights.logsumexp(0) - math.log(self.chains)
+        shares = (log_weights - log_weights.amax(0)).exp()
+        effective = shares.sum(0).square() / shares.square().sum(0)
+        spread = shares.std(0) / shares.mean(0) / math.sqrt(self.chains) if self.chains > 1 else bound * math.nan
+        accepted = torch.stack(rate).mean(0) if rate else torch.ones_like(bound)
+        if back:
+            return -bound, bound * math.nan, bound * math.nan, accepted
+        return bound, spread, effective, accepted
+
+    def _move(self, points: Tensor, inverse: float, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A Hamiltonian transition that leaves f_b as it is.
+
+        Args:
+            points: (R, N).
+            inverse: b, an inverse temperature.
+            step: (B,), lengths in the guide's deviations.
+
+        Returns:
+            Points (R, N); the share that was accepted (B,); and log p(x, z) - log q(z | x), (R,), where they were.
+        """
+        length = step.repeat(self.chains)[:, None]
+        momentum = torch.randn_like(points)
+        before, slope, weight = self._slope(points, inverse)
+        moved, kicked = points, momentum + 0.5 * length * self.scale * slope
+        for leap in range(self.leaps):
+            moved = moved + length * self.scale * kicked
+            after, slope, _ = self._slope(moved, inverse)
+            kicked = kicked + (0.5 if leap == self.leaps - 1 else 1.0) * length * self.scale * slope
+        ratio = after - before - 0.5 * (kicked.square() - momentum.square()).sum(1)
+        chance = ratio.nan_to_num(-math.inf).clamp(max=0).exp()
+        taken = torch.rand_like(chance) < chance
+        points = torch.where(taken[:, None], moved, points)
+        return points, chance.unflatten(0, (self.chains, -1)).mean(0), weight
+
+    def _slope(self, points: Tensor, inverse: float) -> tuple[Tensor, Tensor, Tensor]:
+        """log f_b (R,), its gradient (R, N), and log p(x, z) - log q(z | x), (R,)."""
+        # cuDNN has no gradients of recurrent networks in evaluation
+        with torch.enable_grad(), torch.backends.cudnn.flags(enabled=False):
+            points = points.detach().requires_grad_()
+            joint, own = self._densities(points)
+            tempered = (1 - inverse) * own + inverse * joint
+            (slope,) = torch.autograd.grad(tempered.sum(), points)
+        return tempered.detach(), slope.nan_to_num(), (joint - own).detach()
+
+    def _densities(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """log p(x, z) and log q(z | x), (R,) each."""
+        return joint_and_guide(self.model, self.data, split(points, self.like))
+
+    def _joined(self, values: Mapping[str, Tensor]) -> Tensor:
+        return joined({name: values[name] for name in self.model.latents})

@@ -1,0 +1,437 @@
+"""Bounds on the log evidence, as terms per sequence.
+
+`SequenceELBO` is the evidence lower bound with analytic KL terms wherever these are right; `importance_bound` the
+importance-weighted one (Burda et al., 2016, arXiv 1509.00519) with the Pareto diagnosis of its weights (Vehtari et al.,
+2024, arXiv 1507.02646).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from pyro import poutine
+from pyro.distributions import Unit
+from pyro.infer import ELBO
+from torch import Tensor
+from torch.distributions import kl_divergence
+
+from ...data.views import LOG_DET
+from ...factorization.graph import analytic_kl
+from ...networks.base import computing_once
+from ...program.batch import AnyBatch, repeat
+from ...program.conditional import like
+from ...program.groups import GROUP, Groups
+from ...program.model import DynamicalVAE
+from ...program.rollout import Rollout, Sequence
+from ...turns import alone
+
+
+@dataclass
+class Terms:
+    """What a bound is made of, per sequence and in nats.
+
+    Args:
+        log_likelihood: data variable to (B,); beside them the log-determinant of a view that changes volume.
+        kl: latent to (B,); summed over the steps of a local one.
+        energies: penalty (a `pyro.factor` site) to (B,), positive where it costs.
+        frames: (B,) number of valid steps.
+        steps: local variable to (B, T): its log-likelihood or KL by step, 0 at padding.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2))
+        >>> terms.kl["z"].shape, torch.allclose(terms.bound, terms.log_likelihood["x"] - terms.kl["z"])
+        (torch.Size([3]), True)
+    """
+
+    log_likelihood: dict[str, Tensor]
+    kl: dict[str, Tensor]
+    energies: dict[str, Tensor]
+    frames: Tensor
+    steps: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def likelihood(self) -> bool:
+        """Whether there is a likelihood. Where energies take its place, `bound` is minus the KL terms alone."""
+        return bool(self.log_likelihood)
+
+    @property
+    def bound(self) -> Tensor:
+        """(B,) the unweighted evidence lower bound; energies are not part of it."""
+        none = torch.zeros_like(self.frames)
+        return sum(self.log_likelihood.values(), none) - sum(self.kl.values(), none)
+
+    @property
+    def per_frame(self) -> Tensor:
+        """(B,) the bound in nats per frame."""
+        return self.bound / self.frames
+
+
+class SequenceELBO(ELBO):
+    """The evidence lower bound of a sequence model.
+
+    A Pyro ELBO, to be used as any other; `terms` gives it by variable and sequence. The KL of a latent is analytic per
+    step where none of its generative parents is its descendant in the guide, and both conditionals are normal; else it
+    is the log-ratio at the draw, which is unbiased for every guide. (For a backward guide the analytic form is wrong:
+    it treats parents as fixed that move with the latent.) The parents are those of the program as it is run: where x
+    is missing or fed, the model reads its own mean, which moves with the parents of x.
+
+    It takes traces as `TraceMeanField_ELBO` does and agrees with it where that is right, but evaluates every
+    conditional once, where that would do so for the trace's own log probability too.
+
+    Args:
+        num_particles: draws from the guide to average over.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> dvae.SequenceELBO().loss(model, model.guide, torch.randn(3, 4, 2)) > 0
+        True
+    """
+
+    def __init__(self, num_particles: int = 1):
+        super().__init__(num_particles=num_particles)
+
+    @alone
+    def terms(
+        self, model: Callable[..., Any], batch: AnyBatch, guide: Callable[..., Any] | None = None, **options: Any
+    ) -> Terms:
+        """The bound's terms, averaged over the particles.
+
+        Args:
+            model: a `DynamicalVAE`, or a Pyro model that wraps its program.
+            batch: see `DynamicalVAE.model`.
+            guide: the model's own, if not given.
+            options: of the program, such as `self_feeding`.
+
+        Raises:
+            ValueError: sites that are scaled or missing in guide or model.
+        """
+        guide = guide or model.guide  # type: ignore[attr-defined]
+        draws = [self._terms(model, guide, (batch,), options) for _ in range(self.num_particles)]
+        return draws[0] if len(draws) == 1 else _mean(draws)
+
+    @alone
+    def differentiable_loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> Tensor:
+        """Minus the bound plus the energies, summed over the batch."""
+        draws = [self._terms(model, guide, args, kwargs) for _ in range(self.num_particles)]
+        return sum(sum(t.energies.values()) - t.bound for t in draws).sum() / self.num_particles  # type: ignore[return-value, union-attr]
+
+    def loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> float:
+        """`differentiable_loss` as a number."""
+        with torch.no_grad():
+            return self.differentiable_loss(model, guide, *args, **kwargs).item()
+
+    def loss_and_grads(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> float:
+        """`differentiable_loss` as a number, its gradient left in the parameters."""
+        loss = self.differentiable_loss(model, guide, *args, **kwargs)
+        loss.backward()
+        return loss.item()
+
+    def _get_trace(self, model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Trace, poutine.Trace]:
+        return _traces(model, guide, args, kwargs)
+
+    @computing_once()
+    def _terms(self, model: Any, guide: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Terms:
+        model_sites, guide_sites = map(sites_of, self._get_trace(model, guide, args, kwargs))
+        for name in guide_sites:
+            if name not in model_sites:
+                raise ValueError(f"the latent {name} is in the guide but not in the model")
+        closed = _closed_forms(model_sites, guide_sites)
+        terms = Terms({}, {}, {}, torch.empty(0))
+        for name, site in model_sites.items():
+            fn, value, run = site["fn"], site["value"], site["infer"].get("run")
+            if run is not None:
+                terms.frames = _frames(run)
+            if name == LOG_DET:
+                terms.log_likelihood[name] = fn.log_prob(value)
+            elif isinstance(fn, Unit):
+                terms.energies[name] = -fn.log_prob(value)
+            elif name in guide_sites:
+                _record(terms, terms.kl, name, _kl(fn, guide_sites[name]["fn"], value, name in closed), run)
+            elif site["infer"].get("_deterministic"):
+                continue
+            elif site["is_observed"]:
+                _record(terms, terms.log_likelihood, name, site_log_prob(fn, value), run)
+            else:
+                raise ValueError(f"the latent {name} is in the model but not in the guide")
+        found = [*terms.log_likelihood.values(), *terms.kl.values(), *terms.energies.values()]
+        if found and not len(terms.frames):  # nothing has steps: a sequence counts once
+            terms.frames = torch.ones_like(found[0])
+        return terms
+
+
+def _traces(model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Trace, poutine.Trace]:
+    drawn = poutine.trace(guide).get_trace(*args, **kwargs)
+    return poutine.trace(poutine.replay(model, trace=drawn)).get_trace(*args, **kwargs), drawn
+
+
+def sites_of(trace: Any) -> dict[str, dict[str, Any]]:
+    """The sample sites of a trace by name, but for what all sequences share, which model and guide draw alike.
+
+    Raises:
+        ValueError: a site that a handler has scaled or masked.
+    """
+    sites = {
+        name: site
+        for name, site in trace.nodes.items()
+        if site["type"] == "sample" and not (poutine.util.site_is_subsample(site) or "shared" in site["infer"])
+    }
+    for name, site in sites.items():
+        if site["scale"] != 1.0 or site["mask"] is not None:
+            raise ValueError(
+                f"the site {name} is scaled or masked by a handler; weights belong to the objective "
+                "(Evidence(kl_weight=...)), and missing entries to the batch ('mask'), so that the bound stays a bound"
+            )
+    return sites
+
+
+def site_log_prob(fn: Any, value: Tensor) -> Tensor:
+    """(B, T) of a local variable, (B,) of a static one."""
+    return fn.by_step(value) if isinstance(fn, Sequence) else fn.log_prob(value)
+
+
+def log_densities(trace: Any) -> dict[str, Tensor]:
+    """Of the sample sites of a trace, energies apart: see `site_log_prob`."""
+    sites = sites_of(trace).items()
+    return {n: site_log_prob(s["fn"], s["value"]) for n, s in sites if n == LOG_DET or not isinstance(s["fn"], Unit)}
+
+
+def total(logs: Mapping[str, Tensor]) -> Tensor:
+    """(B,), the sum over variables and steps."""
+    return sum(log.sum(-1) if log.dim() == 2 else log for log in logs.values())  # type: ignore[return-value]
+
+
+def joint_and_guide(model: DynamicalVAE, batch: AnyBatch, latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    """log p(x, z) and log q(z | x) at these latents, (B,) each."""
+    traces = (
+        poutine.trace(poutine.condition(each, data=dict(latents))).get_trace(batch)
+        for each in (model.model, model.guide)
+    )
+    joint, own = (total(log_densities(trace)) for trace in traces)
+    return joint, own
+
+
+def _closed_forms(model_sites: Mapping[str, Any], guide_sites: Mapping[str, Any]) -> set[str]:
+    """The latents whose KL term may be analytic; none for programs whose factorizations are not known."""
+    # In a replayed model the latents' sites carry the guide's notes; those of the data carry its own.
+    sites = ([site for site in model_sites.values() if site["is_observed"]], guide_sites.values())
+    notes = [next((s["infer"] for s in group if "program" in s["infer"]), None) for group in sites]
+    if None in notes:
+        return set()
+    pair, run = [note["program"] for note in notes], notes[0]["run"]  # type: ignore[index]
+    # Data that are missing, fed, or a function of their parents are read as what these make of them.
+    hidden = frozenset(run.hidden) | {name for name, s in model_sites.items() if s["infer"].get("_deterministic")}
+    depends = hidden or any(equations.masks for equations in pair)  # on the length
+    right = _analytic(*pair, hidden, run.length if depends else None)
+    return {name for name, analytic in right.items() if analytic}
+
+
+_analytic = functools.lru_cache(maxsize=256)(analytic_kl)
+
+
+def _kl(p: Any, q: Any, value: Tensor, closed: bool) -> Tensor:
+    """(B, T) or (B,): the divergence of q from p where a closed form is right and known, else the log-ratio."""
+    if closed:
+        try:
+            if isinstance(p, Sequence) and isinstance(q, Sequence):
+                return p.counted(kl_divergence(q.steps(value), p.steps(value)))
+            return kl_divergence(q, p)
+        except NotImplementedError:  # no closed form for this pair of families
+            pass
+    ours, theirs = site_log_prob(q, value), site_log_prob(p, value)
+    if ours.dim() != theirs.dim():  # a guide of the user's own, whose density has no steps
+        ours, theirs = (part.sum(-1) if part.dim() == 2 else part for part in (ours, theirs))
+    return ours - theirs
+
+
+def _record(terms: Terms, table: dict[str, Tensor], name: str, value: Tensor, run: Rollout | None) -> None:
+    if run is not None and run.draws > 1:
+        value = value.unflatten(0, (run.draws, -1)).mean(0)
+    if value.dim() == 2:
+        if not len(terms.frames):  # a program of the user's own, that says nothing of its length
+            terms.frames = value.new_full((len(value),), float(value.shape[1]))
+        terms.steps[name] = value
+        value = value.sum(-1)
+    table[name] = value
+
+
+def _frames(rollout: Rollout) -> Tensor:
+    some, rows = like(next(iter(rollout.conditionals.values()))), rollout.batch // rollout.draws
+    if rollout.lengths is None:
+        return some.new_full((rows,), float(rollout.length))
+    return rollout.lengths[:rows].to(some.dtype)
+
+
+def _mean(draws: list[Terms]) -> Terms:
+    def average(tables: tuple[dict[str, Tensor], ...]) -> dict[str, Tensor]:
+        return {name: torch.stack([table[name] for table in tables]).mean(0) for name in tables[0]}
+
+    tables = zip(*((d.log_likelihood, d.kl, d.energies, d.steps) for d in draws), strict=True)
+    likelihood, kl, energies, steps = map(average, tables)
+    return Terms(likelihood, kl, energies, draws[0].frames, steps)
+
+
+def require_likelihood(model: DynamicalVAE) -> None:
+    """Refuse a model whose data are functions of its latents.
+
+    Raises:
+        ValueError: it has no likelihood, and so no bound.
+    """
+    if not model.likelihood:
+        raise ValueError(
+            f"{model.generative} has no likelihood: its data are functions of its latents, trained by energies; there "
+            "is no bound and nothing to calibrate. Judge its forecasts, with dvae.evaluate"
+        )
+
+
+def require_latents(model: DynamicalVAE) -> None:
+    """Refuse a model in which nothing is drawn.
+
+    Raises:
+        ValueError: it has no latents but those that are summed out.
+    """
+    if not model.latents:
+        summed = f" but {', '.join(model.summed)}, which is summed out" if model.summed else ""
+        raise ValueError(f"nothing is latent in {model.generative}{summed}: its bound is the log evidence itself")
+
+
+def require_data(model: DynamicalVAE, data: AnyBatch) -> int:
+    """The number of sequences of a batch that holds all that a bound needs.
+
+    Raises:
+        ValueError: data or context are missing.
+    """
+    needed = (*model.observed, *model.context)
+    if missing := [name for name in needed if name not in data]:
+        raise ValueError(f"the bound needs {', '.join(needed)}; missing in the batch are {', '.join(missing)}")
+    return len(data[model.observed[0]])  # type: ignore[call-overload, index]
+
+
+KHAT_PARTICLES = 25
+"""Particles below which k-hat is not estimated: arviz_stats fits the tail to a fifth of them, and needs five."""
+
+
+@dataclass(frozen=True)
+class ImportanceBound:
+    """The importance-weighted bound of every sequence and what it says of the guide.
+
+    Args:
+        bound: (B,) log mean of the weights, in nats.
+        khat: (B,) Pareto shape of their tail. Above 0.7 the guide misses so much of the posterior that the bound is
+            unreliable at this number of particles. Infinite where a weight of the tail is 0, and NaN with fewer than
+            25 particles alone. With fewer than about 100, k-hat is mostly noise in a single sequence.
+        particles: K.
+    """
+
+    bound: Tensor
+    khat: Tensor
+    particles: int
+
+
+@alone
+@torch.no_grad()
+def importance_bound(
+    model: DynamicalVAE, batch: AnyBatch, particles: int = 100, *, chunk: int = 4096, **options: Any
+) -> ImportanceBound:
+    """The importance-weighted bound: log of the mean over particles of p(x, z) / q(z | x), per sequence.
+
+    Its mean rises with the number of particles, from the evidence lower bound at 1 to the log evidence. With fewer than
+    25 particles the tail shape is not estimated (nan). Of a model without latents it is the log-likelihood,
+    with k-hat 0, and evaluated once.
+
+    Args:
+        model: the model with its guide.
+        batch: see `DynamicalVAE.model`.
+        particles: K.
+        chunk: sequences times particles to hold at once.
+        options: of the program.
+
+    Returns:
+        Bound and tail shape, (B,) each.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> dvae.importance_bound(model, torch.randn(3, 4, 2), particles=16).bound.shape
+        torch.Size([3])
+    """
+    if particles < 1:
+        raise ValueError(f"particles is at least 1, got {particles}")
+    require_likelihood(model)
+    data = model.read(batch)
+    size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
+    with model._evaluating():
+        if not model.latents:
+            evidence = _log_weights(model, data, options)
+            return ImportanceBound(evidence, torch.zeros_like(evidence), particles)
+        groups = Groups.of(data[GROUP]) if model.grouped and GROUP in data else None
+        weights = partial(_repeated_weights, model, data, options)
+        return importance_mean(weights, size, particles, chunk, groups)
+
+
+def importance_mean(
+    log_weights_of: Callable[[int], Tensor],
+    size: int,
+    particles: int,
+    chunk: int = 4096,
+    groups: Groups | None = None,
+) -> ImportanceBound:
+    """The log of the mean weight of every sequence, and the shape of the weights' tail.
+
+    Sequences that share latents have one weight together, and each an equal share of its logarithm.
+
+    Args:
+        log_weights_of: from a number n of particles to the logs (n B,) of weights, particle by particle.
+        size: B.
+        particles: K.
+        chunk: sequences times particles to hold at once.
+        groups: of sequences that share latents.
+    """
+    at_once = max(1, min(particles, chunk // size))
+    counts = [min(at_once, particles - first) for first in range(0, particles, at_once)]
+    log_weights = torch.cat([log_weights_of(count).unflatten(0, (count, size)) for count in counts])
+    if groups is not None:
+        log_weights = groups.summed(log_weights)
+    bound, khat = log_weights.logsumexp(0) - math.log(particles), _khat(log_weights)
+    if groups is not None:
+        bound, khat = groups.dealt(bound), khat[groups.place]
+    return ImportanceBound(bound, khat, particles)
+
+
+def _repeated_weights(model: DynamicalVAE, data: AnyBatch, options: Mapping[str, Any], count: int) -> Tensor:
+    return _log_weights(model, repeat(data, count), options)
+
+
+def _log_weights(model: DynamicalVAE, batch: AnyBatch, options: Mapping[str, Any]) -> Tensor:
+    joint, drawn = map(log_densities, _traces(model, model.guide, (batch,), options))
+    return total(joint) - total(drawn)
+
+
+def _khat(log_weights: Tensor) -> Tensor:
+    """(B,) Pareto tail shape of weights (K, B)."""
+    if log_weights.shape[0] < KHAT_PARTICLES:
+        return log_weights.new_full(log_weights.shape[1:], math.nan)
+    khat = [_tail_shape(weights) for weights in log_weights.double().cpu().numpy().T]
+    return torch.as_tensor(khat, dtype=log_weights.dtype, device=log_weights.device)
+
+
+def _tail_shape(log_weights: np.ndarray) -> float:
+    """The Pareto shape of weights (K,); by Hill's estimate where the tail underflows or is all the same."""
+    from arviz_stats.base import array_stats  # over a second to import
+
+    tail = np.sort(log_weights)[-(len(log_weights) // 5) - 1 :]
+    if not np.isfinite(tail).all():
+        return math.inf
+    try:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            # psislw is made for leave-one-out: it takes log likelihoods, whose negatives are the log weights.
+            khat = float(array_stats.psislw(-log_weights)[1])
+    except (FloatingPointError, ValueError):
+        khat = math.nan
+    return float((tail[1:] - tail[0]).mean()) if math.isnan(khat) else khat

@@ -1,0 +1,391 @@
+"""The particle bound: importance weighting with resampling on the way, for any factorization with a forward guide.
+
+    sum_t log 1/K sum_k w_t^k,    w_t = p(z_t | .) p(x_t | .) / q(z_t | .)
+
+K particles of each sequence draw their latents from the guide step by step. Where their weights have become too
+unequal, unlikely particles are replaced by copies of likely ones, and the weights begin anew. The product of the mean
+weights is an unbiased estimate of the evidence, so that the mean of its log is a lower bound: that of Maddison et al.
+(2017, FIVO, arXiv 1705.09279), Le et al. (2018, arXiv 1705.10306) and Naesseth et al. (2018, arXiv 1705.11140).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...data.sequences import each
+from ...data.views import LOG_DET, volume
+from ...distributions.base import Parameters
+from ...factorization.notation import Factor, Parent
+from ...networks.base import computing_once, indicator, presence, valid_steps
+from ...networks.rows import Rows, pick, select
+from ...program.batch import AnyBatch
+from ...program.conditional import Conditional, like
+from ...program.groups import GROUP
+from ...program.model import DynamicalVAE
+from ...program.rollout import Rollout
+from ...turns import alone
+from .elbo import require_data, require_likelihood
+
+
+@dataclass(frozen=True)
+class ParticleBound:
+    """The particle bound of every sequence and how its particles fared.
+
+    Args:
+        bound: (B,) log of the estimated evidence, in nats.
+        effective: (T, B) effective sample size of the weights after each step, between 1 and K; nan at padding.
+        resamplings: (B,) how often the particles were resampled.
+        particles: K.
+    """
+
+    bound: Tensor
+    effective: Tensor
+    resamplings: Tensor
+    particles: int
+
+
+@alone
+@torch.no_grad()
+def particle_bound(
+    model: DynamicalVAE, batch: AnyBatch, particles: int = 16, *, resample_below: float = 0.5, chunk: int = 4096
+) -> ParticleBound:
+    """The log of a particle filter's estimate of p(x), per sequence, with the guide as proposal.
+
+    exp(bound) is unbiased for p(x), whatever the number of particles, so that on average the bound rises with it to the
+    log evidence. With one particle it is the evidence lower bound, at one draw; without resampling the
+    importance-weighted bound, which it exceeds on long sequences unless the guide is nearly exact (docs/bounds.md).
+
+    Resampling is systematic. Static latents are drawn first and travel with their particle; several local ones are
+    drawn in the guide's order within each step.
+
+    Args:
+        model: the model with its guide.
+        batch: see `DynamicalVAE.model`; ragged batches and missing entries included.
+        particles: K.
+        resample_below: particles are resampled before a step where the effective sample size has fallen below this
+            share of K. 0 never resamples, 1 wherever weights differ.
+        chunk: sequences times particles to hold at once.
+
+    Returns:
+        Bound (B,), effective sample size (T, B), number of resamplings (B,).
+
+    Raises:
+        ValueError: a factorization that cannot be run forward step by step: a guide that runs backward in time, a
+            factor that reads latents after t, such as p(x_t | z_{1:T}); data or context missing in the batch.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2})
+        >>> dvae.particle_bound(model, torch.randn(3, 4, 2), particles=16).bound.shape
+        torch.Size([3])
+    """
+    if not isinstance(particles, int) or particles < 1:
+        raise ValueError(f"particles is a whole number, at least 1, not {particles!r}")
+    if not 0 <= resample_below <= 1:
+        raise ValueError(f"resample_below is a share of the particles, between 0 and 1, got {resample_below}")
+    require_likelihood(model)
+    data = model.read(batch)
+    size = require_data(model, data)
+    at_once = max(1, chunk // particles)
+    with model._evaluating():
+        if refused := obstacle(model, data):
+            raise ValueError(refused)
+        parts = []
+        for first in range(0, size, at_once):
+            some = each(data, itemgetter(slice(first, first + at_once)))
+            part = Filter(model, some, particles).run(resample_below)
+            parts.append((part.bound, part.effective, part.resamplings))
+    bound, effective, resamplings = (torch.cat(found, dim=-1) for found in zip(*parts, strict=True))
+    return ParticleBound(bound + (volume(data) if LOG_DET in data else 0), effective, resamplings, particles)
+
+
+class Filter:
+    """K particles of every sequence; row k B + b of their N = K B rows is particle k of sequence b.
+
+    Args:
+        model: the model with its guide.
+        batch: of data and context.
+        particles: K.
+    """
+
+    def __init__(self, model: DynamicalVAE, batch: AnyBatch, particles: int):
+        self.model = model
+        self.particles = particles
+        self.known = model._rollout(model.generative, model.generator, batch, None, 1)
+        self.hidden = _hidden(self.known)
+        self.shared = {name: value for name, value in self.known.values.items() if name not in self.hidden}
+        self.late = _late(model)
+        self.sequence = torch.arange(self.known.batch, device=like(model).device).repeat(particles)
+        self.statics: dict[str, Rows] = {}
+        self.paths = {name: Rows([None] * self.known.length) for name in (*self._local(model.latents), *self.hidden)}
+
+    def run(self, resample_below: float) -> ParticleBound:
+        """All steps. After it `drawn` are the draws of the particles that are left."""
+        model, length, batch = self.model, self.known.length, self.known.batch
+        shape = self.particles, batch
+        log_weights = self._draw_statics(late=False).view(shape)
+        bound = log_weights.new_zeros(batch)
+        resamplings = torch.zeros(batch, dtype=torch.long, device=bound.device)
+        valid = None if self.known.lengths is None else valid_steps(self.known.lengths, length).t()
+        effective: list[Tensor] = []
+        with computing_once():
+            guide = {name: self._law(model.encoder[name], self.known.values) for name in self._local(model.latents)}
+            order = [name for block in model.generative.blocks for name in block.names]
+            prior = {name: self._law(model.generator[name], self.shared) for name in self._local(order)}
+        noise = {
+            name: law.conditional.law.noise((len(self.sequence), length, law.conditional.size), bound).unbind(1)
+            for name, law in guide.items()
+        }
+        data = {name: self._by_step(self.known.values[name]) for name in self._local(model.observed)}
+        counted = {name: None if (m := self.known.mask(name)) is None else self._by_step(m) for name in prior}
+        for t in range(length):
+            if t or self.statics:
+                low = effective_size(log_weights) < resample_below * self.particles
+                low = low if valid is None else low & valid[t]
+                if low.any():
+                    bound = torch.where(low, bound + _log_mean(log_weights), bound)
+                    rows = ancestors(log_weights, low)
+                    self.statics, self.paths, guide, prior = select([self.statics, self.paths, guide, prior], rows)
+                    log_weights = log_weights.masked_fill(low, 0)
+                    resamplings += low
+            log_weights = log_weights + self._step(t, guide, prior, noise, data, counted).view(shape)
+            size = effective_size(log_weights)
+            effective.append(size if valid is None else size.masked_fill(~valid[t], math.nan))
+        log_weights = log_weights + self._draw_statics(late=True).view(shape)
+        return ParticleBound(bound + _log_mean(log_weights), torch.stack(effective), resamplings, self.particles)
+
+    @property
+    def drawn(self) -> dict[str, Tensor]:
+        """Name to the latents (N, T, D), or (N, D) if static, of the particles and their ancestors.
+
+        Data with missing entries are among them: the model reads its own means there.
+        """
+        stacked = {name: torch.stack(list(path), 1) for name, path in self.paths.items() if path[-1] is not None}
+        if self.known.lengths is not None:
+            valid = valid_steps(self.known.lengths[self.sequence], self.known.length)[..., None]
+            stacked = {name: value * valid for name, value in stacked.items()}
+        return {**{name: rows[0] for name, rows in self.statics.items()}, **stacked}
+
+    def _local(self, names: Any) -> list[str]:
+        return [name for name in names if self.model.generative.local(name)]
+
+    def _by_step(self, values: Tensor) -> Rows:
+        return Rows(values.unbind(1)).select(self.sequence)
+
+    def _step(
+        self,
+        t: int,
+        guide: Mapping[str, Stepwise],
+        prior: Mapping[str, Stepwise],
+        noise: Mapping[str, tuple[Tensor, ...]],
+        data: Mapping[str, Rows],
+        counted: Mapping[str, Rows | None],
+    ) -> Tensor:
+        """Draws the latents at t, and returns the logs (N,) of the weights for it."""
+        total = like(self.model).new_zeros(len(self.sequence))
+        history = {**data, **self.paths}
+        for name, law in guide.items():
+            parameters = law.step(t, history)
+            self.paths[name][t] = law.conditional.draw(parameters, noise[name][t])
+            total = total - _log_prob(law.conditional, parameters, self.paths[name][t], _at(counted[name], t))
+        for name, law in prior.items():
+            parameters = law.step(t, history)
+            value = data[name][t] if name in data else self.paths[name][t]
+            total = total + _log_prob(law.conditional, parameters, value, _at(counted[name], t))
+            if name in self.hidden:  # the model reads its own mean there
+                seen = self.known.observed[name][:, t].index_select(0, self.sequence)
+                self.paths[name][t] = torch.where(seen, value, law.conditional.mean(parameters))
+        return total
+
+    def _draw_statics(self, late: bool) -> Tensor:
+        """Draws the static latents that come before the steps, or after them; returns the logs (N,) of the weights."""
+        model, total = self.model, like(self.model).new_zeros(len(self.sequence))
+        for name in model.latents:
+            if not model.generative.local(name) and (name in self.late) == late:
+                conditional = model.encoder[name]
+                parameters = self._parameters(conditional, self.known.values)
+                noise = conditional.law.noise((len(self.sequence), conditional.size), total)
+                self.statics[name] = Rows([conditional.draw(parameters, noise)])
+                total = total - _log_prob(conditional, parameters, self.statics[name][0])
+        known = {**self.shared, **self.drawn}
+        for factor in model.generative.factors:
+            if factor.local or _waits(factor, {*self.late, *self.paths}) != late:
+                continue
+            name = factor.child
+            value = known[name] if name in self.statics else pick(known[name], self.sequence)
+            conditional = model.generator[name]
+            total = total + _log_prob(conditional, self._parameters(conditional, self.shared), value)
+        return total
+
+    def _parameters(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Parameters:
+        """Of a static variable, (N, D)."""
+        given, size, lengths, rows = self._given(conditional, shared)
+        return tuple(pick(p, rows) for p in conditional(given, size, self.known.length, lengths))
+
+    def _law(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Stepwise:
+        given, size, lengths, rows = self._given(conditional, shared)
+        live = [name for name in conditional.parents if name not in given]
+        if not live:
+            everywhere = conditional(given, size, self.known.length, lengths)
+            return Stepwise(conditional, select([p.unbind(1) for p in everywhere], rows), [])
+        state = conditional.start(given, size, self.known.length, lengths)
+        reads = [*live, conditional.factor.child] if conditional.law.residual else live
+        return Stepwise(conditional, conditional.select(state, rows), reads)
+
+    def _given(
+        self, conditional: Conditional, shared: Mapping[str, Tensor]
+    ) -> tuple[dict[str, Tensor], int, Tensor | None, Tensor]:
+        """The known parents, their number of rows, their lengths, and the row of each particle.
+
+        What is the same for all particles of a sequence is computed once for them.
+        """
+        lengths, seen = self.known.lengths, self.known.observed
+        there = {presence(name): steps for name, steps in self.known.present.items() if name in conditional.parents}
+        there |= {indicator(name): seen[name] for name in conditional.indicators if name in seen}
+        given = {**{name: shared[name] for name in conditional.parents if name in shared}, **there}
+        own = {name: value for name, value in self.drawn.items() if name in conditional.parents and name not in shared}
+        if not own:
+            return given, self.known.batch, lengths, self.sequence
+        given = {name: pick(value, self.sequence) for name, value in given.items()} | own
+        everyone = torch.arange(len(self.sequence), device=self.sequence.device)
+        return given, len(everyone), None if lengths is None else lengths[self.sequence], everyone
+
+
+@dataclass
+class Stepwise:
+    """A local variable's conditional for all particles, one step after another.
+
+    Args:
+        conditional: of the variable.
+        state: its network's; where nothing that is drawn in the steps enters, the parameters by step.
+        reads: what is drawn in the steps and enters.
+    """
+
+    conditional: Conditional
+    state: Any
+    reads: list[str]
+
+    def step(self, t: int, history: Mapping[str, Rows]) -> Parameters:
+        """The law's parameters (N, D) at step t."""
+        if not self.reads:
+            return tuple(parameter[t] for parameter in self.state)
+        parameters, self.state = self.conditional.step(self.state, t, {name: history[name] for name in self.reads})
+        return parameters
+
+    def select(self, rows: Tensor) -> Stepwise:
+        """For these of its particles."""
+        moved = self.conditional.select(self.state, rows) if self.reads else select(self.state, rows)
+        return Stepwise(self.conditional, moved, self.reads)
+
+
+def effective_size(log_weights: Tensor) -> Tensor:
+    """(B,) effective sample size of weights (K, B): (sum w)^2 / sum w^2."""
+    weights = (log_weights - log_weights.amax(0)).exp()  # a difference of two large logs would have no digits left
+    return weights.sum(0).square() / weights.square().sum(0)
+
+
+def ancestors(log_weights: Tensor, chosen: Tensor) -> Tensor:
+    """Rows (K B,) of the ancestors under systematic resampling with weights (K, B), where `chosen` (B,); else itself.
+
+    Particle k has floor(K w_k) or one more descendants, and K w_k on average.
+    """
+    count, batch = log_weights.shape
+    places = torch.arange(count, device=log_weights.device)[:, None]
+    cumulative = log_weights.double().softmax(0).cumsum(0)
+    points = (places + torch.rand(batch, dtype=torch.double, device=places.device)) / count * cumulative[-1]
+    found = torch.searchsorted(cumulative.t().contiguous(), points.t().contiguous(), right=True).t()
+    particle = torch.where(chosen, found.clamp_(max=count - 1), places)
+    return (particle * batch + torch.arange(batch, device=places.device)).flatten()
+
+
+def _log_mean(log_weights: Tensor) -> Tensor:
+    return log_weights.logsumexp(0) - math.log(len(log_weights))
+
+
+def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, counted: Tensor | None = None) -> Tensor:
+    """(N,) of values (N, D); entries that are not `counted` are left out."""
+    entries = conditional.distribution(parameters).log_prob(conditional.scored(value, counted))
+    if counted is not None and counted.dim() != entries.dim():  # one of guide and model has whole events
+        counted = counted.all(-1) if conditional.whole else counted[:, None]
+    # where, not a product: an entry that does not count may be infinite
+    entries = entries if counted is None else torch.where(counted, entries, 0.0)
+    return entries if conditional.whole else entries.sum(-1)
+
+
+def _at(values: Rows | None, t: int) -> Tensor | None:
+    return None if values is None else values[t]
+
+
+def _hidden(run: Rollout) -> list[str]:
+    """The data with missing entries, at which the model reads its own means."""
+    return [name for name, seen in run.observed.items() if not seen.all()]
+
+
+def _late(model: DynamicalVAE) -> set[str]:
+    """The static latents that the guide draws after the steps, because they read what is drawn there."""
+    late: set[str] = set()
+    for name in model.latents:
+        factor = model.inference.factor(name)
+        if not factor.local and _waits(factor, late | {n for n in model.latents if model.generative.local(n)}):
+            late.add(name)
+    return late
+
+
+def _waits(factor: Factor, names: set[str]) -> bool:
+    return factor.child in names or any(parent.name in names for parent in factor.parents)
+
+
+def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
+    """Why a model cannot be drawn and weighed forward, step by step, in a sentence; "" where it can.
+
+    Raises:
+        ValueError: a batch that cannot be read.
+    """
+    run = model._rollout(model.generative, model.generator, batch, None, 1)
+    instead = "use importance_bound"
+    if model.summed:
+        return f"{', '.join(model.summed)} is summed out, exactly, and not followed by particles; {instead}"
+    if run.groups is not None:
+        return (
+            f"particles are of one sequence each, but groups share {', '.join(model.grouped)}; {instead}, or leave "
+            f"{GROUP!r} out of the batch, where every sequence is a group"
+        )
+    for block in model.inference.blocks:
+        if block.direction < 0:
+            return (
+                f"particles move forward in time, but the guide draws {', '.join(block.names)} backward "
+                f"({model.inference.factor(block.names[0])}); {instead}"
+            )
+    hidden, late = _hidden(run), _late(model)
+    if static := [name for name in hidden if not model.generative.local(name)]:
+        return f"a static variable has no missing entries in a particle bound, but {', '.join(static)} has"
+    latents = [name for name in model.latents if model.generative.local(name)]
+    for equations, drawn in ((model.inference, latents), (model.generative, [*latents, *hidden])):
+        for factor in equations.factors:
+            for parent in factor.parents if factor.local else ():
+                if parent.name in late:
+                    return (
+                        f"{factor} reads {parent}, which {model.inference.factor(parent.name)} draws after all steps, "
+                        f"so that particles cannot be weighed on the way; {instead}"
+                    )
+                if parent.name in drawn and _reads_ahead(parent, run.length):
+                    missing = " where entries are missing" if parent.name in hidden else ""
+                    return (
+                        f"{factor} reads {parent}, and {parent.name} after t is not drawn yet{missing} when the "
+                        f"particles are at t; {instead}"
+                    )
+    return ""
+
+
+def _reads_ahead(parent: Parent, length: int) -> bool:
+    assert parent.relation is not None
+    if parent.relation.intervals is None:
+        return bool(np.triu(parent.relation.mask(length), 1).any())
+    return 1 in parent.relation.directions

@@ -1,0 +1,101 @@
+"""The log score: how probable a forecast holds what happened, as a bound per sequence.
+
+A forecast draws the latents of the past from the guide, given the past alone, and lets the model run free. What it says
+of the future x_{O+1:T} is therefore the density
+
+    F = E_{q(w, z_{1:O} | x_{1:O})} p(x_{O+1:T} | w, z_{1:O}, x_{1:O})
+
+which is p(x_{O+1:T} | x_{1:O}) where the guide is the posterior. Its logarithm is a proper score (Gneiting and Raftery
+2007), which draws from F estimate badly: few of them come near a given future. So the latents are proposed by the
+guide that has seen the future too, and weighted:
+
+    F = E_q [ q(w, z_{1:O} | x_{1:O}) prod_{t > O} p(z_t | .) p(x_t | .) / q ],    q = q(w, z_{1:T} | x_{1:T})
+
+The mean of K weights is unbiased for F, so that its logarithm is on average at most log F: it errs to the side of a
+worse score, by the less the more particles there are, and not at all where both guides are posteriors.
+
+Where entries are missing, the density is that of the observed ones: x_{O+1:T} and x_{1:O} are what was observed of
+them. A model that reads its own past reads its means in gaps, as in the bounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from ...data.sequences import each
+from ...data.views import LOG_DET
+from ...program.batch import AnyBatch, repeat
+from ...program.groups import GROUP
+from ...program.model import DynamicalVAE
+from ...turns import alone
+from .elbo import ImportanceBound, importance_mean, log_densities, require_likelihood, sites_of, total
+
+
+@alone
+@torch.no_grad()
+def predictive_bound(
+    model: DynamicalVAE, batch: AnyBatch, observed: int, particles: int = 100, *, chunk: int = 4096
+) -> ImportanceBound:
+    """Log density of what follows the observed frames under the model's own forecasts; see the module.
+
+    Args:
+        model: the model with its guide.
+        batch: whole sequences (B, T, D), or a mapping with context over all T steps.
+        observed: O, the frames that are given.
+        particles: K.
+        chunk: sequences times particles to hold at once.
+
+    Returns:
+        The bound in nats a sequence, and the shape of the weights' tail, (B,) each.
+
+    Raises:
+        ValueError: a model without likelihood or with forecasts of its own, a ragged batch, or nothing observed or to
+            predict.
+    """
+    require_likelihood(model)
+    if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
+        raise ValueError(
+            f"{type(model).__name__} forecasts in a way of its own, whose density is not known; leave the log score out"
+        )
+    data = model.read(batch)
+    size, length = data[model.observed[0]].shape[:2]
+    observed -= model.view.past  # the others are context, and given anyhow
+    if model.grouped and GROUP in data:
+        raise ValueError(f"groups share {', '.join(model.grouped)}, and a log score is of one sequence; leave it out")
+    if "lengths" in data:
+        raise ValueError("a log score needs sequences of one length, but these have lengths")
+    first = 0 if model.view.past else 1
+    if particles < 1 or not first <= observed < length:
+        taken = model.view.past
+        raise ValueError(
+            f"expected at least 1 particle, and observed frames from {taken + first} to {taken + length - 1}; got "
+            f"{particles} and {taken + observed}"
+        )
+    log_det = data.get(LOG_DET, torch.zeros(size, length))
+    if log_det.dim() == 1:
+        raise ValueError(
+            "the view changes the volume of whole sequences, and what of that is due to the future is not known; leave "
+            "the log score out, or give the view a log_det by entry, (B, T, D)"
+        )
+    past = each(data, lambda value: value[:, :observed] if value.dim() == 3 else value)
+
+    def log_weights(count: int) -> Tensor:
+        whole = repeat(data, count)
+        proposed = poutine.trace(model.guide).get_trace(whole)
+        joint = poutine.trace(poutine.replay(model.model, trace=proposed)).get_trace(whole)
+        if not observed:  # and latents are from the prior
+            return total(log_densities(joint)) - total(log_densities(proposed))
+        drawn = {n: s["value"] for n, s in sites_of(proposed).items()}
+        known = {n: v[:, :observed] if model.generative.local(n) else v for n, v in drawn.items()}
+        seen = poutine.trace(poutine.condition(model.guide, data=known)).get_trace(repeat(past, count))
+        local = [n for n in model.generative.variables if model.generative.local(n)]
+        future = {n: log[:, observed:] for n, log in log_densities(joint).items() if n in local}
+        return total(future) + total(log_densities(seen)) - total(log_densities(proposed))
+
+    with model._evaluating():
+        found = importance_mean(log_weights, size, particles, chunk)
+    return replace(found, bound=found.bound + log_det[:, observed:].sum(1).to(found.bound))

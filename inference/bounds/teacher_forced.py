@@ -1,0 +1,149 @@
+"""What a comparison measures of one model, teacher-forced: bounds, and what the guide's latents do and tell.
+
+References: Burda et al., 2016, arXiv 1509.00519 (importance-weighted bound, active units); Vehtari et al., 2024, arXiv
+1507.02646 (k-hat); Hoffman and Johnson, 2016, "ELBO surgery", and Poole et al., 2019, arXiv 1905.06922 (information).
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from ...data.sequences import Batch, each
+from ...networks.base import valid_steps
+from ...program.batch import repeat
+from ...program.model import DynamicalVAE
+from ...program.rollout import Sequence as SequenceLaw
+from ..evaluation.held import on_device_of, refuse_non_finite
+from .elbo import SequenceELBO, importance_bound, site_log_prob, sites_of
+from .particles import particle_bound
+
+_GUIDE_DRAWS = 8  # over which posterior means are averaged; the noise that this leaves is taken out
+
+
+def bounds(
+    name: str,
+    model: DynamicalVAE,
+    batch: Batch,
+    keys: Sequence[tuple[str, str, int]],
+    particles: int,
+    estimates: int,
+    parts: Iterable[slice],
+) -> dict[str, Any]:
+    """Bounds and KL terms in nats a sequence (N,), KL by step (T,), estimates (E, N), frames (N,)."""
+    found: list[dict[str, Tensor]] = []
+    steps: dict[str, Tensor] = {}
+    for part in parts:
+        piece = on_device_of(model, each(batch, itemgetter(part)))
+        terms = SequenceELBO().terms(model, piece)
+        draws = [importance_bound(model, piece, particles=particles) for _ in range(estimates)]
+        values = torch.stack([draw.bound for draw in draws])
+        scores = {"ELBO": terms.bound, "importance bound": values.mean(0)}
+        for bound in scores.values():
+            refuse_non_finite(name, "bound", bound.isfinite(), keys[part])
+        scores["k-hat"] = torch.stack([draw.khat for draw in draws]).mean(0)
+        scores |= {f"KL {latent}": kl for latent, kl in terms.kl.items()}
+        for latent in terms.kl.keys() & terms.steps.keys():
+            steps[latent] = steps.get(latent, 0) + terms.steps[latent].double().sum(0)
+        scores |= {"estimates": values, "frames": terms.frames}
+        found.append({metric: value.double().cpu() for metric, value in scores.items()})
+    whole = {metric: torch.cat([piece[metric] for piece in found], dim=-1) for metric in found[0]}
+    weighted, length = whole.pop("estimates"), whole.pop("frames")
+    return {
+        "bounds": {metric: values.numpy() for metric, values in whole.items()},
+        "kl_steps": {
+            latent: (total.cpu() / _alive(length, len(total)).clamp(min=1)).numpy() for latent, total in steps.items()
+        },
+        "estimates": weighted.numpy(),
+        "frames": length.numpy(),
+    }
+
+
+def filtered(
+    name: str,
+    model: DynamicalVAE,
+    batch: Batch,
+    keys: Sequence[tuple[str, str, int]],
+    particles: int,
+    parts: Iterable[slice],
+) -> dict[str, np.ndarray]:
+    """The particle bound in nats a sequence (N,)."""
+    found = []
+    for part in parts:
+        bound = particle_bound(model, on_device_of(model, each(batch, itemgetter(part))), particles).bound
+        refuse_non_finite(name, "particle bound", bound.isfinite(), keys[part])
+        found.append(bound.double().cpu())
+    return {"particle bound": torch.cat(found).numpy()}
+
+
+def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
+    """Latent to (D,): the variance over sequences of the posterior mean, pooled over steps."""
+    sums: dict[str, Tensor] = {}
+    for part in parts:
+        piece = on_device_of(model, each(batch, itemgetter(part)))
+        draws = [_posterior_means(model, piece) for _ in range(_GUIDE_DRAWS)]
+        for name in draws[0]:
+            means = torch.stack([draw[name] for draw in draws]).double()
+            mean, noise = means.mean(0), means.var(0) / _GUIDE_DRAWS
+            valid = torch.ones_like(mean)
+            if "lengths" in piece and mean.shape[1] > 1:
+                valid = valid * valid_steps(piece["lengths"], mean.shape[1])[..., None]
+            moments = torch.stack([(valid * value).sum(0) for value in (torch.ones_like(mean), mean, mean**2, noise)])
+            sums[name] = sums[name] + moments if name in sums else moments
+    found = {}
+    for name, (count, total, squares, noise) in sums.items():
+        between = (squares - total**2 / count.clamp(min=1)).sum(0) / (count - 1).clamp(min=0).sum(0)
+        found[name] = (between - noise.sum(0) / count.sum(0)).cpu().numpy()
+    return found
+
+
+def _posterior_means(model: DynamicalVAE, batch: Batch) -> dict[str, Tensor]:
+    """Latent to the means (B, T, D), or (B, 1, D), of its conditionals at a draw from the guide."""
+    means = {}
+    for name, site in sites_of(poutine.trace(model.guide).get_trace(batch)).items():
+        fn, value = site["fn"], site["value"]
+        local = isinstance(fn, SequenceLaw)
+        means[name] = fn.steps(value).mean if local else fn.mean[:, None]
+    return means
+
+
+def information(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
+    """Latent to (T,), or (1,) of a static one: what it tells of the data, among the M sequences of the batch."""
+    batch = on_device_of(model, batch)
+    size = length_of(batch)
+    drawn = model.guide(batch) if size else {}
+    totals: dict[str, Tensor] = {}
+    counts: dict[str, Tensor] = {}
+    for part in parts:
+        rows = torch.arange(size)[part]
+        values = {name: value[part].repeat_interleave(size, 0) for name, value in drawn.items()}
+        guide = poutine.condition(model.guide, data=values)
+        trace = poutine.trace(guide).get_trace(repeat(batch, len(rows)))
+        for name, site in sites_of(trace).items():
+            density = site_log_prob(site["fn"], site["value"]).unflatten(0, (len(rows), size)).double()
+            density = density[..., None] if density.dim() == 2 else density
+            valid = torch.ones_like(density[0], dtype=torch.bool)
+            if "lengths" in batch and density.shape[2] > 1:
+                valid = valid_steps(batch["lengths"], density.shape[2])
+            density = density.masked_fill(~valid, -math.inf)
+            own = density[torch.arange(len(rows)), rows]
+            mixture = density.logsumexp(1) - valid.sum(0).clamp(min=1).double().log()
+            told = torch.where(valid[part], own - mixture, 0.0).sum(0)
+            totals[name] = totals[name] + told if name in totals else told
+            counts[name] = valid.sum(0).clamp(min=1)
+    return {name: (total / counts[name]).cpu().numpy() for name, total in totals.items()}
+
+
+def length_of(batch: Batch) -> int:
+    """N, the number of sequences."""
+    return len(next(value for value in batch.values() if isinstance(value, Tensor)))
+
+
+def _alive(lengths: Tensor, steps: int) -> Tensor:
+    """(T,) the number of sequences that reach each step."""
+    return (lengths[:, None] > torch.arange(steps)).sum(0)

@@ -1,0 +1,459 @@
+"""The evidence between two bounds, and where the bound that is trained loses what it lacks of it.
+
+    evidence - ELBO = (ELBO of the best local guide - ELBO)                                    amortisation
+                    + (that of the best one with all arrows - that of the best local guide)    missing arrows
+                    + (evidence - that of the best one with all arrows)                        family
+
+A local guide is the model's own with parameters that are free for every sequence (`local_guide`), so that what its
+network fails to read off the data, or may not read, is amortisation. With all arrows it reads the latents too that the
+posterior depends on and the guide's equations leave out. What then is left is the price of normals whose locations move
+linearly with what was added. After Cremer, Li and Duvenaud (2018, arXiv 1801.03558), whose approximation gap is the sum
+of the last two. Each part is at least 0, but for noise and what a search has not found, which is counted further down.
+Both local guides have the same number of steps from the model's own.
+
+The evidence is bracketed: from below by annealed importance sampling, which starts at the local guide with all arrows,
+and from above by the same run backward, for sequences simulated from the model (`annealed_bound`).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import torch
+from rich.console import Group
+from torch import Tensor
+from typing_extensions import override
+
+from ...data.sequences import HeldOutWindows, Listed, called, clusters, each, sequences, take_split
+from ...data.views import LOG_DET
+from ...program.batch import AnyBatch, repeat
+from ...program.groups import GROUP
+from ...program.model import DynamicalVAE
+from ...turns import alone
+from ..bounds.annealing import annealed_bound
+from ..bounds.elbo import joint_and_guide, require_latents, require_likelihood
+from ..bounds.local import local_guide, missing_latents, require_local
+from ..bounds.particles import obstacle, particle_bound
+from ..bounds.teacher_forced import length_of
+from ..evaluation.estimates import Crossed, Estimate, number
+from ..evaluation.held import clip_places, on_device_of, plain, refuse_non_finite, reproducibly
+from ..evaluation.result import Result, Table, canvas, progress_bar
+from ..evaluation.uncertainty import decimals
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+OWN, ALL = "local ELBO", "local ELBO, all arrows"
+BOUNDS = ("ELBO", "IWAE", "FIVO", OWN, ALL, "AIS", "upper")
+"""What bounds are called, from the loosest to the upper one."""
+PARTS = {
+    "amortisation": ("ELBO", OWN),
+    "missing arrows": (OWN, ALL),
+    "family": (ALL, "AIS"),
+    "unknown": ("AIS", "upper"),
+}
+"""Parts of the gap, each from one bound to another. "family" is a lower bound of its part, as AIS is one of the
+evidence; "unknown" is the bracket, of simulated data alone."""
+WIDE = 0.5
+"""Nats of a bracket that may be a missed mode: of two equal ones it is log 2."""
+DATA = ("real", "simulated")
+CHUNK = 4096
+"""Sequences times draws to hold at once."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Bracket(Result):
+    """Bounds of one model on the same sequences and on as many simulated ones, in nats a sequence.
+
+    Attributes:
+        bounds: "real" and "simulated" to {bound: (N,)}; "upper" of simulated data alone, FIVO where it can be run,
+            local ones of guides that are normal.
+        keys: (split, clip, first frame) of every sequence.
+        frames: (N,) of every sequence, real and simulated.
+        equations: "generative" and "inference".
+        added: latent to the latents that the guide with all arrows reads beside its own.
+        data: sequences and coordinates, and what windows say of themselves.
+        particles: K of IWAE and FIVO, and draws over which ELBOs are averaged.
+        temperatures, chains: of annealed importance sampling.
+        fitting: steps of each local guide.
+        seed: of all draws.
+        notes: what is not there, and why.
+
+    Example:
+        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
+        >>> found = dvae.bracket(model, model.sample(4, 4)["x"], temperatures=5, fitting=100, progress=False)
+        >>> gap = found.gap("simulated")
+        >>> gap["amortisation"].mean > gap["missing arrows"].mean
+        True
+    """
+
+    bounds: dict[str, dict[str, np.ndarray]]
+    keys: list[tuple[str, str, int]]
+    frames: np.ndarray
+    equations: dict[str, str]
+    added: dict[str, list[str]]
+    data: dict[str, Any]
+    particles: int
+    temperatures: int
+    chains: int
+    fitting: int
+    seed: int
+    notes: list[str]
+
+    def estimate(self, bound: str, above: str = "", data: str = "real", *, frame: bool = False) -> Estimate:
+        """The mean of a bound, or of how far it lies above another one.
+
+        Args:
+            bound, above: names.
+            data: "real", with errors clustered by clip, or "simulated".
+            frame: in nats a frame and not a sequence.
+
+        Raises:
+            KeyError: a bound that is not there.
+        """
+        known = self.bounds[data]
+        if lacking := [name for name in (bound, above) if name and name not in known]:
+            raise KeyError(f"there is no {lacking[0]!r} of {data} data; there are {', '.join(known)}")
+        values = known[bound] - (known[above] if above else 0.0)
+        weights = self.frames if frame else np.ones(len(values))
+        places = clip_places(self.keys).numpy() if data == "real" else np.arange(len(values))
+        return Crossed.by_clip(values[None], weights, places).estimate()
+
+    def gap(self, data: str = "real", *, frame: bool = False) -> dict[str, Estimate]:
+        """The parts of what the ELBO lacks of the evidence, as far as they are known; see the module.
+
+        "family" is at least this, as it ends at the lower bound of the evidence; "unknown", of simulated data, is how
+        far the upper bound lies above that, and so how much more the family may be.
+        """
+        known = self.bounds[data]
+        parts = {name: ends for name, ends in PARTS.items() if all(end in known for end in ends)}
+        return {name: self.estimate(high, low, data, frame=frame) for name, (low, high) in parts.items()}
+
+    def table(self) -> Group:
+        """Bounds of real data and of simulated ones, and the parts of the gap."""
+        return Group(*(self._bounds(data) for data in DATA), self._gap())
+
+    def _bounds(self, data: str) -> Table:
+        clip, frame = called(self.data)
+        said = f"{len(self.keys)} sequences of {len({*clip_places(self.keys).tolist()})} {clip}s"
+        title = f"{self.equations['generative']}\n{self.equations['inference']}\n{said}" if data == "real" else ""
+        caption = f"mean ± standard error over sequences{f', clustered by {clip}' if data == 'real' else ''}"
+        table = Table(title=title, caption="\n".join([caption, *(self.notes if data == "real" else ())]))
+        table.add_column(f"{data} data")
+        for column in ("nats a sequence", "above the ELBO", f"nats a {frame}"):
+            table.add_column(column, justify="right")
+        for name in self.bounds[data]:
+            above = "–" if name == "ELBO" else told(self.estimate(name, "ELBO", data))
+            whole, each = (told(self.estimate(name, data=data, frame=frame)) for frame in (False, True))
+            table.add_row(self._called(name), whole, above, each)
+        return table
+
+    def _called(self, name: str) -> str:
+        if name in ("IWAE", "FIVO"):
+            return f"{name}, K = {self.particles}"
+        return f"{name}, L = {self.temperatures}, K = {self.chains}" if name in ("AIS", "upper") else name
+
+    def _gap(self) -> Table:
+        added = "; ".join(f"{name}: {', '.join(terms)}" for name, terms in self.added.items()) or "none"
+        table = Table(
+            title="evidence above the ELBO, nats a sequence", caption=f"missing arrows between latents: {added}"
+        )
+        table.add_column("")
+        for data in DATA:
+            table.add_column(f"{data} data", justify="right")
+        found = {data: self.gap(data) for data in DATA}
+        for name, (low, high) in PARTS.items():
+            if name in found["simulated"]:
+                cells = (told(found[data][name]) if name in found[data] else "–" for data in DATA)
+                at_least = ", at least" if name == "family" else ""
+                table.add_row(f"{name}{at_least} ({low} to {high})", *cells)
+        return table
+
+    def plot(self) -> Figure:
+        """All bounds above the ELBO, real and simulated data apart, the parts of the gap, and the bracket shaded."""
+        figure = canvas(9, 6)
+        panels = figure.subplots(2, 1)  # each with its own axis: a guide may be far worse on data it was not fitted to
+        unknown = self.estimate("upper", "AIS", "simulated").mean
+        for panel, data in zip(panels, DATA, strict=True):
+            names = list(self.bounds[data])
+            lower = self.estimate("AIS", "ELBO", data).mean
+            shade = {"real": "as wide as on simulated data", "simulated": "evidence"}[data]
+            panel.axvspan(lower, lower + max(unknown, 0.0), color="C2", alpha={"real": 0.15, "simulated": 0.35}[data])
+            panel.annotate(shade, (lower, 1), xycoords=("data", "axes fraction"), fontsize=7, va="bottom")
+            for place, (part, (low, high)) in enumerate(PARTS.items()):
+                if part in self.gap(data) and part != "unknown":
+                    ends = [self.estimate(name, "ELBO", data).mean for name in (low, high)]
+                    panel.barh(len(names), ends[1] - ends[0], left=ends[0], color=f"C{place}", alpha=0.6, label=part)
+            for place, name in enumerate(names):
+                estimate = self.estimate(name, "ELBO", data)
+                panel.errorbar(estimate.mean, place, xerr=_reach(estimate), fmt="o", color="C7", markersize=5)
+            panel.set_yticks(range(len(names) + 1), [*map(self._called, names), "parts of the gap"], fontsize=8)
+            panel.invert_yaxis()
+            panel.set_title(f"{data} data", loc="left", fontsize=10)
+            panel.grid(axis="x", alpha=0.3)
+        panels[1].set_xlabel("nats a sequence above the ELBO (95 % over sequences)")
+        figure.legend(*panels[1].get_legend_handles_labels(), loc="outside lower center", ncols=len(PARTS), fontsize=8)
+        figure.suptitle(f"{self.equations['generative']}\n{self.equations['inference']}", fontsize=9, parse_math=False)
+        return figure
+
+    def to_json(self) -> str:
+        """Everything, with the parts of the gap written out."""
+        parts = {data: {name: vars(each) for name, each in self.gap(data).items()} for data in DATA}
+        return json.dumps(plain({"gap": parts, **vars(self)}), allow_nan=False)
+
+    @classmethod
+    @override
+    def from_json(cls, text: str) -> Self:
+        try:
+            document = json.loads(text)
+            del document["gap"]
+            keys = [(str(split), str(clip), int(start)) for split, clip, start in document.pop("keys")]
+            frames = _numbers(document.pop("frames"), len(keys))
+            given = document.pop("bounds")
+            bounds = {
+                data: {n: _numbers(given[data][n], len(keys)) for n in BOUNDS if n in given[data]} for data in DATA
+            }
+            if (
+                not {"ELBO", "AIS"} <= bounds["real"].keys() & bounds["simulated"].keys()
+                or "upper" not in bounds["simulated"]
+            ):
+                raise ValueError("bounds are missing")
+            for name in ("particles", "temperatures", "chains", "fitting", "seed"):
+                if not isinstance(document[name], int):
+                    raise ValueError(f"{name} is no whole number")
+            clip, frame = called(document["data"])
+            said = [*document["equations"].values(), *document["notes"], clip, frame]
+            said += [term for terms in document["added"].values() for term in terms]
+            if not isinstance(document["notes"], list) or not all(isinstance(each, str) for each in said):
+                raise ValueError("what is said is no text")
+            if document["equations"].keys() != {"generative", "inference"}:
+                raise ValueError("equations are those of a model and its guide")
+            return cls(bounds=bounds, keys=keys, frames=frames, **document)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"this is not a bracket written by Bracket.to_json: {error!r}") from error
+
+
+def _numbers(values: Any, count: int) -> np.ndarray:
+    found = np.array(values, dtype=float)
+    if not count or found.shape != (count,) or not np.isfinite(found).all():
+        raise ValueError(f"expected {count} finite numbers, got an array {found.shape}")
+    return found
+
+
+def told(estimate: Estimate) -> str:
+    """A mean ± its standard error over sequences."""
+    places = decimals(estimate.mean, estimate.sequences)
+    return f"{number(estimate.mean, places)} ± {number(estimate.sequences, places)}"
+
+
+def _reach(estimate: Estimate) -> float:
+    reach = estimate.interval(error="sequences")[1] - estimate.mean
+    return 0.0 if math.isnan(reach) else reach
+
+
+@alone
+@torch.inference_mode(False)
+def bracket(
+    model: DynamicalVAE,
+    data: HeldOutWindows | Listed | Tensor | np.ndarray | Mapping[str, Any],
+    *,
+    count: int | None = None,
+    particles: int = 64,
+    temperatures: int = 50,
+    chains: int = 8,
+    fitting: int = 300,
+    reach: int | None = None,
+    seed: int = 0,
+    batch_size: int = 32,
+    progress: bool = True,
+) -> Bracket:
+    """Bounds on a model's evidence from both sides, and the parts of what its ELBO lacks of it.
+
+    Sequences simulated from the model have the lengths and the context of the real ones, and no missing entries.
+
+    What it costs: for each sequence, real or simulated, 3 K runs of guide and model for means of weights, 12 programs
+    forward and backward for each step of a local guide, of which there are two (one where no arrows are missing), and
+    about 7 L gradients of guide and model for each chain, nearly twice that where simulated.
+
+    Args:
+        model: the model with its guide.
+        data: windows, x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
+        count: how many of the sequences, drawn at random; None for all.
+        particles: K, draws of ELBOs and IWAE, and particles of FIVO.
+        temperatures, chains: L and K of annealed importance sampling, see `annealed_bound`.
+        fitting: steps of the local guides, see `local_guide`; 0 leaves them and the parts of the gap out, and chains
+            start at the model's own guide.
+        reach: of the arrows that local guides have, see `local_guide`.
+        seed: of all draws.
+        batch_size: sequences at once.
+        progress: whether to show a progress bar.
+
+    Raises:
+        ValueError: a model without latents or likelihood, or of which a batch has groups; numbers out of range.
+        TypeError: data of another kind.
+        FloatingPointError: a bound that is not finite.
+
+    Example:
+        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
+        >>> found = dvae.bracket(model, torch.randn(4, 4, 2), temperatures=5, fitting=0, progress=False)
+        >>> list(found.bounds["simulated"])
+        ['ELBO', 'IWAE', 'FIVO', 'AIS', 'upper']
+    """
+    if min(particles, temperatures, chains, batch_size, 1 if count is None else count) < 1 or fitting < 0:
+        raise ValueError(
+            "count, particles, temperatures, chains and batch_size are at least 1, fitting at least 0, not "
+            f"{count}, {particles}, {temperatures}, {chains}, {batch_size} and {fitting}"
+        )
+    require_likelihood(model)
+    require_latents(model)
+    data = take_split(data, "test")
+    whole, notes = sequences(data).batch, []
+    if GROUP in whole and model.grouped:
+        raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")
+    windows = data if isinstance(data, HeldOutWindows) else None
+    size = length_of(whole)
+    keys = [("data", str(n), 0) for n in range(size)] if windows is None else clusters(windows)
+    chance = torch.Generator().manual_seed(seed)
+    chosen = torch.randperm(size, generator=chance)[:count]
+    batch, keys = each(whole, itemgetter(chosen)), [keys[n] for n in chosen.tolist()]
+    parts = [slice(first, first + batch_size) for first in range(0, len(keys), batch_size)]
+    read = [model.read(on_device_of(model, each(batch, itemgetter(part)))) for part in parts]
+    if fitting:
+        try:
+            require_local(model)
+        except ValueError as error:
+            fitting = 0
+            notes.append(f"no parts of the gap: {error}")
+    refused = next(filter(None, (obstacle(model, part) for part in read)), "")
+    if refused:
+        notes.append(f"no FIVO: {refused}")
+    with reproducibly(model, _seeds(chance, 1)[0]):
+        drawn = [_simulated(model, part) for part in read]
+    added = missing_latents(model) if fitting else {}
+    work = _Work(model, particles, temperatures, chains, fitting, reach, bool(refused), bool(added))
+    found: dict[str, list[dict[str, Tensor]]] = {name: [] for name in DATA}
+    few = dict.fromkeys(DATA, 0)
+    with progress_bar(progress) as bar:
+        task = bar.add_task("bracket", total=len(parts) * 2 * ((1 + bool(added)) * fitting + 1))
+        for place, (real, (simulated, latents)) in enumerate(zip(read, drawn, strict=True)):
+            for name, some, start in (("real", real, None), ("simulated", simulated, latents)):
+                bounds, effective = work.bounds(some, start, _seeds(chance, 3), lambda: bar.advance(task))
+                few[name] += int((effective < chains / 2).sum())
+                for bound, values in bounds.items():
+                    refuse_non_finite(bound, f"bound of {name} data", values.isfinite(), keys[parts[place]])
+                found[name].append(bounds)
+                bar.advance(task)
+    notes += [
+        f"AIS of {name} data: less than half of the {chains} chains are effective in {number} of {len(keys)} sequences"
+        for name, number in few.items()
+        if number
+    ]
+    result = Bracket(
+        bounds={
+            name: {bound: torch.cat([part[bound] for part in all_]).double().cpu().numpy() for bound in all_[0]}
+            for name, all_ in found.items()
+        },
+        keys=keys,
+        frames=torch.cat([_frames(model, part) for part in read]).double().cpu().numpy(),
+        equations={"generative": model.generative.text, "inference": model.inference.text},
+        added={name: [term for parent in parents for term in parent.terms] for name, parents in added.items()},
+        data={} if windows is None else {"fingerprint": windows.fingerprint, **_called(windows)},
+        particles=particles,
+        temperatures=temperatures,
+        chains=chains,
+        fitting=fitting,
+        seed=seed,
+        notes=notes,
+    )
+    unknown = result.estimate("upper", "AIS", "simulated")
+    if unknown.mean > max(WIDE, 2 * unknown.sequences):
+        notes.append(
+            f"on simulated data the upper bound lies {told(unknown)} nats above AIS: AIS and family may be that much "
+            "too low, as where all chains stay in one mode, whatever the spread of the chains is"
+        )
+    return result
+
+
+def _seeds(chance: torch.Generator, count: int) -> list[int]:
+    """Of draws that have nothing to do with each other: what a guide was fitted by is not what it is judged by."""
+    return torch.randint(2**31, (count,), generator=chance).tolist()  # type: ignore[no-any-return]
+
+
+def _called(windows: HeldOutWindows) -> dict[str, Any]:
+    return {"called": list(called(windows.description))} if "called" in windows.description else {}
+
+
+def _frames(model: DynamicalVAE, data: Mapping[str, Any]) -> Tensor:
+    x: Tensor = data[model.observed[0]]
+    found: Tensor = data["lengths"] if "lengths" in data else torch.full((len(x),), x.shape[1])
+    return found
+
+
+def _simulated(model: DynamicalVAE, real: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Sequences drawn from the model, as it sees them, of the same lengths and context; and their latents."""
+    x = real[model.observed[0]]
+    kept = {name: value for name, value in real.items() if name not in (*model.observed, "mask", LOG_DET)}
+    drawn = model.model(kept, length=x.shape[1] if x.dim() == 3 else None, size=len(x))
+    latents = {name: drawn[name] for name in model.latents}
+    seen = {**kept, **{name: drawn[name] for name in model.observed}}
+    return (seen if model.view.keeps_volume else model.read(model.shown(seen, kept))), latents
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What is computed of each batch."""
+
+    model: DynamicalVAE
+    particles: int
+    temperatures: int
+    chains: int
+    fitting: int
+    reach: int | None
+    blocked: bool
+    lacking: bool
+
+    def bounds(
+        self, data: Mapping[str, Any], latents: Mapping[str, Tensor] | None, seeds: Sequence[int], advance: Any
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """Bound to (B,), an upper one too where there are latents that data were drawn with, and effective chains (B,).
+
+        The draws of all ELBOs have one seed, so that their differences have less noise.
+        """
+        model, found = self.model, {}
+        judging, fitting, annealing = seeds
+        with reproducibly(model, judging):
+            weights = self._weights(model, data)
+            found["ELBO"], found["IWAE"] = weights.mean(0), weights.logsumexp(0) - math.log(self.particles)
+            if not self.blocked:
+                found["FIVO"] = particle_bound(model, data, self.particles, chunk=CHUNK).bound
+        for name, missing in ((OWN, False), (ALL, True)) if self.fitting else ():
+            if not missing or self.lacking:  # else there is nothing to add
+                how: Any = {"missing": missing, "steps": self.fitting, "reach": self.reach, "seed": fitting}
+                model = local_guide(self.model, data, **how, progress=advance)
+            with reproducibly(model, judging):
+                found[name] = self._weights(model, data).mean(0)
+        how = {"temperatures": self.temperatures, "chains": self.chains, "seed": annealing}
+        how["chunk"] = self.chains * len(found["ELBO"])  # a local guide is for all of them
+        annealed = annealed_bound(model, data, **how)
+        found["AIS"] = annealed.bound
+        if latents is not None:
+            found["upper"] = annealed_bound(model, data, **how, latents=latents).bound
+        return found, annealed.effective
+
+    def _weights(self, model: DynamicalVAE, data: AnyBatch) -> Tensor:
+        """(K, B) of log p(x, z) - log q(z | x), at draws z."""
+        size = len(data[model.observed[0]])  # type: ignore[call-overload, index]
+        at_once = max(1, CHUNK // size)
+        found = []
+        for first in range(0, self.particles, at_once):
+            count = min(at_once, self.particles - first)
+            rows = repeat(data, count)
+            joint, own = joint_and_guide(model, rows, model.guide(rows))
+            found.append((joint - own).unflatten(0, (count, size)))
+        return torch.cat(found)

@@ -1,0 +1,517 @@
+"""Simulation-based calibration of a guide (Talts et al., 2018, arXiv 1804.06788), with the exact simultaneous test and
+envelope for discrete ranks of Säilynoja et al. (2022, arXiv 2103.10522), and with two quantities of all latents
+together that depend on the data: the log joint (Modrák et al., 2023, arXiv 2211.02383) and the distance from a point
+(TARP: Lemos et al., 2023, arXiv 2302.03026).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import scipy
+import torch
+from pyro import poutine
+from torch import Tensor
+from typing_extensions import override
+
+from ...program.batch import repeat
+from ...program.model import DynamicalVAE
+from ...turns import alone
+from ..bounds.elbo import require_likelihood
+from ..evaluation.held import on_device_of, reproducibly
+from ..evaluation.result import Result, Table, canvas, progress_bar
+from .latents import quantities
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LOG_JOINT, TARP = "log joint", "TARP"
+
+_MOST = 2**24  # simulations times draws, or quantities, that are read from a file
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Result):
+    """Ranks of simulated latents among the guide's draws; uniform on 0..L where the guide is the exact posterior.
+
+    Uniform ranks of single coordinates are necessary, not sufficient: a guide that ignores the data and draws from the
+    prior has them. The rank of the log joint, log p(x, latents), tells such a guide, and one that misses dependence
+    between coordinates. So does that of the latents' distance from a point which the data suggest: whose latents those
+    of the simulation with the nearest data are, of as many further ones as there are draws.
+
+    Attributes:
+        ranks: (N, Q), how many of the L draws lie below the truth.
+        names: of the Q quantities: "w[0]", "z_3[1]" (step from 1, coordinate from 0), "TARP", "log joint".
+        draws: L.
+        length: T of the simulated sequences.
+        seed: of simulations and draws.
+        equations: of model and guide; no guide's where it was a program of one's own.
+    """
+
+    ranks: np.ndarray
+    names: tuple[str, ...]
+    draws: int
+    length: int
+    seed: int
+    equations: dict[str, str]
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """(Q, L + 1), how often each rank occurred."""
+        return np.stack([np.bincount(ranks, minlength=self.draws + 1) for ranks in self.ranks.T])
+
+    @cached_property
+    def p_values(self) -> np.ndarray:
+        """(Q,), exact p-values of uniformity: at most alpha just where the ECDF leaves its envelope at alpha."""
+        tails = _tails(len(self.ranks), self.draws)
+        below = self.counts.cumsum(1)[:, :-1]
+        least, which = np.unique(tails[np.arange(self.draws), below].min(1), return_inverse=True)
+        return _ecdf_test(least, len(self.ranks), self.draws)[which]
+
+    @property
+    def adjusted(self) -> np.ndarray:
+        """(Q,), p-values times the number of quantities (Bonferroni), at most 1."""
+        return np.minimum(1.0, self.p_values * len(self.names))
+
+    @property
+    def p_value(self) -> float:
+        """Of uniformity in all quantities at once, however they depend on each other."""
+        return float(self.adjusted.min())
+
+    @property
+    def bias(self) -> np.ndarray:
+        """(Q,), where the truth lies above the guide's mean, in the guide's standard deviations; see `spread`."""
+        return self._normals[:, 0]
+
+    @property
+    def spread(self) -> np.ndarray:
+        """(Q,), standard deviation of the truth about the guide's mean over that of the guide; above 1: too narrow.
+
+        Bias and spread are those of the normal truth most likely to have these ranks among L standard normal draws:
+        what they are called, where guide and posterior are normal. Where ranks pile up at an end and leave them open, a
+        prior worth less than one simulation keeps them finite.
+        """
+        return np.exp(self._normals[:, 1])
+
+    @property
+    def readings(self) -> tuple[str, ...]:
+        """What the shape of the ranks says of the guide; "" where uniformity is not rejected at 5 % (adjusted)."""
+        return tuple(
+            _reading(self.names[q], self.counts[q], self.draws) if adjusted <= 0.05 else ""
+            for q, adjusted in enumerate(self.adjusted)
+        )
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        rejected = int((self.adjusted <= 0.05).sum())
+        number = f"{len(self.names)} quantities, {len(self.ranks)} simulations, p = {self.p_value:.2g}"
+        if not rejected:
+            return f"nothing speaks against the guide ({number})"
+        return f"the guide is not the posterior: {rejected} of {number}"
+
+    def envelope(self, alpha: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where the ECDF of a quantity's ranks lies, at all points at once, with probability at least 1 - alpha.
+
+        Returns:
+            Points k / (L + 1), and the least and largest share of ranks below k that still lie within, (L,) each.
+        """
+        return envelope(len(self.ranks), self.draws, alpha)
+
+    def table(self, worst: int = 20) -> Table:
+        """The quantities with the smallest p-values first."""
+        order = np.argsort(self.p_values, kind="stable")[:worst]
+        table = Table(title=self._title, caption=self.verdict)
+        for column in ("quantity", "p", "p (Bonferroni)", "bias", "spread", "the guide"):
+            table.add_column(column, justify="left" if column in ("quantity", "the guide") else "right", no_wrap=True)
+        for q in order:
+            numbers = f"{self.p_values[q]:.2g}", f"{self.adjusted[q]:.2g}", f"{self.bias[q]:+.3f}"
+            table.add_row(self.names[q], *numbers, f"{self.spread[q]:.2f}", self.readings[q])
+        if len(self.names) > worst:
+            table.add_row(f"and {len(self.names) - worst} more", style="dim")
+        return table
+
+    def plot(self, worst: int = 8) -> Figure:
+        """Rank histogram above ECDF difference, for the quantities with the smallest p-values.
+
+        Histograms are relative to uniform, with a band that holds a bin in 99 % of cases. ECDF differences have the
+        envelope that all quantities keep to, at all points, with 95 % probability (Bonferroni over quantities).
+        """
+        order = np.argsort(self.p_values, kind="stable")[:worst]
+        columns = min(4, len(order))
+        rows = math.ceil(len(order) / columns)
+        figure = canvas(0.8 + 2.4 * columns, 0.6 + 3.1 * rows)
+        panels = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, sharey="row")
+        points, low, high = self.envelope(0.05 / len(self.names))
+        levels, count = self.draws + 1, len(self.ranks)
+        edges = np.linspace(0, levels, min(20, levels) + 1).round().astype(int)
+        width = np.diff(edges) / levels
+        band = [scipy.stats.binom.ppf(level, count, width) / (count * width) for level in (0.005, 0.995)]
+        for place, q in enumerate(order):
+            row, column = divmod(place, columns)
+            top, bottom = panels[2 * row, column], panels[2 * row + 1, column]
+            share = np.add.reduceat(self.counts[q], edges[:-1]) / (count * width)
+            top.stairs(band[1], edges / levels, baseline=band[0], fill=True, color="0.88")
+            top.stairs(share, edges / levels, color="C0")
+            top.axhline(1, color="0.4", linewidth=0.8)
+            reading = f"\n{self.readings[q]}" if self.readings[q] else ""
+            top.set_title(f"{self.names[q]}, p = {self.adjusted[q]:.2g}{reading}", fontsize=8, parse_math=False)
+            bottom.fill_between(points, low - points, high - points, color="0.88", step="mid", linewidth=0)
+            below = self.counts[q].cumsum()[:-1] / count
+            bottom.plot(points, below - points, color="C0", linewidth=1.2)
+            bottom.axhline(0, color="0.4", linewidth=0.8)
+            bottom.tick_params(labelbottom=True)
+            for panel in (top, bottom):
+                panel.tick_params(labelsize=7)
+            if column == 0:
+                top.set_ylabel("ranks\nover uniform", fontsize=8)
+                bottom.set_ylabel("ECDF\nless uniform", fontsize=8)
+        for place in range(len(order), rows * columns):
+            row, column = divmod(place, columns)
+            panels[2 * row, column].set_axis_off()
+            panels[2 * row + 1, column].set_axis_off()
+        shown = "" if len(order) == len(self.names) else f" · worst {len(order)} of {len(self.names)}"
+        figure.suptitle(f"{self._title}{shown}", fontsize=9, parse_math=False)
+        figure.supxlabel(f"rank among {self.draws} draws, scaled to [0, 1]", fontsize=8)
+        return figure
+
+    def document(self) -> dict[str, Any]:
+        """Everything but the single ranks, of which the counts tell all that the tests use, in JSON's types."""
+        columns = (self.p_values, self.adjusted, self.bias, self.spread, self.readings, self.counts.tolist())
+        return {
+            "equations": self.equations,
+            "simulations": len(self.ranks),
+            "draws": self.draws,
+            "length": self.length,
+            "seed": self.seed,
+            "p_value": self.p_value,
+            "verdict": self.verdict,
+            "quantities": {
+                name: {
+                    "p": float(p),
+                    "p_adjusted": float(adjusted),
+                    "bias": float(bias),
+                    "spread": float(spread),
+                    "reading": reading,
+                    "rank_counts": counts,
+                }
+                for name, p, adjusted, bias, spread, reading, counts in zip(self.names, *columns, strict=True)
+            },
+        }
+
+    def to_json(self) -> str:
+        """`document` as text."""
+        return json.dumps(self.document(), indent=1, allow_nan=False)
+
+    @classmethod
+    @override
+    def from_json(cls, text: str) -> Self:
+        """What `to_json` wrote, with the ranks of each quantity in their order, since they alone are kept.
+
+        Raises:
+            ValueError: text that is not such a document, or one of more ranks than memory should be asked for.
+        """
+        try:
+            document = json.loads(text)
+            quantities, draws, simulations = (document[name] for name in ("quantities", "draws", "simulations"))
+            counts = np.array([each["rank_counts"] for each in quantities.values()], dtype=np.int64)
+            if counts.ndim != 2 or counts.shape[1] != draws + 1 or (counts < 0).any():
+                raise ValueError(f"expected counts of the ranks 0 to {draws} for every quantity")
+            if (counts.astype(float).sum(1) != simulations).any() or simulations * max(draws, len(counts)) > _MOST:
+                raise ValueError(
+                    f"the counts of a quantity do not add up to {simulations} simulations, or are too many"
+                )
+            ranks = np.stack([np.repeat(np.arange(draws + 1), row) for row in counts], 1)
+            said = {name: document[name] for name in ("length", "seed", "equations")}
+            return cls(ranks, tuple(quantities), draws, **said)
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+            raise ValueError(f"this is not a calibration written by Calibration.to_json: {error!r}") from error
+
+    @property
+    def _title(self) -> str:
+        return f"simulation-based calibration · {self.equations.get('inference', 'guide of one’s own')}"
+
+    @cached_property
+    def _normals(self) -> np.ndarray:
+        """(Q, 2), bias and logarithm of spread."""
+        return np.stack([_likeliest_normal(counts, self.draws)[0] for counts in self.counts])
+
+
+@alone
+def calibrate(
+    model: DynamicalVAE,
+    length: int,
+    simulations: int = 500,
+    draws: int = 99,
+    *,
+    guide: Callable[..., Any] | None = None,
+    steps: Sequence[int] | None = None,
+    context: Mapping[str, Tensor] | None = None,
+    seed: int = 0,
+    chunk: int = 4096,
+    progress: bool = True,
+) -> Calibration:
+    """Simulation-based calibration: draws latents and data from the model, and asks the guide for the latents.
+
+    Says whether the guide is the model's posterior on the model's own data; it knows nothing of real data, nor
+    of whether the model is a good one.
+
+    Args:
+        model: the generative model; its own guide is examined where no other is given.
+        length: T of the simulated sequences.
+        simulations: N.
+        draws: L, draws from the guide for each simulation.
+        guide: a Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
+        steps: which steps of local latents are ranked, from 1; all without it.
+        context: context variables (C, T, D) or (C, D), used in turn.
+        seed: of simulations and draws.
+        chunk: sequences times draws to hold at once.
+        progress: whether to show a progress bar.
+
+    Raises:
+        ValueError: numbers below 1, steps beyond the length, context that is missing, or a guide without some latent.
+        FloatingPointError: a simulation that is not finite.
+
+    Example:
+        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
+        >>> found = dvae.calibrate(model, 4, simulations=20, draws=19, steps=(2, 4), progress=False)
+    """
+    if min(length, simulations, draws, chunk) < 1:
+        raise ValueError(
+            f"length, simulations, draws and chunk are at least 1, got {length}, {simulations}, {draws} and {chunk}"
+        )
+    require_likelihood(model)
+    if not model.latents:
+        raise ValueError(
+            f"{model.generative} has no latents, so that its likelihood is exact and no guide to calibrate"
+        )
+    kept = list(range(1, length + 1)) if steps is None else list(steps)
+    if not kept or len(set(kept)) < len(kept) or not set(kept) <= set(range(1, length + 1)):
+        raise ValueError(f"steps are different numbers from 1 to {length}, got {kept}")
+    contexts: Mapping[str, Tensor] = context or {}
+    if missing := [name for name in model.context if name not in contexts]:
+        raise ValueError(f"the model reads the context {', '.join(missing)}; pass context={{name: values}}")
+    infer = guide or model.guide
+    at_once = max(1, chunk // draws)
+    ranks, places = [], torch.tensor(kept) - 1
+
+    def given(turn: Tensor) -> dict[str, Any]:
+        return on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
+
+    with reproducibly(model, seed + 1):  # other simulations than those that are ranked
+        points = _Points.of(model, given(torch.arange(draws)), draws, length, places)
+    with reproducibly(model, seed), progress_bar(progress) as bar:
+        for start in bar.track(range(0, simulations, at_once), description="simulations"):
+            turn = torch.arange(start, min(start + at_once, simulations))
+            ranks.append(_ranks(model, infer, given(turn), len(turn), length, draws, places, points))
+    names = quantities(model, kept)
+    equations = {"generative": model.generative.text} | ({} if guide else {"inference": model.inference.text})
+    return Calibration(torch.cat(ranks).numpy(), (*names, TARP, LOG_JOINT), draws, length, seed, equations)
+
+
+def envelope(count: int, draws: int, alpha: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the ECDF of independent uniform ranks lies, at all points at once, with probability at least 1 - alpha.
+
+    Args:
+        count: N, the ranks.
+        draws: L; ranks are on 0..L.
+        alpha: between 0 and 1.
+
+    Returns:
+        Points k / (L + 1), and the least and largest share of ranks below k that still lie within, (L,) each.
+
+    Raises:
+        ValueError: an alpha that is no such probability.
+    """
+    if not 0 < alpha < 1:
+        raise ValueError(f"alpha is a probability between 0 and 1, got {alpha}")
+    within = _tails(count, draws) > _critical(alpha, count, draws)
+    points = np.arange(1, draws + 1) / (draws + 1)
+    return points, within.argmax(1) / count, 1 - within[:, ::-1].argmax(1) / count
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Simulations, to give TARP a point for any data: the latents of those with the nearest data.
+
+    Args:
+        data: (M, F).
+        latents: (M, Q).
+    """
+
+    data: Tensor
+    latents: Tensor
+
+    @classmethod
+    def of(cls, model: DynamicalVAE, given: Mapping[str, Tensor], count: int, length: int, steps: Tensor) -> Self:
+        """So many new ones."""
+        drawn = _simulated(model, given, count, length)
+        return cls(_data(model, drawn), _coordinates(model, drawn, steps))
+
+    def distances(self, model: DynamicalVAE, batch: Mapping[str, Any], latents: Tensor) -> Tensor:
+        """(B,), of latents (B, Q), in standard deviations of each of them in the simulations."""
+        nearest = torch.cdist(_data(model, batch) / _scale(self.data), self.data / _scale(self.data)).argmin(1)
+        return ((latents - self.latents[nearest]) / _scale(self.latents)).norm(dim=1)
+
+
+def _scale(values: Tensor) -> Tensor:
+    """Standard deviations of columns; 1 of those that do not vary."""
+    scale = values.std(0, correction=0)
+    return torch.where(scale > 0, scale, 1.0)
+
+
+def _data(model: DynamicalVAE, batch: Mapping[str, Any]) -> Tensor:
+    """(B, F)."""
+    return torch.cat([batch[name].flatten(1) for name in model.observed], 1)
+
+
+def _coordinates(model: DynamicalVAE, latents: Mapping[str, Tensor], steps: Tensor) -> Tensor:
+    """(B, Q), of all latents at these steps."""
+    local = model.generative.local
+    return torch.cat(
+        [(latents[name][:, steps] if local(name) else latents[name]).flatten(1) for name in model.latents], 1
+    )
+
+
+def _simulated(model: DynamicalVAE, given: Mapping[str, Tensor], count: int, length: int) -> Mapping[str, Tensor]:
+    """Latents and data of so many sequences."""
+    truth = model.sample(count, length, given or None)
+    if wrong := [name for name in (*model.latents, *model.observed) if not truth[name].isfinite().all()]:
+        raise FloatingPointError(
+            f"a free run of {length} steps gave {', '.join(wrong)} that are not finite; simulate fewer steps, "
+            "or see whether the model has been fitted"
+        )
+    return truth
+
+
+def _ranks(
+    model: DynamicalVAE,
+    infer: Callable[..., Any],
+    given: Mapping[str, Tensor],
+    count: int,
+    length: int,
+    draws: int,
+    steps: Tensor,
+    points: _Points,
+) -> Tensor:
+    """Ranks (B, Q) of B simulations, latents and data, among the guide's draws of their latents."""
+
+    def quantities(batch: Mapping[str, Any], latents: Mapping[str, Tensor]) -> Tensor:
+        """(B, Q)."""
+        ranked = _coordinates(model, latents, steps)
+        joint = torch.stack(list(model.log_joint(batch, latents).values())).sum(0)
+        return torch.cat([ranked, points.distances(model, batch, ranked)[:, None], joint[:, None]], 1)
+
+    truth = _simulated(model, given, count, length)
+    batch = {**given, **{name: truth[name] for name in model.observed}}
+    repeated = repeat(batch, draws)
+    sites = poutine.trace(infer).get_trace(repeated).nodes
+    if missing := [name for name in model.latents if name not in sites]:
+        raise ValueError(f"the guide draws no {', '.join(missing)}; it needs one site for each latent")
+    found: dict[str, Any] = {name: sites[name]["value"] for name in model.latents}
+    drawn = quantities(repeated, found)
+    true = quantities(batch, {name: truth[name] for name in model.latents})
+    return (drawn.unflatten(0, (draws, count)) < true).sum(0).cpu()
+
+
+@lru_cache(maxsize=8)
+def _tails(count: int, draws: int) -> np.ndarray:
+    """(L, N + 1): the smaller tail of k in a Binomial(N, i / (L + 1)), which the number of ranks below i follows."""
+    points = np.arange(1, draws + 1)[:, None] / (draws + 1)
+    number = np.arange(count + 1.0)
+    at_least = np.where(number > 0, scipy.special.bdtrc(np.maximum(number - 1, 0), count, points), 1.0)
+    return np.minimum(scipy.special.bdtr(number, count, points), at_least)
+
+
+def _ecdf_test(least: np.ndarray, count: int, draws: int) -> np.ndarray:
+    """P(the smallest tail of a uniform sample's ECDF over all points is at most `least`), elementwise; exact.
+
+    Counts below 1, 2, ... of uniform ranks are a Poisson process given that it ends at N, so the probability to stay
+    within bounds is a chain of convolutions (Säilynoja et al. have binomial steps). `arviz_stats` simulates the same
+    probability, but drops the upper tail of every simulation with no rank below some point.
+    """
+    step, size = _poisson(count, count / (draws + 1)), scipy.fft.next_fast_len(2 * count + 1, real=True)
+    transform = scipy.fft.rfft(step, size)
+    bound = least[:, None] * (1 + 1e-9)  # tails that are equal but for rounding are equal
+    within = np.zeros((len(least), count + 1))
+    within[:, 0] = 1
+    for tails in _tails(count, draws):
+        moved = scipy.fft.irfft(scipy.fft.rfft(within, size) * transform, size)[:, : count + 1]
+        within = np.where(tails > bound, moved, 0.0)
+    inside = within @ step[::-1] / _poisson(count, count)[-1]
+    # Where rounding hides the difference from 1, the sum over points bounds the probability from above.
+    return np.clip(np.where(1 - inside > 1e-10, 1 - inside, 2 * draws * least), 0.0, 1.0)
+
+
+def _poisson(largest: int, mean: float) -> np.ndarray:
+    """Probabilities of 0 to `largest`."""
+    number = np.arange(largest + 1)
+    return np.exp(scipy.special.xlogy(number, mean) - mean - scipy.special.gammaln(number + 1))
+
+
+@lru_cache(maxsize=32)
+def _critical(alpha: float, count: int, draws: int) -> float:
+    """The largest tail that is rejected at level alpha; 0 where none is."""
+    candidates = np.unique(_tails(count, draws))
+    place = bisect_right(candidates, alpha, key=lambda least: _ecdf_test(np.array([least]), count, draws)[0])
+    return float(candidates[place - 1]) * (1 + 1e-9) if place else 0.0
+
+
+@lru_cache(maxsize=8)
+def _rank_table(draws: int) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of fine intervals of the real line, and P(rank | truth in the interval) among standard normal draws."""
+    edges = np.linspace(-8, 8, 801)
+    middles = np.concatenate([edges[:1], (edges[1:] + edges[:-1]) / 2, edges[-1:]])
+    number, special = np.arange(draws + 1.0)[:, None], scipy.special
+    choices = special.gammaln(draws + 1) - special.gammaln(number + 1) - special.gammaln(draws - number + 1)
+    return edges, np.exp(choices + number * special.log_ndtr(middles) + (draws - number) * special.log_ndtr(-middles))
+
+
+def _likeliest_normal(
+    counts: np.ndarray, draws: int, bias: float | None = None, log_spread: float | None = None
+) -> tuple[np.ndarray, float]:
+    """Mean and log standard deviation, where not given, of the truth that most likely has these ranks; how likely.
+
+    Ranks 0 and L are tails: they do not say how far beyond all draws a truth lies.
+    """
+    edges, table = _rank_table(draws)
+    scores = scipy.special.ndtri((np.arange(draws + 1) + 0.5) / (draws + 1))
+
+    def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        spread = math.exp(parameters[1])
+        t = (edges - parameters[0]) / spread
+        density = np.exp(-(t**2) / 2) / math.sqrt(2 * math.pi)
+        below = np.stack([scipy.special.ndtr(t), -density / spread, -density * t])  # and its two derivatives
+        share, *slopes = np.diff(below, prepend=0.0, append=[[1.0], [0.0], [0.0]]) @ table.T
+        share = np.maximum(share, 1e-300)
+        weak = parameters / (100.0, 1.0)  # gradient of a prior with standard deviations of 10 and 1
+        value = -counts @ np.log(share) + parameters @ weak / 2
+        return float(value), weak - np.stack(slopes) @ (counts / share)
+
+    mean = counts @ scores / counts.sum()
+    ratio = math.sqrt(counts @ (scores - mean) ** 2 / counts.sum() / (scores**2).mean())
+    limits = [(-12.0, 12.0) if bias is None else (bias, bias), (-3.0, 3.0) if log_spread is None else (log_spread,) * 2]
+    start = np.clip([mean, math.log(max(ratio, 1.0))], *np.transpose(limits))  # wide, so that all ranks have a slope
+    found = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=limits)
+    return found.x, -float(found.fun)
+
+
+def _reading(name: str, counts: np.ndarray, draws: int) -> str:
+    """What three standard errors, by the likelihood ratio, tell of bias at any spread and of spread at any bias."""
+    (bias, log_spread), likelihood = _likeliest_normal(counts, draws)
+    biased = 2 * (likelihood - _likeliest_normal(counts, draws, bias=0.0)[1]) > 9
+    spread = 2 * (likelihood - _likeliest_normal(counts, draws, log_spread=0.0)[1]) > 9
+    if name == LOG_JOINT:  # of draws that are all near the mode, the truth is the least probable
+        return ("draws improbable latents" if bias > 0 else "is too concentrated") if biased else "has another shape"
+    if name == TARP:  # the nearer draws are to each other, the nearer to a point among them
+        return ("is too concentrated" if bias > 0 else "is too dispersed") if biased else "has another shape"
+    parts = ["is too narrow" if log_spread > 0 else "is too wide"] * spread
+    parts += ["draws too low" if bias > 0 else "draws too high"] * biased
+    return ", ".join(parts) or "has another shape"

@@ -1,0 +1,459 @@
+"""Predictive checks: do replicated sequences look like real ones?
+
+`predictive_checks` compares statistics of real windows with those of forecasts and of draws from the posterior
+predictive distribution (Gelman, Meng and Stern, 1996). `STATISTICS` are some for any sequences, `usual` these in the
+unit of the data.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy
+import torch
+from rich.text import Text
+from torch import Tensor
+
+from ...data.sequences import HeldOutWindows, called, columns_of, gapped, mean_of_known, past_of, scales_of
+from ...program.batch import repeat
+from ...program.model import DynamicalVAE
+from ...turns import alone
+from ..bounds.elbo import require_likelihood
+from ..evaluation.held import hold, on_device_of, plain, reproducibly
+from ..evaluation.result import Result, Table, as_they_are, canvas, progress_bar
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """A number that says something of a sequence.
+
+    Args:
+        function: x (..., T, D) -> (...). Of windows with missing entries x is NaN there, in replicates too.
+        unit: of the number.
+        note: a line below the table.
+    """
+
+    function: Callable[[Tensor], Tensor]
+    unit: str = ""
+    note: str = ""
+
+
+def variance(x: Tensor) -> Tensor:
+    """(..., D), over time, of what is not NaN of x (..., T, D)."""
+    if not x.isnan().any():
+        return x.var(-2, correction=0)
+    return mean_of_known((x - mean_of_known(x, -2).unsqueeze(-2)).square(), -2)
+
+
+def _scale(x: Tensor) -> Tensor:
+    return mean_of_known(variance(x), -1).sqrt()
+
+
+def _roughness(x: Tensor) -> Tensor:
+    return mean_of_known(x.diff(dim=-2).square(), (-2, -1)).sqrt()
+
+
+def _correlation_length(x: Tensor) -> Tensor:
+    length = x.shape[-2]
+    centred = x - mean_of_known(x, -2).unsqueeze(-2)
+    products = (centred[..., lag:, :] * centred[..., : length - lag, :] for lag in range(length))
+    lags = [(1 - lag / length) * mean_of_known(product, (-2, -1)) for lag, product in enumerate(products)]
+    below = torch.stack(lags, -1) < lags[0][..., None] / math.e
+    return torch.where(below.any(-1), below.double().argmax(-1), length).double()
+
+
+def _persistence(x: Tensor) -> Tensor:
+    centred = x - mean_of_known(x, -2).unsqueeze(-2)
+    power = mean_of_known(centred.square(), (-2, -1))
+    return torch.where(power == 0, 1.0, mean_of_known(centred[..., 1:, :] * centred[..., :-1, :], (-2, -1)) / power)
+
+
+def _zeros(x: Tensor) -> Tensor:
+    return mean_of_known(torch.where(x.isnan(), torch.nan, (x == 0).to(x)), (-2, -1))
+
+
+def _smallest(x: Tensor) -> Tensor:
+    return x.where(~x.isnan(), torch.inf).amin((-2, -1))
+
+
+STATISTICS = {
+    "mean": Statistic(lambda x: mean_of_known(x, (-2, -1))),
+    "scale": Statistic(_scale),
+    "roughness": Statistic(_roughness),
+    "correlation length": Statistic(_correlation_length, "frames"),
+    "lag-1 correlation": Statistic(_persistence),
+    "zeros": Statistic(_zeros, "share"),
+    "smallest": Statistic(_smallest),
+    "largest": Statistic(lambda x: -_smallest(-x)),
+}
+"""For any sequences: mean of all numbers; their standard deviation over time about it, coordinate by coordinate, and
+that of their steps from frame to frame (root mean squares over coordinates); the lag at which the autocorrelation,
+pooled over coordinates, falls below 1/e, T where it never does, and that at a lag of 1, 1 of what stands still; and of
+data that are counts or positive, the share of numbers that are 0, and the extremes. Means are of what was observed."""
+_OF_DATA = ("mean", "scale", "roughness", "smallest", "largest")
+"""Those in the unit of the data."""
+
+
+def usual(windows: HeldOutWindows) -> dict[str, Statistic]:
+    """`STATISTICS`, of all columns together, as `scores.proper` has its scores.
+
+    In the unit of the columns, if windows name them and they share one; else, where windows tell the scales of columns,
+    of numbers in these, which have no unit.
+    """
+    units = dict.fromkeys(columns_of(windows).values())
+    if scales := scales_of(windows):
+        unit, note = "scales", "statistics of all columns together are of numbers in their scales, in the training data"
+    elif len(units) > 1:
+        unit, note = "", f"statistics without a unit mix numbers in {', '.join(unit or '1' for unit in units)}"
+    else:
+        unit, note = next(iter(units), ""), ""
+    return {
+        name: replace(
+            each,
+            function=_in_scales(each.function, scales) if scales else each.function,
+            unit=unit if name in _OF_DATA else each.unit,
+            note=note,
+        )
+        for name, each in STATISTICS.items()
+    }
+
+
+def _in_scales(function: Callable[[Tensor], Tensor], scales: Sequence[float]) -> Callable[[Tensor], Tensor]:
+    return lambda x: function(x / x.new_tensor(scales))
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """One statistic of real and of replicated windows.
+
+    Attributes:
+        real: (N,), of the windows of which the statistic says something.
+        replicated: (S, N).
+        unit: of both.
+    """
+
+    real: np.ndarray
+    replicated: np.ndarray
+    unit: str
+
+    @property
+    def tail_areas(self) -> np.ndarray:
+        """(N,), each window's Bayesian p-value: the share of its replicates that are larger, ties counting half."""
+        larger, equal = self.replicated > self.real, self.replicated == self.real
+        return (larger + 0.5 * equal).mean(0)
+
+    @property
+    def outside(self) -> float:
+        """Share of windows whose tail area is below .05 or above .95."""
+        return float(((self.tail_areas < 0.05) | (self.tail_areas > 0.95)).mean())
+
+    @property
+    def expected_outside(self) -> float:
+        """`outside` of the true model's forecasts, ties apart: the window's rank among its S is uniform on 0..S."""
+        samples = len(self.replicated)
+        return 2 * -(-samples // 20) / (samples + 1)
+
+    @property
+    def wasserstein(self) -> float:
+        """Distance between the distributions of real and replicated values, in their unit."""
+        return float(scipy.stats.wasserstein_distance(self.real, self.replicated.ravel()))
+
+    def document(self) -> dict[str, Any]:
+        """What the table shows and the tail area of every window, in JSON's types."""
+        levels = (0.05, 0.25, 0.5, 0.75, 0.95)
+        return {
+            "unit": self.unit,
+            "quantiles": list(levels),
+            "real": np.quantile(self.real, levels).tolist(),
+            "replicated": np.quantile(self.replicated, levels).tolist(),
+            "wasserstein": self.wasserstein,
+            "tail_area": float(self.tail_areas.mean()),
+            "outside": self.outside,
+            "expected_outside": self.expected_outside,
+            "tail_areas": self.tail_areas.tolist(),
+        }
+
+
+_SEAM = 2  # observed frames that are joined to a forecast, so that a jump counts
+PROGRAMS = {
+    "forecast": "free-running given what was observed",
+    "posterior": "free-running given latents inferred from the whole window",
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PredictiveChecks(Result):
+    """Statistics of replicated windows beside those of the real ones.
+
+    Attributes:
+        checks: (model, program, statistic) to `Check`; programs are "forecast" and, of a model with latents,
+            "posterior".
+        data: fingerprint, windows, frames, coordinates, and what the windows say of themselves.
+        protocol: the fields of the windows' protocol.
+        samples: S, replicates of each window.
+        emission: "mean" or "drawn".
+        seed: of every model's draws.
+        notes: lines below the table on how statistics are to be read.
+    """
+
+    checks: dict[tuple[str, str, str], Check]
+    data: dict[str, Any]
+    protocol: dict[str, Any]
+    samples: int
+    emission: str
+    seed: int
+    notes: list[str] = field(default_factory=list)
+
+    def __getitem__(self, key: tuple[str, str, str]) -> Check:
+        if key not in self.checks:
+            raise KeyError(f"no check {key}; there are {', '.join(map(str, self.checks))}")
+        return self.checks[key]
+
+    def table(self) -> Table:
+        """Quantiles of real and replicated values, their distance, and where real values lie among replicates."""
+        expected = next(iter(self.checks.values())).expected_outside
+        models, programs, names = self._keys
+        caption = [
+            *(f"{program}: {PROGRAMS[program]}" for program in programs),
+            "tail area: share of a window's replicates above the real value, mean over windows",
+            "outside: share of windows with a tail area below .05 or above .95",
+            f"forecasts of a true model have ½ and, with {self.samples} replicates, {expected:.1%}"
+            if self.emission == "drawn"
+            else f"means lack the emission's noise: even a true model's need not have ½ and {expected:.1%}",
+            *self.notes,
+        ]
+        table = Table(title=self._title, caption="\n".join(caption))
+        for column in ("", "", "5 %", "median", "95 %", "Wasserstein", "tail area", "outside"):
+            table.add_column(column, justify="right" if column else "left", no_wrap=True)
+        for program in programs:
+            table.add_section()
+            table.add_row(Text(program, "bold"))
+            for name in names:
+                first = self.checks[models[program][0], program, name]
+                label = Text.assemble(name, (f" ({first.unit})" if first.unit else "", "dim"))
+                table.add_row(label, "real", *_quantiles(first.real))
+                for model in models[program]:
+                    check = self.checks[model, program, name]
+                    outcome = (f"{check.wasserstein:.3g}", f"{check.tail_areas.mean():.2f}", f"{check.outside:.0%}")
+                    table.add_row("", model, *_quantiles(check.replicated), *outcome)
+        return table
+
+    def plot(self) -> Figure:
+        """Densities of each statistic: real windows grey, replicates as one line per model."""
+        models, programs, names = self._keys
+        size = (0.6 + 2.3 * len(names), 0.8 + 2.0 * len(programs))
+        figure = canvas(*size)
+        panels = figure.subplots(len(programs), len(names), squeeze=False, sharex="col")
+        for column, name in enumerate(names):
+            checks = [self.checks[model, program, name] for program in programs for model in models[program]]
+            values = [found for check in checks for found in (check.real, check.replicated)]
+            # the outer bins take what is more extreme: a wild replicate must not flatten the rest
+            low, high = np.quantile(np.stack([np.quantile(v, (0.005, 0.995)) for v in values]), (0, 1))
+            edges = np.linspace(low, high if high > low else low + 1, 41)
+            for row, program in enumerate(programs):
+                panel = panels[row, column]
+                real = self.checks[models[program][0], program, name].real
+                panel.stairs(_density(real, edges), edges, fill=True, color="0.8", label="real")
+                for place, model in enumerate(models["forecast"]):
+                    if model not in models[program]:
+                        continue
+                    replicated = self.checks[model, program, name].replicated
+                    panel.stairs(_density(replicated, edges), edges, color=f"C{place}", label=model, linewidth=1.3)
+                panel.set_yticks([])
+                panel.tick_params(labelsize=7)
+            unit = checks[0].unit
+            panels[-1, column].set_xlabel(f"{name} ({unit})" if unit else name, fontsize=9, parse_math=False)
+        for row, program in enumerate(programs):
+            panels[row, 0].set_ylabel(program, fontsize=9)
+        handles, labels = panels[0, 0].get_legend_handles_labels()
+        below: dict[str, Any] = {"loc": "outside lower center", "ncols": len(labels), "frameon": False}
+        legend = figure.legend(handles, labels, fontsize=8, **below)
+        as_they_are(legend.get_texts())
+        figure.suptitle(self._title, fontsize=9, parse_math=False)
+        return figure
+
+    def document(self) -> dict[str, Any]:
+        """Summaries of every check and what they rest on, in JSON's types."""
+        nested: dict[str, Any] = {}
+        for (model, program, name), check in self.checks.items():
+            nested.setdefault(model, {}).setdefault(program, {})[name] = check.document()
+        rest = {name: value for name, value in vars(self).items() if name != "checks"}
+        return {**rest, "programs": {program: PROGRAMS[program] for program in self._keys[1]}, "checks": nested}
+
+    def to_json(self) -> str:
+        """`document` as text."""
+        return json.dumps(self.document(), indent=1, allow_nan=False)
+
+    @property
+    def _keys(self) -> tuple[dict[str, list[str]], list[str], list[str]]:
+        """Models of each program, programs and statistics."""
+        _, programs, names = (list(dict.fromkeys(keys)) for keys in zip(*self.checks, strict=True))
+        models = {p: list(dict.fromkeys(model for model, own, _ in self.checks if own == p)) for p in programs}
+        return models, programs, names
+
+    @property
+    def _title(self) -> str:
+        parts = ["predictive checks", self.protocol.get("name", ""), f"{self.data['windows']} windows"]
+        parts += [f"{self.samples} replicates", f"{self.emission} emission", f"data {self.data['fingerprint'][:12]}"]
+        return " · ".join(part for part in parts if part)
+
+
+@alone
+def predictive_checks(
+    model: DynamicalVAE | Mapping[str, DynamicalVAE],
+    windows: HeldOutWindows,
+    statistics: Mapping[str, Statistic] | None = None,
+    *,
+    samples: int = 20,
+    draw_emission: bool = True,
+    seed: int = 0,
+    batch_size: int = 32,
+    progress: bool = True,
+) -> PredictiveChecks:
+    """Replicates windows with one model or several, and compares statistics with those of the real ones.
+
+    Two replications, both free-running. "forecast": the frames after the observed ones; the last two observed frames
+    are joined to them, so that a jump at the seam counts. "posterior", the posterior predictive distribution proper:
+    latents are inferred from the whole window, and all its frames are generated anew from them; a model without latents
+    has none. Where entries of a window are missing, its replicates lack them too; a window that leaves too few for a
+    statistic does not count in it.
+
+    Args:
+        model: a model, or `{name: model}`.
+        windows: `ArrayWindows`, windows of `dvae.motion`, or any `HeldOutWindows`.
+        statistics: name to `Statistic`, such as `dvae.motion.statistics(windows)`; those that are `usual`, if not
+            given.
+        samples: S, replicates of each window; at least 19, for tail areas below .05 to be a tenth.
+        draw_emission: replicate draws of x. Its means, as forecasts are shown, lack the noise of the emission: with
+            them what is shown is examined, and no longer the model.
+        seed: of every model's draws.
+        batch_size: windows replicated at once.
+        progress: whether to show a progress bar.
+
+    Raises:
+        ValueError: ragged windows, too few samples, a statistic of the wrong shape or not finite on real windows.
+        FloatingPointError: a statistic that is not finite on replicated windows.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=4)
+        >>> checks = dvae.predictive_checks({"model": model}, windows, progress=False)
+    """
+    models = dict(model) if isinstance(model, Mapping) else {"model": model}
+    if samples < 19 or batch_size < 1 or not models:
+        raise ValueError(
+            "expected a model, at least 19 samples, for tail areas below .05 to be no more than a tenth, and a "
+            f"batch_size of at least 1; got {len(models)}, {samples} and {batch_size}"
+        )
+    held = hold(windows)
+    windows = held.windows
+    statistics = usual(windows) if statistics is None else statistics
+    if not statistics:
+        raise ValueError("there is no statistic to check")
+    for each in models.values():
+        require_likelihood(each)
+    truth = gapped(held.batch)
+    _, frame = called(windows.description)
+    firsts = {"forecast": held.observed - min(_SEAM, held.observed), "posterior": 0}
+    checks = {}
+    with progress_bar(progress) as bar:
+        for program, first in firsts.items():
+            real = _measure(statistics, truth[:, first:], "real windows")
+            told = {name: values.isfinite() for name, values in real.items()}
+            for label, each in models.items():
+                if program == "posterior" and not each.latents:
+                    continue  # nothing is inferred
+                parts: list[dict[str, Tensor]] = []
+                with reproducibly(each, seed):
+                    starts = range(0, len(held.x), batch_size)
+                    for start in bar.track(starts, description=f"{label}, {program}"):
+                        some = slice(start, start + batch_size)
+                        part = on_device_of(each, held.part(some))
+                        x = _REPLICATES[program](each, part, held.observed, samples, draw_emission).to(held.x)
+                        x = x.masked_fill(truth[some, first:].isnan(), torch.nan)
+                        known = {name: seen[some] for name, seen in told.items()}
+                        parts.append(_measure(statistics, x, f"replicates of {label} ({program})", known))
+                for name, statistic in statistics.items():
+                    values, replicated = real[name], torch.cat([part[name] for part in parts], 1)
+                    kept = told[name]
+                    unit = statistic.unit.replace("frame", frame)
+                    checks[label, program, name] = Check(values[kept].numpy(), replicated[:, kept].numpy(), unit)
+    return PredictiveChecks(
+        checks={(m, p, s): checks[m, p, s] for m in models for p in firsts for s in statistics if (m, p, s) in checks},
+        data=held.description(),
+        protocol=plain(asdict(windows.protocol)),
+        samples=samples,
+        emission="drawn" if draw_emission else "mean",
+        seed=seed,
+        notes=list(dict.fromkeys(each.note for each in statistics.values() if each.note)),
+    )
+
+
+def _forecast(model: DynamicalVAE, batch: dict[str, Tensor], observed: int, samples: int, drawn: bool) -> Tensor:
+    """The last observed frames and the future, (S, B, seam + H, D)."""
+    x = batch["x"]
+    seen, horizon = past_of(batch, observed), x.shape[1] - observed
+    future = model.forecast(seen, horizon, samples, draw_emission=drawn)["x"]
+    return torch.cat([seen["x"][None, :, -_SEAM:].expand(samples, -1, -1, -1), future], 2)
+
+
+def _posterior(model: DynamicalVAE, batch: dict[str, Tensor], observed: int, samples: int, drawn: bool) -> Tensor:
+    """(S, B, T, D)."""
+    repeated = repeat(batch, samples)
+    return decode(model, repeated, model.guide(repeated), not drawn).unflatten(0, (samples, -1))
+
+
+_REPLICATES = {"forecast": _forecast, "posterior": _posterior}
+
+
+def _measure(
+    statistics: Mapping[str, Statistic], x: Tensor, whose: str, told: Mapping[str, Tensor] | None = None
+) -> dict[str, Tensor]:
+    """Statistics (..., N) by name; NaN of a window that has too many gaps, or of which `told` (N,) says so."""
+    found = {}
+    for name, statistic in statistics.items():
+        found[name] = statistic.function(x).double().cpu()
+        if found[name].shape != x.shape[:-2]:
+            raise ValueError(
+                f"the statistic {name} maps {tuple(x.shape)} to {tuple(found[name].shape)}; expected "
+                f"{tuple(x.shape[:-2])}, one number for each sequence (..., T, D)"
+            )
+        nothing = found[name].isnan() & x.isnan().any(-1).any(-1) if told is None else ~told[name]
+        if not (found[name].isfinite() | nothing).all() or (told is None and nothing.all()):
+            error = ValueError if told is None else FloatingPointError
+            raise error(f"the statistic {name} is not finite on {whose} of {x.shape[-2]} frames")
+    return found
+
+
+def decode(
+    model: DynamicalVAE, batch: Mapping[str, Tensor], latents: Mapping[str, Tensor], mean_emission: bool
+) -> Tensor:
+    """x (B, T, D) run free from its own past, given context and latents; latents that are not given are drawn.
+
+    It is as the data are, and not as the model sees them. First frames that are context, as a pose from which motion
+    starts, stay as they are.
+    """
+    data = model.read(batch)
+    known = {name: value for name, value in data.items() if name in model.context}
+    length, size = data.get("x", batch["x"]).shape[1], len(batch["x"])
+    made = model.model({**known, **latents}, length=length, size=size, mean_emission=mean_emission)
+    x = model.shown({name: made[name] for name in model.observed}, data)["x"]
+    before = batch["x"].shape[1] - length
+    return torch.cat([batch["x"][:, :before], x], 1) if before else x
+
+
+def _quantiles(values: np.ndarray) -> list[str]:
+    return [f"{value:.3g}" for value in np.quantile(values, (0.05, 0.5, 0.95))]
+
+
+def _density(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    counts = np.histogram(values.clip(edges[0], edges[-1]), edges)[0]
+    return counts / (values.size * np.diff(edges))

@@ -1,0 +1,384 @@
+"""The posterior of latents given whatever was observed: its mode and the normal about that, of all sequences at once.
+
+    w* = argmax log p(w, seen),    p(w | seen) ~ N(w*, H^-1),    H = -d2 log p(w*, seen) / dw dw
+
+What was observed is said as a Pyro program says it. Its sequences do not know of each other, so that the sum of their
+energies E = -log p has the gradient of each: sequences and starts go down as the rows of one batch, by Adam, which
+steps number by number. Curvatures of all rows come out of as many backward passes as a row has numbers. By them the
+last steps are Newton's, which are exact where E is quadratic; the normal is so too, and else Laplace's approximation.
+
+A row's posterior says how far it has converged (`left`), whether starts agree (`behind`), and whether the normal is
+one to rely on (`bent`, and k-hat of `evidence`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from math import ceil
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from ...options import Count, Delay, Positive, Size, check
+from ...program.batch import repeat, rows
+from ...turns import alone
+from ..bounds.elbo import ImportanceBound, importance_mean
+from ..evaluation.result import progress_bar
+from .latents import Values, joined, split
+
+_Program = Callable[[Any], Any]
+
+
+@dataclass(frozen=True)
+class Descent:
+    """How a mode is looked for.
+
+    Args:
+        steps: of Adam.
+        rate: of learning at first; it falls to 0 along a cosine.
+        starts: S, from which a sequence's mode is looked for; the lowest one is kept.
+        candidates: draws from the prior, and as many from the guide where there is one. They and the mean of the
+            prior's are dealt out to the starts, each of which is the most probable of its own.
+        renewed: steps after which what the batch says of the values is renewed.
+        newton: steps of Newton's at the end, each with a curvature of its own.
+
+    Example:
+        >>> quick = dvae.Descent(steps=50, starts=2)
+    """
+
+    steps: Count = 400
+    rate: Positive = 0.05
+    starts: Size = 4
+    candidates: Size = 16
+    renewed: Count = 10
+    newton: Delay = 2
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.starts > self.candidates:
+            raise ValueError(
+                f"{self.starts} starts are chosen among at least so many candidates, got {self.candidates}"
+            )
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Modes of B sequences, and normals about them.
+
+    Args:
+        mode: latent to its most probable value (B, ...).
+        energy: (B,) -log p(w*, seen), in nats.
+        energies: (S, B) those at which starts arrived, the lowest first, before Newton's steps.
+        course: (steps, B) that of the start which arrived lowest, on its way.
+        left: (B,) nats by which another step of Newton's would lower the energy, if it were quadratic: about 0 where
+            the descent has converged.
+        bent: (B,) directions in which the energy is less curved than that of the prior alone. There the normal is as
+            wide as the prior, for it would be wider, or have no width.
+        factor: (B, P, P) lower triangle whose square is the covariance of all numbers of a sequence's latents, in the
+            order of `mode`.
+
+    Example:
+        >>> model = dvae.twin("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
+        >>> found = dvae.posterior(model.model, {"x": model.sample(5, 4)["x"]}, descent=dvae.Descent(steps=20))
+        >>> bool((found.left < 1e-6).all())  # nats: it has converged
+        True
+    """
+
+    mode: Mapping[str, Tensor]
+    energy: Tensor
+    energies: Tensor
+    course: Tensor
+    left: Tensor
+    bent: Tensor
+    factor: Tensor
+
+    @property
+    def moved(self) -> Tensor:
+        """(B,) nats by which the energy fell in the last tenth of the steps."""
+        return self.course[-ceil(len(self.course) / 10)] - self.course[-1]
+
+    @property
+    def behind(self) -> Tensor:
+        """(S, B) nats by which starts arrived above the lowest one."""
+        return self.energies - self.energies[:1]
+
+    @property
+    def deviation(self) -> dict[str, Tensor]:
+        """Latent to standard deviations (B, ...)."""
+        return split(self.factor.norm(dim=-1), self.mode)
+
+    def draw(self, n: int, seed: int = 0) -> dict[str, Tensor]:
+        """Latent to draws (n, B, ...) from the normal."""
+        return split(joined(self.mode) + self._away(n, torch.Generator().manual_seed(seed)), self.mode)
+
+    def guide(self, batch: Any = None) -> dict[str, Tensor]:
+        """The normal as a Pyro guide of the program, on the same batch."""
+        with pyro.plate("sequences", len(self.factor)):
+            law = dist.MultivariateNormal(joined(self.mode), scale_tril=self.factor)
+            flat = pyro.sample("_latents", law, infer={"is_auxiliary": True})
+            values = split(flat, self.mode).items()
+            return {name: pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 1)) for name, value in values}
+
+    @alone
+    @torch.no_grad()
+    def evidence(
+        self, program: _Program, batch: Any, particles: int = 200, *, seed: int = 0, chunk: int = 4096
+    ) -> ImportanceBound:
+        """The log evidence of what was seen, by importance sampling from the normal, and k-hat of its weights.
+
+        A k-hat above 0.7 says that the posterior is not like the normal: take its intervals as rough.
+
+        Args:
+            program, batch: of which this is the posterior.
+            particles: K.
+            seed: of the draws.
+            chunk: sequences times particles to hold at once.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        law = dist.MultivariateNormal(torch.zeros_like(self.factor[..., 0]), scale_tril=self.factor)
+
+        def log_weights(count: int) -> Tensor:
+            away = self._away(count, generator)
+            drawn = split((joined(self.mode) + away).flatten(0, 1), self.mode)
+            return -_energy(program, repeat(batch, count), drawn) - law.log_prob(away).flatten()
+
+        return importance_mean(log_weights, len(self.factor), particles, chunk)
+
+    def _away(self, n: int, generator: torch.Generator) -> Tensor:
+        """(n, B, P) draws from the normal, less its mean."""
+        noise = torch.randn(n, *self.factor.shape[:-1], generator=generator, dtype=self.factor.dtype)
+        return (self.factor @ noise.to(self.factor)[..., None]).squeeze(-1)
+
+
+@alone
+@torch.inference_mode(False)
+def posterior(
+    program: _Program,
+    batch: Mapping[str, Any],
+    *,
+    guide: _Program | None = None,
+    descent: Descent | None = None,
+    renew: Callable[[Mapping[str, Any], Values], Mapping[str, Any]] | None = None,
+    seed: int = 0,
+    chunk: int = 2048,
+    progress: bool = False,
+) -> Posterior:
+    """The posterior of a program's latents given a batch.
+
+    Args:
+        program: a Pyro program of the batch, such as `DynamicalVAE.model`, in evaluation mode. Its latents (B, ...) are
+            continuous and unbounded, about as wide as N(0, I), and have a log-concave prior, such as normals; every
+            site has one log-density for each sequence.
+        batch: tensors (B, ...) by name, of what was observed and what else the program reads.
+        guide: a program of the batch that draws latents, or some of them, to begin from as well.
+        descent: how a mode is looked for.
+        renew: what the batch is to hold beside values of latents, such as which points belong together: called with the
+            batch and the latents every `descent.renewed` steps, without gradients.
+        seed: of the candidates.
+        chunk: sequences times starts to hold at once.
+        progress: whether to show a progress bar.
+
+    Raises:
+        ValueError: a program without latents, with sites of which sequences have no log-density of their own, or with
+            a prior that is not log-concave.
+        FloatingPointError: a sequence of which no start has a finite energy.
+
+    Example:
+        >>> model = dvae.twin("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
+        >>> seen = model.sample(5, 4)["x"]
+        >>> batch = {"x": seen, "mask": torch.rand(seen.shape) < 0.5}
+        >>> found = dvae.posterior(model.model, batch, descent=dvae.Descent(steps=20))
+        >>> found.mode["w"].shape, found.draw(10)["w"].shape
+        (torch.Size([5, 2]), torch.Size([10, 5, 2]))
+    """
+    descent = descent or Descent()
+    size, at_once = len(_some(batch)), max(1, chunk // descent.starts)
+    device = _some(batch).device
+    forked = torch.random.fork_rng([device] if device.type == "cuda" else [])
+    with forked, pyro.validation_enabled(False), progress_bar(progress) as bar:
+        torch.manual_seed(seed)
+        chunks = [rows(batch, slice(first, first + at_once)) for first in range(0, size, at_once)]
+        task = bar.add_task("looking for modes", total=len(chunks) * (descent.steps + descent.newton + 1))
+        parts = [_Search(program, chunk, guide, descent, renew, partial(bar.advance, task)).run() for chunk in chunks]
+    return parts[0] if len(parts) == 1 else _together(parts)
+
+
+def _some(batch: Any) -> Tensor:
+    """A tensor (B, ...) of a batch."""
+    return batch if isinstance(batch, Tensor) else _some(next(iter(batch.values())))
+
+
+class _Search:
+    """Of one chunk of sequences."""
+
+    def __init__(
+        self,
+        program: _Program,
+        batch: Any,
+        guide: _Program | None,
+        descent: Descent,
+        renew: Any,
+        went: Callable[[], object],
+    ):
+        self.program, self.batch, self.guide, self.descent, self.went = program, batch, guide, descent, went
+        self.size = len(_some(batch))
+        self.renew = renew or (lambda batch, values: batch)
+        self.latents: dict[str, Tensor] = {}  # of which shapes are read
+
+    def run(self) -> Posterior:
+        with torch.no_grad():
+            starts = self._starts()
+        ends, course = self._down(starts)
+        batch = repeat(self.batch, len(starts))
+        energies = self._measured(batch, ends.flatten(0, 1)).unflatten(0, starts.shape[:2])
+        finite = energies.isfinite().any(0)
+        if not finite.all():
+            raise FloatingPointError(
+                f"no start of sequence {int(finite.logical_not().nonzero()[0])} of these {self.size} arrived at a "
+                "finite energy; see whether what was observed of it is finite, or lower the rate"
+            )
+        order = energies.nan_to_num(torch.inf).argsort(0)
+        best, each = order[0], torch.arange(self.size)
+        values, batch = ends[best, each], self.batch
+        for round in range(self.descent.newton + 1):
+            batch = self._renewed(batch, values)
+            gradient, curvature = self._curvature(batch, values)
+            factor, bent = _root(curvature, self._curvature(batch, values, list(self.latents))[1])
+            step = -(factor @ factor.mT @ gradient[..., None]).squeeze(-1)
+            if round < self.descent.newton:
+                values = self._lower(batch, values, step)
+            self.went()
+        left = -(gradient * step).sum(-1) / 2
+        return Posterior(
+            split(values, self.latents),
+            self._measured(batch, values),
+            energies.gather(0, order),
+            course[:, best, each],
+            left,
+            bent,
+            factor,
+        )
+
+    def _starts(self) -> Tensor:
+        """(S, B, P): of the candidates, the most probable ones."""
+        nodes: dict[str, Any] = poutine.trace(self.program).get_trace(self.batch).nodes
+        self.latents = {
+            name: site["value"]
+            for name, site in nodes.items()
+            if site["type"] == "sample" and not site["is_observed"] and not poutine.util.site_is_subsample(site)
+        }
+        if not self.latents:
+            raise ValueError("the program has no latents: all its sites are observed in this batch")
+        if wrong := [name for name, value in self.latents.items() if len(value) != self.size]:
+            raise ValueError(
+                f"{', '.join(wrong)} has no value for each of {self.size} sequences; latents are drawn in a plate over "
+                "them"
+            )
+        drawn = [self._drawn(self.program) for _ in range(self.descent.candidates)]
+        guided = [self._drawn(self.program) | self._drawn(self.guide) for _ in drawn] if self.guide else []
+        every = torch.stack([torch.stack([joined(each) for each in drawn]).mean(0), *map(joined, drawn + guided)])
+        energies = torch.stack([self._measured(self.batch, each) for each in every]).nan_to_num(torch.inf)
+        starts, each = self.descent.starts, torch.arange(self.size)
+        return torch.stack([every[n::starts][energies[n::starts].argmin(0), each] for n in range(starts)])
+
+    def _drawn(self, program: _Program) -> dict[str, Tensor]:
+        """Latents that a program draws."""
+        nodes: dict[str, Any] = poutine.trace(program).get_trace(self.batch).nodes
+        return {name: nodes[name]["value"] for name in self.latents if name in nodes}
+
+    def _down(self, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """Where starts (S, B, P) arrive, and their energies (steps, S, B) on the way."""
+        descent, course = self.descent, []
+        batch = repeat(self.batch, len(starts))
+        values = starts.flatten(0, 1).clone().requires_grad_()
+        adam = torch.optim.Adam([values], descent.rate)
+        falling = torch.optim.lr_scheduler.CosineAnnealingLR(adam, descent.steps)
+        for step in range(descent.steps):
+            if step % descent.renewed == 0:
+                batch = self._renewed(batch, values.detach())
+            energy = self._energy(batch, values)
+            (gradient,) = torch.autograd.grad(energy.sum(), values)
+            values.grad = gradient.nan_to_num(0.0, 0.0, 0.0)  # of a row that has left for infinity, and others go on
+            adam.step()
+            falling.step()
+            course.append(energy.detach())
+            self.went()
+        return values.detach().unflatten(0, starts.shape[:2]), torch.stack(course).unflatten(1, starts.shape[:2])
+
+    def _energy(self, batch: Any, values: Tensor, sites: Collection[str] | None = None) -> Tensor:
+        return _energy(self.program, batch, split(values, self.latents), sites)
+
+    def _renewed(self, batch: Any, values: Tensor) -> Any:
+        with torch.no_grad():
+            return self.renew(batch, split(values, self.latents))
+
+    def _measured(self, batch: Any, values: Tensor) -> Tensor:
+        with torch.no_grad():
+            return self._energy(self._renewed(batch, values), values)
+
+    def _curvature(self, batch: Any, values: Tensor, sites: Collection[str] | None = None) -> tuple[Tensor, Tensor]:
+        """Gradients (B, P) and second derivatives (B, P, P) of the energy, or of what these sites add to it."""
+        values = values.clone().requires_grad_()
+        with torch.enable_grad():
+            energy = self._energy(batch, values, sites)
+            (gradient,) = torch.autograd.grad(energy.sum(), values, create_graph=True)
+            found = [
+                torch.autograd.grad(part.sum(), values, retain_graph=True, materialize_grads=True)[0]
+                for part in gradient.unbind(-1)
+            ]
+        return gradient.detach(), torch.stack(found, -1)
+
+    def _lower(self, batch: Any, values: Tensor, step: Tensor) -> Tensor:
+        """A step, or what half, quarter or eighth of it lowers the energy; no step where none does."""
+        shares = step.new_tensor([1.0, 0.5, 0.25, 0.125, 0.0])
+        tried = [values + share * step for share in shares]
+        energies = torch.stack([self._measured(batch, each) for each in tried]).nan_to_num(torch.inf)
+        return torch.stack(tried)[energies.argmin(0), torch.arange(self.size)]
+
+
+def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str] | None = None) -> Tensor:
+    """-log p (B,) of a program's sites, or of some of them, at these values of its latents."""
+    trace = poutine.trace(poutine.condition(program, data=dict(values))).get_trace(batch)
+    trace.compute_log_prob(site_filter=lambda name, _: sites is None or name in sites)
+    logs = {name: site["log_prob"] for name, site in trace.nodes.items() if "log_prob" in site}
+    size = len(next(iter(values.values())))
+    if wrong := {name: tuple(log.shape) for name, log in logs.items() if log.shape != (size,) and log.dim()}:
+        raise ValueError(
+            f"log-densities are {wrong}, expected one for each of {size} sequences; draw in one plate over sequences, "
+            "and say of all other dimensions that they are of one event (`.to_event()`)"
+        )
+    return -torch.stack([log for log in logs.values() if log.dim()]).sum(0)  # plates have none
+
+
+def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
+    """Lower roots (B, P, P) of inverse curvature, at least the prior's, and in how many directions it was less."""
+    kind, curvature, prior = curvature, curvature.double(), prior.double()
+    root, failed = torch.linalg.cholesky_ex(prior)
+    if failed.any():
+        raise ValueError(
+            "the prior of the latents is not log-concave where the posterior has its mode, so that nothing says how "
+            "wide it may be; this is for priors such as normals"
+        )
+    white = torch.linalg.solve_triangular(root, torch.eye(prior.shape[-1]).to(prior), upper=False)
+    relative = white @ curvature @ white.mT
+    values, directions = torch.linalg.eigh((relative + relative.mT) / 2)
+    bent = (values < 1 - 1e-3).sum(-1)  # 1 but for rounding, where nothing was observed
+    upper = torch.linalg.qr((white.mT @ directions / values.clamp(min=1.0)[..., None, :].sqrt()).mT)[1]
+    signs = upper.diagonal(dim1=-2, dim2=-1).sign()
+    return (upper * signs[..., None]).mT.to(kind), bent
+
+
+def _together(parts: Sequence[Posterior]) -> Posterior:
+    along = {"energies": 1, "course": 1}
+    found: dict[str, Any] = {
+        field.name: torch.cat([getattr(part, field.name) for part in parts], along.get(field.name, 0))
+        for field in fields(Posterior)
+        if field.name != "mode"
+    }
+    return Posterior({name: torch.cat([part.mode[name] for part in parts]) for name in parts[0].mode}, **found)

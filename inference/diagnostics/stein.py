@@ -1,0 +1,215 @@
+"""Kernel Stein discrepancy of a guide's draws from the posterior: a test that needs no draws from the posterior.
+
+    h(u, v) = s(u)'s(v) k(u, v) + s(u)' dk/dv + s(v)' dk/du + sum_p d2k / du_p dv_p,    s = d log p(x, u) / du,
+    KSD^2   = mean of h over pairs of different draws: unbiased, and 0 on average where they are from the posterior
+
+(Liu, Lee and Jordan, 2016, arXiv 1602.03253; Chwialkowski, Strathmann and Gretton, 2016, arXiv 1602.02964), with the
+inverse multiquadric kernel k(u, v) = (1 + |u - v|^2 / b^2)^(-1/2), whose tails are heavy enough that draws which do not
+converge to the posterior are told (Gorham and Mackey, 2017, arXiv 1703.01717). Preconditioned: u are the latents in
+standard deviations of the guide, number by number, by draws of their own. The bandwidth is b^2 = 2 P, as far apart as
+two draws of P such numbers are, squared, on average. The score needs no evidence; it is one gradient of the model.
+
+p-values are by the wild bootstrap: the mean of h with the sign of each draw changed at random is what KSD^2 would be
+of draws from the posterior. Sums over sequences have that of sums, and tell more than any sequence by itself.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from ...program.batch import AnyBatch
+from ...program.model import DynamicalVAE
+from ...turns import alone
+from ..evaluation.held import plain, reproducibly
+from ..evaluation.result import Result, Table, canvas, progress_bar
+from .latents import Inferred, some_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCALED = 1000
+"""Draws of the guide, of which its deviations are."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SteinDiscrepancy(Result):
+    """How far a guide's draws are from the posterior of each of S sequences, and whether that is chance.
+
+    Attributes:
+        squared: (S,) KSD^2; it may be below 0, as it is unbiased.
+        critical: (S,) what draws from the posterior exceed in 5 % of cases.
+        p_values: (S,) share of the bootstrap that is not below.
+        p_value: of all sequences together, by the sum of their KSD^2.
+        numbers: (S,) P, of which a sequence's latents are.
+        sequences: which of the batch.
+        draws: K.
+        bootstrap: replicates of the wild bootstrap.
+        seed: of all draws.
+        equations: of model and guide; no guide's where it was a program of one's own.
+    """
+
+    squared: np.ndarray
+    critical: np.ndarray
+    p_values: np.ndarray
+    p_value: float
+    numbers: np.ndarray
+    sequences: tuple[int, ...]
+    draws: int
+    bootstrap: int
+    seed: int
+    equations: dict[str, str]
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        number = f"p = {self.p_value:.2g} of {len(self.sequences)} sequences together, {self.draws} draws of each"
+        if self.p_value <= 0.05:
+            alone = f"; {(self.p_values <= 0.05).sum()} of them are told at 5 % by themselves"
+            return f"the guide is not the posterior ({number}{alone})"
+        return f"nothing speaks against the guide ({number})"
+
+    def table(self) -> Table:
+        """Every sequence."""
+        guide = self.equations.get("inference", "a guide of one’s own")
+        table = Table(title=f"kernel Stein discrepancy · {guide}", caption=self.verdict)
+        for column in ("sequence", "latent numbers", "KSD²", "5 % critical", "p"):
+            table.add_column(column, justify="right", no_wrap=True)
+        columns = (self.sequences, self.numbers, self.squared, self.critical, self.p_values)
+        for sequence, number, *rest in zip(*columns, strict=True):
+            table.add_row(str(sequence), str(number), *(f"{value:.3g}" for value in rest))
+        return table
+
+    def plot(self) -> Figure:
+        """KSD^2 of every sequence over what draws from the posterior exceed in 5 % of cases."""
+        figure = canvas(2.5 + 0.3 * len(self.sequences), 3.2)
+        panel = figure.subplots()
+        panel.plot([str(sequence) for sequence in self.sequences], self.squared / self.critical, "o")
+        panel.axhline(1, color="0.4", linewidth=0.8)
+        panel.set_xlabel("sequence")
+        panel.set_ylabel("KSD² over its 5 % critical value")
+        figure.suptitle(self.equations.get("inference", "a guide of one’s own"), fontsize=9, parse_math=False)
+        return figure
+
+    def document(self) -> dict[str, Any]:
+        """Everything, in JSON's types."""
+        return {**plain(asdict(self)), "verdict": self.verdict}
+
+    def to_json(self) -> str:
+        """`document` as text."""
+        return json.dumps(self.document(), indent=1, allow_nan=False)
+
+    @classmethod
+    @override
+    def from_json(cls, text: str) -> Self:
+        """What `to_json` wrote.
+
+        Raises:
+            ValueError: text that is not such a document.
+        """
+        try:
+            said = json.loads(text)
+            said.pop("verdict")
+            sequences = tuple(map(int, said.pop("sequences")))
+            kinds = {"squared": float, "critical": float, "p_values": float, "numbers": int}
+            arrays: dict[str, Any] = {name: np.array(said.pop(name), dtype=kind) for name, kind in kinds.items()}
+            if not sequences or any(each.shape != (len(sequences),) for each in arrays.values()):
+                raise ValueError(f"expected a number for each of {len(sequences)} sequences")
+            numbers = {"p_value": float, "draws": int, "bootstrap": int, "seed": int, "equations": dict}
+            told: dict[str, Any] = {name: kind(said.pop(name)) for name, kind in numbers.items()}
+            return cls(**arrays, sequences=sequences, **told, **said)
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"this is not a Stein discrepancy written by SteinDiscrepancy.to_json: {error!r}"
+            ) from error
+
+
+@alone
+@torch.inference_mode(False)
+def stein_discrepancy(
+    model: DynamicalVAE,
+    batch: AnyBatch,
+    sequences: Sequence[int] | None = None,
+    *,
+    guide: Callable[..., Any] | None = None,
+    draws: int = 500,
+    bootstrap: int = 1000,
+    seed: int = 0,
+    progress: bool = True,
+) -> SteinDiscrepancy:
+    """Tests whether a guide's draws are from the posterior, on data of any kind, sequence by sequence.
+
+    Nothing is drawn from the posterior: the gradient of the log joint at the guide's draws is enough. A small p-value
+    says that the guide is wrong, a large one little where latents are many numbers: see docs/criticism.md for how much
+    is told.
+
+    Args:
+        model: the generative model; its own guide is examined where no other is given.
+        batch: see `DynamicalVAE.model`; ragged batches, missing entries and context included.
+        sequences: which of the batch, from 0; all without it.
+        guide: a Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
+        draws: K, from the guide for each sequence; memory grows with its square.
+        bootstrap: replicates of the wild bootstrap: p-values are at least 1 / (1 + bootstrap).
+        seed: of all draws.
+        progress: whether to show a progress bar.
+
+    Raises:
+        ValueError: a model without latents or likelihood, whose sequences share latents or whose latents cannot be any
+            real numbers; sequences that are not in the batch; data that are missing; numbers that are too small.
+        FloatingPointError: a gradient that is not finite.
+
+    Example:
+        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
+        >>> found = dvae.stein_discrepancy(model, model.sample(3, 4)["x"])
+        >>> found.p_values.shape, found.p_value < 0.05  # a guide that was not fitted
+        ((3,), True)
+    """
+    if draws < 2 or bootstrap < 1:
+        raise ValueError(f"draws are at least 2 and bootstrap at least 1, got {draws} and {bootstrap}")
+    found, together = [], torch.zeros(bootstrap + 1, dtype=torch.float64)
+    with reproducibly(model, seed), progress_bar(progress) as bar:
+        some = some_of(model, batch, sequences)
+        for data in bar.track(some, description="scores of draws"):
+            inferred = Inferred(model, data, guide, SCALED)
+            u = inferred.whitened(inferred.drawn(draws))
+            pairs = _stein(u, inferred.score(u))
+            if not pairs.isfinite().all():
+                raise FloatingPointError(
+                    "the gradient of the log joint is not finite at a draw of the guide; see whether the model has "
+                    "been fitted, and on data of this scale"
+                )
+            signs = 2.0 * torch.randint(2, (bootstrap + 1, draws)).to(pairs) - 1
+            signs[0] = 1  # KSD^2 itself
+            means = ((signs @ pairs) * signs).sum(1).cpu() / (draws * (draws - 1))
+            found.append((float(means[0]), float(means.quantile(0.95)), _share(means), u.shape[1]))
+            together += means
+    squared, critical, p_values, numbers = map(np.array, zip(*found, strict=True))
+    equations = {"generative": model.generative.text} | ({} if guide else {"inference": model.inference.text})
+    which = tuple(range(len(some)) if sequences is None else sequences)
+    tests = squared, critical, p_values, _share(together), numbers
+    return SteinDiscrepancy(*tests, which, draws, bootstrap, seed, equations)
+
+
+def _share(means: Tensor) -> float:
+    """Of the first and the bootstrap's, those that are not below the first."""
+    return float((means >= means[0]).double().mean())
+
+
+def _stein(u: Tensor, score: Tensor) -> Tensor:
+    """(K, K) h of all pairs of draws u (K, P) with these scores, 0 of a draw and itself."""
+    u, score = u.double(), score.double()
+    width = 2 * u.shape[1]
+    base = 1 / (1 + torch.cdist(u, u).square() / width)
+    kernel = base.sqrt()
+    along = score @ u.T  # s(u)'v
+    toward = along.diagonal()[:, None] - along  # s(u)'(u - v)
+    slope = kernel * base / width  # dk/dv = slope (u - v) and dk/du = -slope (u - v)
+    trace = slope * u.shape[1] - 3 * (slope * base) * torch.cdist(u, u).square() / width
+    return (score @ score.T * kernel + slope * (toward + toward.T) + trace).fill_diagonal_(0.0)

@@ -1,0 +1,151 @@
+"""Traversals: what a coordinate of a latent does to the data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ...program.batch import AnyBatch, repeat
+from ...program.model import DynamicalVAE
+from ...turns import alone
+from ..evaluation.held import on_device_of, reproducibly
+from .checks import decode
+
+
+@dataclass(frozen=True, eq=False)
+class Traversal:
+    """Motions decoded while one coordinate of a latent moves.
+
+    Attributes:
+        latent: its name.
+        coordinates: the C coordinates that were moved, one at a time.
+        offsets: (M,) in units of `scale`; 0 is the latent as inferred.
+        scale: (C,) the standard deviation of each coordinate under the prior or the posterior.
+        frames: (C, M, B, T, D), x decoded.
+        unit: "prior" or "posterior".
+    """
+
+    latent: str
+    coordinates: tuple[int, ...]
+    offsets: Tensor
+    scale: Tensor
+    frames: Tensor
+    unit: str
+
+    @property
+    def effect(self) -> Tensor:
+        """(C,), root mean square over sequences, steps and dimensions of how far x moves about its mean."""
+        return self.frames.var(1, correction=0).mean((1, 2, 3)).sqrt()
+
+
+@alone
+@torch.no_grad()
+def traverse(
+    model: DynamicalVAE,
+    batch: AnyBatch,
+    latent: str,
+    coordinates: Sequence[int] | None = None,
+    span: tuple[float, float] = (-3.0, 3.0),
+    steps: int = 7,
+    *,
+    unit: Literal["prior", "posterior"] = "prior",
+    free: Sequence[str] = (),
+    draws: int = 256,
+    seed: int = 0,
+) -> Traversal:
+    """Moves one coordinate of a latent at a time, a local one at all steps alike, and decodes.
+
+    Latents are drawn once from the guide. One coordinate is then shifted, the rest stays, and x runs free from its own
+    past, set to its mean: all that changes between two decoded motions is what x reads of that coordinate.
+
+    Args:
+        model: the model with its guide.
+        batch: sequences (B, T, D) to start from, or a mapping with context.
+        latent: which latent moves.
+        coordinates: of it; all without.
+        span: smallest and largest offset, in standard deviations.
+        steps: M, the number of offsets, evenly spaced; 0, the latent as inferred, is to be one of them.
+        unit: whose standard deviation: that of the prior (over free runs and steps), or the guide's given the batch.
+        free: other latents, drawn anew from the model with the same noise, so that they follow the one that moves.
+            Needed to see a latent that acts on x through others only.
+        draws: from which the standard deviation is estimated.
+        seed: of all draws.
+
+    Raises:
+        ValueError: an unknown latent or coordinate, offsets without 0, or a latent that nothing on the way to x reads.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3})
+        >>> found = dvae.traverse(model, torch.randn(4, 5, 3), "w", steps=5)
+    """
+    if latent not in model.latents or not set(free) <= set(model.latents) - {latent}:
+        raise ValueError(
+            f"the latents are {', '.join(model.latents)}; expected one to move and others to be free, got {latent} "
+            f"and free={tuple(free)}"
+        )
+    chosen = tuple(range(model.sizes[latent]) if coordinates is None else coordinates)
+    if not chosen or not set(chosen) <= set(range(model.sizes[latent])) or steps < 2 or draws < 2:
+        raise ValueError(
+            f"coordinates of {latent} go from 0 to {model.sizes[latent] - 1}, steps is at least 2, draws at least 2; "
+            f"got {chosen}, {steps} and {draws}"
+        )
+    offsets = torch.linspace(*span, steps, dtype=torch.float64)
+    offsets[offsets.abs() < 1e-9 * offsets.abs().max()] = 0
+    if (offsets != 0).all():
+        raise ValueError(
+            f"{steps} offsets from {span[0]:g} to {span[1]:g} leave out 0, the latent as inferred, with which others "
+            "are compared; take an odd number of steps, and a span about 0"
+        )
+    if unit not in ("prior", "posterior"):
+        raise ValueError(f"unit is 'prior' or 'posterior', got {unit!r}")
+    _check_path(model, latent, free)
+    data = on_device_of(model, model.read(batch))
+    if partial := {"lengths", "mask"} & data.keys():
+        raise ValueError(f"a traversal needs complete sequences, but these have {', '.join(sorted(partial))}")
+    with reproducibly(model, seed):
+        scale = _scale(model, data, latent, unit, draws)[list(chosen)]
+        torch.manual_seed(seed)
+        inferred = model.guide(data)
+        offsets = offsets.to(scale)
+        kept = {name: value for name, value in inferred.items() if name not in (*free, latent)}
+        frames = []
+        for coordinate, unit_scale in zip(chosen, scale, strict=True):
+            moved = repeat(inferred[latent], steps).unflatten(0, (steps, -1))
+            moved[..., coordinate] += (offsets * unit_scale).reshape(steps, *[1] * (moved.dim() - 2))
+            # Draws of free latents have the same noise only in runs of their own.
+            for group in moved.split(1 if free else steps):
+                torch.manual_seed(seed)
+                latents = {**repeat(kept, len(group)), latent: group.flatten(0, 1)}
+                frames.append(decode(model, repeat(data, len(group)), latents, True))
+    shape = (len(chosen), steps, -1)
+    return Traversal(latent, chosen, offsets.cpu(), scale.cpu(), torch.cat(frames).unflatten(0, shape).cpu(), unit)
+
+
+def _check_path(model: DynamicalVAE, latent: str, free: Sequence[str]) -> None:
+    moving, reach = {latent}, True
+    while reach:
+        readers = {name for name in (*free, *model.observed) if moving & set(model.generator[name].parents)}
+        reach = bool(readers - moving)
+        moving |= readers
+    if not moving & set(model.observed):
+        readers = {name for name in model.latents if latent in model.generator[name].parents}
+        raise ValueError(
+            f"x does not read {latent}, so nothing would move; let the latents on the way be free: "
+            f"free={tuple(sorted(readers))}"
+        )
+
+
+def _scale(model: DynamicalVAE, data: dict[str, Tensor], latent: str, unit: str, draws: int) -> Tensor:
+    """(D,), the standard deviation of a latent's coordinates, pooled over steps (and sequences, of the posterior)."""
+    if unit == "prior":
+        size, length = data["x"].shape[:2]
+        rows = torch.arange(draws) % size
+        context = {name: value[rows] for name, value in data.items() if name in model.context}
+        values = model.sample(draws, length, context or None)[latent]
+        return values.flatten(0, -2).std(0)
+    values = model.guide(repeat(data, draws))[latent].unflatten(0, (draws, -1))
+    return values.var(0).flatten(0, -2).mean(0).sqrt()

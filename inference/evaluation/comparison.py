@@ -1,0 +1,526 @@
+"""Comparisons: several models on the same sequences, and how sure one can be of their order (`.estimates`, `.many`)."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import textwrap
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from rich.console import Group
+from typing_extensions import override
+
+from ...data.sequences import called
+from ...options import nearest
+from ..bounds.elbo import KHAT_PARTICLES
+from ..training.many import ConfidenceSet, Pairs, Requirement, confidence_set, pairs, required
+from .estimates import Crossed, Estimate, number
+from .evaluation import ARROWS
+from .held import clip_places, plain
+from .result import Result, Table, as_they_are, canvas
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ACTIVE = 0.01
+"""Variance over the data above which the posterior mean of a latent's coordinate counts as active (Burda et al.)."""
+
+ACROSS = 6
+"""Scores that have room side by side; more stand below each other."""
+
+KHAT = 0.7
+"""Pareto shape above which an importance-weighted bound is unreliable (Vehtari et al.)."""
+
+# what files of version 0.1 show, which do not say it
+_FORMER = {
+    "shown": dict.fromkeys(("ADE", "FDE", "MMADE", "MMFDE", "energy score"), "m"),
+    "notes": ["MM: over the futures of all windows in almost the same pose, itself included"],
+}
+_LOO_DRAWS = 25  # arviz_stats fits a Pareto tail to a fifth of the draws, and needs five
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """What was measured of one model, for S seeds, N sequences in C clips, T steps.
+
+    Args:
+        equations: "generative" and "inference".
+        config: what the caller said of it.
+        bounds: "ELBO", "importance bound", "k-hat" and "KL z" for every latent z, and "particle bound" where there is
+            one: (S, N), bounds in nats a sequence.
+        kl_steps: local latent to (S, T), its mean KL over sequences by step, in nats.
+        variances: latent to (S, D), variance over the data of each coordinate's posterior mean.
+        information: latent to (S, T), or (S, 1) of a static one: nats a step, or a sequence.
+        estimates: (E, N) independent importance-weighted bounds in nats a sequence, each the mean over seeds.
+        free_running: metric to (S, C), the means of each clip's windows.
+        notes: what was asked for and is not there, and why.
+    """
+
+    equations: dict[str, str]
+    config: dict[str, Any]
+    bounds: dict[str, np.ndarray]
+    kl_steps: dict[str, np.ndarray]
+    variances: dict[str, np.ndarray]
+    information: dict[str, np.ndarray]
+    estimates: np.ndarray
+    free_running: dict[str, np.ndarray]
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def seeds(self) -> int:
+        """S."""
+        return len(self.bounds["ELBO"])
+
+    @property
+    def latents(self) -> list[str]:
+        """Names of the latents."""
+        return list(self.variances)
+
+    @property
+    def active_units(self) -> dict[str, np.ndarray]:
+        """Latent to (S,), how many of its coordinates have a posterior mean that varies; NaN of one sequence."""
+        return {
+            name: np.where(np.isnan(variance).any(-1), math.nan, (variance > ACTIVE).sum(-1))
+            for name, variance in self.variances.items()
+        }
+
+    @property
+    def unreliable(self) -> float:
+        """Share of sequences whose k-hat is above 0.7; NaN where it was not estimated."""
+        khat = self.bounds["k-hat"]
+        return float((khat > KHAT)[~np.isnan(khat)].mean()) if not np.isnan(khat).all() else math.nan
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Result):
+    """Models side by side on the same sequences, with all that is needed to say what was measured.
+
+    Indexing gives the estimates of a model: `comparison["srnn"]["importance bound"].mean`, in nats per frame.
+
+    Attributes:
+        rows: `{name: Contender}`.
+        keys: (split, clip, first frame) of every sequence.
+        frames: (N,) the number of frames of every sequence.
+        data: fingerprint (of windows), sequences, frames and coordinates.
+        protocol: the fields of the windows' protocol; empty for tensors.
+        particles: K of the importance-weighted bound.
+        contrasts: M, the sequences among which information was measured; its upper limit is log M.
+        samples: forecasts per window, 0 where there are no free-running scores.
+        emission: "mean" or "drawn": what was forecast.
+        seed: of every model's draws.
+        shown: free-running score to its unit, those of the table.
+        notes: lines below that table on how scores are to be read, or why there are none.
+        better: by score of that table, "lower", "higher" or "".
+        filter_particles: K of the particle bound; 0 where there is none.
+
+    Example:
+        >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
+        >>> models = {n: dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", q, {"z": 1, "x": 2}, 4) for n, q in pairs.items()}
+        >>> found = dvae.compare(models, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
+        >>> found.difference("smooths", "filters").mean, found.ranking  # doctest: +ELLIPSIS
+        (..., [...])
+    """
+
+    rows: dict[str, Contender]
+    keys: list[tuple[str, str, int]]
+    frames: np.ndarray
+    data: dict[str, Any]
+    protocol: dict[str, Any]
+    particles: int
+    contrasts: int
+    samples: int
+    emission: str
+    seed: int
+    shown: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    better: dict[str, str] = field(default_factory=dict)
+    filter_particles: int = 0
+
+    def __getitem__(self, name: str) -> dict[str, Estimate]:
+        row = self._row(name)
+        metrics = [metric for metric in row.bounds if metric != "k-hat"]
+        return {metric: self._parts(name, metric).estimate() for metric in (*metrics, *row.free_running)}
+
+    @property
+    def ranking(self) -> list[str]:
+        """Names by importance-weighted bound per frame, the best first."""
+        return sorted(self.rows, key=lambda name: -self[name]["importance bound"].mean)
+
+    def difference(self, first: str, second: str, metric: str = "importance bound") -> Estimate:
+        """Paired difference of two models, first minus second; see the module for its standard errors.
+
+        Raises:
+            KeyError: a model that was not compared, or a metric that one of the two lacks.
+        """
+        parts = [self._parts(name, metric) for name in (first, second)]
+        if first == second:
+            return Estimate(0.0, 0.0, 0.0, 0.0)
+        return parts[0].estimate(parts[1])
+
+    def pairs(self, metric: str = "importance bound") -> Pairs:
+        """All paired differences in a metric, with p-values for as many of them as there are (`many.pairs`).
+
+        Raises:
+            KeyError: a metric that a model lacks.
+        """
+        return pairs(self._all(metric))
+
+    def confidence_set(
+        self, metric: str = "importance bound", level: float = 0.9, *, over_seeds: bool = True
+    ) -> ConfidenceSet:
+        """The models that may be the best in a metric (`many.confidence_set`).
+
+        Args:
+            metric: of all models.
+            level: with which the best is among them.
+            over_seeds: whether another training seed may change what is best; without, of these very weights.
+
+        Raises:
+            KeyError: a metric that a model lacks.
+            ValueError: a model of one seed, of which nothing is known over seeds; one clip.
+        """
+        better = self.better.get(metric, "lower") if metric in self.shown else "higher"
+        return confidence_set(self._all(metric), better, level, over_seeds=over_seeds)
+
+    def required(self, first: str, second: str, metric: str = "importance bound", **options: Any) -> Requirement:
+        """How many training seeds and clips would tell two models apart (`many.required`, which has the options).
+
+        Raises:
+            KeyError: as `difference`.
+            ValueError: a model of one seed; options that are out of range.
+        """
+        return required(self._parts(first, metric), self._parts(second, metric), **options)
+
+    def _all(self, metric: str) -> dict[str, Crossed]:
+        return {name: self._parts(name, metric) for name in self.rows}
+
+    def join(self, other: Comparison) -> Comparison:
+        """This comparison with the rows of another one, made of other models on the same sequences in the same way.
+
+        Raises:
+            ValueError: sequences or settings that differ, or a name that both have.
+        """
+        ours, theirs = ({**vars(each), "rows": None, "frames": None} for each in (self, other))
+        if different := [name for name, value in ours.items() if value != theirs[name]]:
+            raise ValueError(f"comparisons to join may differ in their models alone, not in {', '.join(different)}")
+        if shared := self.rows.keys() & other.rows.keys():
+            raise ValueError(f"both comparisons have a model {', '.join(sorted(shared))}; name one of them otherwise")
+        return dataclasses.replace(self, rows={**self.rows, **other.rows})
+
+    def table(self) -> Group:
+        """Three tables: bounds in the order of the ranking, use of the latents, free-running scores."""
+        tables = [self._bound_table(), self._latent_table()]
+        return Group(*tables, *([self._free_running_table()] if self.samples else []))
+
+    def plot(self) -> Figure:
+        """Bounds, paired differences to the best, k-hat, and the KL of every local latent over time."""
+        ranking = self.ranking
+        colours = {name: f"C{place % 10}" for place, name in enumerate(self.rows)}
+        latents = list(dict.fromkeys(latent for row in self.rows.values() for latent in row.kl_steps))
+        rows = math.ceil((3 + len(latents)) / 2)
+        labels = {name: textwrap.fill(name, 30) for name in ranking}
+        widest = min(30, max(map(len, ranking)))
+        lines = sum(label.count("\n") + 1 for label in labels.values())
+        heights = [1.4 + 0.25 * lines] + [3.0] * (rows - 1)
+        figure = canvas(10, sum(heights) + 0.3)
+        panels = list(figure.subplots(rows, 2, squeeze=False, gridspec_kw={"height_ratios": heights}).flat)
+        bounds = {name: self[name]["importance bound"] for name in ranking}
+        differences = {name: self.difference(name, ranking[0]) for name in ranking}
+        for panel, estimates in zip(panels, (bounds, differences), strict=False):
+            for place, (name, estimate) in enumerate(estimates.items()):
+                for error, width in (("sequences", 3), ("total", 1)):
+                    reach = estimate.interval(error=error)[1] - estimate.mean
+                    if reach > 0:
+                        panel.errorbar(estimate.mean, place, xerr=reach, color=colours[name], elinewidth=width)
+                if estimate.freedom[-1] > 0:
+                    freedom = f"{estimate.freedom[-1]:.2g} df"
+                    above = {"xytext": (-2, 4), "textcoords": "offset points", "ha": "right", "fontsize": 7}
+                    panel.annotate(freedom, (1, place), xycoords=("axes fraction", "data"), **above)
+                panel.plot(estimate.mean, place, "o", markersize=5, color=colours[name], label=labels[name])
+            panel.set_ylim(len(ranking) - 0.5, -0.5)
+            panel.set_yticks(range(len(ranking)), labels.values(), parse_math=False)
+            each, _, frame = self._words
+            panel.set_xlabel(f"nats a {frame} (95 %, thick: over {each}s, thin: over seeds too)", fontsize=9)
+            panel.grid(axis="x", alpha=0.3)
+        for place, name in enumerate(ranking):
+            if "particle bound" in self.rows[name].bounds:
+                mean = self[name]["particle bound"].mean
+                panels[0].plot(mean, place, "D", markersize=6, color="black", fillstyle="none")
+        title = f"importance-weighted bound ↑ (K = {self.particles})"
+        panels[0].set_title(title + (f", ◇ FIVO (K = {self.filter_particles})" if self.filter_particles else ""))
+        panels[1].set_title(f"difference to {ranking[0]}", parse_math=False)
+        panels[1].axvline(0, color="grey", linewidth=0.8)
+        panels[1].set_yticklabels([])
+        self._khat_panel(panels[2], colours)
+        for panel, latent in zip(panels[3:], latents, strict=False):
+            for name in ranking:
+                if latent in self.rows[name].kl_steps:
+                    steps = self.rows[name].kl_steps[latent].mean(0)
+                    panel.plot(range(1, len(steps) + 1), steps, color=colours[name])
+            panel.set(title=f"KL of {latent} over time", xlabel="step", ylabel="nats a step")
+            drawn = np.concatenate([line.get_ydata() for line in panel.lines])
+            if (top := drawn.max()) > 0:  # the first step may take a hundred times what the others take
+                least = max(drawn[drawn > 0].min(), top / 1e5)
+                panel.set(yscale="log", ylim=(least / 1.5, top * 1.5))
+        for panel in panels[3 + len(latents) :]:
+            panel.set_axis_off()
+        columns = min(5, 100 // (widest + 5))
+        handles = panels[0].get_legend_handles_labels()
+        legend = figure.legend(*handles, loc="outside lower center", ncols=columns, fontsize=9)
+        as_they_are(legend.get_texts())
+        return figure
+
+    def _khat_panel(self, panel: Axes, colours: Mapping[str, str]) -> None:
+        khats = {name: self.rows[name].bounds["k-hat"] for name in self.ranking}
+        khats = {name: khat[~np.isnan(khat)] for name, khat in khats.items() if not np.isnan(khat).all()}
+        known = np.concatenate([np.zeros(1), *khats.values()])
+        left, right = max(-1.0, known.min()), max(1.0, min(3.0, known.max()))
+        for name, khat in khats.items():
+            beyond = (khat > right).mean()
+            label = f"{100 * beyond:.3g} % beyond {right:g}" if beyond else None
+            panel.ecdf(np.minimum(khat, right + 1), color=colours[name], label=label)  # it cannot draw infinity
+        panel.axvline(KHAT, color="grey", linewidth=0.8, linestyle="--")
+        panel.set(title="Pareto k-hat of the weights", xlabel=f"k-hat (unreliable above {KHAT})")
+        panel.set(ylabel="share of sequences", xlim=(left, right), ylim=(0, 1.02))
+        if not khats:
+            missing = f"not estimated with fewer than {KHAT_PARTICLES} particles"
+            panel.text(0.5, 0.5, missing, transform=panel.transAxes, ha="center", fontsize=9)
+        if panel.get_legend_handles_labels()[1]:
+            panel.legend(fontsize=8)
+
+    def to_arviz(self) -> dict[str, Any]:
+        """`{name: DataTree}` for `arviz_stats.compare` and `arviz_stats.loo`.
+
+        The group `log_likelihood` holds independent importance-weighted estimates of every sequence's log evidence, as
+        draws of one chain; a row of several seeds has the mean over its seeds, which is the score of a typical
+        run. (Seeds as draws would be a mixture of runs, and its harmonic mean is ruled by the worst of them.)
+        `constant_data` holds ELBO, importance-weighted bound and k-hat by seed, frames and clip of every sequence.
+
+        What `loo` means here: the sequences were held out, so nothing is left to leave out, and its elpd is the
+        held-out log evidence. Its p ("effective parameters") measures how far the independent estimates differ, in
+        nats, and is Monte Carlo error; as elpd is a harmonic mean over draws, it lies below their mean by about as
+        much. More particles lower both. Its k-hat is that of the harmonic mean's weights: it warns where estimates
+        of a sequence differ by a nat or more, and nearly always with fewer than 200 draws. Its standard errors take
+        sequences for independent and know no seeds; those of `difference` are clustered by clip.
+
+        Raises:
+            ValueError: fewer than 25 estimates, which `loo` cannot smooth.
+        """
+        from arviz_base import from_dict
+
+        trees = {}
+        for name, row in self.rows.items():
+            if len(row.estimates) < _LOO_DRAWS:
+                raise ValueError(
+                    f"arviz fits a Pareto tail to independent estimates of every sequence's log evidence and needs at "
+                    f"least {_LOO_DRAWS}, but this comparison has {len(row.estimates)}; compare again with "
+                    "estimates=200 (and fewer particles, as each estimate costs as much as the bound)"
+                )
+            likelihood = row.estimates[None]
+            by_seed = {"elbo": "ELBO", "importance_bound": "importance bound", "khat": "k-hat"}
+            constant = {key: row.bounds[metric] for key, metric in by_seed.items()}
+            trees[name] = from_dict(
+                {
+                    "posterior": {"log_evidence": likelihood.sum(-1)},
+                    "log_likelihood": {"x": likelihood},
+                    "constant_data": {**constant, "frames": self.frames, "clip": np.array(self._clips)},
+                },
+                dims={
+                    "x": ["sequence"],
+                    "frames": ["sequence"],
+                    "clip": ["sequence"],
+                    **{key: ["seed", "sequence"] for key in by_seed},
+                },
+                attrs={"/": {"particles": self.particles, "data": json.dumps(self.data), "seed": self.seed}},
+            )
+        return trees
+
+    def to_json(self) -> str:
+        """Everything, with the estimates, ranking and differences written out.
+
+        What is not finite becomes null; null as k-hat is infinity, and not estimated with fewer than 25 particles.
+        """
+        ranking = self.ranking
+        rows = {
+            name: {
+                **vars(row),
+                "scores": {metric: _scored(estimate) for metric, estimate in self[name].items()},
+                "difference_to_best": _scored(self.difference(name, ranking[0])),
+                "khat_above_0.7": row.unreliable,
+                "active_units": row.active_units,
+            }
+            for name, row in self.rows.items()
+        }
+        return json.dumps({"ranking": ranking, **plain({**vars(self), "rows": rows})}, allow_nan=False)
+
+    @classmethod
+    @override
+    def from_json(cls, text: str) -> Self:
+        try:
+            document = _FORMER | json.loads(text)
+            del document["ranking"]
+            rows = {name: _contender(row, document["particles"]) for name, row in document.pop("rows").items()}
+            keys = [(split, clip, start) for split, clip, start in document.pop("keys")]
+            if not isinstance(document.get("filter_particles", 0), int):
+                raise ValueError("filter_particles is no whole number")
+            return cls(rows=rows, keys=keys, frames=np.array(document.pop("frames"), dtype=float), **document)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"this is not a comparison written by Comparison.to_json: {error!r}") from error
+
+    # Estimates
+
+    def _row(self, name: str) -> Contender:
+        if name not in self.rows:
+            raise KeyError(
+                f"no model {name!r} in this comparison{nearest(name, self.rows)}; it has {', '.join(self.rows)}"
+            )
+        return self.rows[name]
+
+    @property
+    def _clips(self) -> list[str]:
+        return [f"{split}/{clip}" for split, clip, _ in self.keys]
+
+    def _parts(self, name: str, metric: str) -> Crossed:
+        row = self._row(name)
+        if metric not in {*row.bounds, *row.free_running} - {"k-hat"}:
+            known = [known for known in (*row.bounds, *row.free_running) if known != "k-hat"]
+            raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, known)}; it has {', '.join(known)}")
+        places = clip_places(self.keys).numpy()
+        if metric in row.free_running:
+            return Crossed.of(row.free_running[metric], np.bincount(places, weights=self.frames))
+        return Crossed.by_clip(row.bounds[metric], self.frames, places)
+
+    # Tables
+
+    @property
+    def _words(self) -> tuple[str, str, str]:
+        """What is scored, what errors are over, and what it consists of."""
+        clip, frame = called(self.data)
+        if self.protocol.get("observed", 0) is None:
+            return "whole sequence", clip, frame
+        return "window" if "called" in self.data else "sequence", clip, frame
+
+    def _title(self) -> str:
+        each, clip, _ = self._words
+        parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} {each}s"]
+        parts[-1] += "" if each == f"whole {clip}" else f" of {len(set(self._clips))} {clip}s"
+        parts += [f"seed {self.seed}"]
+        parts += [f"data {self.data['fingerprint'][:12]}"] if "fingerprint" in self.data else []
+        return " · ".join(part for part in parts if part)
+
+    def _bound_table(self) -> Table:
+        each, clip, frame = self._words
+        bounds = (f"importance bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
+        filters = [f"particle bound ↑\nK = {self.filter_particles}"] if self.filter_particles else []
+        table = _table(
+            f"{self._title()}\nteacher-forced, nats a {frame}",
+            "\n".join(
+                [
+                    f"mean ± standard error over {each}s (clustered by {clip}) ± over seeds",
+                    "95 %: from both, by Student's t, in brackets its degrees of freedom",
+                    *([] if self.samples else self.notes),
+                    *(f"{name}: {note}" for name, row in self.rows.items() for note in row.notes),
+                ]
+            ),
+            ("seeds", *bounds, *filters, f"k-hat\n> {KHAT}"),
+        )
+        ranking = self.ranking
+        for name in ranking:
+            row, scores = self.rows[name], self[name]
+            difference = self.difference(name, ranking[0])
+            behind = ["–", "–"] if name == ranking[0] else [str(difference), _interval(difference)]
+            share = "–" if math.isnan(row.unreliable) else f"{100 * row.unreliable:.1f} %"
+            means = (str(scores["importance bound"]), *behind, str(scores["ELBO"]))
+            filtered = [str(scores.get("particle bound", "–")) for _ in filters]
+            table.add_row(name, str(row.seeds), *means, *filtered, share)
+        return table
+
+    def _latent_table(self) -> Table:
+        limit = f"at most log {self.contrasts} = {math.log(self.contrasts):.2f}" if self.contrasts else "left out"
+        table = _table(
+            "latents under the guide, teacher-forced",
+            f"active: variance of the posterior mean over data above {ACTIVE}\ninformation {limit}",
+            ("latent", f"KL\nnats a {self._words[2]}", "active\nunits", "information\nnats"),
+        )
+        for name in self.ranking:
+            row, scores = self.rows[name], self[name]
+            for latent in row.latents:
+                active = row.active_units[latent].mean()
+                units = f"{active:g}" if active.is_integer() else f"{active:.1f}"
+                table.add_row(
+                    name if latent == row.latents[0] else "",
+                    latent,
+                    str(scores[f"KL {latent}"]),
+                    "–" if math.isnan(active) else f"{units} of {row.variances[latent].shape[-1]}",
+                    self._told(row, latent),
+                )
+        return table
+
+    def _told(self, row: Contender, latent: str) -> str:
+        if latent not in row.information:
+            return "–"
+        steps = row.information[latent].mean(0)
+        if latent not in row.kl_steps:
+            return f"{number(steps[0])} a sequence"
+        weights = (self.frames[:, None] > np.arange(len(steps))).sum(0)
+        return f"{number((weights * steps).sum() / weights.sum())} a step"
+
+    def _free_running_table(self) -> Table:
+        scores = {name: self[name] for name in self.ranking}
+        lines = [["", *scores]]
+        for metric, unit in self.shown.items():
+            label = metric + ARROWS[self.better.get(metric, "lower")] + (f" ({unit})" if unit else "")
+            lines.append([label, *(str(score[metric]) for score in scores.values())])
+        if len(self.shown) <= ACROSS:
+            lines = [list(line) for line in zip(*lines, strict=True)]
+        table = _table(
+            f"free-running, K = {self.samples}, {self.emission} emission",
+            "\n".join(
+                [f"mean ± standard error over windows (clustered by {self._words[1]}) ± over seeds", *self.notes]
+            ),
+            lines[0][1:],
+        )
+        for line in lines[1:]:
+            table.add_row(*line)
+        return table
+
+
+def _table(title: str, caption: str, columns: Iterable[str]) -> Table:
+    """An empty table whose first column has the names, which take no room from the numbers."""
+    table = Table(title=title, caption=caption)
+    table.add_column("", overflow="fold")
+    for column in columns:
+        table.add_column(column, justify="right", overflow="fold")
+    return table
+
+
+def _interval(estimate: Estimate) -> str:
+    """The interval of 95 % and its degrees of freedom."""
+    low, high = map(number, estimate.interval())
+    return low if low == "–" else f"{low} to {high} ({estimate.freedom[-1]:.3g})"
+
+
+def _scored(estimate: Estimate) -> dict[str, Any]:
+    return {**dataclasses.asdict(estimate), "interval": estimate.interval(), "p_value": estimate.p_value()}
+
+
+def _contender(document: dict[str, Any], particles: int) -> Contender:
+    def arrays(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: arrays(item) for key, item in value.items()}
+        return np.array(value, dtype=float)
+
+    said = {"equations", "config", "notes"}
+    document = {"notes": [], **document}  # of which older files have none
+    if not isinstance(document["notes"], list) or not all(isinstance(note, str) for note in document["notes"]):
+        raise ValueError("notes are no list of texts")
+    names = [field.name for field in dataclasses.fields(Contender)]
+    row = Contender(**{name: document[name] if name in said else arrays(document[name]) for name in names})
+    if particles >= KHAT_PARTICLES and "k-hat" in row.bounds:
+        row.bounds["k-hat"][np.isnan(row.bounds["k-hat"])] = math.inf
+    return row

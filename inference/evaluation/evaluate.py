@@ -1,0 +1,319 @@
+"""Evaluation on held-out windows: what a model forecasts, and how well it explains.
+
+Two programs are scored and never mixed. *Free-running*: the model sees the observed frames, forecasts K futures on its
+own, and `Measure`s compare the futures with the true one; the *log score* is the density that such forecasts have at
+the true future. *Teacher-forced*: the model reads every frame of the window, and its bound on log p(x_{1:T}) is
+reported in nats per frame.
+
+Every evaluation carries reference rows that any method should beat, such as the last value repeated; `References` has
+them all. Another reference for any data is a model without latents, given as one of the models. Scores that are read by
+what they give the truth add a row, the true futures, which no method should be expected to beat. All rows score the
+same windows, and windows of one clip overlap, so that standard errors are clustered by clip and
+`Evaluation.difference` is paired.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from reprlib import repr as brief
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ...data.sequences import HeldOutWindows, called, columns_of
+from ...options import Count, Delay, require
+from ...program.model import DynamicalVAE
+from ...program.protocols import Emitting, Forecasting
+from ...turns import alone
+from ..bounds.elbo import SequenceELBO, importance_bound
+from ..bounds.predictive import predictive_bound
+from .evaluation import Evaluation, Row
+from .held import Held, hold, on_device_of, plain, refuse_non_finite, reproducibly
+from .references import OF_TABLES, USUAL, Forecaster, References
+from .result import progress_bar
+from .scores import KL, LOG_SCORE, TEACHER_FORCED, Measure, Metric, Scores, clip_means, proper
+
+
+@alone
+def evaluate(
+    model: nn.Module | Mapping[str, nn.Module],
+    windows: HeldOutWindows,
+    *,
+    scores: Scores = proper,
+    samples: int = 50,
+    seed: int = 0,
+    batch_size: int = 32,
+    draw_emission: bool | None = None,
+    bound_particles: int = 0,
+    log_score_particles: int = 0,
+    references: bool | Sequence[str] = True,
+    training_windows: HeldOutWindows | None = None,
+    season: int | None = None,
+    configs: Mapping[str, Mapping[str, Any]] | None = None,
+    options: Mapping[str, Any] | None = None,
+    progress: bool = True,
+) -> Evaluation:
+    """Score one model or several, and the reference rows, on the same windows.
+
+    Every method draws from the same seed, so that its scores do not depend on which others are evaluated;
+    they do depend on `batch_size`, as draws come batch by batch. The models' modes and torch's random state
+    are restored.
+
+    Args:
+        model: a model (`Forecasting`), or `{name: model}`.
+        windows: `ArrayWindows`, windows of `dvae.motion`, or any `HeldOutWindows`; of data with parts, such as
+            `dvae.tables.PanelData`, those of the test split.
+        scores: of the forecasts, as a function of the windows: `proper` scoring rules, `calibrated` with coverage and
+            PIT beside them, or `dvae.motion.scores`, with judges as `functools.partial(dvae.motion.scores,
+            pose_prior=..., classifiers=...)`.
+        samples: K, the forecasts per window.
+        seed: seed of every method's draws.
+        batch_size: windows forecast at once.
+        draw_emission: forecast draws of x, or (False) its means. Proper scoring rules judge the model's predictive
+            distribution only when x is drawn; the papers of motion score means. None for draws, or for means where
+            a score is published for these (`Measure.of_means`); see `DynamicalVAE.is_drawn` for exceptions.
+        bound_particles: particles of the importance-weighted bound and its k-hat; 0 leaves both out.
+        log_score_particles: particles of the log score, see `predictive_bound`; 0 leaves it out.
+        references: whether to add the reference rows, each where it can be had; or names of some, see `References`.
+        training_windows: what "mean", "climatology" and "nearest neighbours" know, such as x (N, T, D); without it
+            these are left out.
+        season: the period of "seasonal", in frames; by default what the windows' description says.
+        configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
+        options: further arguments of the models' `forecast`, such as {"temperature": 0} for motion at the mean of
+            TrajeVAE's prior.
+        progress: whether to show a progress bar.
+
+    Returns:
+        The evaluation; print it, or take its `table`, `plot` and `to_json`.
+
+    Raises:
+        TypeError: what is no model that forecasts, or data that do not say which steps are observed.
+        ValueError: windows that are ragged or leave nothing to predict; a forecast of the wrong shape; a model with the
+            name of a reference row; a reference row that is asked for and cannot be had; fewer than one sample; two
+            scores of one name.
+        FloatingPointError: a forecast or bound that is not finite, naming method and window.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=4)
+        >>> list(dvae.evaluate(model, windows, samples=5, progress=False)["model"])[:3]
+        ['energy score', 'variogram score', 'CRPS']
+    """
+    models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
+    _check(models, samples, batch_size, bound_particles, log_score_particles)
+    held = hold(windows)
+    windows = held.windows
+    measures = _measures(scores, windows)
+    means = any(measure.of_means for measure in measures)
+    drawn = {name: _is_drawn(each, draw_emission, means) for name, each in models.items()}
+    judge = _Judge(held, measures, bound_particles, log_score_particles)
+    known = References(held, samples, seed, training_windows, season)
+    baselines = _references(references, known, measures)
+    if clash := models.keys() & baselines.keys():
+        raise ValueError(f"a model must not have the name of a reference row: {', '.join(sorted(clash))}")
+
+    rows: dict[str, Row] = {}
+    with progress_bar(progress) as bar:
+
+        def parts(label: str) -> Iterator[slice]:
+            for start in bar.track(range(0, len(held.keys), batch_size), description=label):
+                yield slice(start, start + batch_size)
+
+        for name, (count, forecaster) in baselines.items():
+            scored, histograms = judge.forecasts(name, forecaster, count, parts(name))
+            rows[name] = Row(count, scored, histograms=histograms)
+        for name, each in models.items():
+            with reproducibly(each, seed):
+                forecaster = forecaster_of(each, held, samples, {"draw_emission": drawn[name], **(options or {})})
+                scored, histograms = judge.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
+            if each.likelihood:
+                with reproducibly(each, seed):
+                    scored |= judge.bounds(name, each, parts(f"{name}, bound"))
+                with reproducibly(each, seed):
+                    scored |= judge.log_score(name, each, parts(f"{name}, log score"))
+            equations = {"generative": each.generative.text, "inference": each.inference.text}
+            rows[name] = Row(samples, scored, equations, dict((configs or {}).get(name, {})), histograms)
+
+    kinds = {"drawn" if each else "mean" for each in drawn.values() or [_is_drawn(None, draw_emission, means)]}
+    return Evaluation(
+        rows=rows,
+        metrics=judge.metrics(rows),
+        clips=held.clips,
+        data=held.description(),
+        protocol=plain(dataclasses.asdict(windows.protocol)),
+        samples=samples,
+        emission=" or ".join(sorted(kinds)),
+        bound_particles=bound_particles,
+        seed=seed,
+        log_score_particles=log_score_particles,
+        basis={name: value for measure in measures for name, value in measure.basis.items()},
+        notes=[
+            *dict.fromkeys([*held.notes, *(measure.note for measure in measures if measure.note)]),
+            *_reservations(measures, samples, [name for name, each in drawn.items() if not each]),
+            *(
+                f"{name} draws nothing: its {samples} forecasts of a window are one, which is the best of them"
+                for name, each in models.items()
+                if samples > 1 and _certain(each, drawn[name])
+            ),
+            *(
+                f"bounds of {name}: densities of {each.view.measured}"
+                for name, each in models.items()
+                if isinstance(each, DynamicalVAE) and each.likelihood and each.view.measured
+            ),
+        ],
+        options=dict(options or {}),
+    )
+
+
+def _check(models: Mapping[str, Any], samples: int, batch_size: int, *particles: int) -> None:
+    require(Count, samples=samples, batch_size=batch_size)
+    for name, count in zip(("bound_particles", "log_score_particles"), particles, strict=True):
+        require(Delay, **{name: count})
+    for name, each in models.items():
+        if not isinstance(each, Forecasting):
+            raise TypeError(
+                f"{name!r} is a {type(each).__name__}, not a model that forecasts, such as a DynamicalVAE; see "
+                "dvae.program.protocols.Forecasting for what one of your own needs"
+            )
+
+
+def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
+    if not callable(scores):
+        raise TypeError(f"scores is {brief(scores)}; expected a function of the windows, such as dvae.motion.scores")
+    measures = list(scores(windows))
+    names = [measure.name for measure in measures]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise ValueError(f"scores have names of their own; two are called {', '.join(sorted(twice))}")
+    return measures
+
+
+def _is_drawn(model: Any, draw_emission: bool | None, means: bool) -> bool:
+    """Whether a model's forecasts draw the data: as the caller says, or else by what the scores are published for."""
+    if draw_emission is not None:
+        return draw_emission
+    return model.is_drawn(means) if isinstance(model, Emitting) else not means
+
+
+def _certain(model: Any, drawn: bool) -> bool:
+    """Whether all forecasts of a window are one: means of a model in which nothing is latent."""
+    return isinstance(model, DynamicalVAE) and not (drawn or model.latents or model.summed or model.shared)
+
+
+def _reservations(measures: Sequence[Measure], samples: int, of_means: Sequence[str]) -> Iterator[str]:
+    """Notes on scores that cannot be had of these forecasts, or say little."""
+    if lacking := [f"{measure.name} ({measure.least})" for measure in measures if measure.least > samples]:
+        yield f"left out, as they need more than {samples} forecasts: {', '.join(lacking)}"
+    judged = [each.name for each in measures if each.of_draws and not each.of_means and each.least <= samples]
+    if of_means and judged:
+        names = f"forecasts of {', '.join(of_means)}"
+        yield f"{names} are means, which lack the emission's noise and are too narrow for {', '.join(judged)}"
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """What is asked of every row of one evaluation; values are by clip."""
+
+    held: Held
+    measures: Sequence[Measure]
+    bound_particles: int
+    log_score_particles: int
+
+    @torch.no_grad()
+    def forecasts(
+        self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]
+    ) -> tuple[dict[str, tuple[float, ...]], dict[str, tuple[tuple[float, ...], ...]]]:
+        """Scores and histograms of free-running forecasts, those that so many samples have."""
+        measures = [measure for measure in self.measures if measure.least <= samples]
+        held, found = self.held, []
+        index = torch.arange(len(held.keys))
+        for part in parts:
+            forecasts = forecasts_of(name, forecaster, samples, held, part)
+            scored = forecasts, held.futures[part], held.past(part), index[part]
+            found.append({measure.name: measure.function(*scored) for measure in measures})
+        values = _concatenate(found)
+        pooled = {measure.name: measure.pool(values[measure.name], held.places) for measure in measures}
+        scores = {measure.name: tuple(pooled[measure.name]) for measure in measures if not measure.bins}
+        return scores, {m.name: tuple(map(tuple, pooled[m.name])) for m in measures if m.bins}
+
+    def bounds(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, tuple[float, ...]]:
+        """Bounds and KL terms in nats per frame."""
+        found = []
+        for part in parts:
+            batch = on_device_of(model, self.held.part(part))
+            terms = SequenceELBO().terms(model, batch)
+            scores = {"ELBO": terms.per_frame}
+            scores |= {f"KL {latent}": kl / terms.frames for latent, kl in terms.kl.items()}
+            if self.bound_particles:
+                weighted = importance_bound(model, batch, particles=self.bound_particles)
+                scores |= {"importance bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
+            refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), self.held.keys[part])
+            found.append({metric: values.cpu() for metric, values in scores.items()})
+        return self._means(_concatenate(found))
+
+    def log_score(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, tuple[float, ...]]:
+        """The log score in nats per predicted frame, where it is asked for."""
+        if not self.log_score_particles:
+            return {}
+        found = []
+        for part in parts:
+            batch = on_device_of(model, self.held.part(part))
+            bound = predictive_bound(model, batch, self.held.observed, self.log_score_particles).bound
+            refuse_non_finite(name, "log score", bound.isfinite(), self.held.keys[part])
+            found.append({"log score": (bound / self.held.futures.shape[1]).cpu()})
+        return self._means(_concatenate(found))
+
+    def metrics(self, rows: Mapping[str, Row]) -> dict[str, Metric]:
+        """How the scores that rows have are read, in the order of the table."""
+        found = {name for row in rows.values() for name in row.clip_means}
+        latents = sorted(name for name in found if name.startswith("KL "))
+        _, frame = called(self.held.windows.description)
+        bounds = {"log score": LOG_SCORE, **TEACHER_FORCED, **dict.fromkeys(latents, KL)}
+        order = {measure.name: measure.metric for measure in self.measures}
+        order |= {
+            name: dataclasses.replace(each, unit=each.unit.replace("frame", frame)) for name, each in bounds.items()
+        }
+        return {name: metric for name, metric in order.items() if name in found}
+
+    def _means(self, scores: dict[str, Tensor]) -> dict[str, tuple[float, ...]]:
+        return {name: tuple(clip_means(values, self.held.places)) for name, values in scores.items()}
+
+
+def _references(
+    asked: bool | Sequence[str], known: References, measures: Sequence[Measure]
+) -> dict[str, tuple[int, Forecaster]]:
+    """Number of forecasts and forecaster of each reference row."""
+    futures = known.held.futures
+    truths: dict[str, tuple[int, Forecaster]] = {
+        measure.truth: (1, lambda part: futures[part][None]) for measure in measures if measure.truth
+    }
+    if isinstance(asked, bool):
+        usual = OF_TABLES if columns_of(known.held.windows) else USUAL
+        asked = [name for name in usual if not known.lacking(name)] if asked else []
+        truths = truths if asked else {}
+    return truths | {name: known[name] for name in asked}
+
+
+def forecaster_of(model: Any, held: Held, samples: int, options: Mapping[str, Any]) -> Forecaster:
+    """Which windows to a model's K futures of each, with these options of its `forecast`."""
+    horizon = held.futures.shape[1]
+    return lambda part: model.forecast(on_device_of(model, held.past(part)), horizon, samples, **options)["x"]
+
+
+def forecasts_of(name: str, forecaster: Forecaster, samples: int, held: Held, part: slice) -> Tensor:
+    """Futures `(B, K, H, D)` of some windows, on the CPU.
+
+    Raises:
+        ValueError, FloatingPointError: forecasts of another shape, or that are not finite.
+    """
+    forecasts = forecaster(part).cpu()
+    expected = (samples, *held.futures[part].shape)
+    if forecasts.shape != expected:
+        raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
+    if not forecasts.sum().isfinite():  # what is not finite survives a sum, which takes a fortieth of the time
+        refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
+    return forecasts.movedim(0, 1)
+
+
+def _concatenate(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

@@ -1,0 +1,415 @@
+"""Evaluations: scores of several methods on the same windows, with all that is needed to say what was measured."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from rich.text import Text
+from typing_extensions import override
+
+from ...data.sequences import called
+from ...options import nearest
+from ..diagnostics.calibration import envelope
+from .held import plain
+from .references import multimodal_note
+from .result import Result, Table, canvas
+from .scores import Metric
+from .uncertainty import clustered_variance, decimals, effective_number, linearised, student_interval
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
+"""By the direction that is better."""
+_MOST_RANKS = 10_000  # whose envelope is found in a second
+
+
+@dataclass(frozen=True)
+class Score:
+    """Mean over windows, or a score of the whole set, and its standard error, clustered by clip (NaN of a single one).
+
+    Args:
+        mean: the mean.
+        standard_error: its standard error.
+        freedom: degrees of freedom of that, one less than there are clips.
+    """
+
+    mean: float
+    standard_error: float
+    freedom: float = field(default=math.nan, compare=False)
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Where the mean lies at this level, by Student's t; NaN where the error is unknown."""
+        return student_interval(self.mean, self.standard_error, self.freedom, level)
+
+    def __str__(self) -> str:
+        if math.isnan(self.mean):
+            return "–"
+        places = decimals(self.mean, self.standard_error)
+        error = f" ± {self.standard_error:.{places}f}" if self.standard_error > 0 else ""
+        return f"{self.mean:.{places}f}{error}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method: its number of samples, what it is, and each score's value for each clip (see `Measure.pool`).
+
+    Histograms, such as that of the PIT, have as many shares as bins for each clip.
+    """
+
+    samples: int
+    clip_means: dict[str, tuple[float, ...]]
+    equations: dict[str, str] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)
+    histograms: dict[str, tuple[tuple[float, ...], ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, repr=False)
+class Evaluation(Result):
+    """Scores of several methods on the same windows, with all that is needed to say what was measured.
+
+    Indexing gives the scores of a method: `evaluation["srnn"]["ADE"].mean`.
+
+    Attributes:
+        rows: `{method: Row}`.
+        metrics: name to how it is to be read, of all scores that at least one method has, in the order of the table.
+        clips: `{"split/clip": number of its windows}`, in the order of `Row.clip_means`.
+        data: fingerprint, windows, frames and coordinates of a window, and what the windows say of themselves.
+        protocol: the fields of the windows' protocol.
+        samples: K, the number of forecasts asked of every method.
+        emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it; "drawn or mean"
+            where those of discrete models were draws and those of others means.
+        bound_particles: particles of the importance bound, 0 where it was not computed.
+        seed: the seed of every method's draws.
+        log_score_particles: particles of the log score, 0 where it was not computed.
+        basis: what scores rest on, by name, such as a judge's weights or a ground truth.
+        notes: lines below the table on how scores are to be read.
+        options: further arguments of the models' `forecast`.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=4)
+        >>> scores = dvae.evaluate(model, windows, samples=5, progress=False)
+        >>> list(scores.rows), scores.difference("model", "zero velocity", "CRPS").mean < 0
+        (['zero velocity', 'model'], True)
+    """
+
+    rows: dict[str, Row]
+    metrics: dict[str, Metric]
+    clips: dict[str, int]
+    data: dict[str, Any]
+    protocol: dict[str, Any]
+    samples: int
+    emission: str
+    bound_particles: int
+    seed: int
+    log_score_particles: int = 0
+    basis: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def __getitem__(self, method: str) -> dict[str, Score]:
+        return {name: self._score(name, np.array(means)) for name, means in self._row(method).clip_means.items()}
+
+    def difference(self, first: str, second: str, metric: str) -> Score:
+        """Paired difference of two methods in a metric, first minus second, with its standard error.
+
+        Raises:
+            KeyError: a method that was not evaluated, or a metric that one of the two lacks.
+        """
+        ours, theirs = self._both(first, second, metric)
+        return self._score(metric, ours - theirs)
+
+    def ratio(self, first: str, second: str, metric: str) -> Score:
+        """Ratio of the means of two methods in a metric, first by second, with its standard error, linearised.
+
+        Raises:
+            KeyError: as `difference`.
+            ValueError: a second mean of 0.
+        """
+        ours, theirs = self._both(first, second, metric)
+        over, under = (self._score(metric, means).mean for means in (ours, theirs))
+        if not under:
+            raise ValueError(f"the mean {metric} of {second} is 0, by which nothing can be divided")
+        return self._score(metric, over / under + (ours - over / under * theirs) / under)
+
+    def _both(self, first: str, second: str, metric: str) -> list[np.ndarray]:
+        """The values of two methods by clip."""
+        means = []
+        for method in (first, second):
+            row = self._row(method)
+            if metric not in row.clip_means:
+                meant = nearest(metric, row.clip_means)
+                raise KeyError(f"{method!r} has no score {metric!r}{meant}; it has {', '.join(row.clip_means)}")
+            means.append(np.array(row.clip_means[metric]))
+        return means
+
+    def table(self) -> Table:
+        """Metrics down, methods across: mean ± standard error, the two programs apart."""
+        table = Table(title=self._title(), caption=self._caption())
+        table.add_column("", no_wrap=True)  # on a narrow terminal the numbers wrap, never the names
+        for method, row in self.rows.items():
+            table.add_column(f"{method}\nK = {row.samples}", justify="right")
+        scores = {method: self[method] for method in self.rows}
+        for program in ("free-running", "teacher-forced"):
+            found = {name: metric for name, metric in self.metrics.items() if metric.program == program}
+            if found:
+                table.add_section()
+                table.add_row(Text(program, "bold"))
+            for name, metric in found.items():
+                unit = f" ({metric.unit})" if metric.unit else ""
+                values = (str(row[name]) if name in row else "–" for row in scores.values())
+                table.add_row(Text.assemble(name + ARROWS[metric.better], (unit, "dim")), *values)
+        return table
+
+    def plot(self, metrics: Sequence[str] | None = None) -> Figure:
+        """One panel per metric, with an arrow for what is better; a dot per method with a bar of one standard error."""
+        names = list(self.metrics if metrics is None else metrics)
+        columns = min(4, len(names))
+        rows = math.ceil(len(names) / columns)
+        height = 0.7 + 0.22 * len(self.rows)
+        figure = canvas(2 + 2.2 * columns, height * rows)
+        panels = list(figure.subplots(rows, columns, sharey=True, squeeze=False).flat)
+        scores = {method: self[method] for method in self.rows}
+        for panel, name in zip(panels, names, strict=False):
+            for place, row in enumerate(scores.values()):
+                if name in row:
+                    error = np.nan_to_num(row[name].standard_error)
+                    panel.errorbar(row[name].mean, place, xerr=error, fmt="o", markersize=4, color=f"C{place}")
+            metric = self.metrics[name]
+            unit = f" ({metric.unit})" if metric.unit else ""
+            panel.set_title(name + ARROWS[metric.better] + unit, fontsize=9, parse_math=False)
+            panel.set_yticks(range(len(scores)), list(scores), parse_math=False)
+            panel.set_ylim(len(scores) - 0.5, -0.5)
+            panel.tick_params(labelsize=8)
+            panel.locator_params(axis="x", nbins=4)  # more would overlap where values agree in many digits
+            panel.grid(axis="x", alpha=0.3)
+        for panel in panels[len(names) :]:
+            panel.set_axis_off()
+        return figure
+
+    def departure(self, method: str, histogram: str = "PIT", alpha: float = 0.05) -> tuple[np.ndarray, ...]:
+        """How far the distribution of the PIT of a method's forecasts is from uniform, with a simultaneous band.
+
+        The band is the exact envelope of independent uniform ranks (`calibration.envelope`), of as many as are worth
+        these dependent ones, by their spread over clips (`uncertainty.effective_number`): an approximation, but for
+        clips of one number each. A curve that leaves the band at any point is not that of calibrated forecasts.
+
+        Returns:
+            Points between bins, the share of the PIT below each less the point itself, and the least and the largest
+            of these that lie within, `(bins - 1,)` each; the band is NaN where there is one clip.
+
+        Raises:
+            KeyError: a method or a histogram that there is not.
+        """
+        shares = np.array(self._histogram(method, histogram)).cumsum(1)[:, :-1].T
+        points = np.arange(1, len(shares) + 1) / (len(shares) + 1)
+        below, deviations = linearised(shares, np.array(list(self.clips.values())))
+        if len(self.clips) == 1:
+            return points, below - points, points * np.nan, points * np.nan
+        whole = (self.data["frames"] - self.protocol["observed"]) * self.data["coordinates"]
+        numbers = self.data["windows"] * self.basis.get(histogram, {}).get("numbers", whole)
+        worth = effective_number(points, deviations, min(numbers, _MOST_RANKS))
+        _, low, high = envelope(worth, len(points), alpha)
+        return points, below - points, low - points, high - points
+
+    def plot_calibration(self, histogram: str = "PIT") -> Figure:
+        """For each method, its histogram of the PIT, and below it the `departure` of its distribution from uniform.
+
+        The band of the histogram is two standard errors of each bin, that of the curve holds all of it with 95 %
+        probability where forecasts are calibrated. Methods without a histogram, such as points, are left out.
+
+        Raises:
+            KeyError: no method has the histogram.
+        """
+        methods = [method for method, row in self.rows.items() if histogram in row.histograms]
+        if not methods:
+            raise KeyError(f"no method has a histogram {histogram!r}; evaluate with scores=calibrated")
+        figure = canvas(0.8 + 2.4 * len(methods), 3.7)
+        panels = figure.subplots(2, len(methods), squeeze=False, sharex=True, sharey="row")
+        for (top, bottom), method in zip(panels.T, methods, strict=True):
+            self._draw(top, method, histogram)
+            top.set_title(f"{method}, K = {self.rows[method].samples}", fontsize=8, parse_math=False)
+            points, departs, low, high = self.departure(method, histogram)
+            bottom.fill_between(points, low, high, color="0.88", step="mid", linewidth=0)
+            bottom.plot(points, departs, color="C0", linewidth=1.2)
+            bottom.axhline(0, color="0.4", linewidth=0.8)
+            for panel in (top, bottom):
+                panel.tick_params(labelsize=7)
+        panels[0, 0].set_ylim(bottom=0)
+        panels[0, 0].set_ylabel(f"{histogram}\nover uniform", fontsize=8, parse_math=False)
+        panels[1, 0].set_ylabel("ECDF\nless uniform", fontsize=8)
+        figure.suptitle(self._title(), fontsize=9, parse_math=False)
+        figure.supxlabel(f"{histogram} of the true future among the forecasts", fontsize=8, parse_math=False)
+        return figure
+
+    def plot_horizon(self) -> Figure:
+        """For each method, histograms of the PIT at some frames of the future, and coverage over them.
+
+        Bands are two standard errors, clustered by clip; see `scores.over_horizon`.
+
+        Raises:
+            KeyError: no method has a histogram of a frame.
+        """
+        _, frame = called(self.data)
+
+        def at(score: str, names: Iterable[str]) -> dict[int, str]:
+            """Names of a score by frame."""
+            found = (re.fullmatch(rf"{re.escape(score)}, {re.escape(frame)} (\d+)", name) for name in names)
+            return {int(each[1]): each[0] for each in found if each}
+
+        shown = {name: found for name, row in self.rows.items() if (found := at("PIT", row.histograms))}
+        if not shown:
+            raise KeyError("no method has a histogram of a frame; evaluate with scores=over_horizon")
+        columns = max(map(len, shown.values())) + 1
+        figure = canvas(1 + 1.5 * columns, 0.9 + 1.7 * len(shown))
+        panels = figure.subplots(len(shown), columns, squeeze=False)
+        for (*alone, last), (method, histograms) in zip(panels, shown.items(), strict=True):
+            for panel, (place, name) in zip(alone, histograms.items(), strict=True):
+                self._draw(panel, method, name)
+                panel.sharey(alone[0])
+                panel.set_title(f"{frame} {place}", fontsize=8)
+            alone[0].set_ylim(bottom=0)
+            alone[0].set_ylabel(f"{method}\nPIT over uniform", fontsize=8, parse_math=False)
+            scores = self[method]
+            for order, level in enumerate((50, 80, 90)):
+                covered = {place: scores[name] for place, name in at(f"coverage {level} %", scores).items()}
+                means, errors = (
+                    np.array([getattr(each, of) for each in covered.values()]) for of in ("mean", "standard_error")
+                )
+                last.fill_between(
+                    [*covered], means - 2 * errors, means + 2 * errors, color=f"C{order}", alpha=0.2, linewidth=0
+                )
+                last.plot([*covered], means, color=f"C{order}", linewidth=1.2)
+                last.axhline(level / 100, color=f"C{order}", linewidth=0.8, linestyle=":")
+            last.set_ylim(0, 1)
+            last.set_title(f"coverage by {frame}", fontsize=8, parse_math=False)
+        for panel in panels.flat:
+            panel.tick_params(labelsize=7)
+        figure.suptitle(self._title(), fontsize=9, parse_math=False)
+        return figure
+
+    def _draw(self, panel: Axes, method: str, histogram: str) -> None:
+        """A histogram over uniform, with two standard errors of each bin."""
+        clip_shares = np.array(self.rows[method].histograms[histogram]).T
+        bins = len(clip_shares)
+        shares, deviations = linearised(clip_shares, np.array(list(self.clips.values())))
+        errors = np.array([math.sqrt(clustered_variance(each)) for each in deviations])
+        edges = np.linspace(0, 1, bins + 1)
+        low, high = (bins * (shares + reach * errors) for reach in (-2, 2))
+        panel.stairs(high, edges, baseline=low, fill=True, color="0.88")
+        panel.stairs(bins * shares, edges, color="C0")
+        panel.axhline(1, color="0.4", linewidth=0.8)
+
+    def to_json(self) -> str:
+        """Everything, with means and standard errors written out; numbers that are not finite become null."""
+        metrics = {name: dataclasses.asdict(metric) for name, metric in self.metrics.items()}
+        rows = {method: self._document(method) for method in self.rows}
+        return json.dumps({**vars(self), "rows": rows, "metrics": metrics}, indent=1, allow_nan=False)
+
+    @classmethod
+    @override
+    def from_json(cls, text: str) -> Self:
+        try:
+            document = json.loads(text)
+            if "metrics" not in document:
+                _migrate(document)
+            metrics = {name: Metric(**metric) for name, metric in document.pop("metrics").items()}
+            rows = {method: _row(row) for method, row in document.pop("rows").items()}
+            return cls(rows=rows, metrics=metrics, **document)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"this is not an evaluation written by Evaluation.to_json: {error!r}") from error
+
+    def _histogram(self, method: str, name: str) -> tuple[tuple[float, ...], ...]:
+        found = self._row(method).histograms
+        if name not in found:
+            has = ", ".join(found) or "none"
+            raise KeyError(f"{method!r} has no histogram {name!r}{nearest(name, found)}; it has {has}")
+        return found[name]
+
+    def _row(self, method: str) -> Row:
+        if method not in self.rows:
+            raise KeyError(
+                f"no method {method!r} in this evaluation{nearest(method, self.rows)}; it has {', '.join(self.rows)}"
+            )
+        return self.rows[method]
+
+    def _score(self, metric: str, clip_means: np.ndarray) -> Score:
+        known = ~np.isnan(clip_means) if self.metrics[metric].partial else slice(None)
+        mean, deviations = linearised(clip_means[known], np.array(list(self.clips.values()))[known])
+        return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
+
+    def _document(self, method: str) -> dict[str, Any]:
+        row = dataclasses.asdict(self.rows[method])
+        clip_means, histograms = row.pop("clip_means"), row.pop("histograms")
+        row["scores"] = {
+            name: {
+                **dataclasses.asdict(self.metrics[name]),
+                **dataclasses.asdict(score),
+                "clip_means": clip_means[name],
+            }
+            for name, score in self[method].items()
+        }
+        return plain(row | ({"histograms": histograms} if histograms else {}))
+
+    def _caption(self) -> str:
+        freedom = f"{len(self.clips) - 1} degrees of freedom"
+        clip, _ = called(self.data)
+        return "\n".join([f"mean ± standard error over windows, clustered by {clip} ({freedom})", *self.notes])
+
+    def _title(self) -> str:
+        name = str(self.protocol.get("name", ""))
+        parts = [name, f"{self.data['windows']} windows of {len(self.clips)} {called(self.data)[0]}s"]
+        parts += self.data.get("title", [])
+        parts += [f"{name} {value}" for name, value in self.options.items()]
+        parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]
+        return " · ".join(part for part in parts if part)
+
+
+def _row(document: dict[str, Any]) -> Row:
+    scores = document.pop("scores")
+    means = {
+        name: tuple(math.nan if mean is None else mean for mean in score["clip_means"])
+        for name, score in scores.items()
+    }
+    return Row(clip_means=means, **document)
+
+
+# The order of the table's scores where files do not tell: "ACC way" stands in it as ACC.
+_FORMER = (
+    *("APD", "ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm", "energy score", "variogram score"),
+    *("global ADE", "global FDE", "path error", "bone-length error", "pose NLL", "ACC", "FID"),
+    *("ELBO", "importance bound", "k-hat", "KL"),
+)
+
+
+def _migrate(document: dict[str, Any]) -> None:
+    """Brings a document of version 0.1, when every evaluation had the same scores, to what is written now."""
+    found = {name: score for row in document["rows"].values() for name, score in row["scores"].items()}
+
+    def place(name: str) -> tuple[int, str]:
+        return _FORMER.index(name if name in _FORMER else name.partition(" ")[0]), name
+
+    document["metrics"] = {
+        name: {key: found[name][key] for key in ("unit", "program", "better")} | {"partial": name.startswith("ACC ")}
+        for name in sorted(found, key=place)
+    }
+    data, multimodal = document["data"], document.pop("multimodal")
+    document["basis"] = {"multimodal": multimodal}
+    document["notes"] = [multimodal_note(**multimodal, windows=data["windows"])]
+    if prior := document.pop("pose_prior", None):
+        document["basis"]["pose prior"] = prior
+    for name, used in document.pop("classifiers", {}).items():
+        document["basis"][f"classifier {name}"] = used
+        document["notes"].append(f"ACC, FID {name}: classifier {used['weights'][:12]}")
+    data["title"] = [f"given {', '.join(data['given']) or 'no paths'}"] if "given" in data else []
+    if exchanged := data.get("exchanged"):
+        data["title"].append(f"first poses of {exchanged['partners']} other windows")

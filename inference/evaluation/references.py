@@ -1,0 +1,317 @@
+"""References for forecasts of any sequences: what needs no model, and which other futures were possible."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from ...data.sequences import Batch, HeldOutWindows, bridged, gapped, mask_of, mean_of_known, sequences, take_split
+from ...options import nearest
+from .held import Held
+
+Forecaster = Callable[[slice], Tensor]
+"""Which windows to (K, B, H, D)."""
+USUAL = ("zero velocity", "nearest neighbours")
+"""Reference rows of motion and of bare arrays."""
+OF_TABLES = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
+"""Those of windows that name their columns."""
+
+_EXACT = "donot_use_mm_for_euclid_dist"
+
+
+def multimodal_truths(windows: HeldOutWindows, threshold: float | None = None, itself: bool = True) -> list[Tensor]:
+    """Multimodal ground truth: for every window, those that were in almost the same pose when their future began.
+
+    Two windows belong together when their last observed poses are at a Euclidean distance *below* the threshold, over
+    all coordinates; where some are missing, see `distances`. By default as in the evaluation of DLow (Yuan and Kitani
+    2020): a window belongs to itself, and one that nobody joins keeps its single truth and is scored like the others,
+    as every evaluation here does. (GSPS leaves such windows out of every metric, so that its published numbers are on a
+    subset.)
+
+    Args:
+        windows: N windows; the protocol says what is observed.
+        threshold: largest distance (exclusive), in the unit of the data; by default the protocol's, 0.5 m in the
+            papers.
+        itself: whether a window is among its own truths. Without, it may have none, and its multimodal errors are
+            undefined.
+
+    Returns:
+        N index tensors `(M_n,)`, ascending; `futures[truths[n]]` are the truths `(M_n, T, D)` of window n.
+
+    Raises:
+        ValueError: a threshold that is not positive.
+    """
+    observed = windows.protocol.observed
+    threshold = windows.protocol.multimodal_threshold if threshold is None else threshold
+    if not threshold > 0:
+        raise ValueError(f"the multimodal threshold is a distance and must be positive, but is {threshold}")
+    poses, seen = last_places(windows.all(), observed)
+    poses = poses.double()
+    found: list[Tensor] = []
+    for rows in torch.arange(len(poses)).split(512):
+        close = distances(poses[rows], poses, None if seen is None else seen[rows], seen) < threshold
+        close[torch.arange(len(rows)), rows] = itself
+        found += [row.nonzero()[:, 0] for row in close]
+    return found
+
+
+def multimodal_note(threshold: float, itself: bool, alone: int, windows: int) -> str:
+    """How multimodal errors are to be read, for the caption of a table."""
+    closer = f"all windows whose last poses are closer than {threshold:g} m{', itself included' if itself else ''}"
+    return f"MM: over the futures of {closer}; {alone} of {windows} have no other"
+
+
+def last_places(batch: Batch, observed: int) -> tuple[Tensor, Tensor | None]:
+    """The last observed pose `(B, D)`, and which of its coordinates were observed at all, None for all of them.
+
+    Where a coordinate is missing in the last frame it is where it was last, and 0 if it was nowhere.
+
+    Args:
+        batch: x `(B, T, D)`, with or without a mask of it.
+        observed: O.
+    """
+    x, mask = batch["x"][:, :observed], mask_of(batch)
+    if mask is None:
+        return x[:, -1], None
+    mask = mask[:, :observed]
+    return bridged(x, mask)[:, -1], mask.any(1)
+
+
+def distances(first: Tensor, second: Tensor, seen: Tensor | None = None, also: Tensor | None = None) -> Tensor:
+    """Euclidean distances `(N, M)` of `(N, D)` and `(M, D)`.
+
+    Where coordinates are missing, the mean square over those that both have stands for all of them; two that share none
+    are infinitely far apart.
+
+    Args:
+        first, second: the points, anything where a coordinate is missing.
+        seen, also: `(N, D)` and `(M, D)`, True where the coordinates of each were observed; None for all.
+    """
+    if seen is None and also is None:
+        # Matrix-product distances would lose what tells poses apart that lie far from the origin, or at a threshold.
+        return torch.cdist(first, second, compute_mode=_EXACT)
+    here = torch.ones_like(first, dtype=torch.bool) if seen is None else seen
+    there = torch.ones_like(second, dtype=torch.bool) if also is None else also
+    ours, theirs = here.to(first), there.to(second)
+    centre = (torch.where(there, second, 0.0).sum(0) / theirs.sum(0).clamp(min=1)).double()  # or digits cancel
+    a, b = (torch.where(m, x.double() - centre, 0.0) for m, x in ((here, first), (there, second)))
+    ours, theirs = ours.double(), theirs.double()
+    shared = ours @ theirs.T
+    squares = a.square() @ theirs.T + ours @ b.square().T - 2 * a @ b.T
+    found = (squares.clamp(min=0) * (first.shape[-1] / shared)).sqrt()
+    return torch.where(shared > 0, found, torch.inf).to(first)
+
+
+def zero_velocity(observed: Tensor, horizon: int, mask: Tensor | None = None) -> Tensor:
+    """The last pose repeated: the forecast that any method should beat.
+
+    Args:
+        observed: `(B, O, D)`.
+        horizon: frames H to predict.
+        mask: `(B, O, D)`, True where a coordinate was observed; one that is missing in the last frame is where it was
+            last.
+
+    Returns:
+        One forecast, `(1, B, H, D)`, laid out like those of a model.
+    """
+    return bridged(observed, mask)[None, :, -1:].expand(-1, -1, horizon, -1)
+
+
+def seasonal(observed: Tensor, horizon: int, season: int, mask: Tensor | None = None) -> Tensor:
+    """The last period repeated: every value is the one that was there a whole number of periods before.
+
+    Args:
+        observed: `(B, O, D)`.
+        horizon: frames H to predict.
+        season: frames of a period, at most O; 1 is the last value repeated.
+        mask: `(B, O, D)`, True where a coordinate was observed. Where the last period lacks a value it is that of the
+            latest period that has it, and where all of them do, on the straight line between its neighbours in time.
+
+    Returns:
+        One forecast, `(1, B, H, D)`.
+
+    Raises:
+        ValueError: a season that is not from 1 to O.
+    """
+    frames = observed.shape[1]
+    if not 1 <= season <= frames:
+        raise ValueError(f"a season is from 1 to the {frames} observed frames, not {season}")
+    last = bridged(observed, mask)[:, -season:]
+    if mask is not None:
+        periods = frames // season * season
+        x, seen = (each[:, -periods:].unflatten(1, (-1, season)).movedim(1, 2) for each in (observed, mask))
+        last = torch.where(seen.any(2), bridged(x, seen)[:, :, -1], last)
+    return last[None, :, torch.arange(horizon) % season]
+
+
+def climatology(futures: Tensor, count: int, samples: int, seed: int = 0) -> Callable[[slice], Tensor]:
+    """Futures of training windows drawn at random: what a forecaster says who knows the data and not the past.
+
+    Args:
+        futures: `(N, H, D)`, of training windows.
+        count: of windows to forecast.
+        samples: K, draws for each of them, independent and with replacement.
+        seed: of the draws.
+
+    Returns:
+        Which of the windows to `(K, B, H, D)`.
+    """
+    drawn = torch.randint(len(futures), (samples, count), generator=torch.Generator().manual_seed(seed))
+    return lambda part: futures[drawn[:, part]]
+
+
+def nearest_neighbours(
+    observed: Tensor,
+    training: Tensor,
+    samples: int = 50,
+    mask: Tensor | None = None,
+    training_mask: Tensor | None = None,
+) -> Tensor:
+    """The futures of the training windows whose last observed poses are closest: memory without a model.
+
+    Args:
+        observed: `(B, O, D)`.
+        training: `(N, O + H, D)`, training windows observed for as many frames.
+        samples: K, the number of neighbours.
+        mask, training_mask: of both, True where a coordinate was observed. Poses are those of `last_places`, and the
+            gaps of futures are bridged.
+
+    Returns:
+        `(K, B, H, D)`, the closest neighbour first.
+
+    Raises:
+        ValueError: training windows of another size or without a future, or fewer of them than K.
+    """
+    frames, size = observed.shape[1:]
+    if training.ndim != 3 or training.shape[2] != size or training.shape[1] <= frames:
+        raise ValueError(
+            f"training windows must be (N, T, {size}) with T above the {frames} observed frames, but have "
+            f"shape {tuple(training.shape)}"
+        )
+    if len(training) < samples:
+        raise ValueError(f"{samples} neighbours were asked of {len(training)} training windows; use fewer")
+    here = last_places({"x": observed} | ({} if mask is None else {"mask": mask}), frames)
+    there = last_places({"x": training} | ({} if training_mask is None else {"mask": training_mask}), frames)
+    nearest = distances(here[0], there[0], here[1], there[1]).topk(samples, largest=False).indices
+    return bridged(training, training_mask)[nearest.T, frames:]
+
+
+@dataclass(frozen=True)
+class References:
+    """Forecasters without a model, by name: `references["mean"]` is the number of its forecasts and a `Forecaster`.
+
+    | name | forecasts | needs |
+    |---|---|---|
+    | zero velocity | the last pose repeated: what motion calls the next | |
+    | last value | the last frame repeated | |
+    | seasonal | the last period repeated | a season that was observed |
+    | mean | of every column in the training windows, at all frames | training windows |
+    | climatology | K futures of training windows, drawn at random for each window | training windows |
+    | nearest neighbours | the futures of the K training windows with the closest last frames | training windows |
+
+    All but the last two are points: their energy score is a distance, their CRPS an absolute error, and intervals they
+    have none. Climatology is the distribution of what is forecast, by one who knows the data and not the past.
+
+    Args:
+        held: windows to forecast.
+        samples: K.
+        seed: of draws.
+        training: what may be known.
+        season: frames of a period; by default what the windows' description says.
+
+    Raises:
+        ValueError: by the index: no such reference, or one that cannot be had.
+    """
+
+    held: Held
+    samples: int
+    seed: int = 0
+    training: HeldOutWindows | None = None
+    season: int | None = None
+
+    def lacking(self, name: str) -> str:
+        """What a reference needs and has not; empty where it can be had.
+
+        Raises:
+            ValueError: no such reference.
+        """
+        if name not in self._makers:
+            raise ValueError(
+                f"no reference row {name!r}{nearest(name, self._makers)}; there are {', '.join(self._makers)}"
+            )
+        if name in ("mean", "climatology", "nearest neighbours"):
+            return "" if self.training is not None else "training windows"
+        if name == "seasonal" and not 1 <= (self._period or 0) <= self.held.observed:
+            given = f", not {self._period}" if self._period else ""
+            return f"a season of 1 to {self.held.observed} frames, which are observed{given}"
+        return ""
+
+    def __getitem__(self, name: str) -> tuple[int, Forecaster]:
+        if needed := self.lacking(name):
+            raise ValueError(f"the reference row {name!r} needs {needed}")
+        return self._makers[name]()
+
+    @property
+    def _makers(self) -> dict[str, Callable[[], tuple[int, Forecaster]]]:
+        return {
+            "zero velocity": self._last,
+            "last value": self._last,
+            "seasonal": self._seasonal,
+            "mean": self._mean,
+            "climatology": self._climatology,
+            "nearest neighbours": self._neighbours,
+        }
+
+    def _last(self) -> tuple[int, Forecaster]:
+        return 1, lambda part: zero_velocity(*self._past(part))
+
+    def _seasonal(self) -> tuple[int, Forecaster]:
+        def again(part: slice) -> Tensor:
+            x, horizon, mask = self._past(part)
+            return seasonal(x, horizon, self._period or 1, mask)
+
+        return 1, again
+
+    def _mean(self) -> tuple[int, Forecaster]:
+        mean = mean_of_known(gapped(self._known), (0, 1))
+        return 1, lambda part: mean.expand(1, len(self.held.x[part]), self._horizon, -1)
+
+    def _climatology(self) -> tuple[int, Forecaster]:
+        training, gaps = self._training
+        futures = bridged(training, gaps)[:, self.held.observed :]
+        return self.samples, climatology(futures, len(self.held.x), self.samples, self.seed)
+
+    def _neighbours(self) -> tuple[int, Forecaster]:
+        training, gaps = self._training
+        count = min(self.samples, len(training))
+
+        def remembered(part: slice) -> Tensor:
+            x, _, mask = self._past(part)
+            return nearest_neighbours(x, training, count, mask, gaps)
+
+        return count, remembered
+
+    @property
+    def _horizon(self) -> int:
+        return self.held.x.shape[1] - self.held.observed
+
+    @property
+    def _period(self) -> int | None:
+        return self.held.windows.description.get("season") if self.season is None else self.season
+
+    def _past(self, part: slice) -> tuple[Tensor, int, Tensor | None]:
+        past = self.held.past(part)
+        return past["x"], self._horizon, mask_of(past)
+
+    @cached_property
+    def _known(self) -> Batch:
+        return sequences(take_split(self.training, "train")).batch
+
+    @cached_property
+    def _training(self) -> tuple[Tensor, Tensor | None]:
+        """As much of training windows as those to forecast have, and its mask."""
+        listed, frames = self._known, self.held.x.shape[1]
+        mask = mask_of(listed)
+        return listed["x"][:, :frames], None if mask is None else mask[:, :frames]

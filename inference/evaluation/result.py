@@ -1,0 +1,168 @@
+"""What every result is: a table on a terminal, in print and in a notebook, and a file. And the bar while one waits."""
+
+import io
+import os
+from collections.abc import Iterable
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import rich.table
+from rich.console import Console, RenderableType
+from rich.progress import Progress, TextColumn
+from rich.text import Text
+from typing_extensions import override
+
+from ... import files
+from ...turns import SHAPES
+
+if TYPE_CHECKING:
+    import matplotlib.text
+    from matplotlib.figure import Figure
+
+LARGEST = 2**28
+"""Bytes of a result."""
+
+
+class Table(rich.table.Table):
+    """A rich table that shows texts as they are: names of clips, labels and models hold no markup and no emoji."""
+
+    def __init__(self, *, title: str = "", caption: str = "", **options: Any) -> None:
+        super().__init__(**options)
+        self.title = Text(_shown(title), "table.title") if title else None
+        self.caption = Text(_shown(caption), "table.caption") if caption else None
+
+    @override
+    def add_column(self, header: RenderableType = "", *arguments: Any, **options: Any) -> None:
+        super().add_column(_as_it_is(header), *arguments, **options)
+
+    @override
+    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
+        super().add_row(*map(_as_it_is, cells), **options)
+
+
+class Plain(Console):
+    """A console that prints texts as they are: paths, names and messages hold no markup and no emoji.
+
+    It stops printing when the reader closes the pipe, as in `dvae evaluate RUN | head`. The command continues.
+    """
+
+    unread: ClassVar[bool] = False
+    """Whether the reader of a console's output has closed the pipe."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, **options)
+
+    @override
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(_shown(text), **options)
+
+    @override
+    def on_broken_pipe(self) -> None:
+        Plain.unread = self.quiet = True
+        self.print()  # a quiet console empties its buffer
+        with suppress(OSError), open(os.devnull, "wb") as nowhere:  # the rest of Python's buffer is written there
+            os.dup2(nowhere.fileno(), self.file.fileno())
+
+
+def _as_it_is(cell: Any) -> Any:
+    return Text(_shown(cell)) if isinstance(cell, str) else cell
+
+
+def _shown(text: str) -> str:
+    """The text, which cannot command the terminal: rich drops the other control characters."""
+    return text.replace("\x1b", r"\x1b")
+
+
+def reason(error: BaseException) -> str:
+    """What an error says, without the table of shapes that Pyro appends where it passes a program."""
+    return SHAPES.sub("", str(error))
+
+
+def canvas(width: float, height: float) -> "Figure":
+    """An empty figure, in inches; matplotlib is imported by whoever draws."""
+    from .picture import Picture
+
+    return Picture(figsize=(width, height), layout="constrained")
+
+
+def as_they_are(texts: "Iterable[matplotlib.text.Text]") -> None:
+    """Have matplotlib draw texts as they are: dollar signs in a name enclose no formula."""
+    for text in texts:
+        text.set_parse_math(False)
+
+
+class Shown:
+    """What has a `table` shows itself as that, in a terminal and in a notebook."""
+
+    def table(self) -> RenderableType:
+        """Everything that matters, with its uncertainty."""
+        raise NotImplementedError
+
+    def __rich__(self) -> RenderableType:
+        return self.table()
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=400, force_jupyter=False)
+        console.print(self.table())
+        return console.file.getvalue().rstrip()  # type: ignore[attr-defined]
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        console = Console(file=io.StringIO(), width=400, force_jupyter=False, record=True)
+        console.print(self.table())
+        lines = "\n".join(
+            line.rstrip() for line in console.export_html(inline_styles=True, code_format="{code}").split("\n")
+        )
+        return f'<pre style="line-height:normal; font-family:monospace">{lines}</pre>'
+
+
+class Result(Shown):
+    """A result with a `table` and a `to_json`; it shows itself as the one and is kept as the other."""
+
+    def to_json(self) -> str:
+        """Everything, as text."""
+        raise NotImplementedError
+
+    def save(self, path: str | Path) -> None:
+        """Write `to_json()` to a file, which takes the place of an older one once it is whole.
+
+        Raises:
+            OSError, ValueError: it cannot be written.
+        """
+        with files.written(path) as file:
+            file.write((self.to_json() + "\n").encode())
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """The result that `to_json` wrote, of a kind that can be read again.
+
+        Raises:
+            ValueError: text that is not such a document.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read the file that `save` wrote.
+
+        Raises:
+            OSError, ValueError: there is no such file, or it is no plain one, or no result of this kind.
+        """
+        return cls.from_json(files.read(path, LARGEST, links=True).decode())
+
+
+def progress_bar(shown: bool) -> Progress:
+    """A bar that goes when the work is done; hidden where nobody would see it move (notebooks need ipywidgets)."""
+    console = Console()
+    moves = find_spec("ipywidgets") is not None if console.is_jupyter else console.is_terminal
+    return Progress(
+        TextColumn("{task.description}", "progress.description", markup=False),  # it may be the name of a model
+        *Progress.get_default_columns()[1:],
+        transient=True,
+        console=console,
+        disable=not (shown and moves),
+    )

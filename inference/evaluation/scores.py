@@ -1,0 +1,346 @@
+"""Scores of forecasts as small objects, for any sequences; an application adds its own to those here.
+
+A `Measure` is a function of forecasts and truth with a name, a unit and the direction that is better. A set of them is
+a function of the windows that are evaluated on:
+
+    speed = Measure("speed error", lambda forecasts, truth, past, index: ..., unit="m/s")
+    dvae.evaluate(model, windows, scores=lambda windows: [*proper(windows), speed])
+
+`proper` are proper scoring rules, and `calibrated` adds coverage, sharpness, PIT and TARP: what there is to know of
+forecasts of any data. `by_column` has a score of every column alone, in its own unit, `by_frame` one of some frames,
+and `over_horizon` calibration at these. What a model explains (bound, importance bound, k-hat, KL, log score) needs the
+model and no forecasts; `dvae.evaluate` has options for it.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...data.sequences import Batch, HeldOutWindows, bridged, called, columns_of, gapped, mask_of, scales_of
+from . import metrics
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a score is to be read.
+
+    Args:
+        unit: of the score.
+        program: "free-running" or "teacher-forced".
+        better: "lower", "higher", or "" for neither.
+        partial: it is NaN of clips of which it says nothing, and they are left out.
+    """
+
+    unit: str = ""
+    program: str = "free-running"
+    better: str = "lower"
+    partial: bool = False
+
+
+LOG_SCORE = Metric("nats/frame", "free-running", "higher")
+TEACHER_FORCED = {
+    "ELBO": Metric("nats/frame", "teacher-forced", "higher"),
+    "importance bound": Metric("nats/frame", "teacher-forced", "higher"),
+    "k-hat": Metric("", "teacher-forced"),
+}
+KL = Metric("nats/frame", "teacher-forced", "")
+
+
+def clip_means(values: Tensor, clips: Tensor) -> Sequence[Any]:
+    """Means over the windows of each clip.
+
+    Args:
+        values: `(N, ...)`, the score of every window.
+        clips: `(N,)`, the clip of every window, from 0 to C - 1.
+    """
+    places = clips.numpy()
+    found: list[Any] = (_sums(values.double().numpy(), places).T / np.bincount(places)).T.tolist()
+    return found
+
+
+def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[Any]:
+    """Of scores that are NaN of windows that do not count: the mean over windows is that over those that do.
+
+    R + N / M (s_c - R m_c) / n_c for each clip, s_c the sum over those m_c of its n_c windows that count, M of all N,
+    and R the mean over these M: a ratio of sums, linearised, so that errors are those of a ratio (Cochran 1977). NaN of
+    all clips where no window counts.
+    """
+    places, known = clips.numpy(), ~values.isnan().numpy()
+    if not known.any():
+        return clip_means(values, clips)
+    windows, counted = np.bincount(places), _sums(known, places)
+    sums = _sums(values.nan_to_num().double().numpy(), places)
+    ratio = sums.sum(0) / counted.sum(0)
+    found: list[Any] = (ratio + ((sums - ratio * counted).T / windows).T * (len(places) / counted.sum(0))).tolist()
+    return found
+
+
+def _sums(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(C, ...), of values (N, ...) over the windows of each clip."""
+    columns = values.reshape(len(values), -1).T
+    return np.stack([np.bincount(places, weights=each) for each in columns], -1).reshape(-1, *values.shape[1:])
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A score of free-running forecasts.
+
+    Args:
+        name: of the score.
+        function: of forecasts `(B, K, H, D)`, true futures `(B, H, D)`, NaN where they were not observed, the past (x
+            `(B, O, D)`, its mask if there is one, and context) and the places `(B,)` of these windows among all, to the
+            score `(B,)`, on the CPU.
+        unit, better, partial: see `Metric`.
+        pool: from what `function` gave of all windows, `(N, ...)`, and the clip of each, to a value for each clip, of
+            which the score is the mean weighted by windows. A score of the whole set gives pseudo-values, a histogram
+            lists of shares.
+        headline: whether a comparison shows it in its table.
+        truth: name of a reference row that forecasts the true futures, where these are needed to read the score.
+        note: a line below the table.
+        basis: what the score rests on, by name, for the record, in JSON's types.
+        bins: 0 of a score; of a histogram, which is in `Row.histograms` and in no table, the number of its bins, and
+            `function` gives shares `(B, bins)`.
+        least: forecasts of a window that it needs; rows with fewer, such as points, are left without it.
+        of_draws: whether it scores the distribution of the data. A note says so where forecasts are means.
+        of_means: whether it is published for means of the emission, as errors of motion are. Forecasts are then means
+            by default; otherwise they are draws.
+    """
+
+    name: str
+    function: Callable[[Tensor, Tensor, Batch, Tensor], Tensor]
+    unit: str = ""
+    better: str = "lower"
+    partial: bool = False
+    pool: Callable[[Tensor, Tensor], Sequence[Any]] = clip_means
+    headline: bool = False
+    truth: str = ""
+    note: str = ""
+    basis: Mapping[str, Any] = field(default_factory=dict)
+    bins: int = 0
+    least: int = 1
+    of_draws: bool = False
+    of_means: bool = False
+
+    @property
+    def metric(self) -> Metric:
+        """How it is to be read."""
+        return Metric(self.unit, "free-running", self.better, self.partial)
+
+
+def paired(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor, Batch, Tensor], Tensor]:
+    """The function of a measure from a score of samples `(..., K, T, D)` and truth `(..., T, D)`, as in `metrics`."""
+    return lambda forecasts, truth, past, index: score(forecasts, truth)
+
+
+ENERGY = Measure("energy score", paired(metrics.energy_score), headline=True, of_draws=True)
+VARIOGRAM = Measure("variogram score", paired(metrics.variogram_score), of_draws=True)
+CRPS = Measure("CRPS", paired(metrics.continuous_ranked_probability_score), headline=True, of_draws=True)
+
+
+def proper(windows: HeldOutWindows) -> list[Measure]:
+    """Proper scoring rules: of the future as one vector, of dependence between coordinates, of each number alone.
+
+    In the unit of the columns, if windows name them and they share one; else, where windows tell the scales of columns,
+    of numbers in these, which have no unit. A single column has no dependence to score.
+    """
+    columns = columns_of(windows)
+    alone = (len(columns) or windows.all()["x"].shape[-1]) == 1
+    return [_of_all(measure, windows) for measure in (ENERGY, VARIOGRAM, CRPS) if not (alone and measure is VARIOGRAM)]
+
+
+def _of_all(measure: Measure, windows: HeldOutWindows) -> Measure:
+    """A score in the unit of the data, of all columns together."""
+    units = dict.fromkeys(columns_of(windows).values())
+    if scales := scales_of(windows):
+        note = "scores of all columns together are of numbers in the scales of their columns, in the training data"
+        means = windows.description.get("means", [0.0] * len(scales))
+        return replace(measure, function=_in_scales(measure.function, means, scales), unit="scales", note=note)
+    mixed = f"scores without a unit mix numbers in {', '.join(unit or '1' for unit in units)}; by_column has them apart"
+    shared: dict[str, Any] = {"note": mixed} if len(units) > 1 else {"unit": next(iter(units), "")}
+    return replace(measure, **shared)
+
+
+def _in_scales(
+    function: Callable[..., Tensor], means: Sequence[float], scales: Sequence[float]
+) -> Callable[..., Tensor]:
+    def scaled(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        less, by = torch.tensor([means, scales], dtype=torch.float64).to(truth)
+        forecasts, truth, x = ((values - less) / by for values in (forecasts, truth, past["x"]))
+        return function(forecasts, truth, {**past, "x": x}, index)
+
+    return scaled
+
+
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+"""Of the intervals whose coverage is scored."""
+_CALIBRATED: dict[str, Any] = {
+    "better": "",
+    "of_draws": True,
+    "note": "calibrated forecasts cover as much as the level says, and their PIT has mean ½ and variance 1 twelfth; "
+    "above 1 they are too narrow or off, below it too wide",
+}
+
+
+def coverage_at(level: float) -> Measure:
+    """Coverage of the central interval of a level (`metrics.coverage`), of as many forecasts as reach around it."""
+    function = paired(partial(metrics.coverage, level=level))
+    return Measure(f"coverage {100 * level:g} %", function, "share", **_CALIBRATED, least=reaching(level))
+
+
+def width_at(level: float) -> Measure:
+    """Width of the central interval of a level (`metrics.interval_width`), where there is a truth."""
+
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        return metrics.interval_width(forecasts.masked_fill(truth[:, None].isnan(), torch.nan), level)
+
+    return Measure(f"width {100 * level:g} %", function, better="", least=reaching(level), of_draws=True)
+
+
+def reaching(level: float) -> int:
+    """The fewest samples of which some lie beyond a central interval of this level."""
+    if not 0 < level < 1:
+        raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
+    return math.ceil(round(2 / (1 - level) - 1, 9))
+
+
+BINS = 20
+PIT = Measure(
+    "PIT", paired(partial(metrics.pit_histogram, bins=BINS)), "share", **_CALIBRATED, bins=BINS, least=BINS - 1
+)
+PIT_MEAN = Measure("PIT mean", paired(metrics.pit_mean), "share", **_CALIBRATED, least=BINS - 1)
+PIT_VARIANCE = Measure("PIT variance", paired(metrics.pit_variance), "1/12", **_CALIBRATED, least=BINS - 1)
+
+
+def calibrated(windows: HeldOutWindows) -> list[Measure]:
+    """Proper scores, and whether forecasts are calibrated and how sharp they are, for any data.
+
+    Coverage at 50, 80, 90 and 95 %, width of the intervals of 90 %, mean and variance of the PIT, and the histograms of
+    PIT and TARP, for `Evaluation.plot_calibration`. Coverage at 95 % needs 39 forecasts of a window.
+    """
+    width = _of_all(width_at(0.9), windows)
+    return [*proper(windows), *map(coverage_at, LEVELS), width, PIT_MEAN, PIT_VARIANCE, PIT, tarp(windows)]
+
+
+def tarp(windows: HeldOutWindows, seed: int = 0) -> Measure:
+    """TARP of whole futures (`metrics.tarp_histogram`), one number of a window, as a histogram.
+
+    The point of a window is its last observed frame (or where each number was last seen), repeated, with a normal step
+    away from it at every frame and number, drawn from `seed`: it depends on the past and on no forecast, so that
+    forecasts which do not heed the past are told too. Steps and distances are in standard deviations of each column's
+    observed frames.
+    """
+    batch, observed = windows.all(), windows.protocol.observed
+    past = gapped(batch)[:, :observed].double()
+    scale = torch.from_numpy(np.nanstd(past.numpy(), (0, 1)))
+    scale = torch.where(scale > 0, scale, 1.0)
+    last = bridged(past, ~past.isnan())[:, -1:]
+    steps = torch.randn(
+        len(last), batch["x"].shape[1] - observed, len(scale), generator=torch.Generator().manual_seed(seed)
+    )
+    points = last / scale + steps
+
+    def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        return metrics.tarp_histogram(forecasts / scale, truth / scale, points[index], BINS)
+
+    told = {"TARP": {"numbers": 1, "seed": seed}}  # of a window
+    return Measure("TARP", function, "share", **_CALIBRATED, bins=BINS, least=BINS - 1, basis=told)
+
+
+def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
+    """A score of every column alone, named "CRPS, speed", in the column's unit where the score's is that of the data.
+
+    Args:
+        measure: of forecasts of any number of columns, whose unit is "" or that of the data, such as `CRPS` or
+            `width_at(0.9)`; one in a unit of its own, such as a share, keeps it.
+        columns: {name: unit} of all columns, in the order of the data, "" for none; windows that name theirs have them
+            as `description["columns"]`.
+
+    Raises:
+        ValueError: other columns than forecasts have.
+
+    Example:
+        >>> [each.name for each in by_column(CRPS, {"speed": "m/s", "load": "kN"})]
+        ['CRPS, speed', 'CRPS, load']
+    """
+
+    def of(place: int) -> Measure:
+        column = slice(place, place + 1)
+
+        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+            if truth.shape[-1] != len(columns):
+                raise ValueError(f"{len(columns)} columns ({', '.join(columns)}) are not the {truth.shape[-1]} of x")
+            mask = mask_of(past)
+            seen = {"x": past["x"][..., column]} | ({} if mask is None else {"mask": mask[..., column]})
+            return measure.function(forecasts[..., column], truth[..., column], {**past, **seen}, index)
+
+        return _part(measure, function, lambda truth: truth[..., column])
+
+    return [
+        replace(of(place), name=f"{measure.name}, {name}", unit=measure.unit or unit)
+        for place, (name, unit) in enumerate(columns.items())
+    ]
+
+
+def by_frame(measure: Measure, frames: Sequence[int], frame: str = "frame") -> list[Measure]:
+    """A score at some frames of the future alone, named "PIT, frame 30"; `Evaluation.plot_horizon` draws them.
+
+    Args:
+        measure: of forecasts of any number of frames.
+        frames: which, the first of the future being 1.
+        frame: what one is called.
+
+    Raises:
+        ValueError: a frame beyond the future.
+
+    Example:
+        >>> [each.name for each in by_frame(CRPS, (1, 30))]
+        ['CRPS, frame 1', 'CRPS, frame 30']
+    """
+
+    def of(place: int) -> Measure:
+        def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+            if not 1 <= place <= truth.shape[-2]:
+                raise ValueError(f"{frame} {place} is none of the {truth.shape[-2]} of the future, counted from 1")
+            return measure.function(forecasts[..., place - 1 : place, :], truth[..., place - 1 : place, :], past, index)
+
+        return _part(measure, function, lambda truth: truth[..., place - 1 : place, :])
+
+    return [replace(of(place), name=f"{measure.name}, {frame} {place}") for place in frames]
+
+
+def _part(
+    measure: Measure, function: Callable[[Tensor, Tensor, Batch, Tensor], Tensor], part: Callable[[Tensor], Tensor]
+) -> Measure:
+    """A score of a part of the future, of those windows of which something of it was observed."""
+
+    def known(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        found = function(forecasts, truth, past, index)
+        nothing = part(truth).isnan().all(-1).all(-1)
+        return found.masked_fill(nothing.reshape(-1, *[1] * (found.ndim - 1)), torch.nan)
+
+    pool = means_of_those_that_count if measure.pool is clip_means else measure.pool
+    return replace(measure, function=known, pool=pool)
+
+
+def over_horizon(windows: HeldOutWindows, frames: Sequence[int] | None = None) -> list[Measure]:
+    """Whether forecasts are calibrated, as a whole and at some frames of the future alone; see `calibrated`.
+
+    Args:
+        windows: that are evaluated on.
+        frames: which frames of the future, from 1; by default six, evenly spread from the first to the last.
+    """
+    horizon = windows.all()["x"].shape[1] - windows.protocol.observed
+    frames = frames or sorted({round(place) for place in np.linspace(1, horizon, 6)})
+    _, frame = called(windows.description)
+    alone = [*map(coverage_at, (0.5, 0.8, 0.9)), PIT]
+    return [*calibrated(windows), *(each for measure in alone for each in by_frame(measure, frames, frame))]
+
+
+Scores = Callable[[HeldOutWindows], Sequence[Measure]]
+"""A set of scores: from the windows that are evaluated on, whose order its measures may know, to the measures."""

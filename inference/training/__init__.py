@@ -1,0 +1,8 @@
+"""Training: the shared SVI loop, objectives, schedules, checkpoints and logs."""
+
+from typing import TYPE_CHECKING
+
+from ...lazy import importing
+
+if not TYPE_CHECKING:
+    __getattr__ = importing(__name__)

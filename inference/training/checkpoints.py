@@ -1,0 +1,497 @@
+"""Run directories: weights, the state that training resumes from, and what was run.
+
+    config.json        what was run: method, schema, data, training options
+    best.safetensors   weights at the best unweighted validation bound (absent without validation data)
+    last.safetensors   weights at the last checkpoint
+    last.state.pt      optimiser, random number generators and what an objective has of its own, read with torch's
+                       restricted unpickler
+    state.json         step, best step and bound, status, and the SHA-256 of the three files above
+
+`state.json` is the commit record. New files are first written whole under a temporary name, then `state.json`
+is replaced, then they take their names; whenever a run is killed, the files that match `state.json` are on
+the disk.
+
+The directory may come from anybody. Its files are opened as `files` does, never through a link, and read up to the size
+that the model gives them.
+"""
+
+import hashlib
+import io
+import json
+import math
+import os
+import pickletools
+import threading
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor, nn
+from torch.nn.modules.module import (
+    register_module_buffer_registration_hook,
+    register_module_parameter_registration_hook,
+)
+
+from ... import files
+from ...distributions.base import renamed
+
+try:
+    import fcntl
+except ImportError:  # no locks on Windows
+    fcntl = None  # type: ignore[assignment]
+
+BEST, LAST, OPTIMISER = "best.safetensors", "last.safetensors", "last.state.pt"
+STATE, CONFIG, LOCK = "state.json", "config.json", ".lock"
+LARGEST_TEXT = 2**24
+"""Bytes of `config.json` and `state.json`."""
+LARGEST_WEIGHTS = 2**32
+"""Bytes of a model's weights."""
+
+ENDED: tuple[str, ...] = ("finished", "stopped early")
+STATUSES: tuple[str, ...] = ("running", *ENDED, "interrupted", "failed")
+
+# what state.json holds of a run, and what makes a value of it sound
+_NUMBER = "a whole number from 0"
+_STORED: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "step": (lambda value: _count(value), _NUMBER),
+    "best_step": (lambda value: value is None or _count(value), f"{_NUMBER} or null"),
+    "best_bound": (lambda v: v is None or (isinstance(v, float) and math.isfinite(v)), "a finite number or null"),
+    "last_value": (
+        lambda v: v is None or v is ... or (isinstance(v, float) and math.isfinite(v)),
+        "a finite number or null",
+    ),
+    "waited": (lambda value: _count(value), _NUMBER),
+    "status": (lambda value: value in STATUSES, "one of the known ones"),
+    "per": (lambda value: value is ... or (isinstance(value, str) and value.isidentifier()), "a word"),
+    "processor_seconds": (lambda v: v is ... or (isinstance(v, float) and 0 <= v < math.inf), "a number from 0"),
+}
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint is missing, damaged, or belongs to another model."""
+
+
+class Run:
+    """A run directory.
+
+    Args:
+        path: the directory; it need not exist before the first `write_config` or `commit`.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        if not isinstance(path, str | os.PathLike):
+            raise TypeError(f"a run is a folder that fit wrote; expected its path, got {path!r}")
+        self.path = Path(path)
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r})"
+
+    @property
+    def exists(self) -> bool:
+        """Whether the directory holds a checkpoint."""
+        return os.path.lexists(self.path / STATE)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What was run."""
+        return self._json(CONFIG)
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """Step, best step and bound, status, and the fingerprints of the checkpoint's files.
+
+        Raises:
+            CheckpointError: when the file is missing, damaged, or leaves a file of the checkpoint unverified.
+        """
+        state = self._json(STATE)
+        fingerprints = state.get("fingerprints")
+        wrong = [
+            f"{name} missing or not {sound}"
+            for name, (test, sound) in _STORED.items()
+            if not test(state.get(name, ...))
+        ]
+        if not isinstance(fingerprints, dict) or not all(isinstance(value, str) for value in fingerprints.values()):
+            problem = "its fingerprints are no object of texts"
+        elif unknown := fingerprints.keys() - {BEST, LAST, OPTIMISER}:
+            problem = f"it has a fingerprint of {min(unknown)[:50]!r}, which is no file of a checkpoint"
+        elif lacking := {LAST, *([BEST] if state.get("best_step") is not None else [])} - fingerprints.keys():
+            problem = f"it has no fingerprint of {' and '.join(sorted(lacking))}"
+        elif wrong:
+            problem = ", ".join(wrong)
+        else:
+            return state
+        raise CheckpointError(f"{self.path / STATE} is damaged: {problem}; copy the run directory whole, or fit again")
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the directory for one process, which writes to it; the lock goes with the process, however it ends.
+
+        Raises:
+            CheckpointError: when another process holds it.
+        """
+        with files.made(self.path), self._opened_lock() as file:
+            if fcntl is not None:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    raise CheckpointError(
+                        f"{self.path} is being fitted by another process; wait for it or stop it, or choose another "
+                        "directory"
+                    ) from error
+            try:
+                yield
+            except BaseException:
+                if not self.exists:
+                    (self.path / LOCK).unlink(missing_ok=True)
+                raise
+
+    def _opened_lock(self) -> BinaryIO:
+        with _refusing():
+            return files.open_plain(self.path / LOCK, os.O_RDWR | os.O_CREAT)
+
+    def _write_new(self, name: str, content: bytes) -> None:
+        """Write a file under the name that it has until it is whole."""
+        with files.naming(self.path / name, self.path / f"{name}.new"):
+            files.write(self.path / f"{name}.new", content)
+
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        """Write `config.json`.
+
+        Raises:
+            TypeError: when the config is not made of JSON's types.
+        """
+        content = json.dumps(config, indent=2).encode()
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._write_new(CONFIG, content)
+        os.replace(self.path / f"{CONFIG}.new", self.path / CONFIG)
+
+    def commit(self, state: Mapping[str, Any], contents: Mapping[str, bytes]) -> None:
+        """Replace files by `contents`, and `state.json` with them; files of earlier commits that are not given stay."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        fingerprints = self.state["fingerprints"] if self.exists else {}
+        for name in fingerprints:
+            self._settle(name, fingerprints[name])
+        for name, content in contents.items():
+            self._write_new(name, content)
+        fingerprints |= {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+        self._write_new(STATE, json.dumps({**state, "fingerprints": fingerprints}, indent=2).encode())
+        os.replace(self.path / f"{STATE}.new", self.path / STATE)
+        for name in contents:
+            os.replace(self.path / f"{name}.new", self.path / name)
+        for name in {BEST, LAST, OPTIMISER} - contents.keys():  # of a process that was killed while it wrote one
+            (self.path / f"{name}.new").unlink(missing_ok=True)
+
+    def read(self, name: str, most: int = LARGEST_WEIGHTS) -> bytes:
+        """Return a file of the checkpoint, of at most so many bytes, after checking its fingerprint.
+
+        Raises:
+            CheckpointError: when the file is missing, no plain file, too large, or is not the one that was written.
+        """
+        expected = self.state["fingerprints"].get(name)
+        if expected is None:
+            raise CheckpointError(f"{self.path / STATE} lists no {name}; the run has not written it")
+        self._settle(name, expected, most)
+        path = self.path / name
+        if (content := _content(path, most)) is None:
+            raise CheckpointError(f"{path} is missing; copy the run directory whole, or fit again")
+        found = hashlib.sha256(content).hexdigest()
+        if found != expected:
+            raise CheckpointError(
+                f"{path} is damaged or from another run: {STATE} expects SHA-256 {expected[:12]}…, the file "
+                f"of {len(content)} bytes has {found[:12]}…; copy the run directory whole, or fit again"
+            )
+        return content
+
+    def size(self) -> int:
+        """Bytes of the weights that `load_weights` takes.
+
+        Raises:
+            CheckpointError: when there are none.
+        """
+        name = BEST if BEST in self.state["fingerprints"] else LAST
+        self._settle(name, self.state["fingerprints"][name])
+        path = self.path / name
+        try:
+            with _refusing(), files.open_plain(path) as file:
+                return os.fstat(file.fileno()).st_size
+        except FileNotFoundError:
+            raise CheckpointError(f"{path} is missing; copy the run directory whole, or fit again") from None
+
+    def optimiser_state(self, most: int = 2 * LARGEST_WEIGHTS) -> dict[str, Any]:
+        """Return the optimiser and random number states of the last checkpoint, on the CPU.
+
+        Raises:
+            CheckpointError: when the file has more bytes than `most`, or is no state that torch wrote.
+        """
+        content = self.read(OPTIMISER, most)
+        try:
+            _check_archive(content)
+            return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        except Exception as error:  # torch raises many types for a file that it did not write
+            raise CheckpointError(f"{self.path / OPTIMISER} is no optimiser state of torch: {error}") from error
+
+    def _settle(self, name: str, expected: str, most: int = LARGEST_WEIGHTS) -> None:
+        """Give a committed file its name, if the process was killed between the commit and the renaming."""
+        new = self.path / f"{name}.new"
+        content = _content(new, most)
+        if content is not None and hashlib.sha256(content).hexdigest() == expected:
+            os.replace(new, self.path / name)
+
+    def _json(self, name: str) -> dict[str, Any]:
+        path = self.path / name
+        try:
+            with _refusing():
+                content = json.loads(files.read(path, LARGEST_TEXT))
+        except FileNotFoundError:
+            raise CheckpointError(
+                f"{self.path} is no run directory: it has no {name}; give the folder that fit wrote (out=… in "
+                "Python, --out on the command line)"
+            ) from None
+        except NotADirectoryError:
+            raise CheckpointError(
+                f"{self.path} is a file and no run directory; leave it out, or give the folder that fit wrote"
+            ) from None
+        except (ValueError, RecursionError) as error:
+            raise CheckpointError(f"{path} is damaged, it is not JSON ({error}); fit again") from error
+        if _depth(content) > 32:
+            raise CheckpointError(f"{path} is damaged, it nests deeper than any that fit writes; fit again")
+        if not isinstance(content, dict):
+            raise CheckpointError(f"{path} is damaged, it holds no JSON object but {type(content).__name__}; fit again")
+        return content
+
+
+def weights(model: nn.Module) -> dict[str, Tensor]:
+    """Return a copy of a model's parameters and buffers on the CPU, which later training does not change."""
+    return {name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()}
+
+
+def save_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
+    """Write a model's weights to a safetensors file, which replaces an older one only when it is complete."""
+    with files.written(path) as file:
+        file.write(save_tensors(weights(model)))
+
+
+def load_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
+    """Load weights into a model, in place; the names and shapes must agree exactly.
+
+    Args:
+        model: the module to fill.
+        path: a run directory (its best weights, or the last without validation data) or a safetensors file;
+            in a run directory, fingerprints are checked.
+
+    Raises:
+        CheckpointError: when the file is missing, damaged, of another model, or holds a number that is not finite.
+    """
+    path = Path(path)
+    most = state_bytes(model)
+    if path.is_dir():
+        path = path / (BEST if BEST in Run(path).state["fingerprints"] else LAST)
+    run = Run(path.parent)
+    if run.exists and (path.name in (BEST, LAST) or path.name in run.state["fingerprints"]):
+        content = run.read(path.name, most)
+    elif (found := _content(path, most, links=True)) is not None:
+        content = found
+    else:
+        raise CheckpointError(f"{path} does not exist; give a run directory or a safetensors file")
+    model.load_state_dict(read_weights(model, content, path))
+
+
+def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tensor]:
+    """The weights that a safetensors file of this path holds, which are a model's in names, shapes and kinds.
+
+    Raises:
+        CheckpointError: when they are not, or one is not finite.
+    """
+    try:
+        tensors = {renamed(name): value for name, value in load_tensors(content).items()}
+    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:  # also for types it has none for
+        raise CheckpointError(f"{path} is damaged or no safetensors file ({error}); copy or fit it again") from error
+    _check_names_and_shapes(model, tensors, path)
+    for name, value in model.state_dict().items():
+        found = tensors[name]
+        if found.dtype not in (_FLOATING if value.is_floating_point() else (value.dtype,)):
+            raise CheckpointError(f"{path} is damaged: {name} is {found.dtype}, the model's is {value.dtype}")
+        if value.is_floating_point() and not torch.isfinite(found).all():
+            raise CheckpointError(
+                f"{path} holds no usable weights: {name} has entries that are NaN or infinite, so the run had failed; "
+                "fit again, with a lower learning rate"
+            )
+    return tensors
+
+
+def state_bytes(model: nn.Module, copies: int = 1) -> int:
+    """Bytes that so many copies of a model's weights can take in a file, in any floating type, with their names."""
+    state = model.state_dict()
+    return copies * sum(8 * value.numel() + 1024 + 4 * len(name) for name, value in state.items()) + 2**16
+
+
+@contextmanager
+def at_most(size: int, what: str) -> Iterator[None]:
+    """Within it, this thread makes no modules whose parameters and buffers outnumber the bytes of a file of weights.
+
+    A file of weights tells how large the model is that it is of. What is shared or made anew counts several times; a
+    number takes four bytes in a file, or two.
+
+    Raises:
+        CheckpointError: when they do.
+    """
+    if size > LARGEST_WEIGHTS:
+        raise CheckpointError(f"{what} has {size} bytes of weights, and can have {LARGEST_WEIGHTS} at most")
+    left, thread = size + 2**24, threading.get_ident()
+
+    def count(module: nn.Module, name: str, value: Tensor | None) -> None:
+        nonlocal left
+        if threading.get_ident() == thread and value is not None:
+            left -= value.numel()
+            if left < 0:
+                raise CheckpointError(
+                    f"{what} asks for a model that is larger than its weights, which take {size} bytes; it is damaged, "
+                    "or the weights are those of another run"
+                )
+
+    hooks = [
+        register(count)
+        for register in (register_module_parameter_registration_hook, register_module_buffer_registration_hook)
+    ]
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def _check_names_and_shapes(model: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> None:
+    expected = {name: tuple(value.shape) for name, value in model.state_dict().items()}
+    found = {name: tuple(value.shape) for name, value in tensors.items()}
+    if expected == found:
+        return
+    problems = [f"it lacks {name} {expected[name]}" for name in expected.keys() - found.keys()]
+    problems += [f"it has {name} {found[name]}, which the model lacks" for name in found.keys() - expected.keys()]
+    problems += [
+        f"{name} is {found[name]}, the model's is {expected[name]}"
+        for name in expected.keys() & found.keys()
+        if expected[name] != found[name]
+    ]
+    more = f" (and {len(problems) - 3} more)" if len(problems) > 3 else ""
+    raise CheckpointError(
+        f"{path} holds the weights of another model: {'; '.join(sorted(problems)[:3])}{more}; "
+        "build the model with the equations, sizes and network of the run's config.json"
+    )
+
+
+_FLOATING = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
+
+# all that torch writes into the state of an optimiser and of random number generators
+_STORAGES = {f"torch {kind}Storage" for kind in ("Float", "Double", "BFloat16", "Half", "Byte", "Long", "Int")}
+_KNOWN = _STORAGES | {"torch._utils _rebuild_tensor_v2", "collections OrderedDict"}
+
+
+# all that torch says of such a state: what puts a plain value on the stack, and what takes values from it
+_PLAIN = {"EMPTY_DICT", "EMPTY_LIST", "NONE", "NEWTRUE", "NEWFALSE", "BINUNICODE", "BINFLOAT"}
+_PLAIN |= {"BININT", "BININT1", "BININT2", "LONG1"}
+_TAKEN = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "REDUCE": 2, "BINPERSID": 1, "APPEND": 1, "SETITEM": 2}
+_INSTRUCTIONS = 2**20
+"""Of a state's pickle, which has about a hundred and fifty for each parameter."""
+_DEEPEST = 8
+"""Tuples in one another; those of a tensor are two."""
+
+
+def _check_archive(content: bytes) -> None:
+    """Refuse an archive that would grow when it is read, or whose pickle asks for more than tensors in dicts.
+
+    Raises:
+        ValueError: saying why.
+    """
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = archive.infolist()
+        if any(each.compress_type != zipfile.ZIP_STORED for each in members):
+            raise ValueError("it is compressed")
+        if sum(each.file_size for each in members) > len(content):
+            raise ValueError("its members are larger than itself")
+        (pickled,) = [each for each in members if each.filename.endswith("/data.pkl")]
+        _check_pickle(archive.read(pickled))
+
+
+def _check_pickle(content: bytes) -> None:
+    """Follow a pickle without making what it says, and refuse what torch would not have written.
+
+    Whatever is a key is hashed, tuples with all that they hold: a hundred thousand of them in one another overflow the
+    stack of C, and forty, each of two times the one before, which a pickle shares by name, take years.
+
+    Raises:
+        ValueError: saying why.
+    """
+    stack: list[int] = []  # of each value, how deep tuples nest in it; 0 for whatever is no tuple
+    below: list[list[int]] = []  # the stacks under the marks
+    memo: dict[Any, int] = {}
+    for count, (code, argument, _) in enumerate(pickletools.genops(content)):
+        name = code.name
+        if count == _INSTRUCTIONS:
+            raise ValueError(f"its pickle has more than {_INSTRUCTIONS:,} instructions")
+        if name in ("GLOBAL", "STACK_GLOBAL", "INST") and argument not in _KNOWN:
+            raise ValueError(f"it asks for {str(argument)[:80]!r}")
+        if isinstance(argument, int) and argument.bit_length() > 64:  # of these, many could have one hash
+            raise ValueError(f"it has a number of {argument.bit_length():,} bits")
+        try:
+            if name in ("TUPLE", "APPENDS", "SETITEMS"):
+                values, stack = stack, below.pop()
+            elif number := _TAKEN.get(name):
+                values = [stack.pop() for _ in range(number)]
+            else:
+                values = []
+            if name.startswith("TUPLE") or name == "EMPTY_TUPLE":
+                stack.append(1 + max(values, default=0))
+                if stack[-1] > _DEEPEST:
+                    raise ValueError(f"its tuples nest deeper than {_DEEPEST}")
+            elif name in _PLAIN or name in ("GLOBAL", "REDUCE", "BINPERSID"):
+                stack.append(0)
+            elif name == "MARK":
+                below.append(stack)
+                stack = []
+            elif name in ("BINPUT", "LONG_BINPUT"):
+                memo[argument] = stack[-1]
+            elif name in ("BINGET", "LONG_BINGET"):
+                stack.append(memo[argument])
+                if stack[-1]:
+                    raise ValueError("it shares a tuple")
+            elif name not in ("PROTO", "STOP", "APPEND", "SETITEM", "APPENDS", "SETITEMS"):
+                raise ValueError(f"it uses the instruction {name}")
+        except LookupError as error:
+            raise ValueError(f"its pickle is damaged, it uses {name} on what is not there") from error
+
+
+def _count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 10**9
+
+
+def _depth(value: Any) -> int:
+    """How deep lists and objects nest."""
+    depth, level = 0, [value]
+    while level := [each for each in level if isinstance(each, dict | list)]:
+        depth += 1
+        level = [inner for each in level for inner in (each.values() if isinstance(each, dict) else each)]
+    return depth
+
+
+def _content(path: Path, most: int, links: bool = False) -> bytes | None:
+    """What a file holds; None if there is none."""
+    try:
+        with _refusing():
+            return files.read(path, most, links)
+    except FileNotFoundError:
+        return None
+
+
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """What is no plain file, or too large, is no part of a checkpoint."""
+    try:
+        yield
+    except files.FileRefused as error:
+        raise CheckpointError(f"{error}; a run directory holds plain files, as fit writes them") from error

@@ -1,0 +1,378 @@
+"""The shared loop, for every method: batches, validations, checkpoints and a log, until the last step.
+
+`fit` is written with the steps of `SVI`, and nothing else moves the weights. Whatever a step depends on is in a
+checkpoint: a resumed run repeats, bit for bit on a CPU, what the uninterrupted run would have done.
+"""
+
+import os
+import signal
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import nn
+
+from ...data.sequences import Fingerprinted, InBatches, Source, as_source, in_batches, is_divided, take_split
+from ...data.views import WHOLE
+from ...program.batch import check_scale
+from ...program.conditional import like
+from ...program.model import DynamicalVAE
+from ...program.rollout import SelfFeeding
+from ...turns import alone
+from ..evaluation.result import as_they_are
+from . import processes
+from .checkpoints import CONFIG, CheckpointError, Run
+from .last_value import last_value_bound
+from .objectives import Objective
+from .options import Stage, Training, recorded
+from .resuming import marking_failure, restore, store
+from .signals import Signals
+from .svi import SVI, State
+from .trackers import InMemory, JSONLines, Terminal, Tracker
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Callback:
+    """Hooks of `fit`. Subclass it and define those you need; numbers by name that one returns are a row of the log."""
+
+    def on_step(self, state: State) -> Mapping[str, float] | None:
+        """Run after each step; `state.terms` holds the terms of its batch."""
+        return None
+
+    def on_validation(self, state: State) -> Mapping[str, float] | None:
+        """Run after each validation; `state.row` holds its numbers."""
+        return None
+
+    def on_end(self, state: State) -> Mapping[str, float] | None:
+        """Run once after the last step, also of an interrupted run, before the best weights are put back."""
+        return None
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a run leaves.
+
+    Args:
+        history: the rows of the log, in nats per frame (see `trackers`).
+        step: the last step.
+        best_step: the step of the best unweighted validation bound; None without validation data.
+        best_bound: that bound, in nats per frame; of the self-fed program in a run with scheduled sampling. For a model
+            without a likelihood, minus its objective.
+        status: "finished", "stopped early" or "interrupted".
+        run: the run directory, if there is one.
+        per: what bounds are per: a frame, unless the model has another word in `per`.
+        model: what was fitted, with the best weights; None where only the log of a run was read.
+        processor_seconds: of all threads of the first process, validation and checkpoints included; of a resumed run in
+            all.
+        last_value: the bound of repeating the last value on the validation windows, to be compared with `best_bound`
+            (see `last_value`); None where these have no horizon, or the model has no likelihood of the data as given.
+
+    Example:
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> found = dvae.fit(model, torch.randn(6, 4, 2), steps=3, log_every=1, progress=False)
+        >>> found.status, found.series("bound")[0]
+        ('finished', [1, 2, 3])
+    """
+
+    history: list[dict[str, Any]]
+    step: int
+    best_step: int | None
+    best_bound: float | None
+    status: str
+    run: Path | None
+    per: str = "frame"
+    model: Any = field(default=None, repr=False)
+    processor_seconds: float = 0.0
+    last_value: float | None = None
+
+    @property
+    def best(self) -> str:
+        """What is best, where, in words, and whether the last value is better; empty without validation data."""
+        if self.best_bound is None:
+            return ""
+        if any("validation/loss" in row for row in self.history):
+            return f"lowest validation loss {-self.best_bound:.4f} at step {self.best_step}"
+        self_fed = any("validation/self_fed/bound" in row for row in self.history)
+        name = "best bound with scheduled sampling" if self_fed else "best bound"
+        found = f"{name} {self.best_bound:.3f} nats a {self.per} at step {self.best_step}"
+        if self.last_value is None or self.best_bound >= self.last_value:
+            return found
+        advice = ["train for more steps"]
+        if self.model is None or not any(getattr(module, "residual", False) for module in self.model.modules()):
+            advice.append("try residual=1, which adds the output to the last value")
+        if not self_fed:
+            advice.append("try self_feeding=1, which trains on the model's own output")
+        return f"{found}, worse than repeating the last value ({self.last_value:.3f}): {', or '.join(advice)}"
+
+    def series(self, name: str) -> tuple[list[int], list[float]]:
+        """Return the steps and values of one number of the log, such as "kl/z" or "validation/bound"."""
+        rows = [row for row in self.history if name in row]
+        return [row["step"] for row in rows], [row[name] for row in rows]
+
+    def plot(self) -> "Figure":
+        """Draw the learning curves: the bound, and the KL of each latent, in nats per frame.
+
+        Of a model without a likelihood, the loss and its energies, per frame.
+        """
+        from matplotlib import pyplot as plt
+
+        names = sorted({name for row in self.history for name in row})
+        likelihood = any(name.startswith("log_likelihood/") for name in names)
+        score, start = ("bound", "kl/") if likelihood else ("loss", "energy/")
+        unit = f"nats per {self.per}" if likelihood else f"per {self.per}"
+        figure, (whole, terms) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
+        whole.plot(*self.series(score), color="0.7", label="training batch")
+        if self.best_step is not None:
+            whole.plot(*self.series(f"validation/{score}"), marker=".", label="validation")
+            whole.axvline(self.best_step, color="0.3", linestyle=":", label=f"best: step {self.best_step}")
+        whole.set(xlabel="step", ylabel=f"{score} ({unit})")
+        whole.legend()
+        for name in names:
+            if name.startswith(start):
+                terms.plot(*self.series(name), label=name.removeprefix(start))
+                as_they_are(terms.legend().get_texts())
+        terms.set(xlabel="step", ylabel="KL (nats per frame)" if likelihood else "energies (per frame)")
+        if not likelihood:
+            terms.set_yscale("log")  # their scales differ by orders of magnitude; weights make up for it
+        return figure
+
+
+class Interrupted(KeyboardInterrupt):
+    """The run was stopped by Ctrl-C or SIGTERM, after a whole step and a checkpoint.
+
+    Args:
+        fit: what the run leaves.
+        signal: number of the signal; a command line exits with 128 + signal.
+    """
+
+    def __init__(self, fit: Fit, signal: int) -> None:
+        how = (
+            f"resume with fit(…, out={str(fit.run)!r}, resume=True)"
+            if fit.run
+            else "without out=… it cannot be resumed"
+        )
+        super().__init__(f"interrupted after step {fit.step}; {how}")
+        self.fit = fit
+        self.signal = signal
+
+
+@alone
+@torch.inference_mode(False)  # which enables gradients too
+def fit(
+    model: nn.Module,
+    train: Any,
+    validation: Any = None,
+    *,
+    objective: Objective | None = None,
+    stages: Sequence[Stage] = (),
+    out: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    config: Mapping[str, Any] | None = None,
+    trackers: Sequence[Tracker] = (),
+    callbacks: Sequence[Callback] = (),
+    **options: Any,
+) -> Fit:
+    """Fit a model and its guide.
+
+    Afterwards the model is in evaluation mode and holds the weights of the best unweighted validation bound,
+    or without validation data the last ones. The caller's random state is left as it was. Threads take turns, as Pyro's
+    handlers and torch's random state are the process's: another fit or forecast waits until this one is done.
+
+    Args:
+        model: a `DynamicalVAE`, or any module that `SequenceELBO` takes.
+        train: x as a tensor (N, T, D), a batch of N sequences, an object with `sample(batch_size, generator)`, or
+            data with parts, such as `dvae.tables.PanelData`, whose validation windows are used too.
+        validation: x as a tensor, a batch, or an object whose `all()` returns a batch, or whose `batches(size)` are
+            some sequences after the others.
+        objective: what to minimise; `Evidence()` by default.
+        stages: objectives one after the other, in place of `objective`; their steps are those of the run.
+        out: run directory for checkpoints and `log.jsonl` (see `checkpoints`).
+        resume: continue the run in `out` from its last checkpoint up to `steps`.
+        config: what is run, in JSON's types, for `config.json`, to which the training options are added; a resumed run
+            keeps its own where none is given.
+        trackers: further receivers of the log's rows.
+        callbacks: hooks after steps, after validations and at the end.
+        **options: fields of `Training`, such as steps=2000, batch_size=32, learning_rate=1e-3.
+
+    Returns:
+        The history, and the best bound and its step.
+
+    Raises:
+        NonFiniteError: when a loss or gradient is NaN or infinite, naming step, site and term; the last
+            checkpoint stays.
+        Interrupted: after Ctrl-C or SIGTERM; the step is complete, the checkpoint written.
+        CheckpointError: when `out` holds a run and `resume` is False, or a run that cannot be resumed, such as one
+            fitted on training data with another `fingerprint`.
+        TypeError: a model or data of another kind, such as a table, whose columns need roles.
+        ValueError: the first batch varies by less than float32 resolves.
+        LostProcess: another one of several processes has ended, or does not answer; the last checkpoint stays.
+
+    Example:
+        >>> import torch, dvae
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3})
+        >>> warm_up = dvae.Evidence(kl_weight=dvae.schedules.Ramp(0.0, 1.0, steps=10))
+        >>> x = torch.randn(32, 10, 3)
+        >>> result = dvae.fit(model, x[:24], validation=x[24:], objective=warm_up, steps=20, progress=False)
+        >>> result.status, result.best_step
+        ('finished', 20)
+    """
+    svi = SVI(model, objective, stages, **options)
+    training = svi.training
+    if validation is None and is_divided(train):
+        validation = train
+    train = take_split(train, "train")
+    source = as_source(train)
+    held_out = None if validation is None else in_batches(validation)
+    if training.patience is not None and held_out is None:
+        raise ValueError("patience counts validations; give validation data, or leave patience out")
+    # a hash of all the data, for a run that is kept
+    fingerprint = train.fingerprint if out is not None and isinstance(train, Fingerprinted) else None
+    record = {"training_data": fingerprint} if isinstance(fingerprint, str) else {}
+    run = run_directory(out, resume, record)
+    record |= recorded(training, svi.plan)
+    with ExitStack() as stack:
+        stack.callback(model.eval)
+        state, first = svi.init(), svi.fabric.is_global_zero
+        if run is not None and first:
+            stack.enter_context(run.locked())
+        processes.wait(svi.fabric)  # every process has looked for an earlier run before the first one writes
+        if run is not None and resume:
+            restore(svi, run)
+            processes.wait(svi.fabric)  # every process has read the checkpoint before the first one writes
+        history, receivers = InMemory(), list[Tracker]()
+        if first:
+            if run is not None:
+                run.write_config((run.config if resume and config is None else dict(config or {})) | record)
+                log = JSONLines(run.path / "log.jsonl")
+                history = InMemory(log.read() if resume else [])
+                receivers = [log]
+            receivers += [history, *trackers, *([Terminal(training.steps)] if training.progress else [])]
+        for tracker in receivers:
+            tracker.start(state.step)
+            stack.callback(tracker.close)
+        if run is not None:
+            stack.enter_context(marking_failure(svi, run))
+        signals = stack.enter_context(Signals())
+        before, state.status = state.status, _status(state, training)
+        if run is not None and (not resume or state.status not in ("running", before)):
+            store(svi, run)  # also of a run that was interrupted at its last step
+        observed = None if validation is None else _observed(svi.model, take_split(validation, "validation"))
+        _train(svi, source, held_out, observed, run, receivers, callbacks, signals)
+        processes.wait(svi.fabric)  # whoever goes on may read what the first one has written
+        if state.best is not None:
+            model.load_state_dict(state.best)
+    path = run.path if run else None
+    told = state.step, state.best_step, state.best_bound, state.status
+    result = Fit(history.rows, *told, path, state.per, model, state.processor_seconds, state.last_value)
+    if state.status == "interrupted":
+        raise Interrupted(result, signals.received or signal.SIGINT)
+    return result
+
+
+def _observed(model: nn.Module, validation: Any) -> int | None:
+    """Observed steps of validation windows with a horizon, if the bound of the model is of the data as given."""
+    if not isinstance(model, DynamicalVAE) or not model.likelihood or model.view.measured:
+        return None
+    if WHOLE not in (*model.observed, *model.view.names):
+        return None
+    return getattr(getattr(validation, "protocol", None), "observed", None)
+
+
+def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapping[str, Any]) -> Run | None:
+    """The run directory, refused where `fit` would lose a run, find none, or go on with data known to be others."""
+    run = None if out is None else Run(out)
+    if resume and (run is None or not run.exists):
+        raise CheckpointError(f"no run to resume in {out}; give its directory as out=…, or leave out resume=True")
+    if run is None or not run.exists:
+        return run
+    if not resume:
+        lower = " and a lower learning_rate, as it failed" if run.state["status"] == "failed" else ""
+        raise CheckpointError(
+            f"{out} already holds a run; continue it with resume=True{lower}, or choose another directory"
+        )
+    before, now = run.config.get("training_data"), record.get("training_data")
+    if before is not None and now is not None and before != now:
+        raise CheckpointError(
+            f"{run.path} was fitted on other training data: {CONFIG} has the fingerprint {str(before)[:12]}…, these "
+            f"data {now[:12]}…; resume on the same data, or fit anew in another directory"
+        )
+    return run
+
+
+def _train(
+    svi: SVI,
+    source: Source,
+    held_out: InBatches | None,
+    observed: int | None,
+    run: Run | None,
+    receivers: Sequence[Tracker],
+    callbacks: Sequence[Callback],
+    signals: Signals,
+) -> None:
+    """Steps, rows, validations and checkpoints, until the run ends."""
+    state, training = svi.state, svi.training
+
+    def log(row: Mapping[str, float]) -> None:
+        for tracker in receivers:
+            tracker.log(state.step, row)
+
+    def report(row: dict[str, float]) -> None:
+        state.row = row
+        log(row)
+
+    def call(hook: str) -> None:
+        try:
+            for callback in callbacks:
+                if row := getattr(callback, hook)(state):
+                    log(row)
+        except KeyboardInterrupt:  # the step is complete, so this is as good a place to stop as any
+            signals.received = signal.SIGINT
+
+    def asked_to_stop() -> bool:
+        """Whether a signal has come to any process; a callback's `stop` in one of them is one in all."""
+        asked = torch.tensor([bool(signals.received), state.stop]).int()
+        stopped, state.stop = (svi.total(asked) > 0).tolist()
+        return bool(stopped)
+
+    begun = time.process_time() - state.processor_seconds
+    model: Any = svi.model
+    unchecked = isinstance(model, DynamicalVAE) and like(model).dtype is not torch.float64
+    while state.status == "running":
+        batch = source.sample(training.batch_size, svi.generator)
+        if unchecked:  # once, as it waits for the device
+            check_scale(batch, {WHOLE, *model.observed})
+            unchecked = False
+        svi.step(batch)
+        if state.step % training.log_every == 0 or state.step == training.steps:
+            report(svi.row())
+        call("on_step")
+        stopped = asked_to_stop()
+        due = state.step % training.validate_every == 0 or state.step == training.steps or state.stop
+        if due and held_out is not None:
+            report(svi.validate(held_out))
+            if observed is not None and state.last_value is None and "validation/loss" not in state.row:
+                fed = bool(svi.final_feeding) and isinstance(model.feeding, SelfFeeding)
+                state.last_value = last_value_bound(
+                    model, source, held_out, observed, fed=fed, batch_size=training.batch_size
+                )
+            call("on_validation")
+            stopped = asked_to_stop()
+        state.status = "interrupted" if stopped else _status(state, training)
+        state.processor_seconds = time.process_time() - begun
+        if run is not None and (due or state.status != "running"):
+            store(svi, run)
+    call("on_end")
+
+
+def _status(state: State, training: Training) -> str:
+    """Whether the run is "finished", "stopped early" or "running"."""
+    if state.step >= training.steps:
+        return "finished"
+    impatient = training.patience is not None and state.waited >= training.patience
+    return "stopped early" if state.stop or impatient else "running"

@@ -1,0 +1,215 @@
+"""GradNorm: weights of losses that adapt so that all train at one pace (Chen et al. 2018, arXiv 1711.02257).
+
+Of tasks with losses L_i and weights w_i, n of them, and parameters W that they share:
+
+    G_i = |grad_W w_i L_i|                                norms of gradients, and Gbar their mean
+    r_i = (L_i / L_i(0)) / mean_j (L_j / L_j(0))          relative inverse training rates
+    L_grad = sum_i |G_i - Gbar r_i^a|                     with the targets Gbar r_i^a held constant
+
+The weights descend L_grad and are then scaled to the sum n. As W is reached by w_i L_i in proportion to w_i, the
+derivative of G_i by log w_i is G_i itself, and no second backward pass is needed. We go down in log w, not in w, and by
+L_grad / Gbar:
+
+    log w_i <- log w_i - rate sign(G_i - Gbar r_i^a) G_i / Gbar
+
+so that weights are positive without being clipped, and the rate means the same whatever unit the losses are in.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from ...options import Range, Share, check
+from .objectives import Evidence
+
+if TYPE_CHECKING:
+    from ..bounds.elbo import Terms
+
+
+@dataclass(frozen=True)
+class GradNorm:
+    """Named log-likelihoods and energies with adaptive weights, beside all other terms, which have those of `others`.
+
+    With L_i minus a log-likelihood, or an energy, summed over the batch and divided by its frames,
+
+        loss = sum_tasks w_i L_i + others(the other terms).
+
+    The weights begin at 1 at every stage and are part of the checkpoint; `log.jsonl` has a step's as "weight/NAME".
+    Called itself, as a validation by "loss" does, all of them are 1, so that losses can be compared. In several
+    processes gradients are means over them, as those of the model are.
+
+    Args:
+        tasks: names of log-likelihoods and energies, at least two.
+        shared: W, the trained parameters whose names start with it, such as a last layer that all tasks go through.
+        others: what weighs all other terms, the KL among them, and tells draws and selection.
+        asymmetry: a, how strongly tasks that train slowly are favoured. At 0 norms of gradients are brought together;
+            above, losses must be positive, which those of densities need not be. The paper has .12, and 1.5 where
+            tasks differ more.
+        learning_rate: of log w: what a weight with the mean gradient gains or loses in a step.
+
+    Raises:
+        ValueError: less than two tasks, or one twice; on the first call, a task that is no such term, or that does not
+            go through the shared parameters; when a run is laid out, a model without them.
+
+    Example:
+        >>> weighing = dvae.GradNorm(("pose", "time"), shared="generator.x.", others=dvae.Evidence(kl_weight=0.01))
+        >>> terms = dvae.Terms({}, {"z": torch.ones(1)}, {"pose": torch.ones(1), "time": torch.ones(1)}, torch.ones(1))
+        >>> weighing(terms, step=0)
+        tensor(2.0100)
+    """
+
+    tasks: tuple[str, ...]
+    shared: str
+    others: Evidence = field(default_factory=Evidence)
+    asymmetry: Annotated[float, Range(0, 10)] = 0.12
+    learning_rate: Share = 0.025
+
+    def __post_init__(self) -> None:
+        check(self)
+        if len(set(self.tasks)) != len(self.tasks) or len(self.tasks) < 2:
+            raise ValueError(
+                f"tasks are {', '.join(self.tasks) or 'none'}; weights need two of them or more, each once"
+            )
+
+    @property
+    def draws(self) -> Mapping[str, int]:
+        """Those of `others`."""
+        return self.others.draws
+
+    @property
+    def select(self) -> Literal["bound", "loss"]:
+        """That of `others`."""
+        return self.others.select
+
+    def __call__(self, terms: "Terms", step: int) -> Tensor:
+        """Return the loss with all weights 1, a scalar."""
+        return self.weighted(terms, step, torch.ones(len(self.tasks)))
+
+    def weighted(self, terms: "Terms", step: int, weights: Tensor) -> Tensor:
+        """The loss with such weights (tasks,) of the tasks, a scalar."""
+        rest = [
+            {name: value for name, value in table.items() if name not in self.tasks}
+            for table in (terms.log_likelihood, terms.energies)
+        ]
+        loss = self.others(replace(terms, log_likelihood=rest[0], energies=rest[1]), step)
+        for weight, task in zip(weights.tolist(), self.losses(terms), strict=True):
+            loss = loss + weight * task
+        return loss
+
+    def losses(self, terms: "Terms") -> list[Tensor]:
+        """The losses of the tasks in their order, scalars."""
+        costs = {name: -value for name, value in terms.log_likelihood.items()} | terms.energies
+        if unknown := [task for task in self.tasks if task not in costs]:
+            raise ValueError(
+                f"tasks names {', '.join(map(repr, unknown))}, but the log-likelihoods and energies are "
+                f"{', '.join(costs) or 'none'}; all other terms are weighed by others"
+            )
+        return [costs[task].sum() / terms.frames.sum() for task in self.tasks]
+
+    def begin(self, model: nn.Module) -> "Balance":
+        """The objective in a stage of a run, with weights of its own, that begin at 1."""
+        trained = {name: value for name, value in model.named_parameters() if value.requires_grad}
+        shared = [value for name, value in trained.items() if name.startswith(self.shared)]
+        if not shared:
+            raise ValueError(f"no parameter's name starts with {self.shared!r} (shared); they are {', '.join(trained)}")
+        return Balance(self, shared)
+
+    def to_config(self) -> dict[str, Any]:
+        """Return the objective as a JSON object."""
+        own = vars(self) | {"tasks": list(self.tasks), "others": self.others.to_config()}
+        return {"objective": "GradNorm"} | own
+
+
+class Balance:
+    """Weights of a `GradNorm` in a stage of a run; see `objectives.Adapting`.
+
+    Args:
+        objective: whose weights they are.
+        shared: the parameters W.
+    """
+
+    def __init__(self, objective: GradNorm, shared: list[nn.Parameter]) -> None:
+        self.objective = objective
+        self.shared = shared
+        self.weights = torch.ones(len(objective.tasks), dtype=torch.float64)
+        self.first = torch.zeros_like(self.weights)  # L_i(0), zeros before the first step
+
+    def __call__(self, terms: "Terms", step: int) -> Tensor:
+        """Return the loss, a scalar."""
+        return self.objective.weighted(terms, step, self.weights)
+
+    def measure(self, terms: "Terms") -> None:
+        """Take the losses of the tasks, and their gradients by W, of a batch."""
+        losses = self.objective.losses(terms)
+        self._losses = torch.stack([loss.detach() for loss in losses])
+        self._gradients = torch.stack(
+            [self._gradient(*each) for each in zip(self.objective.tasks, losses, strict=True)]
+        )
+
+    def adapt(self, mean: Callable[[Tensor], Tensor]) -> None:
+        """Take a step of the weights, which the loss of the next step has.
+
+        Raises:
+            ValueError: losses without a training rate.
+        """
+        norms = torch.linalg.vector_norm(mean(self._gradients), dim=1, dtype=torch.float64)
+        losses, norms = torch.stack([mean(self._losses).double(), norms]).cpu()  # at once, as it is waited for
+        first, asymmetry = self.first if self.first.any() else losses, self.objective.asymmetry
+        for task, start, now in zip(self.objective.tasks, first.tolist(), losses.tolist(), strict=True):
+            if asymmetry and (start <= 0 or now < 0):
+                raise ValueError(
+                    f"the loss of {task} is {now:.4g}, {start:.4g} at first, and has no training rate, a ratio of "
+                    "losses above 0; give asymmetry=0, which needs none"
+                )
+        self.first = first
+        smallest = torch.finfo(torch.float64).tiny  # where all losses or all gradients are 0
+        ratios = losses / first if asymmetry else torch.ones_like(losses)
+        norms = self.weights * norms
+        target = norms.mean() * (ratios / ratios.mean().clamp(min=smallest)) ** asymmetry
+        move = torch.sign(norms - target) * norms / norms.mean().clamp(min=smallest)
+        logarithms = self.weights.log() - self.objective.learning_rate * move
+        self.weights = torch.softmax(logarithms, 0) * len(logarithms)
+
+    @property
+    def row(self) -> dict[str, float]:
+        """The weights by name, for the log."""
+        return {
+            f"weight/{task}": weight for task, weight in zip(self.objective.tasks, self.weights.tolist(), strict=True)
+        }
+
+    @property
+    def state(self) -> dict[str, Tensor]:
+        """The weights, and the losses of the first step."""
+        named = {"weight": self.weights, "first": self.first}
+        return {
+            f"{name}/{task}": value[i] for name, value in named.items() for i, task in enumerate(self.objective.tasks)
+        }
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on with the state of a checkpoint.
+
+        Raises:
+            ValueError: weights that are not positive, or whose sum is not their number.
+        """
+        tasks = self.objective.tasks
+        weights, first = (torch.stack([state[f"{name}/{task}"] for task in tasks]) for name in ("weight", "first"))
+        if not (weights > 0).all() or abs(weights.sum() - len(tasks)) > 1e-6:
+            raise ValueError(f"the weights of {', '.join(tasks)} are not positive numbers with the sum {len(tasks)}")
+        self.weights, self.first = weights, first
+
+    def _gradient(self, task: str, loss: Tensor) -> Tensor:
+        """Of a task's loss by the shared parameters, flat; zeros where this batch has no loss that could have one."""
+        none = [torch.zeros_like(value) for value in self.shared]
+        found = (
+            torch.autograd.grad(loss, self.shared, retain_graph=True, allow_unused=True) if loss.requires_grad else none
+        )
+        if all(gradient is None for gradient in found):
+            raise ValueError(
+                f"the loss of {task} has no gradient by the parameters whose names start with "
+                f"{self.objective.shared!r} (shared); name some that all tasks go through"
+            )
+        gradients = [zero if gradient is None else gradient for gradient, zero in zip(found, none, strict=True)]
+        return torch.cat([gradient.flatten() for gradient in gradients])

@@ -1,0 +1,121 @@
+"""Log density of a forecast that repeats the last value: a reference for bounds on validation windows.
+
+    x_t ~ N(x_s, v_{t-s}),    s: the last step before t at which the coordinate was observed
+
+v_h is the mean square of x_{t+h} - x_t over training windows, for each coordinate. The reference of a model that reads
+the true past is this density given all steps before t. A model trained with scheduled sampling reads its own means:
+in its reference, observed steps have their mean and variance over training windows, and x_s is the last observed value
+at all future steps. A discrete value has the probability of the interval around it. A class has the probability that it
+does not change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.distributions import constraints
+
+from ...data.sequences import Batch, InBatches, Source, mask_of
+from ...data.views import WHOLE
+from ...networks.base import valid_steps
+from ...program.model import DynamicalVAE
+
+WINDOWS = 128
+"""Training windows from which variances are estimated."""
+_FLOOR = 1e-3
+"""Least deviation of a difference, in deviations of the coordinate."""
+_ONE_HOT = type(constraints.one_hot)
+
+
+def last_value_bound(
+    model: DynamicalVAE, train: Source, validation: InBatches, observed: int, *, fed: bool, batch_size: int
+) -> float:
+    """Return the log density of validation windows by their last values, in nats per frame.
+
+    Args:
+        model: its view tells which first frames no bound scores, and its laws which coordinates are discrete.
+        train: windows of which the spread of differences is estimated.
+        validation: windows to score.
+        observed: O, the steps before the horizon.
+        fed: whether the model is fed its own means, and not the true steps.
+        batch_size: windows at once.
+    """
+    classes, discrete = _discrete(model)
+    mean, spreads = _spreads(*_values(train.sample(WINDOWS, torch.Generator().manual_seed(0))), classes, discrete)
+    total, frames = 0.0, 0
+    for batch in validation.batches(batch_size):
+        x, seen = _values(batch)
+        steps = torch.arange(x.shape[1])
+        known = torch.where(seen, steps[:, None], -1).cummax(1).values  # the last observed step up to each
+        before = torch.where(steps < observed, -1, observed - 1) if fed else steps - 1
+        source = torch.where(before[:, None] < 0, -1, known[:, before.clamp(min=0)])
+        lag = torch.where(source < 0, 0, steps[:, None] - source).clamp(max=len(spreads) - 1)
+        away = x - torch.where(source < 0, mean, x.gather(1, source.clamp(min=0)))
+        spread = spreads.gather(0, lag.flatten(0, 1)).view_as(x)
+        entries = _log_density(away, spread, discrete)
+        for places in classes:
+            stays, same = spread[..., places[0]], (away[..., places] == 0).all(-1)
+            entries[..., places] = 0.0
+            entries[..., places[0]] = torch.where(same, stays, (1 - stays) / (len(places) - 1)).log()
+        total += float(entries.masked_fill(~seen, 0.0)[:, model.view.past :].sum())
+        lengths = batch.get("lengths")
+        frames += len(x) * (x.shape[1] - model.view.past) if lengths is None else int(lengths.sum())
+    return total / frames
+
+
+def _discrete(model: DynamicalVAE) -> tuple[list[list[int]], Tensor]:
+    """Coordinates of x that are one class each, and (D,) where single ones have discrete values."""
+    if WHOLE not in model.observed:  # its parts are seen
+        return [], torch.tensor(False)
+    conditional = model.generator[WHOLE]
+    parts = getattr(conditional.support, "parts", [(range(conditional.size), conditional.support)])
+    found = [(list(places), own) for places, own in parts if own is not None and own.is_discrete]
+    discrete = torch.zeros(conditional.size, dtype=torch.bool)
+    for places, own in found:
+        discrete[places] = not isinstance(own, _ONE_HOT)
+    return [places for places, own in found if isinstance(own, _ONE_HOT)], discrete
+
+
+def _spreads(x: Tensor, seen: Tensor, classes: Sequence[list[int]], discrete: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean (D,), and (T, D) the deviation from it, then that of differences over 1 to T - 1 steps.
+
+    Of a class its first coordinate has the probability of staying, and first that of each class.
+    """
+    count = seen.sum((0, 1)).clamp(min=1)
+    mean = x.sum((0, 1)) / count
+    scale = (torch.where(seen, x - mean, 0.0).square().sum((0, 1)) / count).sqrt().clamp(min=1e-6)
+    rows = [scale]
+    for lag in range(1, x.shape[1]):
+        both = seen[:, lag:] & seen[:, :-lag]
+        away = torch.where(both, x[:, lag:] - x[:, :-lag], 0.0)
+        pairs = both.sum((0, 1))
+        row = torch.where(pairs > 0, (away.square().sum((0, 1)) / pairs.clamp(min=1)).sqrt(), rows[-1])
+        row = torch.maximum(row, _FLOOR * scale)
+        for places in classes:
+            same = ((away[..., places] == 0).all(-1) & both[..., places[0]]).sum()
+            row[places[0]] = (same + 1) / (pairs[places[0]] + 2)
+        rows.append(row)
+    for places in classes:
+        rows[0][places[0]] = 1 / len(places)
+    return mean, torch.stack([torch.where(discrete, row.clamp(min=0.1), row) for row in rows])
+
+
+def _log_density(away: Tensor, spread: Tensor, discrete: Tensor) -> Tensor:
+    """Of each entry, by how far it is from its location; of discrete ones that of the interval around them."""
+    density = -0.5 * (away / spread).square() - spread.log() - 0.5 * math.log(2 * math.pi)
+    if not discrete.any():
+        return density
+    ends = [torch.special.ndtr((away + end) / spread) for end in (-0.5, 0.5)]
+    return torch.where(discrete, (ends[1] - ends[0]).clamp(min=1e-12).log(), density)
+
+
+def _values(batch: Batch) -> tuple[Tensor, Tensor]:
+    """x (B, T, D) in double precision, and where it was observed."""
+    x, mask = torch.as_tensor(batch[WHOLE]).double().cpu(), mask_of(batch)
+    seen = torch.ones_like(x, dtype=torch.bool) if mask is None else torch.as_tensor(mask).cpu()
+    if "lengths" in batch:
+        seen = seen & valid_steps(torch.as_tensor(batch["lengths"]).cpu(), x.shape[1])[..., None]
+    return torch.where(seen, x, 0.0), seen

@@ -1,0 +1,182 @@
+"""What a run is told: the options of the optimiser's steps, and stages with objectives of their own."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, Literal
+
+from ...options import Amount, Count, Range, Share, check, kind_of, nearest
+from .objectives import Evidence, Objective
+from .schedules import Piecewise, Schedule, clamp, levels, schedule, to_config
+
+Accelerator = Literal["auto", "cpu", "gpu", "cuda", "mps"]
+
+
+@dataclass(frozen=True)
+class Training:
+    """Options of `fit`.
+
+    Args:
+        steps: optimiser steps in all.
+        batch_size: sequences in a batch, in each process.
+        learning_rate: step size of the optimiser, a number or a schedule.
+        decay: last share of the run over which a learning rate that is a number falls linearly to 0; a resumed run
+            with more steps falls later.
+        optimizer: "adam", "adamw" or "sgd".
+        momentum: of "sgd", the share of the last step that the next one goes on with.
+        weight_decay: the optimiser's weight decay.
+        gradient_clip: largest norm of the gradient of the loss (nats per frame); None for no limit.
+        self_feeding: probability that a frame of x's history is replaced by the program's own mean (scheduled
+            sampling, Bengio et al. 2015, arXiv 1506.03099); a number or a schedule. Of a model that is fed noisy data
+            (`InputNoise`), the share of that noise. The best weights are then by the bound of the program that is fed
+            so, from when the schedule has reached its last value.
+        particles: draws from the guide for each sequence and step.
+        validate_every: steps from one validation and checkpoint to the next.
+        patience: validations without a better bound after which the run stops; None to run all steps.
+        log_every: steps from one row of the log to the next.
+        seed: seed of batches and latent draws, from which each of several processes has its own.
+        accelerator: where to run: "auto", "cpu", "gpu", "cuda" or "mps".
+        devices: number of devices, with one process each; under torchrun, which starts them, as many as these are.
+        precision: precision of the computation; "32-true" leaves the model's own.
+        compile: compile the inner functions that are faster so, which takes from seconds to a minute at first
+            (`dvae.compiled`; `benchmarks/compiled.py` measures gains by method). Validation is as without.
+        progress: whether to show the terms on the terminal.
+
+    Raises:
+        ValueError: when an option is out of range.
+
+    Example:
+        >>> dvae.Training(steps=100, learning_rate=1e-3, decay=0.5).rate(75)
+        0.0005
+    """
+
+    steps: Count = 2000
+    batch_size: Annotated[int, Range(1, 16384)] = 32
+    learning_rate: Amount | Schedule = 1e-3
+    decay: Share = 0.0
+    optimizer: Literal["adam", "adamw", "sgd"] = "adam"
+    momentum: Annotated[float, Range(0, 1, below=True)] = 0.0
+    weight_decay: Amount = 0.0
+    gradient_clip: Annotated[float, Range(0, above=True)] | None = 10.0
+    self_feeding: Share | Schedule = 0.0
+    particles: Annotated[int, Range(1, 4096)] = 1
+    validate_every: Count = 100
+    patience: Count | None = None
+    log_every: Count = 10
+    seed: int = 0
+    accelerator: Accelerator = "auto"
+    devices: Annotated[int, Range(1, 32)] = 1
+    precision: Literal["32-true", "64-true", "bf16-mixed", "bf16-true"] = "32-true"
+    compile: bool = False
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        if self.gradient_clip == math.inf:
+            object.__setattr__(self, "gradient_clip", None)
+        check(self)
+        for name, allowed in (("learning_rate", Range(0)), ("self_feeding", Range(0, 1))):
+            for value in levels(getattr(self, name)):
+                if value not in allowed:
+                    raise ValueError(f"{name} is {value}; it must be {allowed}")
+        if self.momentum and self.optimizer != "sgd":
+            raise ValueError(f"momentum is an option of sgd; {self.optimizer} has its own, so leave momentum 0")
+        if self.decay and isinstance(self.learning_rate, Schedule):
+            raise ValueError(
+                "decay is for a learning rate that is a number; a schedule falls by itself, so leave decay 0"
+            )
+
+    @property
+    def rate(self) -> Schedule:
+        """The learning rate with its decay laid out over `steps`."""
+        rate = schedule(self.learning_rate)
+        if not self.decay:
+            return rate
+        return Piecewise(((0, rate(0)), (round((1 - self.decay) * self.steps), rate(0)), (self.steps, 0.0)))
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a run with its own objective, for training in phases. Schedules still see the global step.
+
+    Args:
+        steps: length of the stage.
+        objective: what it minimises.
+        learning_rate: that of `Training` if None.
+        self_feeding: that of `Training` if None.
+        curriculum: how far what comes gradually has come, from 0 to 1, such as draws of what sequences share
+            (`laws.Subset`); all the way if None.
+        frozen: parameters whose names start with one of these stay as they are.
+
+    Example:
+        >>> import dvae
+        >>> stages = [dvae.Stage(500, dvae.Evidence(kl_weight=0.1)), dvae.Stage(1500, frozen=("generator.z.",))]
+    """
+
+    steps: int
+    objective: Objective = field(default_factory=Evidence)
+    learning_rate: float | Schedule | None = None
+    self_feeding: float | Schedule | None = None
+    curriculum: float | Schedule | None = None
+    frozen: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.objective, type):
+            raise TypeError(f"the objective is {kind_of(self.objective)}; expected an instance such as dvae.Evidence()")
+        if self.steps < 1:
+            raise ValueError(f"a stage has {self.steps} steps; it needs at least 1")
+        for value in () if self.curriculum is None else levels(self.curriculum):
+            if value not in Range(0, 1):
+                raise ValueError(f"the curriculum of a stage is {value}; it goes from 0 to 1")
+
+
+def lay_out(
+    options: Mapping[str, Any], objective: Objective | None, stages: Sequence[Stage]
+) -> tuple[Training, list[Stage]]:
+    """The training options and the stages, with schedules that end in time.
+
+    Raises:
+        TypeError: an option that `Training` does not have.
+        ValueError: both an objective and stages, or steps that are not those of the stages.
+    """
+    known = [option.name for option in fields(Training)]
+    for name in options:
+        if name not in known:
+            raise TypeError(f"fit has no option {name!r}{nearest(name, known)}; the options are {', '.join(known)}")
+    training = Training(**options)
+    if not stages:
+        stages = [Stage(training.steps, Evidence() if objective is None else objective)]
+    elif objective is not None:
+        raise ValueError("give either objective or stages: each stage has its own objective")
+    total = sum(stage.steps for stage in stages)
+    if "steps" in options and training.steps != total:
+        raise ValueError(f"steps is {training.steps}, but the stages take {total} steps; leave steps out")
+    plan: list[Stage] = []
+    end = last = total
+    for stage, following in zip(reversed(stages), [None, *reversed(stages[1:])], strict=True):
+        # schedules run on through a next stage that differs in length and frozen parameters alone
+        if following is None or replace(following, steps=stage.steps, frozen=stage.frozen) != stage:
+            last = end
+        plan.insert(0, clamp(stage, last))
+        end -= stage.steps
+    return clamp(replace(training, steps=total), total), plan
+
+
+def stage_at(plan: Sequence[Stage], step: int) -> tuple[int, Stage]:
+    """The first step and the stage that a global step belongs to; after the last step, of the last one."""
+    first = 0
+    for stage in plan[:-1]:
+        if step < first + stage.steps:
+            return first, stage
+        first += stage.steps
+    return first, plan[-1]
+
+
+def recorded(training: Training, plan: Sequence[Stage]) -> dict[str, Any]:
+    """The options and the stages in JSON's types."""
+
+    def config(stage: Stage) -> dict[str, Any]:
+        objective = stage.objective
+        said = getattr(objective, "to_config", objective.__repr__)()
+        return to_config(vars(stage) | {"objective": said})
+
+    return {"training": to_config(vars(training)), "stages": [config(stage) for stage in plan]}

@@ -1,0 +1,431 @@
+"""Stochastic variational inference (Hoffman et al. 2013, arXiv 1206.7051), a step at a time.
+
+`SVI` draws from the guide, asks the bound for its terms and the objective for a number, and takes a step of a torch
+optimiser. lightning-fabric runs the same code on a CPU, a GPU, in bfloat16, or in several processes. Whatever varies
+over time is a schedule of the global step, and random numbers are the run's own: what the caller draws between steps
+changes nothing, nor the reverse.
+"""
+
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from ...compiled import compiling, require_compiler
+from ...data.sequences import Batch, InBatches, each, in_batches, refuse_table, tensor_of
+from ...options import kind_of
+from ...program.model import DynamicalVAE
+from ...program.protocols import Program
+from ...turns import alone, no_fork
+from ..bounds.elbo import SequenceELBO, Terms
+from ..evaluation.result import reason
+from . import processes
+from .checkpoints import weights
+from .objectives import Adapting, Adaptive, Asking, Objective
+from .options import Stage, lay_out, stage_at
+from .schedules import schedule
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+
+# each of them can be fused
+OPTIMISERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch.optim.SGD}
+
+
+class NonFiniteError(FloatingPointError):
+    """A loss or its gradient is NaN or infinite; the step was not taken."""
+
+
+@dataclass
+class State:
+    """Where a run stands. Callbacks of `fit` read it, and set `stop` to end the run after the step."""
+
+    model: nn.Module
+    step: int = 0
+    terms: Terms | None = None
+    row: dict[str, float] = field(default_factory=dict)
+    best: dict[str, Tensor] | None = None
+    best_step: int | None = None
+    best_bound: float | None = None
+    last_value: float | None = None
+    waited: int = 0
+    processor_seconds: float = 0.0
+    status: str = "running"
+    stop: bool = False
+
+    @property
+    def per(self) -> str:
+        """What bounds are per: a frame, unless the model has another word."""
+        return self.model.per if isinstance(self.model, Program) else "frame"
+
+
+class SVI:
+    """Stochastic variational inference by hand: what `fit` is made of, for an epoch of one's own.
+
+    On a CPU, steps on the batches that `fit` draws repeat its numbers bit for bit: `train.sample(batch_size,
+    svi.generator)`. To end and go on later, see `resuming`.
+
+    Args:
+        model: a `DynamicalVAE`, or any module that `SequenceELBO` takes.
+        objective: what to minimise; `Evidence()` by default.
+        stages: objectives one after the other, in place of `objective`; their steps are those of the run.
+        **options: fields of `Training`. Schedules and a decay end by `steps`; when to log, to validate and to stop is
+            the caller's to say.
+
+    Raises:
+        TypeError, ValueError: an option that does not exist or is out of range, or nothing to fit.
+
+    Example:
+        >>> import torch, dvae
+        >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3})
+        >>> x = torch.randn(32, 10, 3)
+        >>> svi = dvae.SVI(model, steps=20, learning_rate=0.01)
+        >>> state = svi.init()
+        >>> for batch in x[:24].split(8):
+        ...     terms = svi.step(batch)
+        >>> state.step, sorted(svi.evaluate(x[24:]))
+        (3, ['bound', 'kl/z', 'log_likelihood/x'])
+    """
+
+    def __init__(
+        self, model: nn.Module, objective: Objective | None = None, stages: Sequence[Stage] = (), **options: Any
+    ) -> None:
+        if not isinstance(model, nn.Module):
+            raise TypeError(
+                f"the model is {kind_of(model)}; expected a module such as a DynamicalVAE, or `method.build(data)`"
+            )
+        self.model = model
+        self.training, self.plan = lay_out(options, objective, stages)
+        trained = {name: parameter for name, parameter in model.named_parameters() if parameter.requires_grad}
+        if not trained:
+            raise ValueError(f"{type(model).__name__} has no parameters that require gradients: nothing to fit")
+        for name, tensor in model.state_dict(keep_vars=True).items():
+            if tensor.is_meta or tensor.is_inference():
+                where = "on the meta device" if tensor.is_meta else "in `torch.inference_mode()`"
+                raise ValueError(f"{name} was made {where} and cannot be fitted; build the model outside of it")
+        for stage in self.plan:
+            if missing := [start for start in stage.frozen if not any(name.startswith(start) for name in trained)]:
+                raise ValueError(f"no parameter's name starts with {', '.join(missing)}; they are {', '.join(trained)}")
+            if all(name.startswith(stage.frozen) for name in trained):
+                raise ValueError(f"a stage of {stage.steps} steps has every parameter frozen; there is nothing to fit")
+            if stage.curriculum is not None and not getattr(model, "gradual", False):
+                raise ValueError(
+                    f"a stage of {stage.steps} steps has a curriculum, by which nothing of {type(model).__name__} "
+                    "comes; what sequences share does (DynamicalVAE(shared=...))"
+                )
+            if isinstance(stage.objective, Adaptive):
+                stage.objective.begin(model)  # which is refused now, not when its stage comes
+        self.parameters = list(trained.values())
+        self.final_feeding = self.rates(self.training.steps - 1)["self_feeding"]
+        self._state: State | None = None
+        self._begun: dict[int, Objective] = {}
+
+    @property
+    def state(self) -> State:
+        """Where the run stands, from `init` on."""
+        if self._state is None:
+            raise RuntimeError("the run has not begun; call init() first, which makes its optimiser")
+        return self._state
+
+    @property
+    def objective(self) -> Objective:
+        """What the next step minimises, with its state, where it has one, that begins with its stage."""
+        first, stage = stage_at(self.plan, self.state.step)
+        if first not in self._begun:
+            described = stage.objective
+            self._begun = {first: described.begin(self.model) if isinstance(described, Adaptive) else described}
+        return self._begun[first]
+
+    @alone
+    @torch.inference_mode(False)
+    def init(self) -> State:
+        """Begin at step 0, with a new optimiser and the random numbers of the seed; the weights stay as they are."""
+        training = self.training
+        with no_fork:  # lightning-fabric, and by the first optimiser parts of torch
+            self.fabric: Fabric = processes.launched(training)
+            torch.optim.SGD([torch.zeros(1)])
+        if training.compile:
+            require_compiler(self.fabric.device)
+        with _forked(self.fabric.device):
+            own: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
+            optimizer = OPTIMISERS[training.optimizer](
+                self.parameters, lr=training.rate(0), weight_decay=training.weight_decay, fused=True, **own
+            )
+            bound = _Bound(self.model, SequenceELBO(training.particles))
+            self.module, self.optimizer = self.fabric.setup(bound, optimizer)
+            processes.agree(self.fabric, self.model.state_dict().values())
+            self.generator = torch.Generator().manual_seed(self._seed)
+            # Another seed than the generator's own: equal seeds would tie the latent draws to the choice of the batch.
+            torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
+            self.random = self._random_state()
+        self._state, self._begun = State(self.model), {}
+        return self._state
+
+    @alone
+    @torch.inference_mode(False)
+    def step(self, batch: Batch | Tensor) -> Terms:
+        """Take one optimiser step, in training mode, and return the terms of the bound before it.
+
+        Args:
+            batch: x as a tensor (B, T, D), or a batch.
+
+        Raises:
+            NonFiniteError: the loss or a gradient is NaN or infinite; the weights stay as they are.
+        """
+        state, training = self.state, self.training
+        (first, stage), rates, objective = stage_at(self.plan, state.step), self.rates(state.step), self.objective
+        for group in self.optimizer.param_groups:
+            group["lr"] = rates["learning_rate"]
+        if not self.model.training:
+            self.module.train()
+        where = f"step {state.step + 1}"
+        with self.drawing(), compiling() if training.compile else nullcontext() as compiled:
+            terms = self._terms(batch, stage.objective, where, rates["self_feeding"], rates.get("curriculum"))
+            loss = objective(terms, state.step)
+            self.optimizer.zero_grad()
+            self.fabric.backward(loss)
+        if compiled is not None and not compiled.used and state.step == first:
+            warnings.warn(
+                f"compile=True changes nothing in this stage of the run: a step of {type(self.model).__name__} has "
+                "nothing in it that is faster compiled (docs/accelerators.md)",
+                stacklevel=3,  # `alone` is between
+            )
+        for name, parameter in self.model.named_parameters() if stage.frozen else ():
+            if name.startswith(stage.frozen):
+                parameter.grad = None  # which the optimiser leaves out, with its state
+        whole, self._share = processes.together(self.fabric, self.parameters, loss, terms.frames.sum())
+        gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
+        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
+        # the one place where a step waits for the device, on which all is queued up to the optimiser's step
+        *self._numbers, of_all = torch.stack([loss.detach(), norm, whole + norm]).tolist()
+        if not math.isfinite(of_all):
+            impossible = any((value == -math.inf).any() for value in terms.log_likelihood.values())
+            advice = "a lower learning rate, a smaller gradient_clip or a longer warm-up"
+            if impossible and not state.step:
+                advice = "a law that can have these values; where it ends may depend on its parameters"
+            raise NonFiniteError(f"{where}: {_culprit(self.model, terms, loss)}; no step was taken. Try {advice}")
+        if training.gradient_clip is not None and self._numbers[1] > training.gradient_clip:
+            for gradient in gradients:
+                gradient.mul_(training.gradient_clip / norm)
+        self._weights = dict[str, float]()
+        if isinstance(objective, Adapting):
+            self._weights |= objective.row
+            objective.adapt(self.mean)
+        self.optimizer.step()
+        state.step += 1
+        state.terms = terms
+        return terms
+
+    def row(self) -> dict[str, float]:
+        """Return the numbers of the last step, in nats per frame (see `trackers`)."""
+        if self.state.terms is None:
+            raise RuntimeError("no step has been taken since init(), so there are no numbers of one")
+        loss, norm = self._numbers
+        rates = self.rates(self.state.step - 1)
+        return {"loss": loss, "gradient_norm": norm, **rates, **self._weights, **_per_frame(_sums(self.state.terms))}
+
+    @alone
+    def evaluate(self, data: Any) -> dict[str, float]:
+        """Return the terms of the unweighted bound on data, in nats per frame; the model is left in evaluation mode.
+
+        The draws from the guide are the same each time, so that bounds differ by the weights alone. Processes share
+        the data, and all have the terms of the whole. A model without a likelihood has no bound but a "loss", and so
+        has an objective that selects by it. A run with self-feeding also has "self_fed/bound": of the program fed as
+        the run ends.
+
+        Args:
+            data: x as a tensor (N, T, D), a batch, or an object whose `all()` returns a batch, or whose `batches(size)`
+                are some sequences after the others.
+        """
+        held_out = in_batches(data)
+        row = self._score(held_out, 0.0)
+        if self.final_feeding:
+            what = "loss" if "loss" in row else "bound"
+            row[f"self_fed/{what}"] = self._score(held_out, self.final_feeding)[what]
+        return row
+
+    def validate(self, data: Any) -> dict[str, float]:
+        """Return what `evaluate` does, as "validation/bound" and so on; keep the weights if that is the best.
+
+        A run with self-feeding learns to run on its own output, which costs it bound on the true past. There
+        the best is by the bound of the self-fed program, once the schedule has reached its last value.
+
+        A model without a likelihood has no bound; there, and where the objective says so, the best is by the objective,
+        among those that its own stages have.
+        """
+        state, row = self.state, self.evaluate(data)
+        fed = "self_fed/" if self.final_feeding else ""
+        score = -row[f"{fed}loss"] if "loss" in row else row[f"{fed}bound"]
+        if not fed or self.rates(state.step - 1)["self_feeding"] == self.final_feeding:
+            state.waited += 1
+            if "loss" in row and state.best_step is not None and not self._alike(state.best_step, state.step):
+                state.best_bound = None  # it is another objective's
+            if score > (-math.inf if state.best_bound is None else state.best_bound):  # never true of NaN
+                state.best_step, state.best_bound, state.waited = state.step, score, 0
+                state.best = weights(self.model)
+        return {f"validation/{name}": value for name, value in row.items()}
+
+    def _alike(self, first: int, second: int) -> bool:
+        """Whether losses at two steps are of one objective."""
+        before, now = (stage_at(self.plan, step)[1].objective for step in (first, second))
+        return before is now or before == now
+
+    def rates(self, step: int) -> dict[str, float]:
+        """The learning rate, the probability of self-feeding and the curriculum, if there is one, at a global step."""
+        _, stage = stage_at(self.plan, step)
+        given = {"learning_rate": self.training.rate, "self_feeding": self.training.self_feeding}
+        own = {name: getattr(stage, name) for name in given}
+        rates = {name: given[name] if own[name] is None else own[name] for name in given}
+        rates |= {} if stage.curriculum is None else {"curriculum": stage.curriculum}
+        return {name: schedule(rate)(step) for name, rate in rates.items()}
+
+    @contextmanager
+    def drawing(self) -> Iterator[None]:
+        """Within it, torch draws the run's random numbers; the caller's random state is left as it was."""
+        with _forked(self.fabric.device):
+            torch.set_rng_state(self.random["torch"])
+            if "cuda" in self.random:
+                torch.cuda.set_rng_state(self.random["cuda"], self.fabric.device)
+            yield
+            self.random = self._random_state()
+
+    def total(self, value: Tensor) -> Tensor:
+        """The sum over the processes."""
+        return processes.summed(self.fabric, value)
+
+    def mean(self, value: Tensor) -> Tensor:
+        """The mean over the processes of what the last step's batches have a frame."""
+        return self.total(value * self._share)
+
+    def settle(self) -> None:
+        """Have what training moves beside parameters, such as running means, be the first process's in all of them."""
+        parameters = dict(self.model.named_parameters())
+        moved = [value for name, value in self.model.state_dict().items() if name not in parameters]
+        processes.agree(self.fabric, moved)
+
+    @property
+    def _seed(self) -> int:
+        return processes.seed_of(self.training.seed, self.fabric.global_rank)
+
+    def _random_state(self) -> dict[str, Tensor]:
+        on_cuda = self.fabric.device.type == "cuda"
+        cuda = {"cuda": torch.cuda.get_rng_state(self.fabric.device)} if on_cuda else {}
+        return {"torch": torch.get_rng_state(), **cuda}
+
+    def _score(self, data: InBatches, feeding: float) -> dict[str, float]:
+        """The unweighted terms on held-out data, per frame, with the same draws each time."""
+        objective = stage_at(self.plan, self.state.step)[1].objective
+        last = self.training.steps  # of the weights, so that losses can be compared
+        self.settle()
+        sums, fabric = dict[str, Tensor](), self.fabric
+        size = min(self.training.batch_size, math.ceil(len(data) / fabric.world_size))
+        shares = fabric.global_rank * size < len(data)
+        # of a process that has no batch, the first one for the names alone
+        first, end = (fabric.global_rank, None) if shares else (0, 1)
+        own = islice(data.batches(size), first, end, fabric.world_size)
+        self.module.eval()
+        with _forked(self.fabric.device), torch.no_grad():
+            torch.manual_seed(self._seed)
+            for batch in own:
+                terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
+                found = _sums(terms)
+                if not terms.likelihood or (isinstance(objective, Asking) and objective.select == "loss"):
+                    found["loss"] = objective(terms, last).double() * found["frames"]
+                for name, value in found.items():
+                    sums[name] = sums[name] + value if name in sums else value
+        totals = self.total(torch.stack(list(sums.values())) * shares)
+        return _per_frame(dict(zip(sums, totals, strict=True)))
+
+    def _terms(
+        self, batch: Batch | Tensor, objective: Objective, where: str, feeding: float, curriculum: float | None = None
+    ) -> Terms:
+        """Terms of a batch that the objective needs, on the device of the model."""
+        refuse_table(batch)
+        placed = each(batch if isinstance(batch, Mapping) else {"x": batch}, tensor_of)
+        if not isinstance(self.model, DynamicalVAE):  # which reads in its own precision
+            dtype = self.parameters[0].dtype
+            placed = each(placed, lambda v: v.to(dtype) if v.is_floating_point() else v)
+        program: dict[str, Any] = {"self_feeding": feeding} if feeding else {}
+        program |= {} if curriculum is None else {"curriculum": curriculum}
+        if isinstance(objective, Asking) and objective.draws:
+            program["draws"] = objective.draws
+        try:
+            measure = self.objective.measure if isinstance(self.objective, Adapting) else None
+            on_device = self.fabric.to_device(placed)
+            return Terms(**self.module(lambda: on_device, program, measure))  # fabric rounds tensors that it sees
+        except ValueError as error:
+            # torch's distributions refuse NaN parameters and values before there is a term to look at
+            if "invalid values" not in str(error) and "within the support" not in str(error):
+                raise
+            raise NonFiniteError(f"{where}: {reason(error).partition(chr(10))[0]}") from error
+
+
+class _Bound(nn.Module):
+    """The bound's terms as the output of a module, which is what synchronises gradients between processes.
+
+    Pyro's `ELBOModule` does the same for a single number; objectives need the terms.
+    """
+
+    def __init__(self, model: nn.Module, estimator: SequenceELBO) -> None:
+        super().__init__()
+        self.model = model
+        self.estimator = estimator
+
+    def forward(
+        self, batch: Callable[[], Batch], program: Mapping[str, Any], measure: Callable[[Terms], None] | None
+    ) -> dict[str, Any]:
+        terms = self.estimator.terms(self.model, batch(), **program)
+        # here, as from what leaves the module fabric alone may take gradients
+        if measure is not None and torch.is_grad_enabled():
+            with torch.autocast(terms.frames.device.type, enabled=False):
+                measure(terms)
+        return dict(vars(terms))
+
+
+def _forked(device: torch.device) -> AbstractContextManager[None]:
+    """Puts the random state of torch back at the end."""
+    return torch.random.fork_rng([device] if device.type == "cuda" else [])
+
+
+def _sums(terms: Terms) -> dict[str, Tensor]:
+    """Each term summed over the sequences of a batch, and the number of frames."""
+    named = {
+        **({"bound": terms.bound} if terms.likelihood else {}),
+        **{f"log_likelihood/{name}": value for name, value in terms.log_likelihood.items()},
+        **{f"kl/{name}": value for name, value in terms.kl.items()},
+        **{f"energy/{name}": value for name, value in terms.energies.items()},
+        "frames": terms.frames,
+    }
+    return {name: value.detach().double().sum() for name, value in named.items()}
+
+
+def _per_frame(sums: Mapping[str, Tensor]) -> dict[str, float]:
+    rates = (torch.stack(list(sums.values())) / sums["frames"]).tolist()
+    return {name: rate for name, rate in zip(sums, rates, strict=True) if name != "frames"}
+
+
+def _culprit(model: nn.Module, terms: Terms, loss: Tensor) -> str:
+    """The first term, or else the loss or a gradient, that is not finite."""
+    groups = {"log likelihood": terms.log_likelihood, "KL": terms.kl, "energy": terms.energies}
+    for group, values in groups.items():
+        for name, value in values.items():
+            bad = ~torch.isfinite(value)
+            if bad.any():
+                first = f"the {group} of {name} is {value[bad][0].item()}"
+                where = f"in {int(bad.sum())} of {len(value)} sequences"
+                if name in terms.steps:
+                    frames = (~torch.isfinite(terms.steps[name])).any(0).nonzero().flatten().tolist()
+                    where += f", frames {', '.join(map(str, frames[:3]))}{'…' if len(frames) > 3 else ''}"
+                return f"{first} {where}"
+    if not torch.isfinite(loss):
+        return f"the loss is {loss.item()} though every term is finite, so a weight of the objective is not"
+    for name, parameter in model.named_parameters():
+        if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+            return f"the gradient of {name} is not finite though the loss is"
+    return "the norm of the gradient overflows, or the loss of another process is not finite"

@@ -1,0 +1,8 @@
+"""Methods that the papers on motion compare themselves with."""
+
+from typing import TYPE_CHECKING
+
+from ...lazy import importing
+
+if not TYPE_CHECKING:
+    __getattr__ = importing(__name__)

@@ -1,0 +1,140 @@
+"""DLow: futures of a moving body in K modes, by one noise that each mode's map takes to the latent of a CVAE.
+
+    p(e) p(x_t | x_{<t}, h, e, k)        w = a_k(h) e + b_k(h)        q(e)
+
+A network of the observed poses h tells the maps of all modes, and the decoder of a fitted CVAE makes the future of w.
+The K futures of a window have one noise e ~ N(0, I). What is minimised is the divergence of each mode's latents from
+N(0, I), how alike the futures are, and the squared error of the best of them,
+
+    beta mean_k KL(N(b_k, diag a_k^2) || N(0, I)) + lambda mean_{i<j} exp(-||x^i - x^j||^2 / s) + 2 min_k ||x^k - x||^2
+
+with distances over all frames and coordinates. Where parts of the body are held, it is the other joints that shall
+differ, and the squared distance of the held ones from those of the first mode is minimised too.
+
+Yuan and Kitani, 2020, arXiv 2003.08386, with the normalisation of its public code. For Human3.6M, the network of 10
+modes has 2,038,528 numbers, and that of 50 has 7,291,648, beside those of the decoder. Ours: the weight of what is
+held, the heading, and lambda and s on other data, which are those of HumanEva, whose windows have as many frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+from typing_extensions import override
+
+from ...constants import indices
+from ...data.schema import SchemaError
+from ...data.views import WHOLE
+from ...inference.training.objectives import Evidence, Objective
+from ...motion import Skeleton
+from ...motion.geometry.parts import places_of
+from ...motion.scoring import energies
+from ...options import Amount, Positive
+from ...program.conditional import like
+from ...program.rollout import Rollout
+from ..motion.futures import HISTORY
+from ..motion.modes import MODE, NOISE, SHAPE, WHOLE_SETS, ModesMethod, ModesModel
+from ..motion.poses import table
+
+PRESETS = table(
+    "latent width hidden modes diversity diversity_scale heading",
+    {
+        "human36m": (*SHAPE, 50, 25.0, 100.0, False),
+        "humaneva": (*SHAPE, 50, 50.0, 20.0, False),
+        "": (*SHAPE, 10, 50.0, 20.0, True),
+    },
+)
+"""Skeleton to options: the paper's; and those for others."""
+
+
+@dataclass(frozen=True)
+class DLow(ModesMethod):
+    """See the file.
+
+    Args:
+        beta: weight of the divergence of each mode's latents from N(0, I).
+        diversity: lambda, weight of how alike the futures are; None, here and below, for the paper's.
+        diversity_scale: s, square metres.
+        reconstruction: weight of the squared error of the best future.
+        held: parts of the body, or joints, whose motion is to be the same in all modes, such as lower.
+        hold: weight of the squared distance of held joints from those of the first mode, mean over the others.
+    """
+
+    name = "dlow"
+    source = "Yuan and Kitani, 2020, arXiv 2003.08386"
+    generative = "p(e) p(x_t | x_{<t}, h, e, k)"
+    inference = "q(e)"
+    presets = PRESETS
+
+    beta: Amount = 1.0
+    diversity: Amount | None = None
+    diversity_scale: Positive | None = None
+    reconstruction: Amount = 2.0
+    held: tuple[str, ...] = ()
+    hold: Amount = 10.0
+
+    @override
+    def sizes(self) -> dict[str, int]:
+        return {NOISE: self.latent or 0, **super().sizes()}
+
+    @override
+    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        """With one noise for the modes of a window."""
+        return {**super().described(sizes), "grouped": (NOISE,)}
+
+    @override
+    def kind(self) -> type[DLowModel]:
+        return DLowModel
+
+    @override
+    def objective(self) -> Objective:
+        """The weighted energies, in `Evidence`'s unit, per frame.
+
+        Raises:
+            ValueError: weights that are still open, which the skeleton decides.
+        """
+        if self.diversity is None:
+            raise ValueError("the weights depend on the skeleton; take those of method.suited(windows)")
+        weights = {"reconstruction": self.reconstruction, "kl": self.beta, "diversity": self.diversity}
+        weights |= {"join": self.join} if self.join else {}
+        weights |= {"held": self.hold} if self.held else {}
+        draws = {MODE: self.modes or 0}
+        return Evidence(energy_weights=weights, likelihood_weight=0.0, draws=draws, select="loss")
+
+
+class DLowModel(ModesModel):
+    """The model of DLow."""
+
+    method: DLow
+
+    def __init__(self, method: DLow, frames: int, skeleton: Skeleton | None, **options: Any) -> None:
+        super().__init__(method, frames, skeleton, **options)
+        if method.held and skeleton is None:
+            raise SchemaError(f"held are {', '.join(method.held)}, of a skeleton; dlow needs to know what poses are")
+        held = set(places_of(skeleton, method.held)) if skeleton else set()
+        parts = [[c for c in range(self.sizes[WHOLE]) if (c // 3 in held) == holds] for holds in (True, False)]
+        self.held, self.free = parts
+        if not self.free:
+            raise ValueError(f"held are {', '.join(method.held)}, all joints, so that nothing is left to differ")
+
+    @override
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+        """The energies of the futures of each window in all modes."""
+        if WHOLE_SETS not in data:
+            return super().penalties(rollout, data, draws)
+        found = super().penalties(rollout, data, {MODE: self.modes})
+        shapes = self.sampler(rollout.values[HISTORY]).to(like(self).dtype)  # of autocast in half precision
+        scale, location = shapes.chunk(2, -1)
+        variance = scale.square()
+        found["kl"] = (variance + location.square() - 1 - variance.log()).sum(2).mean(1) / 2
+        made = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (self.modes, -1))
+        free = made.index_select(-1, indices(self.free, made))
+        found["diversity"] = energies.gaussian_diversity(free, self.method.diversity_scale or 1.0)
+        if self.held:
+            held = made.index_select(-1, indices(self.held, made))
+            apart = (held - held[:1]).square().sum((2, 3))
+            found["held"] = apart.sum(0) / max(self.modes - 1, 1)
+        return found

@@ -1,0 +1,98 @@
+"""DSF, the diversity sampling function: K futures of a moving body, by latents that are far from each other.
+
+    p(x_t | x_{<t}, h, k)        w = b_k(h)        nothing is latent
+
+A network of the observed poses h tells K latents, and the decoder of a fitted CVAE makes the future of each. There is
+no noise, so that a window has K futures and no more. What is minimised is minus the number of them that a determinantal
+point process is expected to choose,
+
+    -tr(I - (L + I)^-1),    L_ij = r_i r_j exp(-||x^i - x^j||^2 / s),    log r_i = log omega - max(||w_i||^2 - R^2, 0)
+
+with distances over all frames and coordinates, and R the radius within which a share rho of N(0, I) is. Nothing but r
+keeps the futures near the data.
+
+Yuan and Kitani, 2020, arXiv 1907.04967, whose code is not known. Ours: omega and rho; the network, its number of modes
+and the distances s, which are those of DLow (arXiv 2003.08386), beside which the tables of motion prediction have it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import scipy
+from torch import Tensor
+from typing_extensions import override
+
+from ...data.views import WHOLE
+from ...inference.training.objectives import Evidence, Objective
+from ...motion.scoring import energies
+from ...options import Amount, Positive, Range
+from ...program.rollout import Rollout
+from ..motion.futures import HISTORY
+from ..motion.modes import MODE, SHAPE, WHOLE_SETS, ModesMethod, ModesModel
+from ..motion.poses import table
+
+PRESETS = table(
+    "latent width hidden modes diversity_scale heading",
+    {"human36m": (*SHAPE, 50, 100.0, False), "humaneva": (*SHAPE, 50, 20.0, False), "": (*SHAPE, 10, 20.0, True)},
+)
+"""Skeleton to options: those of DLow."""
+
+
+@dataclass(frozen=True)
+class DSF(ModesMethod):
+    """See the file.
+
+    Args:
+        beta: weight of half the squared norm of the latents, mean over modes; the paper has none.
+        diversity_scale: s, square metres; None for DLow's.
+        quality: omega, of a latent within the radius.
+        radius: rho, share of N(0, I) that is within it.
+    """
+
+    name = "dsf"
+    source = "Yuan and Kitani, 2020, arXiv 1907.04967"
+    generative = "p(x_t | x_{<t}, h, k)"
+    presets = PRESETS
+
+    beta: Amount = 0.0
+    diversity_scale: Positive | None = None
+    quality: Positive = 1.0
+    radius: Annotated[float, Range(0, 1, above=True, below=True)] = 0.9
+
+    @override
+    def kind(self) -> type[DSFModel]:
+        return DSFModel
+
+    @override
+    def objective(self) -> Objective:
+        """Minus the expected number, in `Evidence`'s unit, per frame."""
+        weights = {"cardinality": 1.0}
+        weights |= {"norm": self.beta} if self.beta else {}
+        weights |= {"join": self.join} if self.join else {}
+        draws = {MODE: self.modes or 0}
+        return Evidence(energy_weights=weights, likelihood_weight=0.0, draws=draws, select="loss")
+
+
+class DSFModel(ModesModel):
+    """The model of DSF. Forecasts of more than K futures have some of them several times."""
+
+    method: DSF
+
+    @override
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+        """The energies of the futures of each window in all modes."""
+        found = super().penalties(rollout, data, {})
+        if WHOLE_SETS not in data:
+            return found
+        method, codes = self.method, self.sampler(rollout.values[HISTORY])
+        squares = codes.square().sum(2).T
+        excess = (squares - float(scipy.special.chdtri(codes.shape[2], 1 - method.radius))).clamp_min(0)
+        made = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (self.modes, -1))
+        quality, scale = method.quality * (-excess).exp(), method.diversity_scale or 1.0
+        found["cardinality"] = energies.determinantal_diversity(made, quality, scale)
+        if method.beta:
+            found["norm"] = squares.mean(0) / 2
+        return found

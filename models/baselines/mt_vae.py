@@ -1,0 +1,321 @@
+"""MT-VAE: futures of a moving body by a latent that codes how the style of motion changes.
+
+    p(w) p(x_t | h, w)        q(w | x_{1:T}, h)
+
+One recurrent network with layer norms embeds the observed poses h, and the future x. An embedding has two halves,
+content and style, LN the normalisation of a layer without gain:
+
+    guide      w from LN(style of x - style of h)
+    decoder    new style = LN(LN(T(LN(W w), style of h)) + style of h); the first state from [content of h, new style]
+
+The decoder's states read the new style at every step, and no pose. Minimised is, for J joints and D numbers of w,
+
+    sum_t |x_t - mean_t| / J  +  a 5 sum_{t <= 8} |velocity_t - made velocity_t| / J  +  a max(KL / D, .01)
+      +  5 |w' - w''| / D,                                                              a = 1 - .99995^step
+
+w' is a draw of the prior, and w'' one of the guide's law for the style that w' leads to. Velocities are those of the
+future of w' too. The first term is the density of a Laplace law of scale J / D metres, beside which the others have
+D times these weights: a that of the KL.
+
+Yan et al., 2018, arXiv 1808.04545, with the layers, weights and sizes of its public code, in which the decoder reads
+no pose, the cycle is of styles and not of poses that are read again, and velocities of both futures count. Ours:
+positions in metres, in place of an image's plane, made by a linear layer; the scale of w as other guides have it; a
+over a run as over the 60,000 steps there, at the end of which it is .95; the smaller sizes off Human3.6M.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import expm1
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from typing_extensions import override
+
+from ...data.views import WHOLE
+from ...distributions import Family
+from ...inference.training.objectives import Evidence
+from ...inference.training.options import Stage, Training
+from ...inference.training.recipe import Recipe
+from ...inference.training.schedules import Saturating
+from ...networks import Input, Network, NetworkSpec
+from ...networks.base import AtOnce, once
+from ...networks.noise import Residual, half
+from ...networks.recurrent import summary
+from ...options import Amount, Size
+from ...program.rollout import Rollout
+from ..motion.futures import HISTORY, FutureMethod, FutureModel
+from ..motion.poses import table
+
+PRESETS = table(
+    "latent width heading", {**dict.fromkeys(("human36m", "humaneva"), (512, 1024, False)), "": (64, 128, True)}
+)
+"""Skeleton to options: the public code's, and smaller ones for others."""
+FIRST = 8
+"""Frames whose velocities count."""
+STEEPNESS = 3.0
+"""Of the weights' rise: 1 - .99995^step comes as near to 1 as e^{-3} in 60,000 steps."""
+
+
+@dataclass(frozen=True)
+class MTVAE(FutureMethod):
+    """See the file. Options that are None are chosen by the skeleton.
+
+    Args:
+        latent: size of w.
+        beta: weight that of the KL rises towards; training ends at .95 of it.
+        width: units of the recurrent networks, and of embeddings, of which half is style.
+        velocity: weight of the velocities at the start, beside that of positions; it rises as that of the KL does.
+        cycle: weight of the latents' way to a style and back.
+        floor: nats for each number of w, averaged over the batch, below which the KL costs nothing more.
+    """
+
+    name = "mt-vae"
+    source = "Yan et al., 2018, arXiv 1808.04545"
+    generative = "p(w) p(x_t | h, w)"
+    inference = "q(w | x_{1:T}, h)"
+    presets = PRESETS
+    trainings: ClassVar[Mapping[str, Training]] = {
+        **dict.fromkeys(("human36m", "humaneva"), Training(60_000, 256, 1e-4)),
+        "": Training(decay=0.5),
+    }
+
+    latent: Size | None = None
+    beta: Amount = 1.0
+    width: Size | None = None
+    velocity: Amount = 5.0
+    cycle: Amount = 5.0
+    floor: Amount = 0.01
+
+    @override
+    def sizes(self) -> dict[str, int]:
+        return {"w": self.latent or 0}
+
+    @override
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        return {"q(w)": ChangeEncoder(self.width or 0), "p(x)": StyleDecoder(self.width or 0)}
+
+    @override
+    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        emission = Family("Laplace", {"scale": self.scale(sizes[WHOLE])}, error_weight=True)
+        return {**super().described(sizes), "laws": {"p(x)": emission}}
+
+    def scale(self, size: int) -> float:
+        """Metres, of the Laplace law of poses of so many coordinates."""
+        return size / 3 / (self.latent or 1)
+
+    @override
+    def kind(self) -> type[FutureModel]:
+        return MTVAEModel
+
+    @override
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
+        """Minimises what the file says; no pose that is made is read."""
+        schema = self.poses(train)
+        frames = schema.frames - schema.protocol.observed
+        return Recipe(
+            train, validation, [Stage(steps, self.suited(schema).objective(steps, frames, schema.size(WHOLE)))]
+        )
+
+    @override
+    def objective(self, steps: int = 60_000, frames: int = 64, size: int = 48) -> Evidence:
+        """What training minimises, over so many steps, by futures of so many frames and coordinates."""
+
+        def rise(weight: float) -> Saturating:
+            return Saturating(0.0, -expm1(-STEEPNESS) * weight, steps, steepness=STEEPNESS)
+
+        weights: dict[str, float | Saturating] = {"join": self.join, "cycle": self.cycle}
+        weights["velocity"] = rise(self.velocity / self.scale(size))
+        return Evidence(
+            kl_weight=rise(self.beta),
+            free_bits=self.floor * (self.latent or 1) / frames,
+            energy_weights={name: weight for name, weight in weights.items() if getattr(self, name)},
+            select="loss",
+        )
+
+
+class MTVAEModel(FutureModel):
+    """A model of MT-VAE."""
+
+    @override
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+        """Errors of the first velocities, of the guide's draw and of one of the prior, and of how that comes back."""
+        found, method = super().penalties(rollout, data, draws), self.method
+        assert isinstance(method, MTVAE)
+        if WHOLE not in data or not (method.velocity or method.cycle):
+            return found
+        values, rows = rollout.values, rollout.batch
+        other = torch.randn_like(values["w"])
+        energies: dict[str, Tensor] = {}
+        if method.velocity:
+            length = min(FIRST, rollout.length)
+            made = rollout.parameters(WHOLE, values[WHOLE])[0][:, :length]
+            (free,) = self.generator[WHOLE]({**rollout.known, "w": other}, rows, length)
+            last, truth = values[HISTORY][:, None, -made.shape[-1] :], values[WHOLE][:, :length]
+            moves = [torch.cat([last, poses], 1).diff(dim=1) for poses in (made, free, truth)]
+            errors = (moves[0] - moves[2]).abs() + (moves[1] - moves[2]).abs()
+            if (seen := rollout.mask(WHOLE)) is not None:
+                both = torch.cat([seen[:, :1], seen[:, 1:length] & seen[:, : length - 1]], 1)
+                errors = torch.where(both, errors, 0.0)
+            energies["velocity"] = errors.sum((1, 2))
+        if method.cycle:
+            guide, network = self.encoder["w"], self.generator[WHOLE].network
+            _, style = network.past(values[HISTORY])
+            loc, scale = guide.law(guide.network.coded(network.changed(style, other) - style))
+            energies["cycle"] = (other - torch.addcmul(loc, scale, torch.randn_like(loc))).abs().sum(-1)
+        size = rows // rollout.draws
+        return found | {name: energy.unflatten(0, (-1, size)).mean(0) for name, energy in energies.items()}
+
+
+@dataclass(frozen=True)
+class ChangeEncoder:
+    """Features of w from the change of style between past and future.
+
+    Args:
+        width: of the embeddings.
+    """
+
+    width: int
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> ChangeEncoderNetwork:
+        """The network of a factor with these parents."""
+        return ChangeEncoderNetwork(self, inputs)
+
+
+class ChangeEncoderNetwork(Network):
+    """What `ChangeEncoder` describes."""
+
+    def __init__(self, spec: ChangeEncoder, inputs: Sequence[Input]) -> None:
+        super().__init__(inputs, False, spec.width)
+        size = next(parent.size for parent in inputs if parent.name == WHOLE)
+        self.past = Embedding(size, spec.width)  # of the future too
+        self.block = RectifiedResidual(half(spec.width), spec.width)
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """Padding at the end is not read."""
+        return self.coded(self.past(parents[WHOLE], lengths)[1] - self.past(parents[HISTORY])[1])
+
+    def coded(self, change: Tensor) -> Tensor:
+        """Features (B, W) of a change of style (B, S)."""
+        return normed(self.block(normed(change)))
+
+
+@dataclass(frozen=True)
+class StyleDecoder:
+    """Features of x_t: states of a recurrent network that starts from content and style, and reads the style.
+
+    Args:
+        width: of the states.
+    """
+
+    width: int
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> StyleDecoderNetwork:
+        """The network of a factor with these parents."""
+        return StyleDecoderNetwork(self, inputs, size)
+
+
+class StyleDecoderNetwork(AtOnce):
+    """What `StyleDecoder` describes."""
+
+    def __init__(self, spec: StyleDecoder, inputs: Sequence[Input], size: int) -> None:
+        super().__init__(inputs, True, spec.width)
+        latent, style = next(parent.size for parent in inputs if parent.name == "w"), half(spec.width)
+        self.past = Embedding(size, spec.width)
+        self.read = nn.Linear(latent, style)
+        self.block, self.out = RectifiedResidual(2 * style, style), nn.Linear(style, style)
+        self.join = RectifiedResidual(spec.width, spec.width)
+        self.hidden, self.cell = nn.Linear(spec.width, spec.width), nn.Linear(spec.width, spec.width)
+        self.network = NormedLSTM(style, spec.width)
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        content, style = self.past(parents[HISTORY])
+        new = self.changed(style, parents["w"])
+        joined = normed(self.join(torch.cat([content, new], -1)))
+        return self.network([self.network.share(new)] * length, torch.tanh(self.hidden(joined)), self.cell(joined))
+
+    def changed(self, style: Tensor, w: Tensor) -> Tensor:
+        """The new style (B, S)."""
+        both = torch.cat([normed(self.read(w)), style], -1)
+        return normed(normed(self.out(normed(self.block(both)))) + style)
+
+
+class Embedding(nn.Module):
+    """Content (B, W - S) and style (B, S) of a motion, S = W / 2, of the last state of a recurrent network.
+
+    Args:
+        size: D.
+        width: W.
+    """
+
+    def __init__(self, size: int, width: int) -> None:
+        super().__init__()
+        self.size = size
+        self.network, self.out = NormedLSTM(size, width), nn.Linear(width, width)
+
+    def forward(self, poses: Tensor, lengths: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Of (B, T, D), or of (B, T D), frame after frame; of the first steps of each where there are lengths."""
+
+        def compute() -> tuple[Tensor, Tensor]:
+            shares = self.network.share(poses.reshape(len(poses), -1, self.size)).unbind(1)
+            zero = poses.new_zeros(len(poses), self.out.in_features)
+            last = summary(self.network(shares, zero, zero), 1, lengths)
+            content, style = self.out(last).tensor_split([-half(self.out.out_features)], -1)
+            return content, normed(style)
+
+        return once(self, [poses, lengths], compute)
+
+
+class NormedLSTM(nn.Module):
+    """An LSTM whose gates are normalised, each over its units, and whose cells are (Ba et al., 2016, arXiv 1607.06450).
+
+    Args:
+        size: D.
+        width: W.
+    """
+
+    def __init__(self, size: int, width: int) -> None:
+        super().__init__()
+        self.share, self.recurrent = nn.Linear(size, 4 * width, bias=False), nn.Linear(width, 4 * width, bias=False)
+        self.gain, self.shift = nn.Parameter(torch.ones(4, width)), nn.Parameter(torch.zeros(4, width))
+        nn.init.ones_(self.shift.data[1])  # of the gate of what is kept
+        self.norm = nn.LayerNorm(width, eps=EPSILON)
+
+    def forward(self, shares: Sequence[Tensor], hidden: Tensor, cell: Tensor) -> Tensor:
+        """States (B, T, W).
+
+        Args:
+            shares: of what is read in the gates (B, 4 W), step by step.
+            hidden, cell: the first state (B, W).
+        """
+        states, weight = [], self.recurrent.weight.t()
+        for share in shares:
+            gates = torch.addmm(share, hidden, weight).unflatten(-1, (4, -1))
+            gates = torch.addcmul(self.shift, self.gain, functional.layer_norm(gates, gates.shape[-1:], eps=EPSILON))
+            entry, kept, output = torch.sigmoid(gates[:, :3]).unbind(1)
+            cell = kept * cell + entry * torch.tanh(gates[:, 3])
+            hidden = output * torch.tanh(self.norm(cell))
+            states.append(hidden)
+        return torch.stack(states, 1)
+
+
+EPSILON = 1e-3
+"""Added to variances in `NormedLSTM`."""
+
+
+class RectifiedResidual(Residual):
+    """A residual block with ReLUs behind both ways, too."""
+
+    @override
+    def forward(self, values: Tensor) -> Tensor:
+        return functional.relu(self.short(values)) + functional.relu(self.long(values))
+
+
+def normed(values: Tensor) -> Tensor:
+    """(B, D) with mean 0 and variance 1 of each row."""
+    return functional.layer_norm(values, values.shape[-1:])

@@ -1,0 +1,78 @@
+"""Pose-Knows: futures of a moving body by a latent for each step and a recurrent decoder.
+
+    p(z_t) p(x_t | x_{<t}, h, z_t)        q(z_t | x_{<=t}, h)
+
+Latents are independent of each other, so that futures jitter. The guide's states go on from the summary of the observed
+poses h; the decoder is that of the CVAE, whose perceptron reads z_t beside the state.
+
+Walker, Marino, Gupta and Hebert, 2017, arXiv 1705.00053, whose code is not known; sizes are those of the CVAE of Yuan
+and Kitani, 2020, arXiv 2003.08386, beside which the tables of motion prediction have it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+from typing_extensions import override
+
+from ...data.views import WHOLE
+from ...networks import Input, NetworkSpec
+from ...networks.base import AtOnce
+from ...networks.cells import GRU
+from ...options import Size
+from ..motion.futures import HISTORY, FutureMethod, LastState
+from .cvae import SummaryDecoder
+
+
+@dataclass(frozen=True)
+class PoseKnows(FutureMethod):
+    """See the file.
+
+    Args:
+        width: units of the recurrent networks.
+        hidden: widths of perceptrons.
+    """
+
+    name = "pose-knows"
+    source = "Walker, Marino, Gupta and Hebert, 2017, arXiv 1705.00053"
+    generative = "p(z_t) p(x_t | x_{<t}, h, z_t)"
+    inference = "q(z_t | x_{<=t}, h)"
+
+    width: Size = 128
+    hidden: tuple[Size, ...] = (300, 200)
+
+    @override
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        return {"q(z)": FutureFilter(self.width), "p(x)": SummaryDecoder(self.width, self.hidden)}
+
+
+@dataclass(frozen=True)
+class FutureFilter:
+    """Features of z_t: states of a recurrent network over the future so far, that goes on from the past.
+
+    Args:
+        width: of the states.
+    """
+
+    width: int
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureFilterNetwork:
+        """The network of a factor with these parents."""
+        return FutureFilterNetwork(self, inputs)
+
+
+class FutureFilterNetwork(AtOnce):
+    """What `FutureFilter` describes."""
+
+    def __init__(self, spec: FutureFilter, inputs: Sequence[Input]) -> None:
+        super().__init__(inputs, True, spec.width)
+        size = next(parent.size for parent in inputs if parent.name == WHOLE)
+        self.past = LastState(size, spec.width)
+        self.network = GRU(size, spec.width, batch_first=True)
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        states: Tensor = self.network(parents[WHOLE], self.past(parents[HISTORY])[None])[0]
+        return states

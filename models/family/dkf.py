@@ -1,0 +1,151 @@
+"""The deep Kalman filter, or deep Markov model: a Markov chain of latents behind independent frames.
+
+    p(z_t | z_{t-1}) p(x_t | z_t)        q(z_t | z_{t-1}, x_{t:T})
+
+Krishnan, Shalit and Sontag, 2015 and 2017, arXiv 1511.05121 and 1609.09869; layers of the public implementation of
+Girin et al., 2021, arXiv 2008.12595. The transition is gated: its mean mixes a linear and a nonlinear proposal. The
+guide averages features of z_{t-1} and a backward recurrent state of x_{t:T}; it has the dependencies of the exact
+posterior. Nothing is shared between guide and model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from typing_extensions import override
+
+from ...distributions.base import LawSpec, Parameters, Shape
+from ...distributions.families import Gaussian
+from ...networks import Dense, Input, NetworkSpec, Recurrent
+from ...networks.base import Network, aligned, at, shift
+from ...options import Extra, Size
+from ..method import LatentMethod
+
+
+@dataclass(frozen=True)
+class Gated:
+    """The transition of Krishnan et al., 2017, equation 13: gate, proposal and linear part of z_{t-1}.
+
+        g = sigmoid(MLP(z))    h = MLP(z)    mean = (1 - g) * L(z) + g * h    variance = softplus(L(relu(h)))
+
+    Gate and proposal also read what is given at t, such as covariates and the gap since t-1. Its features are the mean
+    and relu(h); `GatedNormal` is its law.
+    """
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> GatedTransition:
+        """The network of a factor whose first parent is its own last value, and others static or at t."""
+        fits = bool(inputs) and inputs[0].lags == (-1,) and inputs[0].size == size
+        if not fits or any(parent.relation and parent.lags != (0,) for parent in inputs[1:]):
+            raise ValueError(
+                f"a gated transition is of one variable from its own last value and what is given at t, not {inputs}"
+            )
+        return GatedTransition(inputs, size)
+
+
+class GatedTransition(Network):
+    """What `Gated` describes."""
+
+    def __init__(self, inputs: Sequence[Input], size: int):
+        super().__init__(inputs, True, 2 * size)
+        own, *beside = inputs
+        self.name, self.size, self.beside = own.name, size, [parent.name for parent in beside]
+        read = size + sum(parent.size for parent in beside)
+        self.gate, self.proposal = (
+            nn.Sequential(nn.Linear(read, size), nn.ReLU(), nn.Linear(size, size)) for _ in range(2)
+        )
+        self.linear = nn.Linear(size, size)
+
+    def _features(self, previous: Tensor, beside: Tensor) -> Tensor:
+        read = torch.cat([previous, beside], -1)
+        proposal = self.proposal(read)
+        mean = torch.lerp(self.linear(previous), proposal, torch.sigmoid(self.gate(read)))
+        return torch.cat([mean, functional.relu(proposal)], dim=-1)
+
+    def _given(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
+        """What is given beside z_{t-1}, (B, T, E)."""
+        empty = self.linear.weight.new_empty(batch, length, 0)
+        return torch.cat(aligned([empty, *(parents[name] for name in self.beside)]), -1)
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        previous = shift(parents[self.name], -1)
+        return self._features(previous, self._given(parents, len(previous), length))
+
+    @override
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        return self(given, length).unbind(1) if self.name in given else self._given(given, batch, length)
+
+    @override
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        if isinstance(state, tuple):
+            return state[t], state
+        return self._features(at(drawn[self.name], t - 1, state, self.size), state[:, t]), state
+
+
+@dataclass(frozen=True)
+class GatedNormal:
+    """A normal on the features of `Gated`, whose scale stays above .001."""
+
+    def build(self, shape: Shape) -> GatedLaw:
+        """The law of a variable, from features (..., 2 D)."""
+        return GatedLaw(shape.size)
+
+
+class GatedLaw(Gaussian):
+    """What `GatedNormal` describes."""
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.variance = nn.Linear(size, size)
+
+    @override
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        mean, proposal = features.chunk(2, dim=-1)
+        return mean, torch.sqrt(functional.softplus(self.variance(proposal)) + 1e-6)
+
+
+@dataclass(frozen=True)
+class DKF(LatentMethod):
+    """See the file.
+
+    Args:
+        width: of the guide's recurrent state, and of the features of z_{t-1} beside it.
+        embed: of the dense layer before the state.
+        embed_latent: widths of the layers on z_{t-1} before its last one, of size `width`.
+        hidden: widths of the perceptron on the mean of the two.
+        decoder: widths of the decoder.
+        transition: widths of a perceptron for p(z_t | z_{t-1}) in place of the gated transition.
+    """
+
+    name = "dkf"
+    source = "Krishnan, Shalit and Sontag, 2015, arXiv 1511.05121"
+    generative = "p(z_t | z_{t-1}) p(x_t | z_t)"
+    inference = "q(z_t | z_{t-1}, x_{t:T})"
+    apart = ("q(z)",)
+
+    width: Size = 64
+    embed: Extra = 64
+    embed_latent: tuple[Size, ...] = (16,)
+    hidden: tuple[Size, ...] = (32,)
+    decoder: tuple[Size, ...] = (32, 64)
+    transition: tuple[Size, ...] = ()
+
+    @override
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        """A gated transition, a perceptron for the data, a backward network for the guide."""
+        extract = {"z": (*self.embed_latent, self.width)}
+        return {
+            "p(z)": Dense(self.transition) if self.transition else Gated(),
+            "p(x)": Dense(self.decoder),
+            "q(z)": Recurrent(self.width, embed=self.embed, extract=extract, hidden=self.hidden, mean=True),
+        }
+
+    @override
+    def laws(self) -> Mapping[str, LawSpec]:
+        """The gated transition has its own."""
+        return {**super().laws(), **({} if self.transition else {"p(z)": GatedNormal()})}

@@ -1,0 +1,138 @@
+"""The disentangled sequential autoencoder: a static latent for what lasts, a chain of latents for what moves.
+
+    p(w) p(z_t | z_{<t}) p(x_t | z_t, w)        q(w | x_{1:T}) q(z_t | x_{1:T}, w)
+
+Li and Mandt, 2018, arXiv 1803.02991, their "full" guide (v in the public implementation is our w, f in the paper);
+layers of the public implementation of Girin et al., 2021, arXiv 2008.12595. q(w) reads the two final states of a
+bidirectional network, q(z_t) a recurrent network on top of another one that reads x_t and w. Nothing is shared. The
+guide misses z_{<t}.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+from typing_extensions import override
+
+from ...factorization.relations import ALL
+from ...networks import Dense, Input, NetworkSpec, Recurrent
+from ...networks.base import Network
+from ...networks.cells import RNN
+from ...networks.recurrent import Memory
+from ...options import Size
+from ..method import LatentMethod
+
+
+@dataclass(frozen=True)
+class Layered:
+    """A forward recurrent network (tanh) on the states of a forward and a backward LSTM, which read all parents.
+
+    Args:
+        width: of the states.
+    """
+
+    width: int = 64
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> LayeredNetwork:
+        """The network of a factor whose local parents are all read over {1:T}."""
+        return LayeredNetwork(self, inputs, local)
+
+
+class LayeredNetwork(Network):
+    """What `Layered` describes."""
+
+    def __init__(self, spec: Layered, inputs: Sequence[Input], local: bool):
+        super().__init__(inputs, local, spec.width)
+        for parent in inputs:
+            if parent.relation not in (None, ALL):
+                raise ValueError(f"Layered reads its parents over {{1:T}}, but {parent.name} at {parent.relation}")
+        recurrent = Recurrent(spec.width)
+        self.past = Memory(recurrent, [(p, 0 if p.relation is None else -1) for p in inputs], +1)
+        self.future = Memory(recurrent, [(p, 0) for p in inputs], -1)
+        self.top: Any = RNN(2 * spec.width, spec.width, batch_first=True)
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        values = {n: v if v.dim() == 3 else v[:, None].expand(-1, length, -1) for n, v in parents.items()}
+        states = [memory(values, parents, lengths).transpose(0, 1) for memory in (self.past, self.future)]
+        top = self.top
+        base = functional.linear(torch.cat(states, dim=-1), top.weight_ih_l0, top.bias_ih_l0 + top.bias_hh_l0)
+        return Recurrence.apply(base.to(top.weight_hh_l0.dtype), top.weight_hh_l0).transpose(0, 1)
+
+    @override
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """A parent over {1:T} is never drawn in the same loop."""
+        return self(given, length, lengths).unbind(1)
+
+    @override
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        return state[t], state
+
+
+class Recurrence(torch.autograd.Function):
+    """h_t = tanh(base_t + W h_{t-1}), (T, B, W). torch.nn.RNN records every step of it, which takes far longer."""
+
+    @staticmethod
+    def forward(ctx: Any, base: Tensor, weight: Tensor) -> Tensor:
+        """States from base (T, B, W) and weight (W, W)."""
+        states = torch.empty_like(base)
+        state = torch.zeros_like(base[0])
+        for share, target in zip(base.unbind(0), states.unbind(0), strict=True):
+            state = torch.addmm(share, state, weight.t(), out=target).tanh_()
+        ctx.save_for_backward(states, weight)
+        return states
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_states: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradients of base and weight."""
+        states, weight = ctx.saved_tensors
+        to_base = torch.empty_like(states)
+        targets, slopes, own = to_base.unbind(0), (1 - states * states).unbind(0), to_states.unbind(0)
+        carried = own[-1]
+        for t in range(len(states) - 1, -1, -1):
+            gradient = torch.mul(carried, slopes[t], out=targets[t])
+            if t:
+                carried = torch.addmm(own[t - 1], gradient, weight)
+        return to_base, to_base[1:].flatten(0, 1).t() @ states[:-1].flatten(0, 1)
+
+
+@dataclass(frozen=True)
+class DSAE(LatentMethod):
+    """See the file.
+
+    Args:
+        static: size of w.
+        width: of the recurrent states.
+        decoder: widths of the decoder.
+    """
+
+    name = "dsae"
+    source = "Li and Mandt, 2018, arXiv 1803.02991"
+    generative = "p(w) p(z_t | z_{<t}) p(x_t | z_t, w)"
+    inference = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
+    apart = ("q(z)", "q(w)")
+
+    static: Size = 16
+    width: Size = 64
+    decoder: tuple[Size, ...] = (32, 64)
+
+    @override
+    def sizes(self) -> dict[str, int]:
+        return {"w": self.static, "z": self.latent}
+
+    @override
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        """Recurrent networks for everything but the data."""
+        return {
+            "q(w)": Recurrent(self.width, hidden=()),
+            "q(z)": Layered(self.width),
+            "p(z)": Recurrent(self.width, hidden=()),
+            "p(x)": Dense(self.decoder),
+        }

@@ -1,0 +1,256 @@
+"""What methods share that make futures of a body from the poses observed of it.
+
+    h_{1:O} the observed poses, x_{1:T} those that follow
+
+Their programs are of the future alone, given the past (`dvae.data.views.Past`): a forecast, which knows no future, has
+its latents from the prior. Poses are positions relative to the pelvis, in metres. The likelihood is the squared error
+of the papers, beside which the KL has the weight beta, and decoders read what they have made, in training too.
+
+Ours: windows may be turned so that the last observed pose faces one way, which helps on small sets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from typing_extensions import override
+
+from ...data.schema import Schema
+from ...data.sequences import mask_of
+from ...data.views import WHOLE, Past, Views
+from ...distributions import FixedNormal, LawSpec
+from ...inference.training.objectives import Evidence, Objective
+from ...inference.training.options import Stage, Training
+from ...inference.training.recipe import Recipe
+from ...motion import HUMAN36M, HUMANEVA, Heading, Skeleton
+from ...motion.data.protocols import Poses
+from ...motion.scoring import energies
+from ...networks import Input, Network
+from ...networks.base import once, perceptron, share_modules
+from ...networks.cells import GRU
+from ...networks.recurrent import gru_cell
+from ...options import Amount, Size
+from ...program.batch import AnyBatch
+from ...program.model import DynamicalVAE
+from ...program.rollout import Rollout, SelfFeeding
+from .poses import PoseMethod, table, without_gaps
+
+HISTORY = "h"
+
+
+@dataclass(frozen=True)
+class FutureMethod(PoseMethod):
+    """A method that makes futures.
+
+    Args:
+        latent: size of the latent.
+        beta: weight of the KL, beside squared errors in square metres. None for the papers' with the poses of Human3.6M
+            and HumanEva, and for Human3.6M's with others.
+        join: weight of the squared distance from the last observed pose to the first one that is made.
+        heading: turn every window so that its last observed pose faces one way, and the futures back. None for not with
+            the papers' poses, of Human3.6M and HumanEva, and for so with others whose left and right are known.
+    """
+
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = table(
+        "beta heading", {HUMAN36M.name: (0.1, False), HUMANEVA.name: (0.01, False), "": (0.1, True)}
+    )
+
+    trainings: ClassVar[Mapping[str, Training]] = {
+        HUMAN36M.name: Training(39_063, 64, 1e-3, 0.8),
+        HUMANEVA.name: Training(7813, 64, 1e-3, 0.8),
+        "": Training(learning_rate=3e-3, decay=0.5),
+    }
+
+    latent: Size | None = 128
+    beta: Amount | None = None
+    join: Amount = 0.0
+    heading: bool | None = None
+
+    @override
+    def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
+        """Where left and right are unknown, so are headings."""
+        found = super().preset(skeleton)
+        return found if skeleton.left and skeleton.right else {**found, "heading": False}
+
+    @override
+    def laws(self) -> Mapping[str, LawSpec]:
+        """x is normal with variance 1/2, minus whose log-density is the squared error."""
+        return {"p(x)": FixedNormal(scale=sqrt(0.5), error_weight=True)}
+
+    @override
+    def build(self, data: Any) -> FutureModel:
+        """The model for windows of poses relative to the pelvis.
+
+        Of sizes alone it is one whose batches hold h, two frames of the size of x, beside x.
+
+        Raises:
+            ValueError: poses with a root.
+        """
+        schema = Schema.of(data)
+        if not isinstance(schema, Poses):
+            return self.filled(self.presets[HUMAN36M.name])._built(schema.size(WHOLE), 2)
+        schema = self.poses(schema)
+        method, observed = self.suited(schema), schema.protocol.observed
+        return method._built(schema.size(WHOLE), observed, schema.skeleton)
+
+    def kind(self) -> type[FutureModel]:
+        """The class of the model."""
+        return FutureModel
+
+    def _built(self, size: int, frames: int, skeleton: Skeleton | None = None) -> FutureModel:
+        views = [Heading(skeleton, frames)] if skeleton and self.heading else []
+        given = self.described({WHOLE: size, HISTORY: frames * size})
+        model = self.kind()(self, frames, skeleton, view=Views(*views, Past(HISTORY, frames)), **given)
+        networks = [side[name].network for side in (model.encoder, model.generator) for name in side]
+        share_modules([network for network in networks if hasattr(network, "past")], "past")
+        model.feeding = SelfFeeding(1.0, gradient=True)
+        return model
+
+    @override
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
+        """Minimises squared errors and the weighted KL; the best weights are those of the lowest loss."""
+        return Recipe(train, validation, [Stage(steps, self.suited(train).objective())], 1.0)
+
+    def objective(self) -> Objective:
+        """What training minimises."""
+        assert self.beta is not None  # of a method that is suited
+        return Evidence(kl_weight=self.beta, energy_weights={"join": self.join} if self.join else {}, select="loss")
+
+
+class FutureModel(DynamicalVAE):
+    """A model of futures given the past.
+
+    Args:
+        method: with no option left open.
+        frames: O, that are observed.
+        skeleton: of the poses; None where it is not known.
+        **options: of `DynamicalVAE`.
+    """
+
+    def __init__(self, method: FutureMethod, frames: int, skeleton: Skeleton | None, **options: Any) -> None:
+        super().__init__(**options)
+        self.method, self.frames, self.skeleton = method, frames, skeleton
+
+    @override
+    def read(self, batch: AnyBatch | None, **options: Any) -> dict[str, Any]:
+        """The batch, whose observed frames have no gaps (see `without_gaps`)."""
+        if (
+            self.skeleton
+            and isinstance(batch, Mapping)
+            and HISTORY not in batch
+            and (mask := mask_of(batch)) is not None
+        ):
+            x, (seen, later) = torch.as_tensor(batch[WHOLE]), mask.tensor_split([self.frames], 1)
+            past = without_gaps(self.skeleton, x[:, : self.frames], seen)
+            whole = torch.cat([past, x[:, self.frames :]], 1)
+            batch = {**batch, WHOLE: whole, "mask": torch.cat([torch.ones_like(seen), later], 1)}
+        return super().read(batch, **options)
+
+    @override
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+        """How far the first pose is from the last observed one; and the best of several draws from what happened."""
+        if WHOLE not in data or not (self.method.join or draws):
+            return {}
+        size = rollout.batch // rollout.draws
+        made, truth = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (-1, size)), data[WHOLE][:size]
+        if (mask := data.get("mask", {}).get(WHOLE)) is not None:
+            truth = torch.where(mask[:size], truth, torch.nan)
+        found = {"reconstruction": energies.best_of_many(made, truth)} if draws else {}
+        if self.method.join:
+            steps = made[:, :, 0] - data[HISTORY][:size, -truth.shape[-1] :]
+            found["join"] = steps.square().sum(-1).mean(0)
+        return found
+
+
+class FedBackNetwork(Network):
+    """Features of x_t: states of a recurrent network over what is known at t and x_{t-1}, and a perceptron on them.
+
+    Args:
+        inputs: parents of x.
+        known: numbers that are known at each step, beside x_{t-1}.
+        size: D.
+        width: of the states.
+        hidden: widths of the perceptron.
+        own: name and size of a latent of each step, which the perceptron reads beside the state; no other step does.
+    """
+
+    def __init__(
+        self,
+        inputs: Sequence[Input],
+        known: int,
+        size: int,
+        width: int,
+        hidden: Sequence[int],
+        own: tuple[str, int] | None = None,
+    ) -> None:
+        super().__init__(inputs, True, (width, *hidden)[-1])
+        self.share, (self.own, latent) = known, own or ("", 0)
+        self.cell: Any = GRU(known + size, width, batch_first=True)
+        self.behind = perceptron((width + latent, *hidden), "tanh")
+
+    def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
+        """What is known at each step, the pose before the first (B, D), and the first state (B, W).
+
+        The first is (B, T, known), or (B, 1, known) where it is the same at all steps.
+        """
+        raise NotImplementedError
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        """Padding at the end changes nothing before it."""
+        known, first, state = self.known(parents, length)
+        before = torch.cat([first[:, None], parents[WHOLE][:, : length - 1]], 1)
+        states = self.cell(torch.cat([known.expand(-1, length, -1), before], -1), state[None].contiguous())[0]
+        made: Tensor = self.behind(torch.cat([states, parents[self.own]], -1) if self.own else states)
+        return made
+
+    @override
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        known, first, state = self.known(given, length)
+        weight, bias = self.cell.weight_ih_l0[:, : self.share], self.cell.bias_ih_l0
+        latents = given[self.own].unbind(1) if self.own in given else None
+        shares = functional.linear(known, weight, bias).expand(-1, length, -1)
+        return shares.unbind(1), first, given.get(WHOLE), latents, state
+
+    @override
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        shares, first, given, latents, hidden = state
+        before = first if t == 0 else drawn[WHOLE][t - 1] if given is None else given[:, t - 1]
+        gates = torch.addmm(shares[t], before, self.cell.weight_ih_l0[:, self.share :].t())
+        hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
+        read = hidden
+        if self.own:
+            read = torch.cat([hidden, drawn[self.own][t] if latents is None else latents[t]], -1)
+        return self.behind(read), (shares, first, given, latents, hidden)
+
+
+class LastState(nn.Module):
+    """The last state (B, W) of a recurrent network over poses.
+
+    Args:
+        size: D.
+        width: W.
+    """
+
+    def __init__(self, size: int, width: int) -> None:
+        super().__init__()
+        self.size = size
+        self.network = GRU(size, width, batch_first=True)
+
+    def forward(self, poses: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Of (B, T, D), or of (B, T D), frame after frame; of the first steps of each where there are lengths."""
+
+        def last() -> Tensor:
+            states, final = self.network(poses.reshape(len(poses), -1, self.size))
+            if lengths is None:
+                return final[0]
+            found: Tensor = states.take_along_dim((lengths - 1)[:, None, None], 1)[:, 0]
+            return found
+
+        return once(self, [poses] if lengths is None else [poses, lengths], last)

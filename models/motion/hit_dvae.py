@@ -1,0 +1,335 @@
+"""HiT-DVAE, the hierarchical transformer dynamical VAE: a static latent for what lasts, local ones for what moves.
+
+    p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)        q(w | x_{1:T}) q(z_t | x_{1:T}, w)
+
+Poses become features by graph convolutions over the joints, one set for the guide and one for the model. w sums up a
+short window by graph convolutions over its frames, z comes from a transformer's encoder, and the two generative factors
+attend to the past: z from x_{t-1} to z_{<t}, x from z_t to x_{<t}. The guide does not read z_{<t}, on which the exact
+posterior depends (`guide_past` adds it).
+
+The paper does not maximise the evidence. It draws K motions of the guide's latents for each window and takes the best:
+
+    L = lr min_k |x_k - x|^2 + lmm (the same to pseudo ground truths) + lz KL_z + lw KL_w + energies
+
+with means over time, KL_w whole, and the energies of GSPS (diversity, limbs, angles, pose prior) over all frames; in
+training the model soon reads its own output alone. The paper prints its squared errors as sums; means over time, which
+its weights beside those of GSPS speak for, are one reading of it, and what its weights mean depends on that. Both
+objectives are here: loss="best-of-many" and loss="evidence".
+
+Bie et al., 2022, arXiv 2204.01565. There is no public code. Ours where the paper is silent or cannot be followed:
+
+* One layer a factor; linear biases for positions (`networks.Attention`), so that motions may be longer than in
+  training; a learned start token in place of the first step's past, so that x_1 and z_1 are part of the model.
+* The mean of x_t keeps half of x_{t-1} (`residual`): without that the first predicted frame is off by twice as much,
+  and whole offsets diverge. Poses are standardised: in metres the networks take several times as long to learn what
+  poses have in common. No normalisation over the batch.
+* With best-of-many, the density of x has one scale per coordinate, fitted to the errors and no more: its gradient does
+  not reach the poses. The paper's unit variance is emission="unit".
+* Off the paper's data z costs .03 a nat and not .5, under which it falls silent in short runs: motions then lose their
+  rhythm. A nat of w costs .03 and not 7.5, under which it carries nothing (docs/results/hit_dvae.md).
+* The observed frames are never replaced in training, as they will not be in a forecast, unless `feed_observed`. Means
+  that are fed back carry no gradient, unless `feeding_gradient`; `feeding_passes` feeds them in parallel.
+* A model may see windows turned so that the last observed pose faces one way, which it does on small sets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+from torch import Tensor, nn
+from typing_extensions import override
+
+from ...constants import indices
+from ...data.schema import Schema
+from ...data.views import WHOLE
+from ...distributions import Directions
+from ...factorization.notation import Factorization
+from ...inference.training.objectives import Evidence, Objective
+from ...inference.training.options import Stage, Training
+from ...inference.training.recipe import Recipe
+from ...inference.training.schedules import Ramp, Schedule
+from ...motion import Skeleton
+from ...motion.data.protocols import Poses
+from ...motion.geometry.parts import body_parts
+from ...motion.scoring import energies
+from ...networks import Attention, FrameGraph, NetworkSpec, NodeGraph, Recurrent, SelfAttention
+from ...networks.extract import share
+from ...options import Amount, Delay, Extra, Layers, Range, Share, Size
+from ...program.model import DynamicalVAE
+from ...program.rollout import Rollout, SelfFeeding
+from ..method import SHAPES, LatentMethod, fit_units, start_priors
+from .energies import EnergyMethod, EnergyModel
+from .poses import table
+
+ENERGIES = table(
+    "reconstruction multimodal diversity diversity_scale limb angles pose_prior kl_local kl_static pseudo_minimum",
+    {
+        "humaneva": (10.0, 5.0, (0.1, 0.2), (15.0, 50.0), 100.0, 1.0, 0.001, 0.5, 7.5, 0.01),
+        "human36m": (20.0, 10.0, (0.1, 0.2), (100.0, 300.0), 100.0, 1.0, 0.01, 0.5, 12.5, 0.1),
+        "": (10.0, 5.0, (0.1, 0.2), (15.0, 50.0), 100.0, 1.0, 0.001, 0.03, 0.03, 0.02),
+    },
+)
+NETWORKS = table(
+    "pose_width samples decoder pool_stride heading",
+    {"humaneva": (8, 10, 256, 15, False), "human36m": (8, 10, 256, 20, False), "": (8, 6, 128, 10, True)},
+)
+PRESETS = {skeleton: options | NETWORKS[skeleton] for skeleton, options in ENERGIES.items()}
+"""Skeleton to options: the paper's; and for others, at 30 frames a second, 15 observed and 60 predicted frames."""
+
+PARTS = ("lower", "upper")
+FRAMES = 15
+"""Observed frames, where there are no windows to tell."""
+
+
+@dataclass(frozen=True)
+class HiTDVAE(EnergyMethod, LatentMethod):
+    """See the file. With loss="evidence" the energies do not apply.
+
+    Args:
+        emission: as everywhere, but with loss="best-of-many" the "normal" and "student" do not apply, and with `bones`
+            none does: x is a point.
+        loss: "best-of-many" (the paper's) or "evidence" (the plain bound).
+        samples: K, motions that are drawn for a window in training; with loss="evidence" there is one.
+        kl_local: weight of the KL of z.
+        kl_static: weight of the KL of w, in the bound's unit; the paper's .1 beside means over T frames is .1 T.
+        static: size of w; 0 for a model without w.
+        attention: False for LSTMs in place of the transformers, to which `heads_count` and `nearest` do not apply.
+        width: of the attention of guide and prior.
+        heads_count: number of attention heads.
+        decoder: width of the attention of x.
+        layers: of each factor.
+        nearest: the last frame that a generative factor may read joins its query; in the paper it is one key of many.
+        standardise: networks read and make poses without unit, by the mean pose and one spread (`dvae.data.units`).
+        pose_width: features of a joint, by graph convolutions; 0 for poses as they are. None for 8 where windows tell
+            that x are poses, and for 0 where a model is built from sizes alone.
+        summary: of x for w: "graph" (a graph of `frames` frames) or "attention" (over any length: all frames, in no
+            order, of a window in training and of its past in a forecast).
+        frames: of the graph's window; None for as many as the protocol observes. The same for all draws of a window in
+            training, and the first ones else.
+        guide_past: the guide of z reads z_{<t} too.
+        feed_observed: whether the observed frames may be replaced too, so that motions come of their latents alone. In
+            the paper that is open.
+        feeding_passes: the means that are fed back, computed in so many parallel passes; 0 for exactly, step by step.
+        feeding_gradient: whether gradients flow through these means.
+        warm_up: steps over which the KL weights rise from 0; None for the first 4 % of the run, the paper's 20 epochs
+            of 500.
+        self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over 16 %
+            of training, after the first 4 %: the paper's 80 and 20 of 500 epochs.
+    """
+
+    name = "hit-dvae"
+    source = "Bie et al., 2022, arXiv 2204.01565"
+    generative = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
+    inference = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
+    presets = PRESETS
+    trainings: ClassVar[Mapping[str, Training]] = {
+        "human36m": Training(15_625, 32, 1e-3),
+        "humaneva": Training(7813, 64, 1e-3),
+        "": Training(2400, 16, 2e-3, 0.8),
+    }
+    residual: Share = 0.5
+    self_feeding: Share = 1.0
+    warm_up: Delay | None = None
+    loss: Literal["best-of-many", "evidence"] = "best-of-many"
+    samples: Annotated[int, Range(2, 4096)] | None = None
+    kl_local: Amount | None = None
+    kl_static: Amount | None = None
+    static: Extra = 32
+    attention: bool = True
+    width: Size = 64
+    heads_count: Size = 4
+    decoder: Size | None = None
+    layers: Layers = 1
+    nearest: bool = True
+    standardise: bool = True
+    pose_width: Extra | None = None
+    summary: Literal["graph", "attention"] = "graph"
+    frames: Size | None = None
+    guide_past: bool = False
+    feed_observed: bool = False
+    feeding_passes: Extra = 0
+    feeding_gradient: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.loss == "best-of-many" and self.emission not in (None, "fixed", "unit"):
+            raise ValueError(
+                f"emission={self.emission!r} needs loss='evidence'; with best-of-many it is 'fixed' or 'unit'"
+            )
+        if self.hide:
+            raise ValueError("hit-dvae has no hide: its guide reads whole poses, beside which there are no indicators")
+        own = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run", "bones")
+        if self.loss == "evidence" and (given := [name for name in own if getattr(self, name)]):
+            raise ValueError(f"loss='evidence' has no {', '.join(given)}; these are of loss='best-of-many'")
+        for name in ("diversity", "diversity_scale"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(PARTS):
+                raise ValueError(f"{name} is {values}; expected one number for each of {', '.join(PARTS)}")
+
+    @override
+    def equations(self) -> tuple[Factorization, Factorization]:
+        """The generative model and the guide."""
+        p, q = self.generative, self.inference
+        if self.guide_past:
+            q = q.replace("q(z_t | ", "q(z_t | z_{<t}, ")
+        if not self.static:
+            p, q = (text.replace(", w)", ")") for text in (p.replace("p(w) ", ""), q.replace("q(w | x_{1:T}) ", "")))
+        return Factorization.parse(p), Factorization.parse(q)
+
+    @override
+    def sizes(self) -> dict[str, int]:
+        """Sizes of w and z."""
+        return {**({"w": self.static} if self.static else {}), **super().sizes()}
+
+    @override
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        """The paper's networks, or LSTMs; `build` shares the features of poses."""
+        poses = {"x": NodeGraph(self.pose_width, coordinates=3)} if self.pose_width else {}
+        decoder = self.decoder or PRESETS[""]["decoder"]
+        shape: dict[str, Any] = {"heads": self.heads_count, "layers": self.layers, "extract": poses}
+        found: dict[str, NetworkSpec] = {}
+        if self.attention:
+            found["p(z)"] = Attention(self.width, nearest=self.nearest, **shape)
+            found["p(x)"] = Attention(decoder, nearest=self.nearest, **shape)
+            found["q(z)"] = SelfAttention(self.width, nearest=self.nearest, **shape)
+        else:
+            found["p(z)"] = found["q(z)"] = Recurrent(self.width, layers=self.layers, extract=poses)
+            found["p(x)"] = Recurrent(decoder, layers=self.layers, hidden=(decoder,), extract=poses)
+        if self.static:
+            pooled = Attention(self.width, **shape)
+            graph = FrameGraph(self.frames or FRAMES, extract=poses)
+            found["q(w)"] = graph if self.summary == "graph" else pooled
+        return found
+
+    @override
+    def build(self, data: Any) -> DynamicalVAE:
+        """The model; without a skeleton there are no energies, and x are numbers, not poses (`pose_width`).
+
+        Raises:
+            ValueError: windows with a root, of which there are energies or headings.
+        """
+        schema = Schema.of(data)
+        method, observed = self, self.frames or FRAMES
+        if self.bones or isinstance(schema, Poses):
+            schema = Poses.of(schema, self.name)
+            method, observed = self.suited(schema), schema.protocol.observed
+        described = method.described(schema.sizes)
+        if isinstance(schema, Poses) and (method.loss == "best-of-many" or method.heading):
+            self.poses(schema)
+            if method.loss == "best-of-many":
+                fitted = replace(described["laws"]["p(x)"], fitted="scale")
+                described["laws"]["p(x)"] = Directions(residual=method.residual) if method.bones else fitted
+            model: DynamicalVAE = HiTModel(method, schema.skeleton, observed, **described)
+        else:
+            model = method.suited_to(schema, extended=True)
+        if method.pose_width:
+            for side in (model.generator, model.encoder):
+                share("x", *(conditional.network for conditional in side.values() if conditional.network is not None))
+        if self.standardise and not schema.units:
+            model.standardise(WHOLE)
+        kept = 0 if self.feed_observed else observed
+        model.feeding = SelfFeeding(0.0, self.feeding_passes or None, self.feeding_gradient, kept)
+        return model
+
+    @override
+    def suited(self, data: Any) -> HiTDVAE:
+        """With loss="evidence" windows are turned only if asked for: their bounds are of no other model."""
+        schema = Poses.of(data, self.name)
+        suited = replace(self, frames=self.frames or schema.protocol.observed)
+        if self.loss == "evidence":
+            preset = self.preset(schema.skeleton)
+            open_ = {name: preset[name] for name in ("decoder", "pose_width") if getattr(self, name) is None}
+            return replace(suited, heading=bool(self.heading), **open_)
+        return super(HiTDVAE, suited).suited(schema)
+
+    @override
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
+        """One stage of the paper's objective, or of the evidence, with warm-up and self-feeding over its shares."""
+        method = self.suited(train) if self.loss == "best-of-many" else self
+        if self.warm_up is None:
+            method = replace(method, warm_up=round(0.04 * steps))
+        stages = [Stage(steps, method.objective())]
+        return Recipe(
+            method.scored(train), validation, stages, self._feeding(steps), partial(method.start, windows=train)
+        )
+
+    @override
+    def _feeding(self, steps: int) -> Schedule | float:
+        """Over the paper's shares of the run."""
+        if not self.self_feeding:
+            return 0.0
+        return Ramp(0.0, self.self_feeding, steps=max(round(0.16 * steps), 1), delay=round(0.04 * steps))
+
+    @override
+    def start(self, model: Any, windows: Any) -> None:
+        """With the units of the poses, where a learned scale of x starts."""
+        start_priors(model, windows)
+        if isinstance(model, EnergyModel):
+            super().start(model, windows)
+        if self.standardise and not model.units[WHOLE].scale.dim():  # those of columns are known
+            fit_units(model, windows)
+            if self.emission in (None, "fixed") and not self.bones:
+                nn.init.zeros_(model.generator[WHOLE].law.log_scale)
+
+    @override
+    def objective(self) -> Objective:
+        """The paper's weighted energies, or the evidence.
+
+        Raises:
+            ValueError: weights that are still open, which the skeleton decides.
+        """
+        if self.loss == "evidence":
+            return super().objective()
+        if self.diversity is None or self.kl_local is None or self.kl_static is None or self.samples is None:
+            raise ValueError(
+                "the weights depend on the skeleton; take those of method.suited(windows), or for data that are no "
+                "poses the plain bound, loss='evidence'"
+            )
+        weights = {"z": self.kl_local, **({"w": self.kl_static} if self.static else {})}
+        ramp = SHAPES[self.warm_up_shape]
+        likeness = {f"diversity_{part}": weight for part, weight in zip(PARTS, self.diversity, strict=True)}
+        energy_weights = {name: getattr(self, name) for name in EnergyMethod.weights if name != "diversity"} | likeness
+        return Evidence(
+            kl_weight={n: ramp(0.0, w, steps=self.warm_up) if self.warm_up else w for n, w in weights.items()},
+            free_bits=self.free_bits,
+            energy_weights={name: weight for name, weight in energy_weights.items() if weight},
+            likelihood_weight=1e-3,  # for the scale alone, whose steps are Adam's at any weight
+            draws={"w" if self.static else "z": self.samples},
+            select="loss",
+        )
+
+
+class HiTModel(EnergyModel):
+    """The model of HiT-DVAE for the poses of a skeleton.
+
+    Asked for several draws of a latent, its program scores the motions that come of them, which are the means of x.
+    Energies are of whole sequences, T times the paper's means, so that `Evidence` weighs them as the paper does.
+    """
+
+    def __init__(self, method: HiTDVAE, skeleton: Skeleton, observed: int, **options: Any):
+        super().__init__(method, skeleton, observed, **options)
+        joints = body_parts(skeleton, PARTS) if method.diversity else {}
+        self.coordinates = {part: [3 * j + axis for j in held for axis in range(3)] for part, held in joints.items()}
+
+    @override
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+        if not draws or WHOLE not in rollout.values:
+            return {}
+        if rollout.lengths is not None:
+            raise ValueError(
+                "the energies are of whole windows; leave 'lengths' out of the batch, or fit with loss='evidence'"
+            )
+        size = rollout.batch // rollout.draws
+        x = rollout.values[WHOLE]
+        made = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size))
+        truth, motions = (self.positions({WHOLE: each}, data)[WHOLE] for each in (self.seen(x[:size], data), made))
+        means = self.realism(motions, truth, motions)
+        method = self.method
+        for part, weight, scale in zip(PARTS, method.diversity, method.diversity_scale, strict=True):
+            if weight:
+                held = motions.index_select(-1, indices(self.coordinates[part], motions))
+                means[f"diversity_{part}"] = energies.pairwise_diversity(held, scale)
+        return self.best(motions, truth, data) | {n: rollout.length * e for n, e in means.items()}

@@ -1,0 +1,329 @@
+"""Mix-and-Match: futures of a moving body whose noise perturbs random indices of the code of its past.
+
+With h the observed poses, x those that follow, and i indices that are drawn once for a batch,
+
+    p(z) p(x_t | x_{<t}, h, z, i)        q(z | x_{1:T}, h, i)
+
+Recurrent networks sum up past and future. The first code, perturbed by z at the drawn indices, is the state from which
+a recurrent decoder goes on from the last observed pose, by quaternions of all joints. Other ways for the noise to
+enter are options, with the same recurrent networks, losses and representation (see `dvae.networks.noise`):
+
+    concatenate   p(z) p(x_t | x_{<t}, h, z)          q(z | x_{1:T}, h)
+    add           p(z) p(x_t | x_{<t}, h, z)          q(z), the prior
+    step          p(z_t) p(x_t | x_{<t}, h, z_t)      q(z_t | x_{<=t}, h)
+
+Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733; for the others see there. What the paper
+leaves open, and there is no public code for motion to tell, is ours: the layers of the blocks and of the code's
+decoder, that this ends in the range of a state, the likelihood's scale in place of a weight of the KL, and how long the
+schedules run. Quaternions are brought to unit length where poses are shown, and fed back as they were made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+from typing_extensions import override
+
+from ...compiled import compiled
+from ...constants import constant
+from ...data.schema import Schema
+from ...data.views import WHOLE, Past, Views
+from ...distributions import FixedNormal, LawSpec
+from ...factorization.notation import Factorization
+from ...inference.training.objectives import Evidence
+from ...inference.training.options import Stage, Training
+from ...inference.training.recipe import Recipe
+from ...inference.training.schedules import Logistic, Ramp
+from ...motion.data.protocols import Poses
+from ...motion.geometry.views import LENGTHS, Rotations
+from ...networks import Input, Network, NetworkSpec
+from ...networks.base import share_modules
+from ...networks.cells import GRU
+from ...networks.noise import AddProjected, Concatenate, MixAndMatch, Noise, Residual, half
+from ...networks.recurrent import gru_cell
+from ...options import Amount, Positive, Share, Size
+from ...program.model import DynamicalVAE
+from ...program.rollout import Rollout, SelfFeeding
+from ..baselines.pose_knows import FutureFilter
+from .futures import HISTORY, LastState
+from .poses import PoseMethod
+
+INDICES = MixAndMatch.indices_name
+EQUATIONS = {
+    "mix": ("p(z) p(x_t | x_{<t}, h, z, i)", "q(z | x_{1:T}, h, i)"),
+    "concatenate": ("p(z) p(x_t | x_{<t}, h, z)", "q(z | x_{1:T}, h)"),
+    "add": ("p(z) p(x_t | x_{<t}, h, z)", "q(z)"),
+    "step": ("p(z_t) p(x_t | x_{<t}, h, z_t)", "q(z_t | x_{<=t}, h)"),
+}
+"""How the noise enters, and the factorization that it has so."""
+
+
+@dataclass(frozen=True)
+class MixAndMatchMotion(PoseMethod):
+    """See the file.
+
+    Args:
+        noise: how it enters: "mix" (Mix-and-Match), "concatenate" (MT-VAE's way), "add" (HP-GAN's), "step"
+            (Pose-Knows').
+        alpha: of "mix": the share of the code that is perturbed. 0 for a deterministic model.
+        width: units of recurrent networks and of the code, L; by default 1024 with Human3.6M's skeleton, as in the
+            paper, and 128 with others.
+        latent: size of z; by default floor((1 - alpha) L) with "mix", as in the paper, and L / 2 with the others.
+        scale: standard deviation of the quaternions' numbers; what it stands for is the weight of the KL.
+        skeleton: weight of the squared error of positions, with the root not turned, beside that of quaternions, each
+            the mean over its numbers.
+        velocity: what is added to the pose before, in place of the pose.
+        curriculum: share of training over which the drawn indices become random, from the first ones on; 0 for
+            random ones all the time.
+        annealing: share of training over which the weight of the KL rises to 1, by a logistic curve.
+        feeding: probability, at the end, that a pose of the past is the model's own mean; it rises from 0 over nine
+            tenths of training. 1 is the paper's.
+    """
+
+    name = "mix-and-match"
+    source = "Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733"
+    generative, inference = EQUATIONS["mix"]  # of the default; `equations` has those of each way
+    representation: ClassVar[str] = "quaternion"
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"human36m": {"width": 1024}, "": {"width": 128}}
+    trainings: ClassVar[Mapping[str, Training]] = {
+        "human36m": Training(100_000, 64, 1e-3),
+        "": Training(1000, 32, 2e-3, 0.5),
+    }
+
+    noise: Literal["mix", "concatenate", "add", "step"] = "mix"
+    alpha: Share = 0.5
+    width: Size | None = None
+    latent: Size | None = None
+    scale: Positive = 0.01
+    skeleton: Amount = 1.0
+    velocity: bool = False
+    curriculum: Share = 0.5
+    annealing: Share = 0.5
+    feeding: Share = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, default in (("alpha", 0.5), ("curriculum", 0.5)):
+            if self.noise != "mix" and (value := getattr(self, name)) != default:
+                raise ValueError(
+                    f"{name} is {value}, but noise that is {self.noise!r} draws no indices; {name} is an option of "
+                    "noise='mix'"
+                )
+
+    @override
+    def equations(self) -> tuple[Factorization, Factorization]:
+        generative, inference = map(Factorization.parse, EQUATIONS[self.noise])
+        return generative, inference
+
+    def entering(self) -> Noise | None:
+        """How the noise enters the code; None where each step has its own."""
+        ways: dict[str, Noise] = {"mix": MixAndMatch(self.alpha), "concatenate": Concatenate(), "add": AddProjected()}
+        return ways.get(self.noise)
+
+    @override
+    def sizes(self) -> dict[str, int]:
+        width, way = self.width or 0, self.entering()
+        latent = self.latent or (half(width) if way is None else way.latent(width))
+        return {"z": latent, **({INDICES: width} if self.noise == "mix" else {})}
+
+    @override
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        way, width = self.entering(), self.width or 0
+        guide = {} if self.noise == "add" else {"q(z)": FutureEncoder(width, way)}
+        return {**guide, "p(x)": FutureDecoder(width, way, self.velocity)}
+
+    @override
+    def laws(self) -> Mapping[str, LawSpec]:
+        return {"p(x)": FixedNormal(self.scale, project=False, error_weight=True)}
+
+    @override
+    def build(self, data: Any) -> DynamicalVAE:
+        """The model for windows whose representation is quaternions.
+
+        Of sizes alone it is one whose batches hold h, two frames of the size of x, beside x.
+
+        Raises:
+            SchemaError: windows with another representation.
+        """
+        schema = Schema.of(data)
+        if not isinstance(schema, Poses):
+            return self.filled(self.presets[""])._built(DynamicalVAE, schema.size(WHOLE), 2)
+        schema, method = Poses.of(schema, self.name, self.representation), self.suited(schema)
+        return method._built(MixAndMatchModel, schema.size(WHOLE), schema.protocol.observed, method, schema)
+
+    def _built(self, kind: Any, size: int, frames: int, *arguments: Any) -> Any:
+        described = self.described({WHOLE: size, HISTORY: frames * size})
+        shared = {INDICES: MixAndMatch(self.alpha).indices} if self.noise == "mix" else {}
+        described |= {"inference": None} if self.noise == "add" else {}
+        model = kind(*arguments, **described, shared=shared)
+        if self.noise != "add":
+            share_modules([model.encoder["z"].network, model.generator[WHOLE].network], "past")
+        model.feeding = SelfFeeding(0.0)
+        return model
+
+    @override
+    def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
+        """Minimises squared errors of quaternions and positions and the annealed KL, by the model's own poses."""
+        size = Schema.of(train).size(WHOLE)
+        objective = Evidence(
+            kl_weight=Logistic(0.0, 1.0, steps=max(int(self.annealing * steps), 1)) if self.annealing else 1.0,
+            energy_weights={"skeleton": self.skeleton * size / (2 * self.scale**2)} if self.skeleton else {},
+            select="loss",
+        )
+        gradual = self.noise == "mix" and self.curriculum
+        swaps = Ramp(0.0, 1.0, steps=max(int(self.curriculum * steps), 1)) if gradual else None
+        feeding = Ramp(0.0, self.feeding, steps=max(9 * steps // 10, 1)) if self.feeding else 0.0
+        return Recipe(train, validation, [Stage(steps, objective, curriculum=swaps)], feeding)
+
+
+class MixAndMatchModel(DynamicalVAE):
+    """A model of quaternions that learns from positions too.
+
+    Args:
+        method: with no option left open.
+        schema: of the windows.
+        **options: of `DynamicalVAE`.
+    """
+
+    def __init__(self, method: MixAndMatchMotion, schema: Poses, **options: Any) -> None:
+        assert isinstance(schema.view, Rotations)
+        super().__init__(view=Views(schema.view, Past(HISTORY, schema.protocol.observed)), **options)
+        self.method, self.turns = method, schema.view
+
+    @override
+    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+        """The squared error of positions, mean over their numbers, where there is a future to compare with."""
+        if not self.method.skeleton or WHOLE not in data or LENGTHS not in data:
+            return {}
+        value = rollout.values[WHOLE]
+        made = rollout.parameters(WHOLE, value)[0]
+        with torch.no_grad():
+            theirs = _aligned(value, data[LENGTHS], self.turns)
+        ours = _aligned(made, data[LENGTHS], self.turns)
+        return {"skeleton": (ours - theirs).square().mean(-1).sum(-1)}
+
+
+@compiled
+def _aligned(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
+    """Positions (B, T, 3 J') of poses (B, T, D) whose root is at the origin and not turned."""
+    place, start = view.turning.index(view.skeleton.root), 3 * view.root
+    unturned = constant((1.0, 0.0, 0.0, 0.0), quaternions).expand(*quaternions.shape[:-1], 4)
+    first = torch.zeros_like(quaternions[..., :start])
+    turns = quaternions[..., start:].unflatten(-1, (-1, 4))
+    turns = torch.cat([turns[..., :place, :], unturned[..., None, :], turns[..., place + 1 :, :]], -2)
+    found: Tensor = view.inverse({WHOLE: torch.cat([first, turns.flatten(-2)], -1), LENGTHS: lengths})[WHOLE]
+    return found
+
+
+@dataclass(frozen=True)
+class FutureEncoder:
+    """Features of z from the codes of past and future; of z_t, states of a network that goes on from the past.
+
+    Args:
+        width: units, L.
+        noise: how the noise enters; None where each step has its own.
+    """
+
+    width: int
+    noise: Noise | None
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
+        """The network of a factor with these parents."""
+        return FutureFilter(self.width).build(inputs, local, size) if local else FutureEncoderNetwork(self, inputs)
+
+
+class FutureEncoderNetwork(Network):
+    """What `FutureEncoder` describes, of one latent for all steps."""
+
+    def __init__(self, spec: FutureEncoder, inputs: Sequence[Input]) -> None:
+        super().__init__(inputs, False, spec.width)
+        size = next(parent.size for parent in inputs if parent.name == WHOLE)
+        self.past = LastState(size, spec.width)
+        self.future = LastState(size, spec.width)
+        assert spec.noise is not None
+        self.noise: Any = spec.noise.encoder(spec.width)
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        future = self.future(parents[WHOLE], lengths)
+        features: Tensor = self.noise(self.past(parents[HISTORY]), future, parents.get(INDICES))
+        return features
+
+
+@dataclass(frozen=True)
+class FutureDecoder:
+    """Poses after the past, from states of a recurrent network that reads the pose before.
+
+    Args:
+        width: units, L.
+        noise: how the noise enters the first state; None where each step has its own, which joins behind the state.
+        velocity: add what is made to the pose before.
+    """
+
+    width: int
+    noise: Noise | None
+    velocity: bool
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureDecoderNetwork:
+        """The network of a factor with these parents."""
+        return FutureDecoderNetwork(self, inputs, size)
+
+
+class FutureDecoderNetwork(Network):
+    """What `FutureDecoder` describes."""
+
+    def __init__(self, spec: FutureDecoder, inputs: Sequence[Input], size: int) -> None:
+        super().__init__(inputs, True, size)
+        latent = next(parent.size for parent in inputs if parent.name == "z")
+        self.velocity = spec.velocity
+        self.past = LastState(size, spec.width)
+        self.noise = None if spec.noise is None else spec.noise.decoder(spec.width, latent)
+        self.cell: Any = GRU(size, spec.width, batch_first=True)
+        self.join = Residual(spec.width + latent, spec.width) if spec.noise is None else None
+        self.out = nn.Linear(spec.width, size)
+
+    @override
+    def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
+        before = torch.cat([self._last(parents)[:, None], parents[WHOLE][:, : length - 1]], 1)
+        states = self.cell(before, self.code(parents)[None].contiguous())[0]
+        return self._pose(states, parents["z"], before)
+
+    @property
+    def entrance(self) -> nn.Module:
+        """Of which the noise becomes (B, L): the first state, or the features of each step that poses are made of."""
+        found: Any = self.noise if self.join is None else self.join
+        return found
+
+    def code(self, parents: Mapping[str, Tensor]) -> Tensor:
+        """The first state (B, L)."""
+        code = self.past(parents[HISTORY])
+        if self.noise is None:
+            return code
+        entered: Tensor = self.noise(code, parents["z"], parents.get(INDICES))
+        return entered
+
+    def _last(self, parents: Mapping[str, Tensor]) -> Tensor:
+        """The last pose of the past (B, D)."""
+        return parents[HISTORY][:, -self.features :]
+
+    def _pose(self, state: Tensor, z: Tensor, before: Tensor) -> Tensor:
+        if self.join is not None:
+            state = self.join(torch.cat([state, z], -1))
+        made: Tensor = self.out(state)
+        return made + before if self.velocity else made
+
+    @override
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        return self.code(given), given["z"], given.get(WHOLE), self._last(given)
+
+    @override
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        hidden, z, given, first = state
+        before = first if t == 0 else drawn[WHOLE][t - 1] if given is None else given[:, t - 1]
+        gates = torch.nn.functional.linear(before, self.cell.weight_ih_l0, self.cell.bias_ih_l0)
+        hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
+        return self._pose(hidden, z if z.dim() == 2 else z[:, t], before), (hidden, z, given, first)

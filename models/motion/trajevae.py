@@ -1,0 +1,167 @@
+"""TrajeVAE: motion from one pose and any number of joint trajectories, all at once, by its cosine coefficients.
+
+    p(z_k | y_{1:T}, s) p(x_t | z_{1:T}, s)        q(z_k | r_{1:T}, s)
+
+k counts coefficients of the cosine transform, t frames; z has as many of the one as x has of the other, so that here
+both are steps. The prior is learned: a transformer of the given trajectories y and the first pose s. The guide reads
+what the trajectories leave out, r. The mean of x is s plus offsets, summed up over time. Minimised is
+
+    sum_t |x_t - mean_t|^2 + .01 KL(q | p)
+
+Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, with the layers of its public implementation: prior and guide
+share the perceptrons of poses and two of three transformers, and the decoder the perceptron of s. Ours: scales of z are
+softplus where that has log-variances; and without the learned prior, of which the paper says little, the decoder reads
+the trajectories beside z, in time and as they are. Off the paper's data, options left open stand for small networks,
+few coefficients, a cheaper z and windows turned to one heading (docs/results/trajevae.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from math import sqrt
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from ...distributions.base import Law, LawSpec, Parameters, Shape
+from ...distributions.families import FixedNormal, Normal, NormalLaw
+from ...factorization.notation import Factorization
+from ...motion import Skeleton
+from ...networks import CosineDecoder, CosineEncoder, NetworkSpec
+from ...networks.base import share_modules
+from ...options import Extra, Layers, Range, Size
+from .poses import table
+from .trajectories import LatentTrajectoryMethod
+
+PRESETS = table(
+    "latent beta components width feedforward layers dropout heading",
+    {"human36m": (512, 0.01, 0, 256, 512, 2, 0.1, False), "": (32, 0.001, 15, 32, 128, 1, 0.0, True)},
+)
+"""Skeleton to options: the paper's; and for others what learns in minutes on a processor."""
+
+
+@dataclass(frozen=True)
+class TrajeVAE(LatentTrajectoryMethod):
+    """See the file. Options that are None are chosen by the skeleton.
+
+    Args:
+        latent: size of z, for each coefficient.
+        components: coefficients of z, the slow ones; 0 for as many as there are frames.
+        width: features of a pose; the transformers have twice as many.
+        feedforward: hidden units in their layers.
+        heads_count: of their attention.
+        layers: of each transformer.
+        dropout: share of units left out in training.
+        learned_prior: False for p(z) = N(0, I); the decoder then reads y.
+        cosine: False to leave out the cosine transform, so that z has one value for each frame.
+    """
+
+    name = "trajevae"
+    source = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
+    generative = "p(z_t | y_{1:T}, s) p(x_t | z_{1:T}, s)"
+    inference = "q(z_t | r_{1:T}, s)"
+
+    presets = PRESETS
+
+    components: Extra | None = None
+    width: Size | None = None
+    feedforward: Size | None = None
+    heads_count: Size = 4
+    layers: Layers | None = None
+    dropout: Annotated[float, Range(0, 1, below=True)] | None = None
+    learned_prior: bool = True
+    cosine: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.width is not None and 2 * self.width % self.heads_count:
+            raise ValueError(
+                f"{self.heads_count} heads do not divide the transformers' {2 * self.width} features; take a width "
+                "whose double they divide"
+            )
+        if self.components and not self.cosine:
+            raise ValueError("components are of the cosine transform; leave them at 0 without it")
+
+    @override
+    def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
+        """Without the cosine transform there are no coefficients."""
+        return {**super().preset(skeleton), **({} if self.cosine else {"components": 0})}
+
+    @override
+    def equations(self) -> tuple[Factorization, Factorization]:
+        p = self.generative
+        if not self.learned_prior:
+            p = "p(z_t) p(x_t | z_{1:T}, y_{1:T}, s)"
+        masks = {}
+        if self.components:
+            p = p.replace("z_{1:T}", "z_{1:C}")
+            masks = {"1:C": partial(_slow, components=self.components)}
+        return Factorization.parse(p, masks), Factorization.parse(self.inference)
+
+    @override
+    def networks(self) -> Mapping[str, NetworkSpec]:
+        """The transformers; the model has them share what they share."""
+        shared = ("width", "feedforward", "layers", "dropout", "cosine", "components")
+        shape: dict[str, Any] = {"heads": self.heads_count, **{name: getattr(self, name) for name in shared}}
+        encoder = CosineEncoder(**shape)
+        found: dict[str, NetworkSpec] = {"q(z)": encoder}
+        if self.learned_prior:
+            found["p(z)"] = encoder
+        return {**found, "p(x)": CosineDecoder(hidden=2 * shape["width"], **shape)}
+
+    @override
+    def laws(self) -> Mapping[str, LawSpec]:
+        """The decoder makes poses; normal latents, of which those beyond `components` are noise that nothing reads."""
+        latent: LawSpec = SlowNormal(steps=self.components) if self.components else Normal()
+        emission = FixedNormal(scale=sqrt(0.5), project=False, error_weight=True)
+        return {"p(x)": emission, "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
+
+    @override
+    def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
+        model = super()._built(kind, size, *arguments)
+        guide, decoder = model.encoder["z"].network, model.generator["x"].network
+        share_modules([guide, decoder], "static")
+        if self.learned_prior:
+            share_modules([guide, model.generator["z"].network], "over_time", "static", "before", "between")
+        return model
+
+
+def _slow(length: int, components: int) -> np.ndarray:
+    """Which coefficients each frame reads: the first ones."""
+    return np.arange(length)[None] < components
+
+
+@dataclass(frozen=True)
+class SlowNormal(Normal):
+    """A `Normal` of the first so many steps of a local variable; later ones are N(0, I), whatever the features.
+
+    Args:
+        steps: how many.
+    """
+
+    steps: int = 0
+
+    @override
+    def build(self, shape: Shape) -> Law:
+        return SlowNormalLaw(self, shape)
+
+
+class SlowNormalLaw(NormalLaw):
+    """What `SlowNormal` describes."""
+
+    def __init__(self, spec: SlowNormal, shape: Shape):
+        super().__init__(spec, shape)
+        self.steps = spec.steps
+
+    @override
+    def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
+        loc, scale = super().forward(features, previous, t)
+        if t is not None:
+            return (loc, scale) if t < self.steps else (torch.zeros_like(loc), torch.ones_like(scale))
+        late = torch.arange(loc.shape[1], device=loc.device)[:, None] >= self.steps
+        return loc.masked_fill(late, 0.0), scale.masked_fill(late, 1.0)

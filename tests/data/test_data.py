@@ -1,0 +1,198 @@
+"""Data by their protocols: asking what something is costs nothing, however large it is."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from typing_extensions import get_protocol_members
+
+import dvae
+from dvae.data.sequences import (
+    BESIDE,
+    ArrayWindows,
+    Fingerprinted,
+    HeldOutWindows,
+    InBatches,
+    Listed,
+    Source,
+    leaves,
+    past_of,
+    sequences,
+)
+from dvae.inference.training.objectives import Asking
+from dvae.program.protocols import Forecasting, Program
+from dvae.tables import Panel
+
+
+@pytest.mark.parametrize(
+    "protocol", [Source, Listed, InBatches, Fingerprinted, HeldOutWindows, Program, Forecasting, Asking]
+)
+def test_asking_what_something_is_reads_nothing_of_it(protocol):
+    read = []
+    members = {name: property(lambda _, name=name: read.append(name)) for name in get_protocol_members(protocol)}
+    assert isinstance(type("Whole", (), members)(), protocol)
+    members.popitem()
+    assert not isinstance(type("Part", (), members)(), protocol)
+    assert not read, f"a fingerprint would be computed by this check: {read}"
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_past_holds_no_frame_of_the_future_but_of_context(named):
+    x, mask, context = torch.randn(2, 7, 3), torch.rand(2, 7, 3) < 0.5, torch.randn(2, 7, 1)
+    batch = {"x": x, "mask": {"x": mask} if named else mask, BESIDE: {"turns": x}, "y": context, "w": torch.randn(2, 4)}
+    found, whole = leaves(past_of(batch, 5)), leaves(batch)
+    assert found.keys() == whole.keys()
+    for name, value in found.items():
+        assert torch.equal(value, whole[name] if name in ("y", "w") else whole[name][:, :5])
+
+
+# What functions accept as data
+
+X = torch.randn(20, 6, 3, generator=torch.Generator().manual_seed(0))
+FRAME = pd.DataFrame(X.flatten(0, 1).numpy(), columns=["a", "b", "c"])
+FRAME.insert(0, "step", list(range(6)) * 20)
+FRAME.insert(0, "unit", np.repeat([f"u{n}" for n in range(20)], 6))
+QUIET = {"progress": False}
+METHOD = dvae.method("vae", latent=2, warm_up=0)
+
+
+@pytest.fixture(scope="module")
+def model():
+    with torch.random.fork_rng():
+        return dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3})
+
+
+@pytest.fixture(scope="module")
+def panel():
+    return dvae.tables.PanelData.of(FRAME, dvae.tables.Told(id=("unit",), time="step"), dvae.tables.Cut(4, 2))
+
+
+def fitted(model, data, **options):
+    return dvae.fit(model, data, steps=1, **options, **QUIET)
+
+
+def fitted_by_method(model, data, **options):
+    return METHOD.fit(data, steps=1, **options, **QUIET)
+
+
+ENTRIES = {
+    "fit": fitted,
+    "validation": lambda model, data: fitted(model, X, validation=data),
+    "a step": lambda model, data: (svi := dvae.SVI(model, steps=1), svi.init(), svi.step(data)),
+    "a method's fit": fitted_by_method,
+    "a method's model": lambda _, data: METHOD.build(data),
+    "evaluate": lambda model, data: dvae.evaluate(model, data, samples=2, **QUIET),
+    "compare": lambda model, data: dvae.compare({"a": model}, data, particles=2, contrasts=0, **QUIET),
+    "checks": lambda model, data: dvae.predictive_checks(model, data, **QUIET),
+    "conformal": lambda model, data: dvae.conformal(model, data, level=0.5, samples=3, **QUIET),
+    "forecast": lambda model, data: model.forecast(data, 2),
+    "impute": lambda model, data: model.impute(data),
+    "bound": dvae.importance_bound,
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "table"),
+    [*((name, FRAME) for name in ENTRIES), ("fit", FRAME["a"]), ("fit", FRAME.set_index(["unit", "step"]).to_xarray())],
+)
+def test_a_table_without_roles_is_refused_with_the_call_that_gives_them(model, name, table):
+    with pytest.raises(TypeError, match=r"got (pandas|xarray)\..*PanelData\.of\(frame, dvae.tables.Told\(id="):
+        ENTRIES[name](model, table)
+
+
+@pytest.mark.parametrize("name", ["fit", "validation", "a method's fit", "evaluate", "compare", "checks", "conformal"])
+def test_data_with_parts_stand_for_the_part_that_a_function_is_for(model, panel, name):
+    ENTRIES[name](model, panel)
+
+
+@pytest.mark.parametrize("entry", [fitted, fitted_by_method])
+def test_a_fit_to_data_with_parts_validates_on_their_own(model, panel, entry):
+    assert entry(model, panel).best_step == 1
+    assert entry(model, panel.windows("train")).best_step is None
+    assert entry(model, panel.windows("train"), validation=panel).best_step == 1
+
+
+@pytest.mark.parametrize("data", [X, X.numpy(), {"x": X}, dvae.ArrayWindows(X, observed=4)], ids=type)
+def test_a_method_is_fitted_to_arrays_as_to_their_sizes(data):
+    found = fitted_by_method(None, data, validation=data)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        recipe = METHOD.train(dvae.data.Sequences({"x": X}), {"x": X}, 1)
+        told = recipe.fit(METHOD.build({"x": 3}), decay=0.5, **QUIET)
+    assert found.best_bound == told.best_bound
+
+
+@pytest.mark.parametrize("name", ["evaluate", "checks", "conformal"])
+@pytest.mark.parametrize("data", [X, X.numpy(), {"x": X}], ids=type)
+def test_arrays_do_not_say_which_steps_are_observed(model, name, data):
+    with pytest.raises(TypeError, match=r"got (Tensor|ndarray|dict); of an array x \(N, T, D\).*ArrayWindows\(x, obs"):
+        ENTRIES[name](model, data)
+
+
+def test_reference_rows_know_training_arrays(model):
+    windows = dvae.ArrayWindows(X, observed=4)
+    rows = [
+        dvae.evaluate(model, windows, training_windows=training, references=["mean"], **QUIET).rows["mean"]
+        for training in (X, {"x": X}, windows)
+    ]
+    assert rows[0] == rows[1] == rows[2]
+
+
+@pytest.mark.parametrize("name", ["fit", "validation", "a step", "a method's fit", "compare", "forecast", "bound"])
+def test_tensors_without_values_are_refused(model, name):
+    with pytest.raises(ValueError, match=r"got a tensor \(20, 6, 3\) on the meta device, which has no values"):
+        ENTRIES[name](model, X.to("meta"))
+    if name not in ("a method's fit", "compare"):
+        with pytest.raises(ValueError, match="on the meta device"):
+            ENTRIES[name](dvae.DynamicalVAE("p(z) p(x_t | z)", "q(z | x_{1:T})", {"z": 2, "x": 3}).to("meta"), X)
+
+
+@pytest.mark.parametrize("name", ["fit", "validation", "a step", "a method's fit", "compare", "forecast", "bound"])
+def test_sparse_tensors_are_refused(model, name):
+    with pytest.raises(TypeError, match=r"layout torch\.sparse_coo; .* x\.to_dense\(\)"):
+        ENTRIES[name](model, X.to_sparse())
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.uint32, np.uint64])
+def test_unsigned_integers_are_read_as_numbers(model, kind):
+    x = np.arange(24, dtype=kind).reshape(2, 4, 3)
+    read = model.read({"x": x})["x"]
+    assert read.dtype is torch.float32
+    np.testing.assert_array_equal(read, x)
+    for given in (x, torch.from_numpy(x)):
+        dvae.data.units.Units(3).fit(given)
+
+
+def test_masks_of_arrays_are_masks_of_batches():
+    x = np.ma.masked_values(np.arange(12.0).reshape(2, 3, 2) - 999 * (np.arange(12) == 5).reshape(2, 3, 2), -994)
+    windows, (one, other) = ArrayWindows(x, observed=2), Panel.of(x)
+    for batch in (sequences(x).batch, sequences({"x": x}).batch, windows.all()):
+        np.testing.assert_array_equal(batch["mask"], ~x.mask)
+        np.testing.assert_array_equal(batch["x"], x.filled(0))
+    assert windows.fingerprint == ArrayWindows(x.filled(0), observed=2, mask=~x.mask).fingerprint
+    np.testing.assert_array_equal([one.values, other.values], x.filled(np.nan))
+    assert "mask" not in sequences(np.ma.array(x.filled(0))).batch
+    with pytest.raises(TypeError, match="an array is masked; give"):
+        sequences({"x": x.filled(0), "y": x})
+
+
+@pytest.mark.parametrize(
+    ("x", "said"),
+    [
+        (np.ones((2, 3, 1), complex), "is complex128; expected real numbers: stack the real and the imaginary part"),
+        (torch.ones((2, 3, 1), dtype=torch.complex64), "is torch.complex64; expected real numbers"),
+        (np.zeros((2, 3, 1), [("a", float), ("b", int)]), r"has the fields a, b; .* pandas.DataFrame\(x\)"),
+    ],
+    ids=["complex", "tensor", "records"],
+)
+def test_what_no_model_reads_is_refused(x, said):
+    model = dvae.method("autoregressive", width=2).build({"x": 1})
+    for read in (
+        sequences,
+        Panel.of,
+        lambda x: Panel.of([*x]),
+        lambda x: ArrayWindows(x, 1),
+        lambda x: model.model({"x": x}),
+    ):
+        with pytest.raises(TypeError, match=said):
+            read(x)

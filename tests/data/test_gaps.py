@@ -1,0 +1,69 @@
+"""Gaps as covariates: the time since the step before, and since an entry was last observed."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dvae.data.sequences import gaps, since_observed
+
+
+@given(st.integers(1, 3), st.integers(1, 6), st.integers(0, 100))
+def test_gaps_add_up_to_the_time_since_the_start(batch, steps, seed):
+    generator = torch.Generator().manual_seed(seed)
+    times = torch.rand(batch, steps, generator=generator, dtype=torch.float64).add(0.01).cumsum(1) + 1e6
+    lengths = torch.randint(1, steps + 1, (batch,), generator=generator)
+    found = gaps(times, lengths)
+    assert found.shape == (batch, steps, 1)
+    assert found.dtype == times.dtype
+    for row, n in enumerate(lengths.tolist()):
+        torch.testing.assert_close(found[row, :n, 0].cumsum(0), times[row, :n] - times[row, 0])
+        assert not found[row, n:].any()
+        assert (found[row, 1:n] > 0).all()
+
+
+def test_whole_numbers_and_arrays_are_times():
+    assert gaps(np.array([[1950, 1953, 1954]])).dtype == torch.get_default_dtype()
+    assert gaps(np.array([[1950, 1953, 1954]])).flatten().tolist() == [0, 3, 1]
+    assert gaps(torch.tensor([[7]])).tolist() == [[[0]]]
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([[0.0, 1, 2], [0, 2, 2]], "times of sequence 1 are 2, 2 at steps 1 to 2, counted from 0; .* make one step of"),
+        ([[0.0, 1, 0.5]], "times of sequence 0 are 1, 0.5 at steps 1 to 2"),
+        ([[0.0, float("nan"), 2]], "times of sequence 0 are 0, nan at steps 0 to 1"),
+        ([[float("nan"), 1.0]], "times of sequence 0 are nan at steps 0 to 0"),
+        ([0.0, 1.0], r"times are \(sequences, steps\), but these have shape \(2,\)"),
+    ],
+)
+def test_times_that_do_not_rise_are_refused(times, message):
+    with pytest.raises(ValueError, match=message):
+        gaps(torch.tensor(times))
+
+
+def test_times_of_padding_may_be_anything():
+    times = torch.tensor([[0.0, 1.0, float("nan")], [0.0, 5.0, 1.0]])
+    assert gaps(times, torch.tensor([2, 2]))[..., 0].tolist() == [[0, 1, 0], [0, 5, 0]]
+
+
+@given(st.integers(1, 3), st.integers(1, 8), st.integers(1, 3), st.integers(0, 100))
+def test_the_time_since_observed_is_that_of_the_recursion(batch, steps, size, seed):
+    """delta_1 = 0; delta_t = d_t where the entry was observed at t - 1, else d_t + delta_{t-1} (Che et al., 2018)."""
+    generator = torch.Generator().manual_seed(seed)
+    mask = torch.rand(batch, steps, size, generator=generator) < 0.5
+    d = torch.rand(batch, steps, 1, generator=generator, dtype=torch.float64)
+    expected = [torch.zeros(batch, size, dtype=torch.float64)]
+    for t in range(1, steps):
+        expected.append(d[:, t] + torch.where(mask[:, t - 1], 0.0, expected[-1]))
+    torch.testing.assert_close(since_observed(mask, d), torch.stack(expected, 1))
+    ones = torch.ones(batch, steps, 1)
+    torch.testing.assert_close(since_observed(mask), since_observed(mask, ones))
+
+
+def test_a_short_gap_late_in_a_sequence_is_not_lost():
+    d = torch.full((1, 4, 1), 1e-3)
+    d[0, 1] = 1e6
+    assert since_observed(torch.ones(1, 4, 1, dtype=torch.bool), d)[0, 3].item() == pytest.approx(1e-3, rel=1e-6)

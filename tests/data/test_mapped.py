@@ -1,0 +1,516 @@
+"""Arrays that stay on the disk are what they are in memory, take none of it, and are believed in nothing."""
+
+import errno
+import hashlib
+import os
+import tracemalloc
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import dvae
+from benchmarks.speed import Held
+from dvae import motion
+from dvae.cli import main
+from dvae.cli.tables import is_table
+from dvae.data import npy
+from dvae.data.blocks import ColumnSummary, blocks, cut, hash_list, hash_values, row_blocks
+from dvae.data.npy import is_mapped, mapped
+from dvae.data.sequences import Sequences, leaves, sequences
+from dvae.data.units import Units
+from dvae.tables import Column, Columns, Cut, Panel, PanelData, Series
+
+CUT = Cut(6, 4, split="time")
+GENERATIVE, INFERENCE = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)"
+
+
+def walks(shape=(300, 3), dtype=np.float32, gaps=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    found = (20 * rng.normal(size=shape)).astype(dtype)
+    if gaps:
+        found[rng.random(shape) < gaps] = np.nan
+    return found
+
+
+def saved(path, values):
+    np.save(path, values)
+    return path
+
+
+def assert_same(found, wanted):
+    found, wanted = leaves(found), leaves(wanted)
+    assert found.keys() == wanted.keys()
+    for name, value in found.items():
+        assert value.dtype == wanted[name].dtype
+        assert torch.equal(value, wanted[name]), name
+
+
+def assert_windows_are_the_same(found, wanted):
+    """Drawn, listed and gone through, bit for bit; and records say so."""
+    assert found.keys == wanted.keys
+    assert found.fingerprint == wanted.fingerprint
+    assert_same(found.all(), wanted.all())
+    for size in (1, 7):
+        assert_same(*(each.sample(size, torch.Generator().manual_seed(size)) for each in (found, wanted)))
+    for one, other in zip(found.batches(4), Sequences(wanted.all()).batches(4), strict=True):
+        assert_same(one, other)
+
+
+# What is read -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("split", ["train", "validation", "test", "train+validation", "all"])
+@pytest.mark.parametrize("dtype", ["<f4", "<f8", ">f4", "<f2", "<i2"])
+def test_windows_of_a_mapped_table_are_those_of_memory(tmp_path, dtype, split):
+    values = walks(dtype=dtype)
+    found, wanted = PanelData.open(saved(tmp_path / "walks.npy", values), cut=CUT), PanelData.of(values, cut=CUT)
+    (one,) = found.panel
+    assert is_mapped(one.values)
+    assert one.values.dtype == values.dtype
+    wanted = replace(wanted, panel=replace(wanted.panel, series=[replace(wanted.panel.series[0], name="walks")]))
+    assert found.fingerprint == wanted.fingerprint
+    assert found.schema == wanted.schema
+    assert_windows_are_the_same(found.windows(split), wanted.windows(split))
+
+
+@pytest.mark.parametrize("families", [("real",) * 3, ("correlated",) * 3, ("category", "positive", "real")], ids=str)
+def test_what_a_mapped_table_lacks_is_what_it_lacks_in_memory(tmp_path, families):
+    values = walks((4, 80, 3), gaps=0.1)
+    values[0, 70:] = np.nan
+    values[..., 0] = np.where(families[0] == "category", np.abs(values[..., 0]) % 4 // 1, values[..., 0])
+    values[..., 1] = np.abs(values[..., 1]) if families[1] == "positive" else values[..., 1]
+    classes = {"category": ("a", "b", "c", "d")}
+    told = Columns(tuple(Column(name, "target", f, "", classes.get(f, ())) for name, f in zip("xyz", families)))
+    found = PanelData.of(np.load(saved(tmp_path / "walks.npy", values), mmap_mode="r"), told, CUT)
+    wanted = PanelData.of(values, told, CUT)
+    assert all(is_mapped(one.values) for one in found.panel)
+    assert found.schema == wanted.schema
+    assert [found.panel.present(one) for one in found.panel] == [wanted.panel.present(one) for one in wanted.panel]
+    assert found.panel.missing
+    for split in ("train", "test"):
+        assert "mask" in found.windows(split).all()
+        assert_windows_are_the_same(found.windows(split), wanted.windows(split))
+    assert_same(found.whole().all(), wanted.whole().all())
+
+
+@pytest.mark.parametrize("kind", ["positions", "heading", "missing", "given", "turns"])
+def test_windows_of_mapped_motion_are_those_of_memory(tmp_path, monkeypatch, kind):
+    people = motion.simulate(clips=6, frames=85, seed=1)
+    people = motion.occlude(people, share=0.2, length=15) if kind == "missing" else people
+    people = people.with_rotations() if kind == "turns" else people
+    protocol = replace(motion.PROTOCOLS["simulated"], heading=kind == "heading", rotate=kind == "turns")
+    protocol = replace(protocol, representation="6d" if kind == "turns" else "positions")
+    monkeypatch.setattr("dvae.motion.files.archive.MAPPED", 10_000)
+    motion.save(tmp_path / "people.npz", people)
+    read = motion.read_motion(tmp_path / "people.npz", missing=people.missing)
+    assert all(is_mapped(clip.positions) and not clip.positions.flags.writeable for clip in read)
+    assert all(clip.rotations is None or is_mapped(clip.rotations) for clip in read)
+    assert read.fingerprint() == people.fingerprint()
+    assert read.info()
+    for split in ("train", "validation", "test"):
+        found, wanted = (motion.windows(each, protocol, split) for each in (read, people))
+        if kind == "given":
+            found, wanted = found.given(0.5), wanted.given(0.5)
+        assert_windows_are_the_same(found, wanted)
+        if kind == "missing":
+            some = [each.filled(each.positions(each.all()["x"])).fingerprint() for each in (found, wanted)]
+            assert some[0] == some[1]
+    assert torch.equal(found.poses(), wanted.poses())
+    assert all(is_mapped(clip.positions) for clip in read.divided())
+
+
+def test_a_joint_of_mapped_motion_is_missing_as_a_whole(tmp_path, monkeypatch):
+    people = motion.simulate(clips=2, frames=30)
+    people.clips[0].positions[3, 5, 1] = np.nan
+    monkeypatch.setattr("dvae.motion.files.archive.MAPPED", 0)
+    motion.save(tmp_path / "people.npz", people)
+    first, second = motion.read_motion(tmp_path / "people.npz", missing=True)
+    assert np.isnan(first.positions[3, 5]).all()
+    assert not is_mapped(first.positions)
+    assert is_mapped(second.positions)
+
+
+def test_mapped_arrays_are_sequences_like_others(tmp_path):
+    values = walks((9, 5, 2))
+    x = np.load(saved(tmp_path / "x.npy", values), mmap_mode="r")
+    found, wanted = sequences(x), sequences(values)
+    assert_same(*(each.sample(4, torch.Generator().manual_seed(0)) for each in (found, wanted)))
+    assert found.batch["x"].data_ptr() == x.ctypes.data
+    assert dvae.ArrayWindows(x, 3).fingerprint == dvae.ArrayWindows(values, 3).fingerprint
+    assert_same(dvae.ArrayWindows(x, 3).all(), dvae.ArrayWindows(values, 3).all())
+    with pytest.raises(ValueError, match=r"x has shape \(300, 3\).*windows of a long one are dvae.tables.PanelData"):
+        sequences(walks())
+
+
+def test_what_is_not_finite_is_found_in_whichever_block_it_is(monkeypatch):
+    monkeypatch.setattr("dvae.data.blocks.NUMBERS", 20)
+    values = torch.from_numpy(walks((9, 5, 2)))
+    values[4, 2, 1], values[7, 0, 0] = torch.nan, torch.inf
+    with pytest.raises(ValueError, match=r"x has 2 entries that are NaN or infinite, the first in sequence 4;"):
+        Sequences({"x": values})
+    with pytest.raises(ValueError, match=r"x has 1 entries that are NaN or infinite, the first in sequence 7;"):
+        Sequences({"x": values, "lengths": torch.tensor([2] * 9)})
+    Sequences({"x": values, "mask": values.isfinite()})
+    people = motion.simulate(clips=1, frames=30)
+    people.clips[0].positions[7:9, 3] = np.nan
+    with pytest.raises(ValueError, match=r"2 joint positions in 2 of 30 frames, first \w+ at frame 7;"):
+        motion.MotionSet(people, people.skeleton)
+    series = [Series("a", walks((12, 2))), Series("b", walks((10, 2)))]
+    series[1].values[3, 1] = np.inf
+    with pytest.raises(ValueError, match=r"sequence 'b' of panel has inf in row 3 of column 'x1'"):
+        Panel(series, Columns((Column("x0"), Column("x1"))))
+
+
+@pytest.mark.parametrize("given_mask", [False, True])
+def test_a_fit_validates_on_batches_as_on_all_at_once(given_mask):
+    panel = PanelData.of(walks((200, 2), gaps=0.1 if given_mask else 0.0), cut=CUT)
+    train, validation = panel.windows("train"), panel.windows("validation")
+
+    def bound(held_out):
+        torch.manual_seed(0)
+        model = dvae.DynamicalVAE(GENERATIVE, INFERENCE, {"z": 1, "x": 2}, dvae.networks.Dense((4,)))
+        found = dvae.fit(model, train, held_out, steps=2, batch_size=4, validate_every=1, progress=False)
+        return found.series("validation/bound")
+
+    assert bound(validation) == bound(validation.all())
+
+
+# What is made of blocks ---------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=30)
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=6), st.integers(1, 60), st.booleans())
+def test_statistics_of_blocks_are_those_of_all_rows(lengths, numbers, gaps):
+    arrays = [1e4 + walks((n, 3), np.float64, 0.3 * gaps, seed=n) for n in lengths]
+    whole = np.concatenate(arrays)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dvae.data.blocks.NUMBERS", numbers)
+        np.testing.assert_array_equal(np.concatenate(list(row_blocks(arrays))), whole)
+        found = ColumnSummary.of(row_blocks(arrays))
+    np.testing.assert_array_equal(found.count, (~np.isnan(whole)).sum(0))
+    known = found.count > 0
+    if known.any():
+        wanted = {"mean": np.nanmean, "variance": np.nanvar, "least": np.nanmin, "largest": np.nanmax}
+        for name, of in wanted.items():
+            scale = 1e4 if name == "mean" else 400
+            np.testing.assert_allclose(
+                getattr(found, name)[known], of(whole[:, known], 0), rtol=1e-12, atol=1e-12 * scale
+            )
+
+
+def test_units_of_a_mapped_array_are_those_of_a_tensor(tmp_path):
+    values = walks((50, 8, 3), np.float64) + 1e3
+    found = [Units(3).double() for _ in range(2)]
+    found[0].fit(np.load(saved(tmp_path / "x.npy", values), mmap_mode="r"))
+    found[1].fit(torch.from_numpy(values))
+    rows = values.reshape(-1, 3)
+    for units in found:
+        np.testing.assert_allclose(units.mean, rows.mean(0), rtol=1e-12)
+        np.testing.assert_allclose(units.scale, np.sqrt(rows.var(0, ddof=1).mean()), rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [0, 1, 4095, 4096, 4097])
+def test_hashes_are_those_of_the_whole(monkeypatch, count):
+    items = [("train", f"clip {n}", n) for n in range(count)]
+    digest = hashlib.sha256()
+    hash_list(digest, iter(items))
+    assert digest.digest() == hashlib.sha256(repr(items).encode()).digest()
+    monkeypatch.setattr("dvae.data.blocks.NUMBERS", 1000)
+    for values in (walks((count, 3)), walks((3, count)).T):
+        digest = hashlib.sha256()
+        hash_values(digest, values, "<f8")
+        assert digest.digest() == hashlib.sha256(values.astype("<f8").tobytes()).digest()
+
+
+def test_windows_are_cut_where_they_are_asked_for():
+    arrays = [walks((n, 2), seed=n) for n in (9, 6)]
+    which, starts, lengths = torch.tensor([0, 1, 0]), torch.tensor([2, 0, 8]), torch.tensor([4, 6, 1])
+    found = cut(arrays, which, starts, lengths)
+    for window, place, start, length in zip(found, which, starts, lengths, strict=True):
+        rows = arrays[place][[min(start + n, start + length - 1) for n in range(6)]]
+        np.testing.assert_array_equal(window, rows)  # the last row is repeated
+    assert torch.equal(cut(arrays, which[:2], starts[:2], 4), found[:2, :4])
+    assert sum(len(block) for block in blocks(arrays[0])) == 9
+
+
+# Memory -------------------------------------------------------------------------------------------------------------
+
+
+def most(action, path):
+    """Bytes that arrays and tensors take at most while something is done with a file."""
+    tracemalloc.start()
+    try:
+        with Held() as held:
+            action(path)
+        return tracemalloc.get_traced_memory()[1] + held.most
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_fit_takes_no_memory_for_mapped_frames(tmp_path):
+    """In memory, a table of them takes twice what the file has."""
+    few, many = (saved(tmp_path / f"{frames}.npy", walks((frames, 64))) for frames in (2_000, 20_000))
+
+    def fitted(path):
+        data = PanelData.open(path, cut=Cut(25, 100, split="time"))
+        model = dvae.DynamicalVAE(GENERATIVE, INFERENCE, {"z": 1, "x": 64}, dvae.networks.Dense((4,)))
+        model.standardise("x").fit(np.load(path, mmap_mode="r"))
+        windows = data.windows("train"), data.windows("validation")
+        dvae.fit(model, *windows, steps=1, batch_size=8, progress=False, out=path.with_suffix(""))
+
+    fitted(few)  # imports what takes memory, too
+    few.with_suffix("").rename(tmp_path / "first")
+    found = [most(fitted, path) for path in (few, many)]
+    assert found[1] - found[0] < many.stat().st_size / 10
+    assert most(lambda path: PanelData.of(np.load(path), cut=CUT), many) > 2 * many.stat().st_size
+
+
+def test_windows_of_mapped_motion_take_no_memory(tmp_path, monkeypatch):
+    (walk,) = motion.simulate(clips=1, frames=1000)
+    monkeypatch.setattr("dvae.motion.files.archive.MAPPED", 10_000)
+
+    def drawn(path):
+        data = motion.MotionData.open(path)
+        windows = data.windows("train")
+        windows.sample(32, torch.Generator())
+        return windows.fingerprint, data.fingerprint
+
+    found = {}
+    for count in (2, 4, 40):
+        clips = [replace(walk, name=f"walk {n}", split="train", truth={}) for n in range(count)]
+        path = tmp_path / f"{count}.npz"
+        motion.save(path, motion.MotionSet(clips, motion.WALKER, copy=False))
+        found[count] = most(drawn, path)
+    assert found[40] - found[4] < path.stat().st_size / 10
+
+
+# What is not believed -----------------------------------------------------------------------------------------------
+
+
+def npy_of(header, content=b"", version=1):
+    length = 2 if version == 1 else 4
+    return b"\x93NUMPY" + bytes([version, 0]) + len(header).to_bytes(length, "little") + header.encode() + content
+
+
+def described(descr="'<f4'", order="False", shape="(2, 3)"):
+    return f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "no npy file"),
+        (b"PK\x03\x04 an archive", "no npy file"),
+        (npy_of(described(), b"\0" * 24, version=3), "no npy file of version 1 or 2"),
+        (
+            npy_of(described(), b"\0" * 23),
+            r"declares shape .2, 3. of float32, holds 23 bytes, needs 24; it was cut short",
+        ),
+        (npy_of(described(), b"\0" * 25), r"declares shape \(2, 3\) of float32, holds 25 bytes$"),
+        (npy_of(described(shape="(1000000000000, 48)"), b"\0" * 24), "holds 24 bytes"),
+        (npy_of(described(shape="(99999999999999999999, 3)")), "damaged: its shape"),
+        (npy_of(described(shape="(-2, 3)"), b"\0" * 24), "no plain array"),
+        (npy_of(described(shape="(0, 99999999999)")), "declares shape"),
+        (npy_of(described(shape="(0, 3)")), "in which there is no number"),
+        (npy_of(described(shape=f"({'1, ' * 40})"), b"\0" * 4), "declares shape"),
+        (npy_of(described(shape="(__import__('os').abort(), 3)")), "no plain array"),
+        (npy_of(described("'|O'"), b"\0" * 48), "holds object, expected real numbers"),
+        (npy_of(described("'<c8'"), b"\0" * 48), "expected numbers"),
+        (npy_of(described("'<U4'"), b"\0" * 96), "holds <U4, expected real numbers"),
+        (npy_of(described("'|b1'"), b"\0" * 6), "holds bool, expected real numbers"),
+        (npy_of(described("[('x', '<f4')]"), b"\0" * 24), "no plain array"),
+        (npy_of(described("'<f0'")), "expected numbers"),
+        (npy_of(described(order="True"), b"\0" * 24), "Fortran order"),
+        (npy_of(described() + " " * 10_000, b"\0" * 24), "no plain array"),
+        (npy_of("{" * 4000), "no plain array"),
+    ],
+)
+def test_headers_are_not_believed(tmp_path, content, message):
+    path = tmp_path / "hostile.npy"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=rf"hostile\.npy .*{message}"):
+        mapped(path)
+    with pytest.raises(ValueError, match="hostile"):
+        PanelData.open(path)
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 130), st.integers(0, 255), st.integers(0, 20))
+def test_damage_anywhere_gives_one_sentence_or_numbers(tmp_path_factory, place, byte, less):
+    path = tmp_path_factory.mktemp("damage") / "a.npy"
+    content = bytearray(saved(path, walks((7, 3))).read_bytes())
+    content[place] = byte
+    path.write_bytes(content[: len(content) - less])
+    try:
+        found = mapped(path)
+    except ValueError as error:
+        said = str(error)
+    else:
+        assert found.nbytes <= path.stat().st_size
+        said = f"{path}: {found.tobytes()!r}"  # every byte of it is there
+    assert said.startswith(str(path))
+
+
+def test_links_are_followed_where_they_were_typed_alone(tmp_path):
+    inside, outside = tmp_path / "walks", saved(tmp_path / "secret.npy", walks())
+    inside.mkdir()
+    (inside / "a.npy").symlink_to(outside)
+    with pytest.raises(ValueError, match=r"a\.npy is a link, which could lead to any file"):
+        PanelData.open(inside)
+    with pytest.raises(ValueError, match="is a link"):
+        mapped(inside / "a.npy")
+    assert len(PanelData.open(inside / "a.npy").panel.series[0]) == 300
+    os.mkfifo(tmp_path / "pipe.npy")
+    with pytest.raises(ValueError, match="no file but a directory, a FIFO"):
+        PanelData.open(tmp_path / "pipe.npy")
+    with pytest.raises(FileNotFoundError):
+        PanelData.open(tmp_path / "none.npy")
+
+
+def test_nobody_writes_to_a_mapped_file_and_a_replaced_one_stays(tmp_path):
+    found = mapped(saved(tmp_path / "a.npy", walks()))
+    with pytest.raises(ValueError, match="read-only"):
+        found[0] = 1
+    os.replace(saved(tmp_path / "b.npy", walks(seed=1)), tmp_path / "a.npy")
+    np.testing.assert_array_equal(found, walks())
+
+
+def test_other_processes_can_map_the_file_themselves(tmp_path):
+    """As those of joblib do with what has a name, where they would else be sent all of it."""
+    kept = mapped(saved(tmp_path / "a.npy", walks())).base
+    again = np.memmap(kept.filename, kept.dtype, "r", kept.offset, kept.shape)
+    np.testing.assert_array_equal(again, walks())
+
+
+def test_too_many_files_are_said_to_be_too_many(tmp_path, monkeypatch):
+    def none_left(*_):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(npy.np, "memmap", none_left)
+    with pytest.raises(OSError, match=r"no more may be \(ulimit -n\); write fewer, longer ones.*a\.npy"):
+        mapped(saved(tmp_path / "a.npy", walks()))
+
+
+def stored(path, **arrays):
+    np.savez(path, **arrays)
+    motion.WALKER.to_json(path.with_name("skeleton.json"))
+    return path
+
+
+def test_an_archive_that_is_mapped_may_be_larger_than_memory_and_one_that_is_read_may_not(tmp_path, monkeypatch):
+    positions = motion.simulate(clips=1, frames=30).clips[0].positions
+    monkeypatch.setattr("dvae.motion.files.archive.MAPPED", 0)
+    monkeypatch.setattr("dvae.motion.files.archive.LARGEST", 3 * positions.nbytes)
+    monkeypatch.setattr("dvae.motion.files.plain.LARGEST", 3 * positions.nbytes)
+    single = stored(tmp_path / "a.npz", **{f"train/{n}": positions for n in range(5)})
+    assert len(motion.read_motion(single)) == 5
+    with pytest.raises(ValueError, match=r"it has more than [\d,]+ bytes of motion that is not mapped as float32"):
+        motion.read_motion(single, metres=1.0)
+    double = stored(tmp_path / "b.npz", **{f"train/{n}": positions.astype(np.float64) for n in range(5)})
+    with pytest.raises(ValueError, match="it would unpack to"):
+        motion.read_motion(double)
+    np.savez_compressed(tmp_path / "c.npz", **{f"train/{n}": positions for n in range(5)})
+    with pytest.raises(ValueError, match="it would unpack to"):
+        motion.read_motion(tmp_path / "c.npz")
+
+
+@pytest.mark.parametrize("damage", ["place", "signature", "header", "end", "size"])
+def test_a_damaged_archive_is_not_mapped(tmp_path, monkeypatch, damage):
+    """Where a member does not lie where it is said to lie, the ordinary reader says what is wrong."""
+    path = stored(tmp_path / "a.npz", **{"train/walk": motion.simulate(clips=1, frames=30).clips[0].positions})
+    monkeypatch.setattr("dvae.motion.files.archive.MAPPED", 0)
+    content = bytearray(path.read_bytes())
+    central = content.index(b"PK\x01\x02")
+    if damage == "place":
+        content[central + 42 : central + 46] = (2**31).to_bytes(4, "little")
+    elif damage == "size":
+        for at in (20, 24):
+            content[central + at : central + at + 4] = (2**30).to_bytes(4, "little")
+    elif damage == "end":
+        del content[1000:central]
+    else:
+        at = 0 if damage == "signature" else content.index(b"\x93NUMPY")
+        content[at : at + 4] = b"????"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.npz: "):
+        motion.read_motion(path)
+
+
+def test_what_is_large_is_written_as_it_is(tmp_path, monkeypatch):
+    people = motion.simulate(clips=3, frames=60)
+    for bound, way in ((2**28, zipfile.ZIP_DEFLATED), (1000, zipfile.ZIP_STORED)):
+        monkeypatch.setattr("dvae.motion.files.archive.MAPPED", bound)
+        motion.save(tmp_path / "a.npz", people)
+        with zipfile.ZipFile(tmp_path / "a.npz") as file:
+            assert {info.compress_type for info in file.infolist()} == {way}
+        assert motion.read_motion(tmp_path / "a.npz").fingerprint() == people.fingerprint()
+
+
+# The command line ---------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_of_arrays_is_a_table_with_their_splits(tmp_path):
+    folder = tmp_path / "walks"
+    for name in ("train/a", "train/b/c", "validation", "test/a"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        np.save(folder / f"{name}.npy", walks((30, 2), seed=len(name)))
+    (folder / "README.txt").write_text("of two joints")
+    assert is_table(str(folder))
+    assert is_table(str(folder / "test" / "a.npy"))
+    found = PanelData.open(folder, cut=Cut(6, 4))
+    said = {one.name: one.split for one in found.panel}
+    assert said == {"test/a": "test", "train/a": "train", "train/b/c": "train", "validation": "validation"}
+    (folder / "schema.toml").write_text(
+        '[cut]\nobserved = 5\nhorizon = 5\n[columns.east]\nunit = "m"\n[columns.north]\n'
+    )
+    assert PanelData.open(folder).schema.columns.names == ["east", "north"]
+    assert PanelData.open(folder).protocol.name == "5 + 5 steps"
+    (folder / "walk.bvh").touch()
+    assert not is_table(str(folder))
+    np.save(folder / "test" / "b", walks((30, 2)))
+    (folder / "test" / "b.npy").rename(folder / "test" / "B.NPY")
+    assert {one.name for one in PanelData.open(folder).panel} == {*said, "test/B"}
+    (folder / "test" / "c.csv").write_text("1,2")
+    with pytest.raises(ValueError, match=r"walks holds test.c.csv beside npy files; .* write it as one, or move it"):
+        PanelData.open(folder)
+    (tmp_path / "none").mkdir()
+    with pytest.raises(ValueError, match="none is to hold npy files, from 1 to 100,000; it has none"):
+        PanelData.open(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("values", "options", "message"),
+    [
+        (walks((30,)), {}, r"has shape \(30,\); expected .*; a single one is \(steps, 1\)"),
+        (walks((2, 2, 2, 2)), {}, r"has shape \(2, 2, 2, 2\)"),
+        (walks((30, 2)), {"columns": ("a", "b", "c")}, r"has shape \(30, 2\); expected rows of 3 columns"),
+        (walks((30, 2)), {"covariates": ("plan",)}, "no names by which to tell covariates; give a schema"),
+        (walks((30, 2)), {"columns": Columns((Column("a"), Column("b")), time="t")}, "names a column of time"),
+        (walks((30, 2)), {"columns": ("a:count", "b")}, "family 'count' is of whole numbers"),
+    ],
+)
+def test_arrays_that_are_no_table_are_refused(tmp_path, values, options, message):
+    with pytest.raises(ValueError, match=message):
+        PanelData.open(saved(tmp_path / "a.npy", values), **options)
+
+
+def test_the_command_line_fits_to_a_mapped_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    saved(tmp_path / "walks.npy", walks((400, 2)))
+    cut_as = ["--observed", "6", "--horizon", "4", "--split", "time"]
+    assert main(["data", "info", "walks.npy"]) == 0
+    method = ["vae", "--latent", "2", "--warm-up", "1"]
+    assert main(["fit", *method, "--data", "walks.npy", *cut_as, "--out", "run", "--steps", "2"]) == 0
+    assert main(["resume", "run", "--steps", "3"]) == 0
+    monkeypatch.setattr("dvae.cli.judging.MOST_REMEMBERED", 100)
+    assert main(["evaluate", "run", "--samples", "2"]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "no references that know training windows" in said
+    saved(tmp_path / "walks.npy", walks((400, 2), seed=1))
+    assert main(["resume", "run", "--steps", "4"]) == 1
+    assert "has changed since run was fitted on it" in " ".join(capsys.readouterr().err.split())

@@ -1,0 +1,270 @@
+"""Units: networks read and make variables without unit; values and densities keep theirs."""
+
+import pytest
+import torch
+from pyro import poutine
+
+import dvae
+from dvae.data.units import Coordinate, Units
+from dvae.networks import Attention, Recurrent
+
+PAIR = ("p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)")
+SIZES = {"w": 2, "z": 2, "x": 3}
+
+
+def test_fitted_units_leave_mean_zero_and_mean_variance_one():
+    units, values = Units(3).double(), torch.tensor([1.0, -2.0, 5.0]) + torch.randn(7, 40, 3, dtype=torch.float64)
+    units.fit(values)
+    rows = units(values).flatten(0, 1)
+    torch.testing.assert_close(rows.mean(0), torch.zeros(3, dtype=torch.float64))
+    assert rows.var(0).mean().item() == pytest.approx(1)
+    before, after = (v[0, :20] - v[0, 20:] for v in (values, units(values)))
+    torch.testing.assert_close(torch.cosine_similarity(before, after), torch.ones(20, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(("shape", "fill"), [((4, 2), None), ((4, 3), 1.0)])
+def test_units_come_from_values_that_vary(shape, fill):
+    values = torch.randn(shape) if fill is None else torch.full(shape, fill)
+    with pytest.raises(ValueError, match=r"units come from values \(\.\.\., 3\) that vary"):
+        Units(3).fit(values)
+
+
+def test_units_that_were_given_are_not_fitted():
+    with pytest.raises(ValueError, match="units of their own, which were given"):
+        Units(2, [Coordinate(1.0, 2.0), Coordinate()]).fit(torch.randn(4, 2))
+
+
+@pytest.mark.parametrize("network", [Attention(8, heads=2), Recurrent(4)])
+@pytest.mark.parametrize(
+    "law",
+    [
+        dvae.distributions.Normal(residual=0.5),
+        dvae.distributions.FixedNormal(0.3, learned=True),
+        dvae.distributions.StudentT(),
+    ],
+)
+def test_a_standardised_model_is_the_same_model_of_standardised_data(network, law):
+    """log p(x) = log p(u) - T D log s for u = (x - m) / s, with the guide's draws the same."""
+    torch.manual_seed(0)
+    plain = dvae.DynamicalVAE(*PAIR, SIZES, network, {"p(x)": law}).double()
+    torch.manual_seed(0)
+    model = dvae.DynamicalVAE(*PAIR, SIZES, network, {"p(x)": law}).double()
+    units = model.standardise("x").double()
+    x = 4 + 0.1 * torch.randn(5, 6, 3, dtype=torch.float64)
+    units.fit(x)
+    torch.manual_seed(1)
+    latents = model.guide(x)
+    torch.manual_seed(1)
+    same = plain.guide(units(x))
+    for name in latents:
+        torch.testing.assert_close(latents[name], same[name])
+    ours, theirs = model.log_joint(x, latents), plain.log_joint(units(x), same)
+    torch.testing.assert_close(ours["z"], theirs["z"])
+    log_det = -x[0].numel() * units.scale.log()
+    torch.testing.assert_close(ours["x"], theirs["x"] + log_det)
+    mask = torch.rand_like(x) < 0.7
+    found = []
+    for each, data in ((model, x), (plain, units(x))):
+        torch.manual_seed(3)
+        found.append((each.guide({"x": data, "mask": mask})["z"], dvae.particle_bound(each, data, particles=3).bound))
+    (z, bound), (same_z, same_bound) = found
+    torch.testing.assert_close(z, same_z)
+    torch.testing.assert_close(bound, same_bound + log_det)
+    torch.manual_seed(2)
+    future = model.forecast(x[:, :3], 4, 2)["x"]
+    torch.manual_seed(2)
+    torch.testing.assert_close(units(future), plain.forecast(units(x)[:, :3], 4, 2)["x"])
+
+
+def test_a_scale_that_is_given_is_in_the_variables_own_unit():
+    model = dvae.DynamicalVAE(*PAIR, SIZES, laws={"p(x)": dvae.distributions.FixedNormal(0.3)})
+    x = 4 + 0.1 * torch.randn(5, 6, 3)
+    model.standardise("x").fit(x)
+    site = poutine.trace(model.model).get_trace(x).nodes["x"]
+    assert torch.allclose(site["fn"].steps(x).scale, torch.tensor(0.3))
+
+
+def test_only_variables_have_units():
+    with pytest.raises(ValueError, match="no variable 'y'; there are w, z, x"):
+        dvae.DynamicalVAE(*PAIR, SIZES).standardise("y")
+
+
+OFFSETS = [(1e6, 1.0), (1e9, 1.0), (101325.0, 0.01)]
+
+
+def far(mean, scale, law=None, network=None, **options):
+    """A float32 model with the units of its data (B, T, D), of that mean and scale, and the same without the mean."""
+    torch.manual_seed(0)
+    shift = torch.tensor([mean, -mean, 0.0], dtype=torch.float64)
+    x = shift + scale * torch.randn(6, 8, 3, dtype=torch.float64)
+    found = []
+    for data in (x, x - shift):
+        torch.manual_seed(1)
+        model = dvae.DynamicalVAE(
+            *PAIR, SIZES, network or Recurrent(4), {"p(x)": law or dvae.distributions.Normal()}, **options
+        )
+        model.standardise("x").fit(data)
+        found += [model, data]
+    return shift, *found
+
+
+def seeded(function):
+    torch.manual_seed(2)
+    return function()
+
+
+@pytest.mark.parametrize(("mean", "scale"), OFFSETS)
+@pytest.mark.parametrize(
+    "law",
+    [
+        dvae.distributions.Normal(residual=0.5),
+        dvae.distributions.StudentT(),
+        dvae.distributions.NormalMixture(2),
+        dvae.distributions.LowRankNormal(),
+        dvae.distributions.Family("Laplace"),
+        dvae.distributions.Product(
+            (((2, 0), dvae.distributions.Normal()), ((1,), dvae.distributions.Family("Laplace")))
+        ),
+    ],
+    ids=str,
+)
+def test_a_large_mean_changes_neither_bound_nor_forecast(mean, scale, law):
+    shift, model, x, plain, y = far(mean, scale, law)
+    masks = torch.rand(6, 8, 1).expand(6, 8, 3) < 0.8
+    for rest in ({}, {"mask": masks}, {"lengths": torch.tensor([8, 3, 5, 8, 1, 2])}):
+        ours, theirs = (
+            seeded(lambda b=b, m=m: dvae.SequenceELBO().terms(m, b))
+            for m, b in ((model, {"x": x, **rest}), (plain, {"x": y, **rest}))
+        )
+        assert ours.bound.dtype == torch.float32
+        torch.testing.assert_close(ours.bound, theirs.bound, rtol=1e-5, atol=1e-3)
+        ours.bound.sum().backward()
+    future, same = (
+        seeded(lambda m=m, b=b: m.forecast(b, 3, 4, draw_emission=True)["x"]) for m, b in ((model, x), (plain, y))
+    )
+    assert future.dtype == torch.float64
+    torch.testing.assert_close((future - shift) / scale, same / scale, rtol=0, atol=1e-3)
+    filled = model.impute({"x": x, "mask": masks}, draw=True)["x"][0]
+    assert torch.equal(filled[masks], x[masks])
+
+
+@pytest.mark.parametrize("mean", [0.0, 1e9])
+def test_context_and_sites_are_in_their_own_unit(mean):
+    torch.manual_seed(0)
+    sizes = {"z": 2, "x": 1, "c": 1}
+    model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t, c_t)", "q(z_t | x_{1:T}, c_t)", sizes)
+    x, c = (mean + torch.randn(2, 4, 7, 1, dtype=torch.float64)).unbind()
+    for name, values in (("x", x), ("c", c)):
+        model.standardise(name).fit(values)
+    trace = poutine.trace(model.model).get_trace({"x": x, "c": c})
+    assert torch.equal(trace.nodes["x"]["value"], x)
+    torch.testing.assert_close(trace.nodes["x"]["fn"].steps(x).mean / 1e9, x / 1e9, rtol=0, atol=1e-8)
+    read = model.read({"x": x, "c": c})
+    assert torch.equal(model.read(read)["c"], c)
+    bounds = [dvae.particle_bound(model, {"x": x, "c": c}, particles=3).bound for _ in range(2)]
+    assert all(bound.isfinite().all() and (bound > -100).all() for bound in bounds)
+
+
+def test_scheduled_sampling_and_priors_of_the_data_read_a_large_mean():
+    vamp = {"laws": {"p(w)": dvae.distributions.Vamp(3, steps=2), "p(x)": dvae.distributions.Normal()}}
+    pair = ("p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)")
+    found = []
+    for mean in (0.0, 1e9):
+        torch.manual_seed(0)
+        x = torch.randn(4, 6, 3, dtype=torch.float64)
+        model = dvae.DynamicalVAE(*pair, SIZES, Recurrent(4), **vamp)
+        model.standardise("x").fit(mean + x)
+        model.generator["w"].law.start_at(model.read(mean + x[:3]))
+        feeding = dvae.SelfFeeding(0.5)
+        found.append(seeded(lambda m=model, d=mean + x: dvae.SequenceELBO().terms(m, d, self_feeding=feeding).bound))
+    torch.testing.assert_close(*found, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("rest", ["", "mask", "lengths"])
+def test_values_that_float32_does_not_resolve_are_refused_without_units(rest):
+    x, mask = 1e9 + torch.randn(4, 6, 3, dtype=torch.float64), torch.rand(4, 6, 3) < 0.9
+    lengths = torch.tensor([6, 5, 6, 2])
+    data = {"": {"x": x}, "mask": {"x": x * mask, "mask": mask}, "lengths": {"x": x, "lengths": lengths}}[rest]
+    if rest == "lengths":
+        data["x"] = torch.where((torch.arange(6) < lengths[:, None])[..., None], x, 0.0)
+    model = dvae.DynamicalVAE(*PAIR, SIZES)
+    with pytest.raises(ValueError, match=r"coordinate 0 of x has mean 1e\+09 and .* model.standardise\('x'\).fit"):
+        model.guide(data)
+    model.double().guide(data)
+    dvae.DynamicalVAE(*PAIR, SIZES).guide({"x": torch.full((2, 3, 3), 1 / 3, dtype=torch.float64)})  # no spread to lose
+
+
+def test_means_stay_in_float64_through_changes_of_precision_and_files():
+    _, model, x, *_ = far(1e9, 1.0)
+    mean = model.units["x"].mean.clone()
+    for changed in (model.double(), model.bfloat16(), model.float()):
+        assert torch.equal(changed.units["x"].mean, mean)
+    fresh = dvae.DynamicalVAE(*PAIR, SIZES, Recurrent(4))
+    fresh.standardise("x")
+    fresh.load_state_dict(model.state_dict())
+    assert torch.equal(fresh.units["x"].mean, mean)
+    older = {name: value.float() for name, value in model.state_dict().items()}
+    fresh.load_state_dict(older)  # of a run before means were in float64: it goes on as it was
+    assert fresh.units["x"].mean.dtype == torch.float32
+    single = dvae.DynamicalVAE(*PAIR, SIZES).standardise("x")
+    single.fit(x.float())  # values in float32, such as those of motion, are read as they are
+    assert not single.wide
+
+
+@pytest.mark.parametrize("scale", [1e-40, 1e-19])
+def test_values_too_small_for_float32_are_told_so(scale):
+    with pytest.raises(ValueError, match=r"standard deviation of these values is .*e-\d+; .* multiply the values"):
+        Units(3).fit(scale * torch.randn(40, 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [1e-20, 1e-40, 1e-46])
+def test_a_fit_without_units_refuses_values_too_small_for_float32(scale, dtype):
+    x = (scale * torch.randn(4, 6, 3, dtype=torch.float64)).to(dtype)
+    model = dvae.DynamicalVAE(*PAIR, SIZES)
+    if not x.any():
+        dvae.fit(model, x, steps=1, progress=False)  # a constant has no scale
+        return
+    padded = torch.cat([x, torch.ones_like(x)], 1)
+    for data in (x, {"x": x + 0, "mask": torch.rand(x.shape) < 0.9}, {"x": padded, "lengths": torch.full((4,), 6)}):
+        with pytest.raises(ValueError, match=r"standard deviation of x is .*e-\d+; .* multiply the values"):
+            dvae.fit(model, data, steps=1, progress=False)
+    dvae.fit(model, torch.full((4, 6, 3), 0.05, dtype=dtype), steps=1, progress=False)
+    dvae.fit(model.double(), x, steps=1, progress=False)
+
+
+def test_levels_of_sequences_that_float32_loses_are_named():
+    x = torch.randn(6, 5, 3, dtype=torch.float64)
+    x[..., 1] += torch.linspace(0, 1e9, 6)[:, None]
+    x[2, ..., 1] = 1e8  # a constant loses nothing
+    units = dvae.DynamicalVAE(*PAIR, SIZES).standardise("x")
+    for values in (x, x.numpy()):
+        with pytest.warns(UserWarning, match=r"in 5 of 6 sequences, such as 0, coordinate 1 .* own mean, or fit in"):
+            units.fit(values)
+    dvae.DynamicalVAE(*PAIR, SIZES).double().standardise("x").fit(x)
+    units.fit(1e9 + x - x.mean(1, keepdim=True))
+
+
+def test_a_method_with_units_is_fitted_to_arrays_far_from_zero():
+    torch.manual_seed(0)
+    x, futures = torch.randn(8, 7, 2, dtype=torch.float64), []
+    for mean in (0.0, 1e9):
+        torch.manual_seed(0)
+        model = dvae.method("erd").fit(mean + x, steps=1, progress=False).model
+        torch.manual_seed(2)
+        futures.append(model.forecast(mean + x[:, :4], 3)["x"] - mean)
+    torch.testing.assert_close(*futures, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_training_reads_a_large_mean_in_float64(precision):
+    torch.manual_seed(0)
+    x, losses = torch.randn(6, 5, 3, dtype=torch.float64), []
+    for mean in (0.0, 1e9):
+        torch.manual_seed(0)
+        model = dvae.DynamicalVAE(*PAIR, SIZES, Attention(8, heads=2))
+        model.standardise("x").fit(mean + x)
+        torch.manual_seed(0)
+        dvae.fit(model, mean + x, steps=2, progress=False, precision=precision)
+        losses.append(seeded(lambda m=model, d=mean + x: dvae.SequenceELBO().terms(m, d).bound))
+    torch.testing.assert_close(*losses, rtol=1e-4, atol=1e-2)

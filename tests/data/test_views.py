@@ -1,0 +1,498 @@
+"""Views: bijections with their log-determinants, and models that see through them as one would turn data by hand."""
+
+import pyro
+import pytest
+import torch
+
+import dvae
+from dvae import motion
+from dvae.data.sequences import ArrayWindows
+from dvae.data.views import LOG_DET, History, Parts, Past, View, Views
+from dvae.inference.bounds.predictive import predictive_bound
+from dvae.models.motion.trajectories import Rest
+from dvae.motion import HUMANEVA, WALKER, Bones, Heading, rotate_about_up
+from dvae.networks import Recurrent
+
+B, T, J = 3, 5, WALKER.joints
+D = 3 * J - 3
+LEGS = [i for i in range(D) if i % 6 < 3]
+ARMS = [i for i in range(D) if i % 6 >= 3]
+TURNED = ("x", "s", "y", "r", "legs", "arms")
+VIEWS = {
+    "as it is": (View(), D),
+    "parts": (Parts({"legs": LEGS, "arms": ARMS}), D),
+    "parts and history": (Views(History("h"), Parts({"legs": LEGS, "arms": ARMS})), D),
+    "first frame": (Past("s"), D),
+    "heading": (Heading(WALKER, 3), D),
+    "heading with the root": (Heading(WALKER, 9), 3 * J),
+    "heading of parts": (Views(Heading(WALKER, 3, turned=TURNED), Parts({"legs": LEGS, "arms": ARMS})), D),
+    "heading of a first pose": (Views(Past("s"), Rest(True), Heading(WALKER, pose="s", turned=TURNED)), 3 * J),
+}
+
+
+def people(*shape):
+    return torch.randn(*shape, dtype=torch.float64)
+
+
+def turn(x, angle, skeleton=WALKER):
+    joints = x.unflatten(-1, (-1, 3))
+    return rotate_about_up(joints, torch.as_tensor(angle, dtype=x.dtype), skeleton.up).flatten(-2)
+
+
+@pytest.fixture(params=VIEWS)
+def view_and_data(request):
+    view, size = VIEWS[request.param]
+    return view, {"x": people(B, T, size)}
+
+
+def test_the_way_back_is_the_inverse(view_and_data):
+    view, data = view_and_data
+    torch.testing.assert_close(view.inverse(view(data))["x"], data["x"])
+
+
+def test_what_was_seen_is_seen_as_it_is(view_and_data):
+    view, data = view_and_data
+    once = view(data)
+    again = view(once)
+    assert once.keys() == again.keys()
+    assert all(torch.equal(once[name], again[name]) for name in once)
+
+
+def test_samples_of_the_future_go_back_as_the_past_was_seen(view_and_data):
+    """Seen values (S, B, H, D) beside what the view added to the past."""
+    view, data = view_and_data
+    past, future = data["x"], people(B, 7, data["x"].shape[-1])
+    seen = view({"x": past})
+    added = {name: seen[name] for name in view.names if name in seen}
+    if isinstance(view, Past) or "s" in seen:  # frames that go on from it are seen as such
+        later = {n: v for n, v in view({"x": torch.cat([past[:, :1], future], 1)}).items() if n != "s"}
+    else:
+        later = view({"x": future}, seen)
+    made = {
+        name: value.expand(2, *value.shape) for name, value in later.items() if name not in ("heading", "h", "y", "r")
+    }
+    torch.testing.assert_close(view.inverse({**added, **made})["x"], future.expand(2, *future.shape))
+
+
+def test_views_keep_volume(view_and_data):
+    """The Jacobian of what is seen, by autograd; of a turn, at the heading that the window has."""
+    view, data = view_and_data
+    heading = {"heading": torch.tensor([0.7], dtype=torch.float64)}
+    given = heading if "heading" in view.names and "s" not in view(data) else None
+    names = [name for name in view(data) if name not in ("heading", "h", "y", "r")]
+
+    def seen(x):
+        found = view({"x": x[None]}, given)
+        return torch.cat([found[name].flatten() for name in names])
+
+    if "s" in names and "heading" in view.names:  # which tells the heading; the rest is turned by it
+        first, names = data["x"][0, :1], ["x"]
+        jacobian = torch.autograd.functional.jacobian(lambda x: seen(torch.cat([first, x])), data["x"][0, 1:])
+    else:
+        jacobian = torch.autograd.functional.jacobian(seen, data["x"][0])
+    rows = len(jacobian)
+    _, log_det = torch.linalg.slogdet(jacobian.reshape(rows, rows))
+    torch.testing.assert_close(log_det, view.log_det(data)[0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("skeleton", [WALKER, HUMANEVA])
+def test_every_window_faces_one_way_and_stays_the_same_otherwise(skeleton):
+    x = people(B, T, 3 * skeleton.joints)
+    for angle in (0.0, 2.5):
+        seen = Heading(skeleton, 2)({"x": turn(x, angle, skeleton)})
+        torch.testing.assert_close(skeleton.heading(seen["x"].unflatten(-1, (-1, 3))[:, 1]), torch.zeros(B).double())
+        torch.testing.assert_close(seen["x"], Heading(skeleton, 2).face(x))
+
+
+# ------------------------------------------------------------------------------------------------- models that see so
+
+
+def build(view):
+    torch.manual_seed(0)
+    sizes = {"z": 2, "x": D}
+    equations = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
+    return dvae.DynamicalVAE(*equations, sizes, Recurrent(4), view=view).double().eval()
+
+
+def seeded(call, *arguments, **options):
+    torch.manual_seed(1)
+    return call(*arguments, **options)
+
+
+def missing():
+    """Windows, and a mask of whole joints and of heights that leaves the third pose alone."""
+    x, seen = people(B, T, D), torch.rand(B, T, J - 1, 1) < 0.7
+    mask = seen.expand(-1, -1, -1, 3).clone()
+    mask[..., WALKER.vertical] &= torch.rand(B, T, J - 1) < 0.8
+    mask[:, 2] = True
+    return x, mask.flatten(-2)
+
+
+@pytest.mark.parametrize("hidden", [0.0, 50.0, torch.nan])
+def test_missing_entries_through_a_view_are_those_of_windows_turned_by_hand(hidden):
+    heading = Heading(WALKER, 3)
+    model, plain = build(heading), build(None)
+    x, mask = missing()
+    angle = heading.of(x)
+    ours = {"x": torch.where(mask, x, hidden), "mask": mask}
+    theirs = {"x": heading.face(x), "mask": mask}
+    imputed = seeded(plain.reconstruct, theirs, 2)["x"]
+    torch.testing.assert_close(seeded(model.reconstruct, ours, 2)["x"], turn(imputed, angle[:, None, None]))
+    elbo = dvae.SequenceELBO()
+    torch.testing.assert_close(seeded(elbo.terms, model, ours).bound, seeded(elbo.terms, plain, theirs).bound)
+    past, by_hand = ({name: value[:, :4] for name, value in each.items()} for each in (ours, theirs))
+    future = seeded(plain.forecast, by_hand, 3, 2, draw_emission=True)["x"]
+    found = seeded(model.forecast, past, 3, 2, draw_emission=True)["x"]
+    torch.testing.assert_close(found, turn(future, angle[:, None, None]))
+
+
+def test_what_a_turn_cannot_carry_is_refused():
+    model, (x, mask) = build(Heading(WALKER, 3)), missing()
+    half = mask.clone()
+    half[1, 4, 6:9] = torch.tensor([True, True, False])
+    with pytest.raises(ValueError, match=r"window 1 lacks one horizontal coordinate of .* and has the other"):
+        model.guide({"x": x, "mask": half})
+    with pytest.raises(ValueError, match=r"the mask of x is torch\.float64"):
+        model.guide({"x": x, "mask": mask.double()})
+    with pytest.raises(ValueError, match="have 51 coordinates, or 48 without the root"):
+        model.guide(x[..., :30])
+
+
+def without(mask, window, frames, *names):
+    """The mask without joints of one window in some frames."""
+    mask = mask.clone()
+    for name in names:
+        joint = 3 * (WALKER.names.index(name) - 1)
+        mask[window, frames, joint : joint + 3] = False
+    return mask
+
+
+LEFT, RIGHT = ("LHip", "LShoulder"), ("RHip", "RShoulder")
+
+
+@pytest.mark.parametrize(
+    ("frames", "names", "tells"),
+    [
+        ([2], LEFT, 1),  # no left side: the pose before
+        ([1, 2], RIGHT, 0),
+        ([2], ["LHip"], 1),  # a whole pose goes before one with a shoulder alone
+        ([0, 1, 2], ["LHip", "RHip"], 2),  # the sides that are there
+    ],
+)
+def test_the_nearest_pose_with_hips_and_shoulders_tells_the_heading(frames, names, tells):
+    x = people(B, T, D)
+    mask = without(torch.ones_like(x, dtype=torch.bool), 1, frames, *names)
+    hidden = torch.where(mask, x, torch.nan)
+    seen = Heading(WALKER, 3)({"x": hidden, "mask": {"x": mask}})
+    joints = WALKER.with_root(x.unflatten(-1, (-1, 3)))
+    expected = WALKER.heading(joints[:, 2])
+    pose = WALKER.with_root(hidden.unflatten(-1, (-1, 3)))[1, tells]
+    lateral = torch.stack([pose[WALKER.names.index(n)] for n in LEFT]).nanmean(0)
+    lateral -= torch.stack([pose[WALKER.names.index(n)] for n in RIGHT]).nanmean(0)
+    expected[1] = torch.atan2(lateral[0], lateral[2]) - torch.pi / 2
+    apart = seen["heading"] - expected
+    torch.testing.assert_close(torch.sin(apart), torch.zeros_like(apart), atol=1e-9, rtol=0)
+    assert (torch.cos(apart) > 0).all()
+    torch.testing.assert_close(Heading(WALKER, 3).inverse(seen)["x"][mask], x[mask])
+
+
+@pytest.mark.parametrize("lacking", [T, 3])  # all frames, or those up to the pose
+def test_a_window_that_tells_no_heading_stays_as_it_is(lacking):
+    x = people(B, T, D)
+    mask = without(torch.ones_like(x, dtype=torch.bool), 1, slice(lacking), *LEFT)
+    seen = Heading(WALKER, 3)({"x": x, "mask": {"x": mask}})
+    assert seen["heading"][1] == 0
+    assert torch.equal(seen["x"][1][mask[1]], x[1][mask[1]])
+    past = Heading(WALKER, 3)({"x": x[:, :3], "mask": {"x": mask[:, :3]}})
+    torch.testing.assert_close(past["heading"], seen["heading"])  # a forecast turns as training did
+
+
+def test_samples_beside_a_batch_are_turned_back():
+    """Whatever a model hands out of the data goes through the view; before any batch there is no heading."""
+    model, x = build(Heading(WALKER, 3)), people(B, T, D)
+    torch.testing.assert_close(model.sample(batch=x)["x"], x)
+    assert model.sample(2, length=4)["x"].shape == (2, 4, D)
+
+
+def test_a_fixed_part_comes_back_bit_for_bit_and_is_seen_turned():
+    view = Views(Heading(WALKER, 3, turned=TURNED), Parts({"legs": LEGS, "arms": ARMS}))
+    equations = "p(z) p(legs_t | legs_{<t}, z) p(arms_t | legs_{<=t}, arms_{<t}, z)", "q(z | legs_{1:T}, arms_{1:T})"
+    sizes = {"z": 2, "legs": len(LEGS), "arms": len(ARMS)}
+    model = dvae.DynamicalVAE(*equations, sizes, Recurrent(4), view=view).double().eval()
+    past, legs = people(B, 4, D), people(B, 3, len(LEGS))
+    found = seeded(model.forecast, past, 3, 2, fix={"legs": legs})
+    assert torch.equal(found["legs"], legs.expand(2, -1, -1, -1))
+    assert torch.equal(found["x"][..., LEGS], found["legs"])
+    turned = seeded(model.forecast, turn(past, 1.0), 3, 2, fix={"legs": turn(legs, 1.0)})
+    torch.testing.assert_close(turned["x"], turn(found["x"], 1.0))
+
+
+def test_windows_of_the_simulator_face_one_way():
+    windows = motion.windows(motion.simulate(clips=4, frames=90), motion.PROTOCOLS["simulated"], "train")
+    x = Heading(windows.skeleton, 15).face(windows.all()["x"])
+    poses = windows.positions(x)[:, 14]
+    assert windows.skeleton.heading(poses).abs().max() < 1e-5
+
+
+# ------------------------------------------------------------------------------------------------- bones
+
+BONES = {
+    "no root": (Bones(WALKER, 4), D),
+    "a root": (Bones(WALKER, 4), 3 * J),
+    "pieces": (Views(Bones(WALKER, 4, {"legs": LEGS, "arms": ARMS}), Parts({"legs": LEGS, "arms": ARMS})), D),
+    "turned": (Views(Heading(WALKER, 4, turned=TURNED), Bones(WALKER, 4)), D),
+}
+
+
+def rigid(frames, size, skeleton=WALKER):
+    """Poses (B, T, D) of people whose bones have a length each, joint by joint from the root."""
+    x, lengths = people(B, frames, skeleton.joints, 3), torch.rand(B, 1, skeleton.joints, 1, dtype=torch.float64) + 0.1
+    for joint in skeleton.order[1:]:
+        way = x[:, :, joint] / x[:, :, joint].norm(dim=-1, keepdim=True)
+        x[:, :, joint] = x[:, :, skeleton.parents[joint]] + lengths[:, :, joint] * way
+    return (x if size == 3 * skeleton.joints else skeleton.without_root(x - x[:, :, :1])).flatten(-2)
+
+
+def lengths_of(x, skeleton=WALKER):
+    return skeleton.bone_lengths(skeleton.with_root(x.unflatten(-1, (-1, 3))))
+
+
+@pytest.fixture(params=BONES)
+def bones_and_data(request):
+    view, size = BONES[request.param]
+    return view, rigid(6, size)
+
+
+def test_directions_of_bones_have_length_one_and_lead_back_to_rigid_people(bones_and_data):
+    view, x = bones_and_data
+    seen = view({"x": x})
+    whole = seen["x"] if "x" in seen else Parts({"legs": LEGS, "arms": ARMS}).inverse(seen)["x"]
+    joints = whole.unflatten(-1, (-1, 3))
+    bones = joints if joints.shape[2] < J else WALKER.without_root(joints)
+    torch.testing.assert_close(bones.norm(dim=-1), torch.ones_like(bones[..., 0]))
+    torch.testing.assert_close(view.inverse(seen)["x"], x)
+    again = view(seen)
+    assert all(torch.equal(again[name], seen[name]) for name in seen)
+
+
+def test_whatever_is_made_of_them_no_bone_is_stretched(bones_and_data):
+    """Any numbers (S, B, H, D) in the place of directions; a root stays where it is made."""
+    view, x = bones_and_data
+    seen = view({"x": x})
+    made = {name: people(2, B, 7, value.shape[-1]) for name, value in seen.items() if value.dim() == 3}
+    added = {name: value for name, value in seen.items() if value.dim() < 3}
+    back = view.inverse({**made, **added})
+    torch.testing.assert_close(lengths_of(back["x"]), lengths_of(x)[:, :1].expand(2, -1, 7, -1))
+    if x.shape[-1] == 3 * J:
+        torch.testing.assert_close(back["x"][..., :3], made["x"][..., :3])
+    if "legs" in back:
+        assert torch.equal(back["legs"], back["x"][..., LEGS])
+
+
+def test_lengths_are_the_means_over_the_observed_frames_that_are_no_padding():
+    x = people(B, 6, D)
+    lengths = lengths_of(x)
+    torch.testing.assert_close(Bones(WALKER, 4)({"x": x})["bone_lengths"], lengths[:, :4].mean(1))
+    steps = torch.tensor([2, 6, 3])
+    expected = torch.stack([lengths[n, : min(4, t)].mean(0) for n, t in enumerate(steps)])
+    torch.testing.assert_close(Bones(WALKER, 4)({"x": x, "lengths": steps})["bone_lengths"], expected)
+
+
+def test_directions_alone_have_no_density_and_need_both_ends():
+    x, view = rigid(5, D), Bones(WALKER, 3)
+    with pytest.raises(ValueError, match=r"no density of positions .* directions of bones: lengths are taken as given"):
+        view.log_det({"x": x})
+    with pytest.raises(ValueError, match="no density of positions"):
+        dvae.SequenceELBO().terms(build(view), x)
+    mask = torch.ones_like(x, dtype=torch.bool)
+    assert torch.equal(view({"x": x, "mask": {"x": mask}})["x"], view({"x": x})["x"])
+    mask[1, 2, 5] = False
+    with pytest.raises(ValueError, match="window 1 lacks entries of frame 3, but this model sees the directions of"):
+        view({"x": x, "mask": {"x": mask}})
+
+
+def test_a_model_of_directions_makes_rigid_people_and_has_no_bound():
+    torch.manual_seed(0)
+    equations = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
+    law = {"p(x)": dvae.distributions.Directions(residual=0.5)}
+    model = dvae.DynamicalVAE(*equations, {"z": 2, "x": D}, Recurrent(4), law, view=Bones(WALKER, 4)).double().eval()
+    x = rigid(4, D)
+    future = seeded(model.forecast, x, 5, 3)["x"]
+    torch.testing.assert_close(lengths_of(future), lengths_of(x)[:, :1].expand(3, -1, 5, -1))
+    assert not model.likelihood
+    assert not dvae.SequenceELBO().terms(model, x).likelihood
+    with pytest.raises(ValueError, match="has no likelihood"):
+        dvae.importance_bound(model, x, 2)
+
+
+def test_a_part_that_hangs_from_another_does_not_tell_its_bones():
+    knee = [i for i in range(D) if i // 3 in (1, 2)]  # of the joints without the root: RKnee, RFoot
+    rest = [i for i in range(D) if i not in knee]
+    view, x = Bones(WALKER, 4, {"shank": knee, "rest": rest}), rigid(4, D)
+    seen = view({"x": x, "shank": x[..., knee]})
+    assert torch.equal(seen["shank"], seen["x"][..., knee])
+    assert torch.equal(view({"rest": x[..., rest]}, seen)["rest"], seen["x"][..., rest])
+    with pytest.raises(ValueError, match="shank alone does not tell that of RKnee, which hangs from RHip"):
+        view({"shank": x[..., knee]}, seen)
+
+
+# --------------------------------------------------------------------------------------------- views that change volume
+
+FACTORS = torch.tensor([0.5, -2.0, 3.0], dtype=torch.float64)
+MIXING = torch.tensor([[2.0, 1.0, 0.0], [0.0, 0.5, 0.3], [0.1, 0.0, 3.0]], dtype=torch.float64)
+
+
+class Scaled(View):
+    """Each coordinate of x times a number of its own."""
+
+    def __call__(self, data, beside=None):
+        return {**data, "x": data["x"] * FACTORS} if "x" in data and LOG_DET not in data else dict(data)
+
+    def inverse(self, seen):
+        return {**seen, "x": seen["x"] / FACTORS} if "x" in seen else dict(seen)
+
+    def log_det(self, data):
+        return FACTORS.abs().log().expand_as(data["x"])
+
+
+class Mixed(Scaled):
+    """Frames times a matrix; how much volume changes is known of whole sequences."""
+
+    def __call__(self, data, beside=None):
+        return {**data, "x": data["x"] @ MIXING} if "x" in data and LOG_DET not in data else dict(data)
+
+    def inverse(self, seen):
+        return {**seen, "x": seen["x"] @ MIXING.inverse()} if "x" in seen else dict(seen)
+
+    def log_det(self, data):
+        return torch.full((len(data["x"]),), data["x"].shape[1] * MIXING.logdet().item(), dtype=data["x"].dtype)
+
+
+SMALL = ("p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3})
+ESTIMATES = {
+    "bound": lambda model, batch: dvae.SequenceELBO().terms(model, batch).bound,
+    "importance": lambda model, batch: dvae.importance_bound(model, batch, particles=8, chunk=9).bound,
+    "particles": lambda model, batch: dvae.particle_bound(model, batch, particles=8, chunk=24).bound,
+    "joint": lambda model, batch: sum(model.log_joint(batch, {"z": torch.ones(B, T, 2).double()}).values()),
+    "Pyro's": lambda model, batch: torch.tensor([-pyro.infer.Trace_ELBO().loss(model, model.guide, batch)]),
+}
+
+
+def seeing(view):
+    torch.manual_seed(0)
+    return dvae.DynamicalVAE(*SMALL, Recurrent(4), view=view).double().eval()
+
+
+def incomplete(kind):
+    """Windows, their entry of a batch, and which entries count."""
+    counts = torch.ones(B, T, 3, dtype=torch.bool)
+    beside = {}
+    if "mask" in kind:
+        counts = torch.rand(B, T, 3) < 0.7
+        beside["mask"] = counts
+    if "lengths" in kind:
+        beside["lengths"] = torch.tensor([2, T, 4])
+        counts = counts & (torch.arange(T) < beside["lengths"][:, None])[..., None]
+    return people(B, T, 3), beside, counts
+
+
+@pytest.mark.parametrize("kind", ["complete", "mask", "lengths", "mask and lengths"])
+@pytest.mark.parametrize("estimate", ESTIMATES)
+def test_densities_are_of_the_data_as_given(estimate, kind):
+    """A change of variables: what is said of scaled data, and the log-determinant of the entries that are there."""
+    x, beside, counts = incomplete(kind)
+    view = Scaled()
+    ours, theirs = {"x": x, **beside}, {"x": x * FACTORS, **beside}
+    expected = torch.where(counts, view.log_det(ours), 0.0).sum((1, 2))
+    plain, found = (seeded(ESTIMATES[estimate], seeing(v), data) for v, data in ((None, theirs), (view, ours)))
+    torch.testing.assert_close(found, plain + (expected if len(plain) == B else expected.sum()))
+    assert (expected.abs() > 0.1).all()
+
+
+@pytest.mark.parametrize("estimate", ESTIMATES)
+def test_volume_that_is_known_of_whole_sequences_counts_where_they_are_complete(estimate):
+    x, model = people(B, T, 3), seeing(Mixed())
+    plain, found = (seeded(ESTIMATES[estimate], m, v) for m, v in ((seeing(None), x @ MIXING), (model, x)))
+    torch.testing.assert_close(found, plain + T * MIXING.logdet() * (B / len(plain)))
+    for partial in ("mask", "lengths"):
+        _, beside, _ = incomplete(partial)
+        with pytest.raises(ValueError, match=rf"log_det \(3,\), of data with {partial}; it is \(B,\) of complete"):
+            ESTIMATES[estimate](model, {"x": x, **beside})
+
+
+def test_the_log_score_has_the_volume_of_the_future():
+    x, seen = people(B, T, 3), 3
+    plain = seeded(predictive_bound, seeing(None), x * FACTORS, seen, 8).bound
+    found = seeded(predictive_bound, seeing(Scaled()), x, seen, 8).bound
+    torch.testing.assert_close(found, plain + (T - seen) * FACTORS.abs().log().sum())
+    with pytest.raises(ValueError, match="what of that is due to the future is not known"):
+        predictive_bound(seeing(Mixed()), x, seen, 8)
+
+
+def test_comparison_and_evaluation_rank_by_densities_of_the_data():
+    x, options = people(B, T, 3), {"progress": False}
+    added = FACTORS.abs().log().sum().item()
+    models = {"seen": seeing(Scaled())}
+    plain = {"seen": seeing(None)}
+    compared = [
+        dvae.compare(m, v, particles=4, contrasts=0, **options)["seen"] for m, v in ((models, x), (plain, x * FACTORS))
+    ]
+    windows = [ArrayWindows(v, 3) for v in (x, x * FACTORS)]
+    chosen = {"bound_particles": 4, "log_score_particles": 4, "samples": 1, **options}
+    scored = [dvae.evaluate(m, w, **chosen)["seen"] for m, w in zip((models, plain), windows, strict=True)]
+    for ours, theirs in (compared, scored):
+        for name in {"ELBO", "importance bound", "log score"} & ours.keys():
+            assert ours[name].mean == pytest.approx(theirs[name].mean + added, rel=1e-9)
+        assert ours["KL z"].mean == pytest.approx(theirs["KL z"].mean)
+
+
+def test_a_scaled_normal_has_its_closed_form():
+    model = dvae.DynamicalVAE("p(x_t)", None, {"x": 3}, view=Scaled()).double()
+    x = people(B, T, 3)
+    expected = torch.distributions.Normal(0, 1 / FACTORS.abs()).log_prob(x).sum((1, 2))
+    torch.testing.assert_close(dvae.SequenceELBO().terms(model, x).bound, expected)
+
+
+def test_the_oracle_of_a_scaled_model_is_the_density_of_the_data():
+    model = dvae.twin(*SMALL, T)
+    x = people(B, T, 3)
+    mean, precision = dvae.Oracle(model, T)._joint()
+    scale = FACTORS.repeat(T)
+    covariance = precision.inverse()[-3 * T :, -3 * T :] / scale / scale[:, None]
+    expected = torch.distributions.MultivariateNormal(mean[-3 * T :] / scale, covariance).log_prob(x.flatten(1))
+    arguments = model.generative, model.inference, model.sizes, model.networks, model.laws
+    scaled = dvae.DynamicalVAE(*arguments, view=Scaled()).double()
+    scaled.load_state_dict(model.state_dict())
+    torch.testing.assert_close(dvae.Oracle(scaled, T).evidence(x), expected)
+
+
+def test_views_in_a_row_add_their_volumes():
+    parts = Parts({"legs": [0, 2], "arms": [1]})
+    x, beside, counts = incomplete("mask and lengths")
+    view, data = Views(Scaled(), parts), {"x": x, **beside, "mask": {"x": beside["mask"]}}
+    by_entry = torch.where(counts, Scaled().log_det(data), 0.0)
+    torch.testing.assert_close(view.log_det(data), by_entry.sum((1, 2)))
+    torch.testing.assert_close(view.counted(data), by_entry.sum(2))
+    both = Views(Scaled(), Mixed())
+    torch.testing.assert_close(both.log_det({"x": x}), T * (FACTORS.abs().log().sum() + MIXING.logdet()).expand(B))
+    assert not view.keeps_volume
+    assert Views(parts, History("h")).keeps_volume
+
+
+def test_volumes_that_cannot_be_right_are_refused():
+    with pytest.raises(ValueError, match="changes the volume of frames that nothing scores"):
+        Views(Scaled(), Past("s"))
+    assert Views(Past("s"), Scaled()).log_det({"x": people(B, T, 3)}).shape == (B,)
+
+
+def test_what_a_scaled_model_makes_goes_back_and_it_is_fitted_by_the_bound_of_the_data():
+    x, model, plain = people(B, T, 3), seeing(Scaled()), seeing(None)
+    future = seeded(plain.forecast, x * FACTORS, 3, 2, draw_emission=True)["x"]
+    torch.testing.assert_close(seeded(model.forecast, x, 3, 2, draw_emission=True)["x"], future / FACTORS)
+    added = FACTORS.abs().log().sum().item()
+    ours, theirs = (
+        dvae.fit(m, data, data, steps=2, validate_every=1, log_every=1, progress=False)
+        for m, data in ((model, x), (plain, x * FACTORS))
+    )
+    assert ours.best_bound == pytest.approx(theirs.best_bound + added)
+    assert ours.series("loss")[1] == pytest.approx([loss - added for loss in theirs.series("loss")[1]])

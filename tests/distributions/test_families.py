@@ -1,0 +1,504 @@
+"""Families of observations keep the contract of every model, and say what their distributions say."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from scipy import special, stats
+
+import dvae
+from dvae import distributions
+from dvae.distributions import Family, Shape
+from dvae.inference.training.svi import NonFiniteError
+from dvae.networks import Dense, Recurrent
+
+PAIR = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
+MIXED = distributions.Product((((1,), Family("Poisson")), ((0, 3), distributions.Normal()), ((2,), Family("Gamma"))))
+ONE_OF_TWO = distributions.Product((((1,), Family("Poisson")), ((0, 2), Family("OneHotCategorical"))))
+ALL = {
+    **distributions.FAMILIES,
+    "multivariate": Family("MultivariateNormal"),
+    "simplex": Family("Dirichlet"),
+    "of twelve": Family("Binomial", given={"total_count": 12}),
+    "learned count": Family("NegativeBinomial", learned=("total_count",)),
+    "cauchy": Family("Cauchy"),
+}
+
+
+def built(law, size=2):
+    return dvae.DynamicalVAE(*PAIR, {"z": 2, "x": size}, Recurrent(4), {"p(x)": law})
+
+
+class Contract(dvae.testing.FactorizationContract):
+    """Of the families with something of their own; the others are laws of the same class."""
+
+    missing = None
+    law = None
+
+    def build(self, size):
+        return built(self.law, size)
+
+
+class TestCategorical(Contract):
+    law = Family("OneHotCategorical")
+    # of one class, or of one of which each is seen once, there is nothing to learn
+
+
+class TestPoisson(Contract):
+    law = Family("Poisson")
+
+
+class TestZeroInflated(Contract):
+    law = Family("ZeroInflatedNegativeBinomial")
+
+
+class TestGamma(Contract):
+    law = Family("Gamma")
+
+
+class TestLaplace(Contract):
+    law = Family("Laplace", residual=0.5)
+
+
+class TestNormalMixture(Contract):
+    law = distributions.NormalMixture(3)
+
+
+class TestLowRankNormal(Contract):
+    law = distributions.LowRankNormal(1)
+
+
+class TestMixed(Contract):
+    """Coordinates of three families."""
+
+    def build(self, size):
+        half = (size + 1) // 2
+        parts = [
+            (tuple(range(half)), Family("Poisson")),
+            (tuple(range(half, size)), distributions.Normal(residual=True)),
+        ]
+        return built(distributions.Product(tuple(part for part in parts if part[0])), size)
+
+
+class TestSeveralVariables(dvae.testing.FactorizationContract):
+    """Data variables of a family each, which read each other."""
+
+    missing = None
+
+    def build(self, size):
+        return dvae.DynamicalVAE(
+            "p(z_t | z_{t-1}) p(n_t | n_{t-1}, z_t) p(c_t | n_t, z_t) p(x_t | x_{t-1}, c_t, z_t)",
+            "q(z_t | z_{t-1}, n_{1:T}, c_{1:T}, x_{1:T})",
+            {"z": 2, "n": size, "c": 3, "x": size},
+            Recurrent(4),
+            {"p(n)": Family("Poisson"), "p(c)": Family("OneHotCategorical"), "p(x)": distributions.Normal()},
+            observed=("n", "c", "x"),
+        )
+
+
+# ------------------------------------------------------------------------------------------------- what they say
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_draws_have_the_mean_that_the_law_says(name):
+    law = ALL[name].build(Shape(3, 4)).double()
+    parameters = law(torch.randn(2, 4, dtype=torch.float64))
+    n = 20_000
+    many = tuple(p.expand(n, *p.shape) for p in parameters)
+    draws = law.draw(many, law.noise((n, 2, 3), parameters[0]))
+    if name == "cauchy":
+        assert torch.equal(law.mean(parameters), parameters[0])
+    elif name == "angle":
+        torch.testing.assert_close(
+            torch.atan2(draws.sin().mean(0), draws.cos().mean(0)), law.mean(parameters), atol=0.1, rtol=0
+        )
+    else:
+        z = (draws.mean(0) - law.mean(parameters)) / (draws.std(0) / n**0.5 + 1e-12)
+        assert z.abs().max() < 5
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_description_is_plain_data_and_a_law_has_its_shape(name):
+    import json
+    from dataclasses import asdict
+
+    spec = ALL[name]
+    again = json.loads(json.dumps(asdict(spec)))
+    if "shapes" in again:
+        again["shapes"] = {key: tuple(value) for key, value in again["shapes"].items()}
+        again["learned"] = tuple(again["learned"])
+    assert type(spec)(**again) == spec
+    conditional = built(spec, 3).generator["x"]
+    assert conditional.whole == (name in ("category", "correlated", "multivariate", "simplex"))
+    assert conditional.discrete == (
+        name
+        in (
+            "binary",
+            "category",
+            "count",
+            "overdispersed",
+            "sparse",
+            "sparse-overdispersed",
+            "of twelve",
+            "learned count",
+        )
+    )
+
+
+DENSITIES = {
+    "laplace": lambda p, v: stats.laplace(p[0], p[1]).logpdf(v),
+    "positive": lambda p, v: stats.gamma(p[0], scale=1 / p[1]).logpdf(v),
+    "log-normal": lambda p, v: stats.lognorm(p[1], scale=np.exp(p[0])).logpdf(v),
+    "power": lambda p, v: stats.expon(scale=1 / p[0]).logpdf(v),
+    "share": lambda p, v: stats.beta(p[0], p[1]).logpdf(v),
+    "angle": lambda p, v: stats.vonmises(p[1], p[0]).logpdf(v),
+    "count": lambda p, v: stats.poisson(p[0]).logpmf(v),
+    "overdispersed": lambda p, v: stats.nbinom(p[0], 1 / (1 + np.exp(p[1]))).logpmf(v),
+    "binary": lambda p, v: stats.bernoulli(1 / (1 + np.exp(-p[0]))).logpmf(v),
+}
+
+
+@pytest.mark.parametrize("name", DENSITIES)
+def test_densities_are_those_of_scipy(name):
+    law = ALL[name].build(Shape(3, 4)).double()
+    with torch.no_grad():
+        parameters = law(torch.randn(2, 4, dtype=torch.float64))
+        value = law.draw(parameters, law.noise((2, 3), parameters[0]))
+        found = law.distribution(parameters).log_prob(value)
+    expected = DENSITIES[name]([p.numpy() for p in parameters], value.numpy())
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-6 if name == "angle" else 1e-10)
+
+
+def test_angles_have_densities_and_gradients_at_every_concentration_of_single_precision():
+    law, logs = Family("VonMises", project=False).build(Shape(1, 2)), torch.linspace(-80.0, 80.0, 33)
+    features = torch.stack([torch.full_like(logs, 0.25), logs], -1).requires_grad_()
+    concentration = logs.exp().double().numpy()
+    value = (0.25 + torch.exp(-logs / 2).clamp(max=2.0))[:, None]
+    apart = (value.double() - 0.25).numpy()[:, 0]
+    kernel = -2 * np.sin(apart / 2) ** 2
+    density = law.distribution(law(features)).log_prob(value)[:, 0]
+    expected = concentration * kernel - np.log(2 * np.pi * special.i0e(concentration))
+    np.testing.assert_allclose(density.detach().numpy(), expected, rtol=1e-5, atol=1e-5)
+    (gradient,) = torch.autograd.grad(density.sum(), features)
+    np.testing.assert_allclose(gradient[:, 0].numpy(), concentration * np.sin(apart), rtol=1e-5)
+    moderate = logs < 25  # further up even scipy's 1 - I_1 / I_0 is 0
+    slope = concentration * (kernel + 1 - special.i1e(concentration) / special.i0e(concentration))
+    np.testing.assert_allclose(gradient[moderate, 1].numpy(), slope[moderate], rtol=1e-3, atol=1e-5)
+    assert gradient.isfinite().all()
+    draws = law.draw(law(features), law.noise((33, 1), features))
+    assert draws.isfinite().all()
+
+
+LARGE = {  # parameters by name, and values
+    "count": ({"rate": 1e8}, [1e8 - 2e4, 1e8, 1e8 + 1e4]),
+    "overdispersed": ({"total_count": 50.0, "logits": 16.0}, [1e8, 4e8, 1e9]),
+    "sparse": ({"gate_logits": -1.0, "rate": 1e8}, [0.0, 1e8, 1e8 + 1e4]),
+    "sparse-overdispersed": ({"gate_logits": -1.0, "total_count": 1e5, "logits": 8.0}, [0.0, 3e8, 3.1e8]),
+    "positive": ({"concentration": 1e6, "rate": 1e6}, [0.999, 1.0, 1.001]),
+    "share": ({"concentration1": 3e6, "concentration0": 2e6}, [0.5998, 0.6, 0.6001]),
+    "robust": ({"loc": 0.0, "scale": 1.0, "df": 1e4}, [-1.0, 0.0, 2.0]),
+    "correlated": ({"cov_factor": 30.0, "cov_diag": 1e-4, "loc": 0.0}, [0.011, 0.02, 0.005]),
+}
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_densities_and_gradients_do_not_cancel_in_float32(name):
+    """As in float64, whose own rounding is nine digits smaller."""
+    given, value = LARGE[name]
+    law, value = ALL[name].build(Shape(3, 4)), torch.tensor(value)
+    own = given.values() if name == "robust" else (given[each] for each in law.forms)
+    factors = torch.tensor([1.0, 1.0, 1.0, 2.0, 0.5, 1.0])
+    single = [torch.full((6 if n == 30.0 else 3,), n) * (factors if n == 30.0 else 1.0) for n in own]
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        parameters = [p.to(dtype).requires_grad_() for p in single]
+        density = law.distribution(tuple(parameters)).log_prob(value.to(dtype))
+        assert density.dtype == dtype
+        found.append([density, *torch.autograd.grad(density.sum(), parameters, allow_unused=True)])
+    for ours, theirs in zip(*found, strict=True):
+        ours, theirs = (each if each is None else each.detach() for each in (ours, theirs))
+        if ours is not None:
+            torch.testing.assert_close(ours.double(), theirs, rtol=1e-5, atol=1e-6 * theirs.abs().max().item())
+
+
+@pytest.mark.parametrize("size", [1e5, 1e7, 1e9])
+def test_large_counts_have_the_probability_that_scipy_gives(size):
+    count = (torch.tensor([0.0, 0.9, 1.0, 1.001, 3.0]) * size).round()
+    rates = torch.full((5,), size)
+    found = ALL["count"].build(Shape(5, 4)).distribution((rates,)).log_prob(count)
+    np.testing.assert_allclose(found, stats.poisson(size).logpmf(count.double()), rtol=1e-6)
+    totals, logits = torch.full((5,), 3.0), torch.full((5,), np.log(size / 3))
+    found = ALL["overdispersed"].build(Shape(5, 4)).distribution((totals, logits)).log_prob(count)
+    chance = 1 / (1 + np.exp(logits.double().numpy()))
+    np.testing.assert_allclose(found, stats.nbinom(3.0, chance).logpmf(count.double()), rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("family", "inside", "outside"),
+    [
+        (Family("Pareto", {"scale": 2.0}), 2.5, 1.5),
+        (Family("Binomial", {"total_count": 12}), 12.0, 13.0),
+    ],
+)
+def test_there_is_no_density_outside_a_support_that_depends_on_parameters(family, inside, outside, dtype):
+    law = family.build(Shape(1, 4)).to(dtype)
+    made = law.distribution(law(torch.zeros(2, 4, dtype=dtype)))
+    density = made.log_prob(torch.tensor([[inside], [outside]], dtype=dtype))
+    assert density.isfinite().tolist() == [[True], [False]]
+    assert density[1] == -torch.inf
+    made.expand((3, 2, 1)).log_prob(torch.full((3, 2, 1), inside, dtype=dtype))
+
+
+def test_without_a_layer_features_are_parameters_and_a_location_comes_first():
+    law = Family("Laplace", project=False).build(Shape(3, 6)).double()
+    features, value = torch.randn(2, 6, dtype=torch.float64), torch.randn(2, 3, dtype=torch.float64)
+    loc, scale = law(features)
+    assert not list(law.parameters())
+    torch.testing.assert_close(loc, features[:, :3], rtol=0, atol=0)
+    torch.testing.assert_close(scale, features[:, 3:].exp() + 1e-3)
+    alone = Family("Laplace", {"scale": 1.0}, project=False).build(Shape(3, 3))
+    density = alone.distribution(alone(loc)).log_prob(value)
+    torch.testing.assert_close(density, -(value - loc).abs() - np.log(2))
+
+
+def test_minus_the_log_density_of_a_power_is_its_itakura_saito_divergence():
+    law = distributions.FAMILIES["power"].build(Shape(3, 4)).double()
+    features = torch.randn(2, 2, 4, dtype=torch.float64)
+    power = torch.rand(2, 3, dtype=torch.float64) + 0.1
+    (one, other), both = (
+        (law.mean(law(f)) for f in features),
+        [law.distribution(law(f)).log_prob(power) for f in features],
+    )
+
+    def divergence(mean):
+        return power / mean - (power / mean).log() - 1
+
+    torch.testing.assert_close(both[0] - both[1], divergence(other) - divergence(one))
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if ALL[name].build(Shape(3, 4)).location_scale])
+def test_in_units_a_law_is_that_of_the_variable_in_its_unit(name):
+    law = ALL[name].build(Shape(3, 4)).double()
+    parameters = law(torch.randn(2, 4, dtype=torch.float64))
+    if name == "fixed":
+        assert law.learned  # what is given is in the variable's own unit
+    scale = torch.tensor([0.5, 2.0, 30.0], dtype=torch.float64)
+    mean = (
+        torch.zeros(3, dtype=torch.float64) if law.location_scale and name not in REAL else torch.arange(3.0).double()
+    )
+    there = law.in_units(parameters, mean, scale)
+    torch.testing.assert_close(law.mean(there), mean + scale * law.mean(parameters))
+    if not law.distribution(parameters).support.is_discrete:
+        value = law.draw(parameters, law.noise((2, 3), parameters[0])).detach()
+        volume = scale.log() if not law.distribution(parameters).event_shape else scale.log().sum()
+        here = law.distribution(parameters).log_prob(value)
+        torch.testing.assert_close(law.distribution(there).log_prob(mean + scale * value), here - volume)
+
+
+REAL = ("real", "fixed", "robust", "laplace", "mixture", "correlated", "multivariate", "cauchy")
+
+
+def test_a_product_is_its_parts():
+    law = MIXED.build(Shape(4, 5)).double()
+    parameters = law(torch.randn(2, 3, 5, dtype=torch.float64))
+    value = law.draw(parameters, law.noise((2, 3, 4), parameters[0]))
+    whole, parts = law.distribution(parameters), law.each(parameters)
+    for own, places, theirs in parts:
+        expected = own.distribution(theirs).log_prob(value[..., places])
+        torch.testing.assert_close(whole.log_prob(value)[..., places], expected)
+        torch.testing.assert_close(law.mean(parameters)[..., places], own.mean(theirs))
+    assert whole.support.check(value).all()
+    assert not whole.support.check(value - 100)[..., 1:3].any()
+    with pytest.raises(ValueError, match=r"share the coordinates 0 to 3 of x among them, once each; got \[0, 1, 1\]"):
+        distributions.Product((((0, 1), distributions.Normal()), ((1,), distributions.Normal()))).build(
+            Shape(4, 5, name="x")
+        )
+    with pytest.raises(ValueError, match="has no density; in a Product all have"):
+        distributions.Product((((0, 1), distributions.Delta()),)).build(Shape(2, 2, name="x"))
+
+
+def test_an_event_in_a_product_counts_once_and_is_missing_as_a_whole():
+    model = built(ONE_OF_TWO, 3).double()
+    data = model.sample(4, 5)
+    mask = torch.ones_like(data["x"], dtype=torch.bool)
+    mask[0, :, [0, 2]] = False
+    with pytest.raises(ValueError, match="its law has one density for 2 of them; hide them together"):
+        model.log_joint({"x": data["x"], "mask": mask.index_fill(2, torch.tensor([2]), True)}, {"z": data["z"]})
+    whole = model.log_joint({"x": data["x"]}, {"z": data["z"]})["x"]
+    some = model.log_joint({"x": data["x"], "mask": mask}, {"z": data["z"]})["x"]
+    torch.testing.assert_close(whole[1:], some[1:], rtol=1e-12, atol=0)
+    assert whole[0] < some[0]
+
+
+# ------------------------------------------------------------------------------ evidence, where it can be integrated
+
+
+@pytest.mark.parametrize(
+    "name", ["binary", "category", "count", "overdispersed", "sparse", "positive", "share", "mixture"]
+)
+def test_the_importance_bound_arrives_at_the_evidence(name):
+    """p(w) p(x_t | w) of one latent number is integrated by quadrature."""
+    networks, sizes = {"p": Dense((3,)), "q": Recurrent(4)}, {"w": 1, "x": 2}
+    model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", sizes, networks, {"p(x)": ALL[name]}).double()
+    data = model.sample(2, 3)["x"]
+
+    w = torch.linspace(-8, 8, 2001, dtype=torch.float64)
+    exact = []
+    for row in data:
+        joint = sum(model.log_joint(row.expand(len(w), 3, 2), {"w": w[:, None]}).values())
+        exact.append(torch.trapezoid(joint.exp(), w).log().item())
+    found = [dvae.importance_bound(model, data, particles=4000).bound for _ in range(8)]
+    found = torch.stack(found)
+    error = found.std(0) / len(found) ** 0.5
+    assert ((found.mean(0) - torch.tensor(exact)).abs() < 6 * error + 1e-4).all()
+    filtered = dvae.particle_bound(model, data, particles=4000).bound
+    assert ((filtered - torch.tensor(exact)).abs() < 8 * found.std(0) + 1e-3).all()
+
+
+def test_particles_and_importance_agree_on_counts():
+    model = built(Family("Poisson")).double()
+    data = {"x": model.sample(3, 3)["x"]}
+    data["mask"] = torch.rand_like(data["x"]) < 0.7
+    one = torch.stack([dvae.importance_bound(model, data, particles=3000).bound for _ in range(6)])
+    other = torch.stack([dvae.particle_bound(model, data, particles=3000).bound for _ in range(6)])
+    error = (one.var(0) / 6 + other.var(0) / 6).sqrt()
+    assert ((one.mean(0) - other.mean(0)).abs() < 6 * error + 1e-3).all()
+
+
+# --------------------------------------------------------------------------------------------------- what is asked
+
+
+def test_forecasts_of_counts_are_draws_and_of_others_means_unless_told():
+    counts = built(Family("Poisson"))
+    past = counts.sample(2, 4)["x"]
+    assert not counts.forecast(past, 3, samples=5)["x"].frac().any()
+    assert counts.forecast(past, 3, samples=5, draw_emission=False)["x"].frac().any()
+    missing = built(distributions.Product((((0,), Family("Poisson")), ((1,), distributions.Normal()))))
+    assert not missing.forecast(missing.sample(2, 4)["x"], 3)["x"][..., 0].frac().any()
+
+
+def test_whole_numbers_may_come_as_such():
+    model = built(Family("Poisson"))
+    counts = model.sample(2, 4)["x"].long()
+    assert torch.isfinite(dvae.SequenceELBO().terms(model, counts).bound).all()
+    assert torch.isfinite(dvae.SequenceELBO().terms(built(Family("Bernoulli")), counts > 0).bound).all()
+
+
+@pytest.mark.parametrize(
+    ("law", "value", "said"),
+    [
+        (
+            Family("Poisson"),
+            0.5,
+            r"x holds 0.5 .sequence 1, coordinate 0., and by p\(x_t .*\), Poisson, values are whole numbers from 0",
+        ),
+        (Family("Bernoulli"), 2.0, "values are 0 or 1"),
+        (Family("Exponential"), -1.0, "values are at least 0"),
+        (Family("LogNormal"), 0.0, "values are above 0"),
+        *((Family(name), 0.0, "values are above 0; give x another law, move") for name in ("Gamma", "Chi2")),
+        *((Family("Beta"), value, "values are above 0 and below 1") for value in (0.0, 1.0, 1.5, 1 - 1e-9)),
+        (Family("Kumaraswamy"), 0.0, "values are above 0 and below 1"),
+        (Family("Dirichlet"), 0.0, "values are above 0 and sum to 1"),
+        (
+            distributions.Product((((0,), Family("Beta")), ((1,), distributions.Normal()))),
+            0.0,
+            "of 0: above 0 and below 1",
+        ),
+        (Family("OneHotCategorical"), 1.0, "values are 1 at one coordinate and 0 at the others"),
+        (
+            distributions.Product((((0,), Family("Poisson")), ((1,), distributions.Normal()))),
+            0.5,
+            "values are of 0: whole numbers from 0",
+        ),
+    ],
+)
+def test_values_that_a_family_does_not_have_are_refused_unless_hidden(law, value, said):
+    model = built(law)
+    data = model.sample(2, 4)["x"]
+    if model.generator["x"].whole:
+        data[1, 2] = 1.0
+    data[1, 2, 0] = value
+    with pytest.raises(ValueError, match=said):
+        dvae.SequenceELBO().terms(model, data)
+    mask = torch.ones_like(data, dtype=torch.bool)
+    mask[1, 2] = False
+    assert torch.isfinite(dvae.SequenceELBO().terms(model, {"x": data, "mask": mask}).bound).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Family("Poison"), "Pyro has no distribution 'Poison' .did you mean 'Poisson'"),
+        (lambda: Family("Poisson", given={"rat": 1}), "Poisson has no parameter 'rat' .did you mean 'rate'"),
+        (lambda: Family("Uniform"), "does not say what its parameters may be"),
+        (lambda: Family("Poisson", given={"rate": 1.0}), "nothing of Poisson is left to be read"),
+        (lambda: Family("Poisson", residual=1.0), "Poisson has no location"),
+        (lambda: distributions.NormalMixture(0), "at least one component"),
+        (lambda: Family("Delta"), "Delta with given={} cannot be made of numbers that a network reads"),
+        (lambda: Family("LKJ"), "missing 1 required positional argument: 'dim'.; give what it needs"),
+        (
+            lambda: Family("Laplace", {"scale": 1.0}, project=False),
+            r"takes 2 features, .* read \(loc\), but .* gives 3",
+        ),
+        (lambda: Family("Binomial"), "total_count of Binomial is a whole number, which no network makes; give it"),
+    ],
+)
+def test_refusals(make, said):
+    with pytest.raises(ValueError, match=said):
+        make().build(Shape(2, 3))
+
+
+def test_values_beyond_where_a_law_happens_to_end_are_told_from_steps_that_are_too_large():
+    """Of twelve there are no twenty: where a support depends on parameters, the first bound tells."""
+    x = torch.full((4, 3, 2), 20.0)
+    with pytest.raises(NonFiniteError, match=r"is -inf in 4 of 4 sequences.*Try a law that can have these values"):
+        dvae.fit(built(Family("Binomial", given={"total_count": 12})), x, steps=1, progress=False)
+
+
+def test_a_distribution_without_a_mean_says_so_where_one_is_needed():
+    model = built(
+        Family("MixtureOfDiagNormals", shapes={"locs": (4, -1), "coord_scale": (4, -1), "component_logits": (4,)})
+    )
+    past = model.sample(2, 4)["x"]
+    assert model.forecast(past, 2, draw_emission=True)["x"].shape == (1, 2, 2, 2)
+    with pytest.raises(ValueError, match="MixtureOfDiagNormals has no mean"):
+        model.forecast(past, 2, draw_emission=False)
+
+
+def test_positive_data_may_be_missing_or_padded_and_gradients_stay_finite():
+    model = built(Family("Gamma"))
+    data = {"x": model.sample(3, 4)["x"], "lengths": torch.tensor([4, 2, 1])}
+    data["mask"] = torch.rand_like(data["x"]) < 0.5
+    dvae.SequenceELBO().differentiable_loss(model.model, model.guide, data).backward()
+    assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
+    pyro.clear_param_store()
+
+
+def test_a_class_of_ones_own_is_a_family():
+    class Twice(dist.Poisson):
+        """Its own name."""
+
+    assert built(Family(Twice)).generator["x"].family == "Twice"
+
+
+# ------------------------------------------------------------------------------------- the family of the docs page
+
+PAGE = (Path(__file__).parents[2] / "docs" / "families.md").read_text(encoding="utf-8")
+SHOWN: dict = {}
+for block in re.findall(r"```python\n(.*?)```", PAGE.partition("## A family of one's own")[2], re.DOTALL):
+    exec(compile("import torch, dvae\npair = " + repr(PAIR) + "\n" + block, "families.md", "exec"), SHOWN)
+
+
+class TestOfOnesOwn(SHOWN["TestBursts"]):
+    """In the lines that the page shows."""
+
+
+def test_a_family_of_ones_own_is_short():
+    (law, _) = re.findall(r"```python\n(.*?)```", PAGE.partition("## A family of one's own")[2], re.DOTALL)
+    own = law[law.index("class BurstsLaw") : law.index("@dataclass")]
+    assert len([line for line in own.splitlines() if line.strip()]) <= 15

@@ -1,0 +1,283 @@
+"""Priors of static latents: densities that integrate to one, draws that follow them, and bounds that hold with them."""
+
+import copy
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+import dvae
+from dvae import DynamicalVAE, SequenceELBO, distributions, importance_bound
+from dvae.cli import main
+from dvae.inference.training.checkpoints import load_weights, save_weights
+from dvae.motion.data.dataset import MotionData
+from dvae.networks import Dense, Recurrent
+from dvae.runs import directory as runs
+
+B, T = 3, 5
+PRIORS = {
+    "normal": distributions.FixedNormal(learned=True),
+    "mixture": distributions.Mixture(components=3),
+    "vamp": distributions.Vamp(components=3, steps=4),
+    "flow": distributions.Flow(),
+}
+SIZES = {"w": 2, "z": 2, "x": 2}
+PAIR = "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t, w)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
+
+
+def build(kind, size=2, pair=PAIR, network=None):
+    """A model with such a prior, and parameters that are not those it starts with."""
+    sizes = {name: d for name, d in {"w": size, "z": 2, "x": 2}.items() if f"({name}" in pair[0]}
+    model = DynamicalVAE(*pair, sizes, network or Recurrent(4, hidden=(4,)), laws={"p(w)": PRIORS[kind]}).double()
+    with torch.no_grad():
+        for name, parameter in (*model.generator["w"].named_parameters(), *model.encoder["w"].named_parameters()):
+            parameter.add_((0.05 if ".nn." in name else 0.2) * torch.randn_like(parameter))  # .nn.: of a coupling
+    return model
+
+
+def law(model, batch=1):
+    conditional = model.generator["w"]
+    return conditional.law.joint(conditional({}, batch, T))
+
+
+def data(batch=B, steps=T):
+    return torch.randn(batch, steps, 2, dtype=torch.float64)
+
+
+def grid(model):
+    """Points, their density under the prior, and the step between them."""
+    axis = torch.linspace(-12, 12, 361 if model.sizes["w"] == 2 else 4_801, dtype=torch.float64)
+    points = torch.cartesian_prod(*[axis] * model.sizes["w"]).reshape(-1, model.sizes["w"])
+    density = law(model, len(points)).log_prob(points).exp()
+    return axis, density.detach().reshape([len(axis)] * model.sizes["w"])
+
+
+@pytest.mark.parametrize("size", [1, 2])
+@pytest.mark.parametrize("kind", PRIORS)
+def test_a_prior_is_a_density_and_draws_follow_it(kind, size):
+    model = build(kind, size)
+    axis, density = grid(model)
+    step = axis[1] - axis[0]
+    assert (density.sum() * step**size).item() == pytest.approx(
+        1, abs=3e-3
+    )  # what the grid leaves at the kinks of a spline
+    draws = model.sample(20_000, 1)["w"]
+    for d in range(size):
+        marginal = density.sum(1 - d) * step if size == 2 else density
+        cumulative = (marginal.cumsum(0) - marginal / 2) * step
+        assert stats.kstest(draws[:, d], lambda at, cdf=cumulative: np.interp(at, axis, cdf)).pvalue > 1e-4
+    if size == 2:
+        product = (density * axis[:, None] * axis).sum() * step**2
+        products = draws.prod(1)
+        assert abs(products.mean() - product) < 5 * products.std() / len(products) ** 0.5
+
+
+@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("kind", PRIORS)
+def test_every_parameter_of_a_prior_learns(kind, size):
+    model = build(kind, size)
+    SequenceELBO().differentiable_loss(model, model.guide, data()).backward()
+    assert [name for name, p in model.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0] == []
+
+
+@pytest.mark.parametrize("kind", PRIORS)
+def test_bounds_lie_below_the_evidence_which_quadrature_knows(kind):
+    model = build(kind, 1, ("p(w) p(x_t | w)", "q(w | x_{1:T})"), {"q": Recurrent(4), "p": Dense((4,))})
+    with torch.no_grad():
+        model.encoder["w"].law.out.bias[1:].fill_(1.0)  # wide enough that importance weights have a variance
+    x = data()
+    points = torch.linspace(-15, 15, 1_501, dtype=torch.float64)[:, None]
+    for i in range(B):
+        many = x[i : i + 1].expand(len(points), -1, -1)
+        joint = sum(model.log_joint(many, {"w": points}).values())
+        evidence = torch.logsumexp(joint, 0) + math.log(30 / 1_500)
+        one = x[i : i + 1]
+        with torch.no_grad():
+            draws = SequenceELBO().terms(model, one.expand(4_000, -1, -1)).bound
+        assert draws.mean() < evidence + 4 * draws.std() / len(draws) ** 0.5
+        found = importance_bound(model, one, 10_000)
+        assert found.khat < 0.7
+        assert found.bound.item() == pytest.approx(evidence.item(), abs=0.05)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in PRIORS if kind != "normal"])
+def test_where_no_closed_form_is_known_the_kl_is_the_log_ratio_at_the_draw(kind):
+    model, x = build(kind), data()
+    torch.manual_seed(1)
+    kl = SequenceELBO().terms(model, x).kl["w"]
+    torch.manual_seed(1)
+    w = model.guide(x)["w"]
+    ours = model.encoder["w"].law.distribution(model.encoder["w"]({"x": x}, B, T)).to_event(1)
+    torch.testing.assert_close(kl, ours.log_prob(w) - law(model, B).log_prob(w))
+
+
+@pytest.mark.parametrize("kind", PRIORS)
+def test_a_prior_follows_its_parameters_and_keeps_nothing(kind):
+    """Also at the same points, which a transform's cache would recognise; and copies are made after a backward pass."""
+    model, points = build(kind), torch.randn(4, 2, dtype=torch.float64)
+    with torch.no_grad():
+        before = law(model, 4).log_prob(points)
+        for parameter in (*model.generator["w"].parameters(), *model.encoder["w"].parameters()):
+            parameter.add_(0.1 * torch.randn_like(parameter))
+        assert ((law(model, 4).log_prob(points) - before).abs() > 1e-6).all()
+    after = law(model, 4).log_prob(points)
+    after.sum().backward()
+    torch.testing.assert_close(law(copy.deepcopy(model), 4).log_prob(points), after)
+
+
+@pytest.mark.parametrize("kind", PRIORS)
+def test_a_saved_prior_is_the_one_loaded(kind, tmp_path):
+    model, points = build(kind), torch.randn(4, 2, dtype=torch.float64)
+    save_weights(model, tmp_path / "weights.safetensors")
+    other = build(kind)
+    load_weights(other, tmp_path / "weights.safetensors")
+    assert torch.equal(law(other, 4).log_prob(points), law(model, 4).log_prob(points))
+
+
+def test_the_vamp_prior_is_the_mean_of_the_guides_posteriors_at_its_pseudo_sequences():
+    model, points = build("vamp"), torch.randn(6, 2, dtype=torch.float64)
+    pseudo = model.generator["w"].law.pseudo["x"]
+    loc, scale = model.encoder["w"]({"x": pseudo}, 3, 4)
+    each = torch.distributions.Normal(loc, scale).log_prob(points[:, None]).sum(-1)
+    torch.testing.assert_close(law(model, 6).log_prob(points), each.logsumexp(1) - math.log(3))
+    assert [name for name, _ in model.generator["w"].named_parameters()] == [
+        "law.pseudo.x"
+    ]  # the guide stays the model's
+    twin = copy.deepcopy(model)
+    assert twin.generator["w"].law.guide is twin.encoder["w"]
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_the_density_of_a_flow_is_that_of_its_noise_over_the_volume_it_takes(size):
+    flow = build("flow", size).generator["w"].law.prior()
+
+    def move(noise):
+        for transform in flow.transforms:
+            noise = transform(noise)
+        return noise
+
+    for noise in torch.randn(20, size, dtype=torch.float64):
+        volume = torch.autograd.functional.jacobian(move, noise).slogdet()[1]
+        expected = torch.distributions.Normal(0.0, 1.0).log_prob(noise).sum() - volume
+        torch.testing.assert_close(flow.log_prob(move(noise)), expected)
+
+
+def test_a_flow_starts_near_the_standard_normal():
+    points = torch.randn(200, 3)
+    flow = distributions.Flow().build(distributions.Shape(3, local=False))
+    start = flow.prior().log_prob(points)
+    standard = torch.distributions.Normal(0.0, 1.0).log_prob(points).sum(-1)
+    assert (start - standard).abs().mean() < 1
+    with pytest.raises(ValueError, match=r"no half precision, but its parameters are torch.bfloat16; use mixed"):
+        flow.bfloat16().prior()
+
+
+@pytest.mark.parametrize(
+    ("guide", "not_this"),
+    [("q(w | x_{1:T}, z_{1:T})", r"q\(w \| x_\{1:T\}, z_"), ("q(w)", r"q\(w\)"), (None, "the prior itself")],
+)
+def test_a_vamp_needs_a_guide_of_data_alone(guide, not_this):
+    message = (
+        r"a Vamp of w needs a guide that reads the data x over time and nothing else, such as q\(w \| x_\{1:T\}\), not "
+    )
+    with pytest.raises(ValueError, match=message + not_this):
+        DynamicalVAE(PAIR[0], guide and f"{guide} q(z_t | x_{{1:T}})", SIZES, laws={"p(w)": distributions.Vamp()})
+
+
+@pytest.mark.parametrize(
+    "law", [distributions.Mixture(), distributions.Vamp(), distributions.Flow(), distributions.QRFlow()]
+)
+@pytest.mark.parametrize(
+    ("key", "what"),
+    [
+        ("p(v)", "v is data"),
+        ("p(z)", "z has parents and has a value at every step"),
+        ("q(w)", "w has parents"),
+        ("p(u)", "u has a value at every step"),
+    ],
+)
+def test_a_prior_is_of_a_static_latent_without_parents(law, key, what):
+    p, q = (
+        "p(v) p(w) p(u_t) p(z_t | z_{t-1}, w) p(x_t | v, u_t, z_t)",
+        "q(w | x_{1:T}) q(u_t | x_t) q(z_t | x_{1:T}, w)",
+    )
+    with pytest.raises(
+        ValueError, match=rf"is a law of static latents without parents, such as w in p\(w\), but {what}"
+    ):
+        DynamicalVAE(p, q, {**SIZES, "u": 2, "v": 2}, observed=("x", "v"), laws={key: law})
+
+
+def test_a_mixture_that_is_its_own_guide_would_learn_nothing():
+    with pytest.raises(ValueError, match=r"draws of the latent w are not reparameterised by the law of p\(w\)"):
+        DynamicalVAE(PAIR[0], None, SIZES, laws={"p(w)": distributions.Mixture()})
+
+
+def test_weights_of_heads_and_priors_are_found_under_their_new_names():
+    model = build("mixture")
+    old = {"priors.w.logits", "priors.w.loc", "priors.w.log_scale"}
+    for name in model.state_dict():
+        if not name.startswith("generator.w."):
+            old.add(name.replace(".law.", ".head."))
+    assert any(".head." in name for name in old)
+    assert {distributions.renamed(name) for name in old} == set(model.state_dict())
+    assert all(distributions.renamed(name) == name for name in model.state_dict())
+
+
+# ------------------------------------------------------------------------------------------------------- in a run
+
+OPTIONS = {"latent": 2, "static": 2, "width": 4, "heads_count": 1, "decoder": 4, "warm_up": 0, "self_feeding": 0.0}
+VAMP = {**OPTIONS, "prior": "vamp", "prior_components": 3, "prior_steps": 6, "heading": False, "pose_prior": 0.0}
+
+
+def weights(run: Path):
+    return (run / "last.safetensors").read_bytes()
+
+
+def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
+    """By the run's seed; and a resumed run goes on from where they have come."""
+    data, method = MotionData.open(people), dvae.method("hit-dvae", **VAMP)
+    still = dvae.Training(steps=1, batch_size=2, learning_rate=0.0, progress=False, validate_every=2)
+    starts = []
+    for seed, name in ((0, "a"), (0, "b"), (1, "c")):
+        runs.fit_run(method, data, tmp_path / name, dvae.Training(**{**vars(still), "seed": seed}))
+        starts.append(dvae.load(tmp_path / name).model.generator["w"].law.pseudo["x"])
+    assert torch.equal(starts[0], starts[1])
+    assert not torch.equal(starts[0], starts[2])
+    windows = data.windows("train").all(stride=1)["x"][:, :6]
+    for pseudo in starts[0]:
+        assert (windows == pseudo).flatten(1).all(1).any()
+
+    training = {**vars(still), "learning_rate": 0.01}
+    runs.fit_run(method, data, tmp_path / "whole", dvae.Training(**{**training, "steps": 2}))
+    runs.fit_run(method, data, tmp_path / "parts", dvae.Training(**{**training, "steps": 1}))
+    runs.resume(tmp_path / "parts", steps=2)
+    assert weights(tmp_path / "parts") == weights(tmp_path / "whole")
+
+
+def test_pseudo_sequences_longer_than_the_windows(people, tmp_path):
+    method = dvae.method("hit-dvae", **{**VAMP, "prior_steps": 400})
+    with pytest.raises(ValueError, match=r"pseudo-sequences of 400 steps, but those of x that it is to start at have"):
+        runs.fit_run(method, MotionData.open(people), tmp_path / "run", dvae.Training(steps=1, progress=False))
+
+
+def test_a_prior_on_the_command_line(people, tmp_path):
+    prior = "vamp"
+    out = tmp_path / "run"
+    small = [f"--{name.replace('_', '-')}={value}" for name, value in OPTIONS.items()]
+    fit = ["fit", "hit-dvae", "--prior", prior, *small, "--free-bits", "0.1", "--warm-up-shape", "cosine"]
+    fit += ["--pose-prior", "0"]  # which would be fitted first
+    assert main([*fit, "--data", str(people), "--out", str(out), "--steps", "4", "--batch-size", "2"]) == 0
+    assert main(["resume", str(out), "--steps", "6"]) == 0
+    loaded = dvae.load(out)
+    assert (loaded.method.prior, loaded.method.free_bits, loaded.method.warm_up_shape) == (prior, 0.1, "cosine")
+    x = loaded.data.windows("test").all()["x"][:2, :15]
+    assert torch.isfinite(loaded.model.forecast(x, 5, 2)["x"]).all()
+
+
+def test_the_command_line_says_where_a_prior_has_no_place(people, tmp_path, capsys):
+    run = ["--data", str(people), "--out", str(tmp_path / "run")]
+    assert main(["fit", "dkf", "--prior", "flow", *run]) == 2
+    assert "prior='flow' is for a static latent without parents, such as p(w)" in capsys.readouterr().err

@@ -1,0 +1,200 @@
+"""Derived guides: they miss nothing, they need every arrow, and at their best the bound is the evidence."""
+
+import doctest
+from dataclasses import replace
+from itertools import permutations
+
+import networkx as nx
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import dvae
+import dvae.factorization.inversion
+from benchmarks.tables.audits import FAMILY
+from dvae.factorization.graph import analytic_kl
+from dvae.factorization.inversion import MarkovBoundaries, faithful, guide, orders, spelled
+from dvae.factorization.notation import Block, Factorization
+from dvae.factorization.relations import Relation
+from dvae.testing.strategies import factorizations
+
+DKF = "p(z_t | z_{t-1}) p(x_t | z_t)"
+HIT_DVAE = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
+TWO_LAYERS = "p(u_t | u_{t-1}) p(z_t | z_{t-1}, u_t) p(x_t | z_t)"
+
+
+@settings(max_examples=30, deadline=None)
+@given(factorizations())
+def test_markov_boundary_is_d_separation(pair):
+    dag = Factorization.parse(pair[0]).dag(3)
+    known, boundaries = {node for node in dag if node[0] == "x"}, MarkovBoundaries(dag)
+    for node in sorted(set(dag) - known, key=str):
+        boundary = boundaries.of(node, known)
+        assert boundary == {u for u in known if not nx.is_d_separator(dag, {node}, {u}, known - {u})}
+        assert nx.is_d_separator(dag, {node}, known - boundary, boundary) or boundary == known
+        known = known | {node}
+
+
+def fewer(guide, width):
+    """The guide without one of the offsets, or static parents, that it reads, each in turn."""
+    for factor in guide.factors:
+        for parent in factor.parents:
+            cuts = [None]
+            if factor.local and parent.local:
+                reads = [k for k in range(1 - width, width) if parent.relation.reads(k, 0)]
+                cuts = [parent.relation & ~Relation.of([(k, k)]) for k in reads]
+            for cut in cuts:
+                left = () if cut is None or not cut.intervals else (replace(parent, relation=cut),)
+                parents = [p for each in factor.parents for p in (left if each is parent else (each,))]
+                less = replace(factor, parents=tuple(parents))
+                yield replace(guide, factors=tuple(less if each is factor else each for each in guide.factors))
+
+
+@settings(max_examples=60, deadline=None)
+@given(factorizations(), st.data())
+def test_a_derived_guide_is_exact_and_no_smaller_one_is(pair, data):
+    generative = pair[0]
+    order = data.draw(st.sampled_from(list(orders(generative))), label="order")
+    found = faithful(generative, order=order)
+    audit = dvae.audit(generative, found)
+    assert audit.exact
+    # A lag of 2 alone may make patterns periodic in time, of which relations have no end.
+    assert not audit.redundant or "{t-2}" in generative
+    if not audit.redundant:
+        smaller = list(fewer(found, width=4))
+        for less in data.draw(st.permutations(smaller))[:3]:
+            assert not dvae.audit(generative, less).exact, less.text
+
+
+@pytest.mark.parametrize(
+    ("generative", "order", "expected"),
+    [
+        ("p(z_t) p(x_t | z_t)", None, "q(z_t | x_t)"),
+        (DKF, None, "q(z_t | z_{t-1}, x_{t:T})"),
+        (DKF, [Block(("z",), -1)], "q(z_t | z_{t+1}, x_{<=t})"),
+        ("p(z_t | z_{t-1}, c_t, pose) p(x_t | z_t)", None, "q(z_t | z_{t-1}, x_{t:T}, c_{t:T}, pose)"),
+        (HIT_DVAE, None, "q(w | x_{1:T}) q(z_t | z_{<t}, x_{1:T}, w)"),
+        (HIT_DVAE, [Block(("z",), 1), Block(("w",), 0)], "q(z_t | z_{<t}, x_{1:T}) q(w | z_{1:T}, x_{1:T})"),
+        ("p(w) p(z_t | w) p(x_t | z_t)", None, "q(w | x_{1:T}) q(z_t | x_t, w)"),
+        (TWO_LAYERS, None, "q(u_t | u_{t-1}, z_{t-1}, x_{t:T}) q(z_t | u_t, z_{t-1}, x_{t:T})"),
+        # z first and whole: u tells of z alone, and of x nothing more.
+        (TWO_LAYERS, [Block(("z",), 1), Block(("u",), 1)], "q(z_t | z_{<t}, x_{t:T}) q(u_t | u_{t-1}, z_{t-1:T})"),
+        ("p(x_t | x_{<t})", None, ""),
+    ],
+)
+def test_guides_worked_out_by_hand(generative, order, expected):
+    found = faithful(generative, order=order)
+    assert found == (Factorization.parse(expected) if expected else Factorization("q", ()))
+
+
+def test_what_is_periodic_in_time_reads_more_than_it_needs_and_misses_nothing():
+    found = faithful("p(z_t | z_{t-2}) p(x_t | z_t)")
+    assert found.text == "q(z_t | z_{t-2}, x_t, x_{t+2}, x_{t+4}, x_{>=t+6})"
+    audit = dvae.audit("p(z_t | z_{t-2}) p(x_t | z_t)", found, steps=12)
+    assert audit.exact
+    assert audit.redundant == {"z": ("x_{t+7}", "x_{t+9}", "x_{t+11}", "x_{t+13}")}
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_a_repaired_guide_keeps_the_order_and_misses_nothing(name):
+    audit = dvae.audit(*FAMILY[name])
+    repaired = dvae.audit(audit.generative, audit.repaired)
+    assert repaired.exact
+    assert not repaired.redundant
+    assert repaired.inference.variables == tuple(name for block in audit.inference.blocks for name in block.names)
+    if audit.exact and not audit.redundant:
+        for factor in audit.inference.factors:
+            reads = audit.repaired.factor(factor.child).parents
+            assert {p.name: p.relation for p in reads} == {p.name: p.relation for p in factor.parents}
+
+
+@pytest.mark.parametrize("generative", [DKF, HIT_DVAE, TWO_LAYERS])
+def test_every_order_costs_nothing_where_latents_have_one_dimension(generative):
+    sizes = dict.fromkeys(Factorization.parse(generative).variables, 1)
+    for each in dvae.alternatives(generative).guides:
+        assert dvae.price(generative, each.inference, sizes, steps=3, seeds=1) < 1e-8, each.inference.text
+
+
+def test_alternatives_are_told_by_what_they_cost():
+    found = dvae.alternatives("p(w) p(u_t | w) p(z_t | z_{t-1}, u_t) p(x_t | z_t)")
+    texts = {each.inference.text for each in found.guides}
+    assert len(texts) == len(found) == len(found.guides)
+    loops = [bool(each.looped) for each in found.guides]
+    assert loops == sorted(loops)
+    for each in found.guides:
+        assert each.arrows == each.inference.dag(found.steps).number_of_edges()
+        closed = analytic_kl(found.generative, each.inference)
+        assert each.sampled == tuple(name for name in closed if not closed[name])
+        assert all(text in str(found) for text in (each.inference.text, spelled(each.order)))
+    assert found[0] == found.guides[0].inference
+    assert "<td>" in found._repr_html_()
+
+
+def test_orders_are_all_there_are():
+    generative = "p(w) p(v) p(u_t | w) p(z_t | u_t, v) p(x_t | z_t)"
+    found = [spelled(order) for order in orders(generative)]
+    assert found[0] == "w, v, u with z forward"
+    assert len(set(found)) == len(found) == 2 * 2 * 2 * 2
+    for first, second in permutations("uz"):
+        assert f"{first} backward, {second} backward, w, v" in found
+    assert [spelled(order) for order in orders("p(w) p(x_t | w)")] == ["w"]
+
+
+def test_the_price_of_an_arrow_is_that_of_the_guide_without_it():
+    found = dvae.arrow_prices(DKF, steps=3, seeds=2)
+    assert list(found) == sorted(found, key=lambda arrow: -found[arrow].mean())
+    without = dvae.price(DKF, "q(z_t | z_{t-1}, x_{>t})", {"z": 1, "x": 1}, steps=3, seeds=2)
+    torch.testing.assert_close(found["x_t to z_t"], without, atol=1e-8, rtol=0)
+    assert all((cost > 1e-6).all() for cost in found.values())  # none of a derived guide is for nothing
+    spare = dvae.arrow_prices(DKF, "q(z_t | z_{t-1}, x_{1:T})", steps=3, seeds=1)
+    assert abs(spare["x_{<t} to z_t"]) < 1e-8
+
+
+def test_a_model_takes_the_word():
+    model = dvae.DynamicalVAE(DKF, "faithful", {"z": 2, "x": 3})
+    assert model.inference == faithful(DKF)
+    bound = dvae.SequenceELBO().terms(model, {"x": torch.randn(4, 5, 3)}).bound
+    assert bound.shape == (4,)
+    assert dvae.audit(DKF, "faithful").exact
+    assert guide(Factorization.parse(DKF), "faithful", masks={}) == faithful(DKF)
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: faithful(DKF, order=[Block(("u",), 1)]), "order 'u forward' is not one of the latents z, each once"),
+        (lambda: faithful(DKF, order=[Block(("z", "z"), 1)]), "each once"),
+        (lambda: faithful(DKF, observed=("y",)), "no factor for 'y'"),
+        (lambda: faithful(HIT_DVAE, order=[Block(("w", "z"), 1)]), "mixes static and local"),
+        (lambda: dvae.alternatives(DKF, steps=0), "at least 1 step"),
+        (lambda: dvae.arrow_prices(DKF, seeds=0), "at least 1"),
+        (
+            lambda: faithful(Factorization.parse("p(z_t | z_{own}) p(x_t | z_t)", {"own": Relation.parse("<t").mask})),
+            "a mask of your own",
+        ),
+        (lambda: dvae.alternatives("p(x_t | x_{<t})"), "nothing is latent"),
+        (lambda: Factorization.parse(DKF).without("z", faithful(DKF).factors[0].parents[1]), "no arrow from x_"),
+    ],
+)
+def test_errors_say_what_is_wrong(call, told):
+    with pytest.raises(ValueError, match=told):
+        call()
+
+
+def test_an_arrow_less():
+    found = Factorization.parse("q(z_t | z_{t-2:t-1}, x_{1:T}, w) q(w | x_{1:T})")
+    names = [("z", "z_{t-2:t-1}"), ("z", "x_{<t}"), ("z", "x_t"), ("z", "x_{>t}"), ("z", "w"), ("w", "x_{1:T}")]
+    assert [(child, str(parent)) for child, parent in found.arrows] == names
+    less = [found.without(child, parent).text for child, parent in found.arrows]
+    assert less[0] == "q(z_t | x_{1:T}, w) q(w | x_{1:T})"
+    assert less[2] == "q(z_t | z_{t-2:t-1}, x_{<t}, x_{>t}, w) q(w | x_{1:T})"
+    assert less[4:] == ["q(z_t | z_{t-2:t-1}, x_{1:T}) q(w | x_{1:T})", "q(z_t | z_{t-2:t-1}, x_{1:T}, w) q(w)"]
+    own = Factorization.parse("q(z_t | x_{own})", {"own": Relation.parse("t+1").mask})
+    assert own.without(*own.arrows[0]).text == "q(z_t)"
+
+
+def test_docstrings():
+    result = doctest.testmod(dvae.factorization.inversion, extraglobs={"dvae": dvae})
+    assert result.attempted
+    assert not result.failed

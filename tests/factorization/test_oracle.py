@@ -1,0 +1,460 @@
+"""The oracle against brute force, and every bound of the library against the oracle."""
+
+import math
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from dense import library_bound, masked
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyro.infer import Trace_ELBO
+from scipy import optimize
+from torch.distributions.transforms import ReshapeTransform
+
+from dvae import DynamicalVAE, Oracle, SequenceELBO, audit, model_arrow_prices, model_price, price, twin
+from dvae.data.units import Coordinate
+from dvae.distributions import FixedNormal, Mixture, StandardNormal
+from dvae.factorization.notation import Factorization
+from dvae.factorization.oracle import _lost
+from dvae.networks import Linear
+from dvae.testing.strategies import factorizations
+
+T = 4
+DKF = "p(z_t | z_{t-1}) p(x_t | z_t)"
+TWO_LAYERS = "p(w) p(u_t | u_{t-1}, w) p(z_t | z_{t-1}, u_t) p(x_t | x_{<t}, z_t)"
+HIT_DVAE = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
+PAIRS = {
+    "dkf": (DKF, "q(z_t | z_{t-1}, x_{t:T})"),
+    "dkf, mean field": (DKF, "q(z_t | x_{1:T})"),
+    "dkf, backward": (DKF, "q(z_t | z_{t+1}, x_{<=t})"),
+    "srnn": ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"),
+    "vrnn": ("p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{<=t}, z_{<t})"),
+    "storn": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{1:T})"),
+    "rvae": ("p(z_t) p(x_t | z_{<=t})", "q(z_t | z_{<t}, x_{t:T})"),
+    "dsae": ("p(w) p(z_t | z_{<t}) p(x_t | w, z_t)", "q(w | x_{1:T}) q(z_t | w, x_{1:T})"),
+    "dsae, with z": ("p(w) p(z_t | z_{<t}) p(x_t | w, z_t)", "q(w | x_{1:T}) q(z_t | z_{<t}, w, x_{1:T})"),
+    "hit-dvae": (HIT_DVAE, "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"),
+    "hit-dvae, with z": (HIT_DVAE, "q(w | x_{1:T}) q(z_t | z_{<t}, x_{1:T}, w)"),
+    # w tells of the u_{>t} through which later data tell of z_t.
+    "two layers": (
+        TWO_LAYERS,
+        "q(w | x_{1:T}) q(u_t | u_{t-1}, z_{t-1}, x_{1:T}, w) q(z_t | z_{t-1}, u_t, x_{1:T}, w)",
+    ),
+    "two layers, mean field": (TWO_LAYERS, "q(w | x_{1:T}) q(u_t | x_{1:T}) q(z_t | x_{1:T})"),
+    "statics": ("p(v) p(w | v) p(x_t | x_{t-1}, w)", "q(v | x_{1:T}) q(w | v, x_{1:T})"),
+}
+EXACT = {"dkf", "dkf, backward", "srnn", "rvae", "dsae, with z", "hit-dvae, with z", "two layers", "statics"}
+
+
+def build(pair, size=1, seed=0, steps=T, scale=0.4):
+    pair = PAIRS[pair] if isinstance(pair, str) else pair
+    generative, inference = (Factorization.parse(f) if isinstance(f, str) else f for f in pair)
+    sizes = dict.fromkeys(generative.variables, size)
+    return twin(generative, inference, sizes, steps, seed, scale=scale)
+
+
+def data(model, n, steps=T):
+    return model.sample(n, steps)["x"]
+
+
+def z_score(draws, expected):
+    """How many standard errors the mean of draws (N, ...) lies from what is expected."""
+    error = draws.std(0) / len(draws) ** 0.5
+    return ((draws.mean(0) - expected).abs() / (error + 1e-9)).max().item()
+
+
+# ------------------------------------------------------------------------------- the oracle against brute force
+
+
+def kalman(A, C, b, d, Q, R, x):
+    """log p(x) and smoothed moments for z_t = A_t z_{t-1} + b_t + N(0, Q_t), x_t = C_t z_t + d_t + N(0, R_t)."""
+    steps, n = len(A), A.shape[1]
+    mean, cov, log_evidence, filtered = np.zeros(n), np.zeros((n, n)), 0.0, []
+    for t in range(steps):
+        prior_mean, prior_cov = A[t] @ mean + b[t], A[t] @ cov @ A[t].T + Q[t]
+        S = C[t] @ prior_cov @ C[t].T + R[t]
+        innovation = x[t] - C[t] @ prior_mean - d[t]
+        log_evidence -= 0.5 * (innovation @ np.linalg.solve(S, innovation) + np.linalg.slogdet(2 * np.pi * S)[1])
+        gain = np.linalg.solve(S, C[t] @ prior_cov).T
+        mean, cov = prior_mean + gain @ innovation, prior_cov - gain @ S @ gain.T
+        filtered.append((mean, cov, prior_mean, prior_cov))
+    means, covs = [mean], [cov]
+    for t in range(steps - 2, -1, -1):
+        mean, cov = filtered[t][:2]
+        next_mean, next_cov = filtered[t + 1][2:]
+        back = np.linalg.solve(next_cov, A[t + 1] @ cov).T
+        means.insert(0, mean + back @ (means[0] - next_mean))
+        covs.insert(0, cov + back @ (covs[0] - next_cov) @ back.T)
+    return log_evidence, np.array(means), np.array(covs)
+
+
+def test_evidence_and_posterior_are_the_kalman_filters_and_smoothers():
+    model = twin(*PAIRS["dkf"], {"z": 2, "x": 3}, T)
+    x = data(model, 3)
+    oracle = Oracle(model, T)
+    z_net, x_net = model.generator["z"], model.generator["x"]
+    W, V = z_net.network.weight("z", T).detach().numpy(), x_net.network.weight("z", T).detach().numpy()
+    A = np.array([W[t, t - 1] if t else np.zeros((2, 2)) for t in range(T)])
+    C = np.array([V[t, t] for t in range(T)])
+    b, d = z_net.network.bias.detach().numpy(), x_net.network.bias.detach().numpy()
+    Q, R = (np.array([np.diag(s) for s in c.law.log_scale.exp().square().detach().numpy()]) for c in (z_net, x_net))
+    evidence, (means, covariance) = oracle.evidence(x).detach(), oracle.posterior(x)
+    for i in range(3):
+        log_evidence, smoothed, covs = kalman(A, C, b, d, Q, R, x[i].numpy())
+        assert abs(evidence[i].item() - log_evidence) < 1e-9
+        np.testing.assert_allclose(means[i].detach().reshape(T, 2), smoothed, atol=1e-9)
+        blocks = covariance.detach().reshape(T, 2, T, 2)
+        np.testing.assert_allclose([blocks[t, :, t] for t in range(T)], covs, atol=1e-9)
+
+
+def partly_observed(model, x):
+    """The data with missing entries and lengths, of a model with units for all variables."""
+    for name, size in model.sizes.items():
+        model.standardise(name).double().fit(1 + 2 * torch.randn(50, size, dtype=torch.float64))
+    mask = torch.rand_like(x) < 0.6
+    return {"x": x, "mask": mask, "lengths": torch.tensor([T, T - 1, 1, T])}
+
+
+@pytest.mark.parametrize("partial", [False, True])
+@pytest.mark.parametrize("pair", PAIRS)
+def test_log_joint_is_evidence_plus_log_posterior(pair, partial):
+    model = build(pair, size=2)
+    x = data(model, 4)
+    batch = partly_observed(model, x) if partial else x
+    latents = {name: value.detach() for name, value in model.guide(batch).items()}
+    oracle = Oracle(model, T)
+    means, covariances = (part.detach() for part in oracle.posterior(batch))
+    values, log_posterior = oracle._stack(latents, model.latents), []
+    for mean, covariance, value in zip(means, covariances.expand(4, -1, -1), values, strict=True):
+        there = covariance.diagonal() > 0
+        assert (value[~there] == 0).all()
+        posterior = dist.MultivariateNormal(mean[there], covariance[there][:, there])
+        log_posterior.append(posterior.log_prob(value[there]))
+    joint = sum(model.log_joint(batch, latents).values())
+    torch.testing.assert_close(joint, oracle.evidence(batch).detach() + torch.stack(log_posterior), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("indicators", [(), ("x",)])
+@pytest.mark.parametrize("pair", ["dkf, backward", "two layers", "statics"])
+def test_the_bound_of_partly_observed_data_is_the_mean_of_the_programs(pair, indicators):
+    distributions = {"default": FixedNormal(0.7, learned=True, project=False)}
+    distributions |= {f"p({name})": StandardNormal() for name in ("w", "v") if f"p({name})" in PAIRS[pair][0]}
+    sizes = dict.fromkeys(Factorization.parse(PAIRS[pair][0]).variables, 1)
+    model = DynamicalVAE(*PAIRS[pair], sizes, Linear(T), distributions, indicators=indicators).double()
+    batch = partly_observed(model, torch.randn(4, T, 1, dtype=torch.float64))
+    expected = library_bound(model, batch["x"], lengths=batch["lengths"], seen=batch["mask"])
+    torch.testing.assert_close(Oracle(model, T).bound(batch), expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("pair", ["dkf, backward", "two layers", "statics"])
+def test_the_guides_moments_are_those_of_its_draws(pair):
+    model = build(pair)
+    x = data(model, 1)
+    gain, offset, root = (part[0] for part in Oracle(model, T)._guide())
+    n = 20_000
+    latents = model.guide(x.expand(n, -1, -1))
+    draws = torch.cat([latents[name].flatten(1) for name in model.latents], 1).detach()
+    assert z_score(draws, (gain @ x.flatten() + offset).detach()) < 5
+    centred = draws - draws.mean(0)
+    products = centred[:, :, None] * centred[:, None]
+    assert z_score(products, (root @ root.t()).detach()) < 5
+
+
+# -------------------------------------------------------------------------------- bounds against the evidence
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_sequence_elbo_is_the_exact_bound(pair):
+    model = build(pair)
+    x = data(model, 2)
+    oracle = Oracle(model, T)
+    with torch.no_grad():
+        exact, evidence = oracle.bound(x), oracle.evidence(x)
+        terms = SequenceELBO().terms(model, x.repeat(4000, 1, 1))
+        bounds = terms.bound.reshape(4000, 2)
+    assert (exact <= evidence + 1e-9).all()
+    assert z_score(bounds, exact) < 5
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_gap_is_the_mean_of_evidence_minus_bound(pair):
+    model = build(pair)
+    oracle = Oracle(model, T)
+    with torch.no_grad():
+        x = data(model, 4000)
+        assert z_score(oracle.evidence(x) - oracle.bound(x), oracle.gap()) < 5
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_gap_closes_exactly_where_the_audit_says_so(pair):
+    oracle = Oracle(build(pair), T)
+    assert audit(*PAIRS[pair]).exact == (pair in EXACT)
+    gap = oracle.fit_guide()
+    assert gap > -1e-9
+    assert (gap < 1e-6) == (pair in EXACT), gap
+
+
+@settings(max_examples=25)
+@given(factorizations(), st.integers(0, 999))
+def test_bounds_of_random_factorizations_lie_below_the_evidence(pair, seed):
+    model = build(pair, seed=seed)
+    oracle = Oracle(model, T)
+    torch.manual_seed(seed)
+    x = data(model, 3)
+    with torch.no_grad():
+        assert (oracle.bound(x) <= oracle.evidence(x) + 1e-9).all()
+        bounds = SequenceELBO().terms(model, x.repeat(1000, 1, 1)).bound.reshape(1000, 3)
+        assert z_score(bounds, oracle.bound(x)) < 5.5
+        assert oracle.gap() > -1e-9
+
+
+@settings(max_examples=10)
+@given(factorizations(), st.integers(0, 999))
+def test_random_guides_are_tight_exactly_where_the_audit_says_so(pair, seed):
+    verdict = audit(*pair)
+    gap = Oracle(build(pair, seed=seed, scale=0.6), T).fit_guide()
+    assert gap > -1e-9
+    assert (gap < 1e-6) == verdict.exact, gap
+
+
+@settings(max_examples=10)
+@given(factorizations(), st.integers(0, 999))
+def test_with_masks_of_ones_own_too(pair, seed):
+    rng = np.random.default_rng(seed)
+    pair = [masked(text, rng, 0.6) for text in pair]
+    verdict = audit(*pair, steps=T)
+    gap = Oracle(build(pair, seed=seed, scale=0.6), T).fit_guide()
+    assert (gap < 1e-6) == verdict.exact, gap
+
+
+def exact_guide(model):
+    """The posterior as a Pyro guide, one dense normal per latent given those before it."""
+    oracle = Oracle(model, T)
+
+    def guide(x):
+        mean, covariance = (m.detach() for m in oracle.posterior(x))
+        drawn = x.new_zeros(len(x), 0)
+        with pyro.plate("sequences", len(x), dim=-1):
+            for name in model.latents:
+                past = slice(0, drawn.shape[1])
+                shape = (*([T] if model.generative.local(name) else []), model.sizes[name])
+                here = slice(past.stop, past.stop + math.prod(shape))
+                gain = torch.linalg.solve(covariance[past, past], covariance[past, here])
+                left = covariance[here, here] - covariance[here, past] @ gain
+                law = dist.MultivariateNormal(mean[:, here] + (drawn - mean[:, past]) @ gain, (left + left.t()) / 2)
+                reshape = ReshapeTransform(law.event_shape, shape)
+                value = pyro.sample(name, dist.TransformedDistribution(law, [reshape]))
+                drawn = torch.cat([drawn, value.flatten(1)], dim=1)
+
+    return guide
+
+
+def assert_tight(model, x):
+    """Every draw from the exact posterior gives the evidence: the bound has no variance."""
+    guide, evidence = exact_guide(model), Oracle(model, T).evidence(x).detach()
+    for _ in range(3):
+        bounds = [-Trace_ELBO().loss(model.model, guide, sequence[None]) for sequence in x]
+        torch.testing.assert_close(x.new_tensor(bounds), evidence, rtol=0, atol=1e-8)
+        terms = SequenceELBO().terms(model, x, guide)
+        torch.testing.assert_close(terms.bound.detach(), evidence, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_with_the_exact_posterior_as_guide_every_draw_gives_the_evidence(pair):
+    model = build(pair, size=2)
+    assert_tight(model, data(model, 3))
+
+
+@settings(max_examples=25)
+@given(factorizations(), st.integers(0, 999))
+def test_the_exact_posterior_is_tight_for_random_factorizations(pair, seed):
+    model = build(pair, seed=seed)
+    torch.manual_seed(seed)
+    assert_tight(model, data(model, 2))
+
+
+# ---------------------------------------------------------------------------------- where the analytic KL is wrong
+
+
+AGAINST = {
+    "local": (*PAIRS["dkf, backward"], "z", "z"),
+    # w is drawn first, though v is its parent.
+    "static": ("p(v) p(w | v) p(x_t | w)", "q(w | x_{1:T}) q(v | w)", "w", "v"),
+}
+
+
+@pytest.mark.parametrize("pair", AGAINST)
+def test_a_latent_that_the_guide_draws_against_the_arrows_has_no_analytic_kl(pair, monkeypatch):
+    *equations, child, parent = AGAINST[pair]
+    model = build(tuple(equations))
+    with torch.no_grad():
+        model.generator[child].network.weights[parent].fill_(1.0)  # a strong arrow between latents
+    oracle = Oracle(model, T)
+    assert oracle.fit_guide() < 1e-6  # so the exact bound is the evidence, and draws vary little about it
+    x = data(model, 1).repeat(4000, 1, 1)
+    with torch.no_grad():
+        exact = oracle.bound(x[:1])
+        ours = SequenceELBO().terms(model, x).bound
+        assert z_score(ours, exact) < 5
+        monkeypatch.setattr("dvae.inference.bounds.elbo._closed_forms", lambda *sites: set(model.latents))
+        forced = SequenceELBO().terms(model, x).bound
+    assert z_score(forced, exact) > 20
+
+
+# ----------------------------------------------------------------------------------------------- price and errors
+
+
+def test_the_price_of_a_dropped_arrow():
+    sizes = {"z": 1, "x": 1}
+    full = price(DKF, "q(z_t | z_{t-1}, x_{t:T})", sizes, steps=T, seeds=2)
+    dropped = price(DKF, "q(z_t | x_{t:T})", sizes, steps=T, seeds=2)
+    assert full.shape == (2,)
+    assert full.abs().max() < 1e-6
+    assert dropped.min() > 1e-3
+
+
+def spread(generative, sizes, seed, steps):
+    """The covariance of the data under the model that prices of a seed have."""
+    oracle = Oracle(twin(generative, None, sizes, steps, seed), steps)
+    n = sum(map(oracle._size, oracle.model.latents))
+    return torch.linalg.inv(oracle._joint()[1].detach())[n:, n:]
+
+
+def dependence(covariance, size):
+    """How far blocks of so many normal coordinates are from independent, in nats: their total correlation."""
+    blocks = [covariance[k : k + size, k : k + size] for k in range(0, len(covariance), size)]
+    return float(sum(map(torch.logdet, blocks)) - torch.logdet(covariance)) / 2
+
+
+INDEPENDENT = {
+    "mutual information of two steps": ("p(x_t | x_{t-1})", "p(x_t)", {"x": 1}, 2, 1),
+    "of vectors, whose coordinates become independent too": ("p(x_t | x_{t-1})", "p(x_t)", {"x": 2}, 3, 1),
+    "no chain of latents": (DKF, "p(z_t) p(x_t | z_t)", {"z": 1, "x": 1}, T, 1),
+    "no latents": (DKF, "p(z_t | z_{t-1}) p(x_t)", {"z": 1, "x": 1}, T, 1),
+    "latents that still join the coordinates of a step": (DKF, "p(z_t) p(x_t | z_t)", {"z": 1, "x": 2}, T, 2),
+}
+
+
+@pytest.mark.parametrize("case", INDEPENDENT)
+def test_a_model_without_dependence_loses_all_of_it(case):
+    generative, reduced, sizes, steps, size = INDEPENDENT[case]
+    found = model_price(generative, reduced, sizes, steps, seeds=3)
+    expected = [dependence(spread(generative, sizes, seed, steps), size) for seed in range(3)]
+    assert min(expected) > 1e-6
+    assert found.tolist() == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(("steps", "seed"), [(4, 23), (5, 1), (6, 0)])
+def test_one_static_latent_costs_what_the_best_single_factor_does(steps, seed):
+    """By factor analysis from other starts; a single search ends in a local minimum, or where noise vanishes."""
+    whole, less = (Factorization.parse(text) for text in ("p(w) p(x_t | x_{t-1}, w)", "p(w) p(x_t | w)"))
+    covariance = spread(whole, {"w": 1, "x": 1}, seed, steps).numpy()
+
+    def divergence(values):
+        loadings, scales = np.split(values, 2)
+        inverse = np.linalg.inv(np.outer(loadings, loadings) + np.diag(np.exp(2 * scales)))
+        return (np.trace(inverse @ covariance) - steps - np.linalg.slogdet(inverse @ covariance)[1]) / 2
+
+    starts, bounds = np.random.default_rng(0).standard_normal((8, 2 * steps)), [(-8, 8)] * (2 * steps)
+    least = min(optimize.minimize(divergence, start, bounds=bounds).fun for start in starts)
+    found = _lost(Oracle(twin(whole, None, {"w": 1, "x": 1}, steps, seed), steps), less)
+    assert found == pytest.approx(least, abs=1e-5)
+
+
+def test_what_another_arrow_can_carry_costs_nothing():
+    found = model_arrow_prices("p(z_t | z_{t-1}, x_{<t}) p(x_t | x_{<t}, z_t)", steps=3, seeds=2)
+    assert {arrow for arrow, cost in found.items() if cost.max() < 1e-8} == {"z_{t-1} to z_t", "x_{<t} to z_t"}
+    assert found["x_{<t} to x_t"].min() > 1e-3
+
+
+@settings(max_examples=15)
+@given(factorizations(), st.integers(0, 999), st.data())
+def test_two_arrows_cost_at_least_what_one_costs_which_is_no_less_than_nothing(pair, seed, chosen):
+    whole = Factorization.parse(pair[0])
+    order = chosen.draw(st.permutations(whole.arrows))[:2]
+    sizes = dict.fromkeys(whole.variables, 1) | {"x": 2}
+    costs, less = [0.0], whole
+    for arrow in order:
+        less = less.without(*arrow)
+        costs.append(float(model_price(whole, less, sizes, steps=3, seeds=1)[0]))
+    assert costs == pytest.approx(sorted(costs), abs=1e-8)
+
+
+def test_model_and_guide_are_priced_on_the_same_models():
+    alone, guided = (twin(DKF, guide, {"z": 1, "x": 2}, T, seed=3) for guide in (None, "q(z_t | z_{t-1}, x_{t:T})"))
+    pairs = zip(alone.generator.parameters(), guided.generator.parameters(), strict=True)
+    assert all(torch.equal(ours, theirs) for ours, theirs in pairs)
+
+
+def test_prices_of_models_with_context():
+    driven, sizes = "p(z_t | c_t) p(x_t | z_t)", {"z": 1, "x": 1, "c": 1}
+    assert price(driven, "q(z_t | x_t, c_t)", sizes, steps=3, seeds=2).max() < 1e-8
+    assert price(driven, "q(z_t | x_t)", sizes, steps=3, seeds=2).min() > 1e-4
+    model = twin("p(c_t) p(x_t | c_t)", None, {"x": 1, "c": 1}, 3, 0, ("x", "c"))
+    slopes = model.generator["x"].network.weight("c", 3).detach().squeeze().diagonal()
+    scales = model.generator["x"].law.log_scale.detach().exp().squeeze()
+    expected = float(torch.log1p((slopes / scales) ** 2).sum()) / 2
+    assert float(model_price("p(x_t | c_t)", "p(x_t)", {"x": 1, "c": 1}, 3, 1)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_prices_of_what_is_no_reduced_model():
+    with pytest.raises(ValueError, match="variables of the whole one, z, x, but it is 'p"):
+        model_price(DKF, "p(x_t)", {"z": 1, "x": 1})
+    with pytest.raises(ValueError, match="at least 1 step and 1 model, not of 0 and 5"):
+        model_price(DKF, DKF, {"z": 1, "x": 1}, steps=0)
+
+
+def test_fitting_the_guide_leaves_the_model_and_its_gradients_alone():
+    model = build("storn")
+    before = {name: p.clone() for name, p in model.generator.named_parameters()}
+    Oracle(model, T).fit_guide(iterations=5)
+    for name, parameter in model.generator.named_parameters():
+        assert torch.equal(parameter, before[name])
+        assert parameter.grad is None
+
+
+def test_twins_of_a_seed_are_equal_and_take_nothing_from_the_global_generator():
+    state = torch.get_rng_state()
+    first, second, other = build("srnn"), build("srnn"), build("srnn", seed=1)
+    assert torch.equal(state, torch.get_rng_state())
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
+    assert not torch.equal(first.generator["z"].network.bias, other.generator["z"].network.bias)
+
+
+def with_prior(law):
+    parts = {"default": FixedNormal(project=False), "p(w)": law}
+    return DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 1}, Linear(T), parts).double()
+
+
+def test_a_learned_normal_prior_is_part_of_the_evidence():
+    model = with_prior(FixedNormal(scale=0.6, learned=True))
+    with torch.no_grad():
+        model.generator["w"].law.out.bias.copy_(torch.tensor([1.0, -2.0]))
+    network, x = model.generator["x"].network, torch.randn(3, T, 1, dtype=torch.float64)
+    slopes = network.weights["w"][:, 0, 0]
+    mean = network.bias[:T, 0] + slopes @ torch.tensor([1.0, -2.0], dtype=torch.float64)
+    covariance = 0.36 * slopes @ slopes.T + torch.eye(T, dtype=torch.float64)
+    expected = dist.MultivariateNormal(mean, covariance).log_prob(x[..., 0])
+    torch.testing.assert_close(Oracle(model, T).evidence(x), expected, rtol=0, atol=1e-6)
+
+
+def test_models_that_the_oracle_does_not_know():
+    with pytest.raises(ValueError, match=r"q\(z_t .* is not linear-Gaussian: the oracle needs networks.Linear"):
+        Oracle(DynamicalVAE(*PAIRS["dkf"], {"z": 1, "x": 1}).double(), T).gap()
+    for call, said in (((build("dkf"), "4"), "steps is .4."), ((DynamicalVAE, 4), "is the class DynamicalVAE")):
+        with pytest.raises(TypeError, match=said):
+            Oracle(*call)
+    driven = ("p(z_t | z_{t-1}, c_t) p(x_t | z_t)", "q(z_t | x_{1:T})")
+    with pytest.raises(ValueError, match="no law of the context c"):
+        Oracle(twin(*driven, {"z": 1, "x": 1, "c": 1}, T), T)
+    with pytest.raises(ValueError, match=r"p\(w\) is not linear-Gaussian: .* or without parents a normal"):
+        Oracle(with_prior(Mixture()), T).gap()
+    model = build("dkf")
+    with pytest.raises(ValueError, match=r"the batch has 3 steps, but this oracle is Oracle\(model, 4\)"):
+        Oracle(model, T).evidence(torch.zeros(2, 3, 1))
+    model.standardise("z", [Coordinate(floor=0.1)])
+    with pytest.raises(ValueError, match=r"q\(z_t .* reads logarithms of z"):
+        Oracle(model, T).gap()

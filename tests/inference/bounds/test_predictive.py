@@ -1,0 +1,152 @@
+"""The log score: unbiased for the density of the model's own forecasts, exact where guides are, a bound elsewhere."""
+
+import math
+
+import pytest
+import torch
+
+from dvae import DynamicalVAE, Oracle, twin
+from dvae.data.sequences import ArrayWindows
+from dvae.inference.bounds.predictive import predictive_bound
+from dvae.inference.evaluation.evaluate import evaluate
+
+T, SEEN = 5, 3
+DKF = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2})
+DRIVEN = (
+    "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t, w)",
+    "q(w | x_{1:T}) q(z_t | x_{t-1:t}, w)",
+    {"w": 1, "z": 2, "x": 2},
+)
+EXACT = ("p(z_t) p(x_t | x_{t-1}, z_t)", "q(z_t | x_t, x_{t-1})", {"z": 1, "x": 3})
+
+
+def wide(pair):
+    """A model with a guide that is near the posterior, but wider, so that weights are bounded and not equal."""
+    model = twin(*pair, T)
+    Oracle(model, T).fit_guide(15)
+    with torch.no_grad():
+        for conditional in model.encoder.values():
+            conditional.law.log_scale += 0.25
+    return model
+
+
+def draws(model, n):
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        return model.sample(n, T)["x"]
+
+
+def law(model, x):
+    """Means (B, H D) and covariance of forecasts of x (B, T, D): the guide's law of the past, run on by the model."""
+    whole, past = Oracle(model, T), Oracle(model, SEEN)
+    names = (*model.latents, *model.observed)
+    steps = [T if model.generative.local(name) else 1 for name in names]
+    blocks = torch.arange(sum(s * model.sizes[n] for n, s in zip(names, steps))).split(
+        [s * model.sizes[n] for n, s in zip(names, steps)]
+    )
+    known = torch.cat([block[: min(s, SEEN) * model.sizes[n]] for n, s, block in zip(names, steps, blocks)])
+    future = blocks[-1][SEEN * model.sizes["x"] :]
+    mean, precision = (value.detach() for value in whole._joint())
+    covariance = torch.linalg.inv(precision)
+    gain = torch.linalg.solve(covariance[known][:, known], covariance[known][:, future]).T
+    rest = covariance[future][:, future] - gain @ covariance[known][:, future]
+    weights, offset, root = (value[0].detach() for value in past._guide())
+    seen = x[:, :SEEN].flatten(1)
+    latents = seen @ weights.T + offset
+    read = gain[:, : latents.shape[1]] @ root
+    return mean[future] + (torch.cat([latents, seen], 1) - mean[known]) @ gain.T, rest + read @ read.T
+
+
+def log_density(model, x):
+    mean, covariance = law(model, x)
+    return torch.distributions.MultivariateNormal(mean, covariance).log_prob(x[:, SEEN:].flatten(1))
+
+
+@pytest.mark.parametrize("pair", [DKF, DRIVEN])
+def test_weights_are_unbiased_for_the_density_of_forecasts_and_their_log_is_below_it(pair):
+    model = wide(pair)
+    x = draws(model, 1)
+    exact = log_density(model, x)
+    found = torch.stack(
+        [predictive_bound(model, x.expand(2000, -1, -1), SEEN, particles).bound - exact for particles in (1, 8)]
+    )
+    ratios, error = found.exp().mean(1), found.exp().std(1) / math.sqrt(2000)
+    assert ((ratios - 1).abs() < 4 * error).all()
+    assert (error < 0.1).all()
+    bias, noise = found.mean(1), found.std(1) / math.sqrt(2000)
+    assert (bias < 4 * noise).all()
+    assert bias[0] + 4 * noise[0] < bias[1]  # more particles, less bias
+
+
+@pytest.mark.parametrize("pair", [DKF, DRIVEN])
+def test_forecasts_are_drawn_from_the_density_that_is_scored(pair):
+    model, count = twin(*pair, T), 20_000
+    x = draws(model, 1)
+    mean, covariance = law(model, x)
+    torch.manual_seed(0)
+    futures = model.forecast(x[:, :SEEN], T - SEEN, count, draw_emission=True)["x"].flatten(2)[:, 0]
+    assert ((futures.mean(0) - mean[0]).abs() < 5 * (covariance.diagonal() / count).sqrt()).all()
+    # an entry of a sample covariance has the variance (c_ii c_jj + c_ij^2) / n
+    error = ((covariance.diagonal()[:, None] * covariance.diagonal() + covariance**2) / count).sqrt()
+    assert ((futures.T.cov() - covariance).abs() < 5 * error).all()
+
+
+def test_with_exact_guides_one_particle_gives_the_exact_predictive_density():
+    model = twin(*EXACT, T)
+    Oracle(model, T).fit_guide(100)
+    x = draws(model, 20)
+    exact = (Oracle(model, T).evidence(x) - Oracle(model, SEEN).evidence(x[:, :SEEN])).detach()
+    torch.testing.assert_close(predictive_bound(model, x, SEEN, 1).bound, exact, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("pair", "last"), [(DKF, False), (DRIVEN, True)])
+def test_a_log_score_with_gaps_is_of_what_was_observed(pair, last):
+    """A marginal of the density of forecasts: exact where no x reads a gap, and the guide reads it as 0."""
+    model = wide(pair)
+    x, mask = draws(model, 1), torch.ones(1, T, 2).bool()
+    mask[0, -1, 0] = False
+    if not last:
+        mask[0, 1, 0] = mask[0, 2, 1] = mask[0, 3, 1] = False
+    mean, covariance = law(model, torch.where(mask, x, 0.0))
+    kept = mask[0, SEEN:].flatten()
+    marginal = torch.distributions.MultivariateNormal(mean[:, kept], covariance[kept][:, kept])
+    exact = marginal.log_prob(x[:, SEEN:].flatten(1)[:, kept])
+    batch = {"x": torch.where(mask, x, torch.nan).expand(2000, -1, -1), "mask": mask.expand(2000, -1, -1)}
+    ratios = (predictive_bound(model, batch, SEEN, 8).bound - exact).exp()
+    error = ratios.std() / math.sqrt(2000)
+    assert abs(ratios.mean() - 1) < 4 * error
+    assert error < 0.05
+
+
+def test_what_has_no_log_score():
+    model = twin(*DKF, T)
+    x = draws(model, 4)
+    for observed, particles in ((0, 1), (T, 1), (2, 0)):
+        with pytest.raises(ValueError, match="expected at least 1 particle, and observed frames from 1 to 4"):
+            predictive_bound(model, x, observed, particles)
+    with pytest.raises(ValueError, match="sequences of one length, but these have lengths"):
+        predictive_bound(model, {"x": x, "lengths": torch.full((4,), T)}, 2)
+
+    class Own(DynamicalVAE):
+        def forecast(self, *arguments, **options):
+            return super().forecast(*arguments, **options)
+
+    with pytest.raises(ValueError, match="Own forecasts in a way of its own"):
+        predictive_bound(Own(*DKF), x, 2)
+
+
+def test_an_evaluation_has_it_in_nats_a_predicted_frame():
+    model = twin(*DKF, T)
+    x = draws(model, 6)
+    windows = ArrayWindows(x, SEEN)
+    options = {"samples": 2, "batch_size": 6, "progress": False}
+    result = evaluate({"dkf": model}, windows, log_score_particles=7, seed=2, **options)
+    with torch.random.fork_rng():
+        torch.manual_seed(2)
+        expected = predictive_bound(model, x, SEEN, 7).bound.mean() / (T - SEEN)
+    assert result["dkf"]["log score"].mean == pytest.approx(expected.item())
+    assert list(result.metrics) == ["energy score", "variogram score", "CRPS", "log score", "ELBO", "KL z"]
+    assert (result.metrics["log score"].unit, result.metrics["log score"].better) == ("nats/frame", "higher")
+    assert result.log_score_particles == 7
+    assert "log score" not in result["zero velocity"]
+    assert "log score" not in evaluate({"dkf": model}, windows, **options).metrics

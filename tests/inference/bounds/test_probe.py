@@ -1,0 +1,70 @@
+"""The probe: forecasts with latents from elsewhere, by which one sees whether a model listens to them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.distributions import Normal
+
+import dvae
+from dvae import motion
+from dvae.inference.bounds.probe import Redrawn
+
+PROTOCOL = replace(motion.PROTOCOLS["simulated"], observed=5, predicted=7, test_stride=6, representation="quaternion")
+FAR = Normal(50.0, 50**0.5)
+
+
+@pytest.fixture(scope="module")
+def windows():
+    return motion.windows(motion.simulate(clips=8, frames=40, test=0.3), PROTOCOL, "test")
+
+
+def made(windows, **options):
+    torch.manual_seed(0)
+    return dvae.method("mix-and-match", **{"width": 24, **options}).build(windows).eval()
+
+
+@pytest.mark.parametrize("noise", ["mix", "concatenate", "add", "step"])
+def test_latents_are_from_the_other_law_each_sample_its_own(windows, noise):
+    model, past = made(windows, noise=noise), {"x": windows.all()["x"][:3, :5]}
+    z = Redrawn(model, {"z": FAR}).forecast(past, 7, samples=300)["z"]
+    assert z.shape == model.forecast(past, 7, samples=300)["z"].shape
+    assert z.mean() == pytest.approx(50, abs=0.3)
+    assert z.std() == pytest.approx(50**0.5, rel=0.03)
+    assert z.std(0).min() > 5
+    assert model.forecast(past, 7, samples=300)["z"].mean().abs() < 0.1  # which is as it was
+
+
+def test_a_model_that_listens_goes_astray_and_one_that_does_not_stays(windows):
+    deaf, hears = made(windows, noise="add"), made(windows, noise="add")
+    for model, heard in ((deaf, 0.0), (hears, 0.01)):
+        model.generator["x"].network.noise.layer.weight.data.mul_(heard)
+
+    def ratio(model):
+        models = {"own": model, "far": Redrawn(model, {"z": FAR})}
+        found = dvae.evaluate(models, windows, scores=motion.displacements, samples=10, progress=False)
+        return found["own"]["APD"].mean, found["far"]["APD"].mean
+
+    assert ratio(deaf) == (pytest.approx(0, abs=1e-5), pytest.approx(0, abs=1e-5))
+    own, far = ratio(hears)
+    assert far > 3 * own > 0  # what is nearly linear in z, whose standard deviation is 7 in place of 1
+
+
+def test_what_would_be_inferred_is_drawn_too():
+    model = dvae.method("vae", latent=3).build({"x": 4})
+    forecast = Redrawn(model, {"z": FAR}).forecast(torch.randn(5, 6, 4), 2, samples=40)
+    assert forecast["z"].shape == (40, 5, 8, 3)
+    assert forecast["z"][:, :, :6].mean() == pytest.approx(50, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("method", "laws", "message"),
+    [
+        ("vae", {"w": FAR}, "some of z; got w"),
+        ("vae", {}, "some of z; got none"),
+        ("srnn", {"z": FAR}, "z follows from .*, so that there is no one law to replace"),
+    ],
+)
+def test_what_it_refuses(method, laws, message):
+    with pytest.raises(ValueError, match=message):
+        Redrawn(dvae.method(method, latent=3).build({"x": 4}), laws)

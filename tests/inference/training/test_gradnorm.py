@@ -1,0 +1,474 @@
+"""Weights that adapt: they balance what the paper says, belong to one run, and are as they were when it goes on."""
+
+import io
+import json
+import math
+import signal
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors.torch import load_file
+from stopping import At, interrupt
+
+import dvae
+from dvae.inference.training.checkpoints import OPTIMISER, CheckpointError, Run, weights
+from dvae.inference.training.fit import Interrupted, fit
+from dvae.inference.training.gradnorm import GradNorm
+from dvae.inference.training.objectives import Adapting, Adaptive, Evidence
+from dvae.inference.training.options import Stage
+from dvae.inference.training.resuming import restore, store
+from dvae.inference.training.schedules import Ramp
+from dvae.inference.training.svi import NonFiniteError
+from dvae.networks import Dense
+from dvae.program.model import DynamicalVAE
+
+RATE = 0.1
+
+
+def alone(value):
+    """The mean over one process."""
+    return value
+
+
+def energies(**values):
+    """Terms of two frames, each energy as given."""
+    return dvae.Terms(
+        {}, {}, {name: value.reshape(1) for name, value in values.items()}, torch.full((1,), 2.0).double()
+    )
+
+
+class Linear(torch.nn.Module):
+    """Three tasks on one matrix, each a squared error: L_i = scale_i |W x - y_i|^2 / 2 by two frames."""
+
+    def __init__(self, scales=(1.0, 30.0, 0.2)):
+        super().__init__()
+        generator = torch.Generator().manual_seed(3)
+        draw = lambda *size: torch.randn(*size, generator=generator, dtype=torch.float64)  # noqa: E731
+        self.shared = torch.nn.Parameter(draw(2, 3))
+        self.own = torch.nn.Parameter(draw(2))
+        self.x, self.y, self.scales = draw(3), draw(len(scales), 2), scales
+
+    @property
+    def names(self):
+        return tuple(f"task{i}" for i in range(len(self.scales)))
+
+    def terms(self):
+        found = [s * ((self.shared @ self.x - y) ** 2).sum() for s, y in zip(self.scales, self.y)]
+        return energies(**dict(zip(self.names, found)))
+
+    def losses(self):
+        return torch.stack(list(self.terms().energies.values())).flatten().detach() / 2
+
+    def norms(self):
+        """Of the gradient of s |W x - y|^2 / 2, which is s (W x - y) x^T."""
+        miss = self.shared.detach() @ self.x - self.y
+        return torch.tensor(self.scales).double() * miss.norm(dim=1) * self.x.norm()
+
+
+def run(model=None, **options):
+    """A short quiet run of a model with two energies."""
+    defaults = {"batch_size": 8, "log_every": 1, "validate_every": 20, "progress": False, "learning_rate": 0.02}
+    if "stages" not in options:
+        defaults |= {"steps": 30, "objective": BALANCED}
+    return fit(model or build(), TRAIN, **(defaults | options))
+
+
+class Scaled(DynamicalVAE):
+    """Energies of one gradient, and one that is another."""
+
+    def penalties(self, rollout, batch, draws):
+        means = rollout.parameters("x", rollout.values["x"])[0]
+        small = ((means - batch["x"]) ** 2).sum((1, 2))
+        return {"small": small, "large": 100 * small, "other": ((means[:, 1:] - means[:, :-1]) ** 2).sum((1, 2))}
+
+
+def build(seed=0):
+    torch.manual_seed(seed)
+    equations = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)"
+    return Scaled(*equations, {"z": 2, "x": 3}, network=Dense(widths=(8,))).double()
+
+
+TRAIN = torch.randn(24, 4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).cumsum(1)
+BALANCED = GradNorm(("small", "large"), "generator.x.", asymmetry=0.0, learning_rate=RATE)
+MIXED = GradNorm(("x", "other", "large"), "generator.x.", Evidence(kl_weight=Ramp(0.0, 0.1, 4)), asymmetry=0.0)
+CERTAIN = GradNorm(("x", "other", "large"), "generator.x.", asymmetry=0.0)
+
+
+def weighing(result, name):
+    return result.series(f"weight/{name}")[1]
+
+
+# The weights --------------------
+
+
+@pytest.mark.parametrize("asymmetry", [0.0, 0.12, 1.5])
+def test_weights_of_equal_tasks_stay_1(asymmetry):
+    model = Linear(scales=(2.0, 2.0, 2.0))
+    model.y[:] = model.y[0]
+    balance = GradNorm(model.names, "shared", asymmetry=asymmetry).begin(model)
+    for step in range(50):
+        balance.measure(model.terms())
+        balance.adapt(alone)
+        with torch.no_grad():
+            model.shared.mul_(0.9)
+    assert list(balance.row.values()) == pytest.approx([1.0] * 3, abs=1e-12)
+
+
+def test_gradients_of_two_scales_come_to_one_norm_and_stay_there():
+    """Two norms come nearer by twice the rate in a step, in their logarithms, and cross by no more."""
+    result = run(steps=40)
+    gaps = [math.log(100 * b / a) for a, b in zip(weighing(result, "small"), weighing(result, "large"), strict=True)]
+    reached = math.ceil(math.log(100) / (2 * RATE))
+    assert gaps[:reached] == pytest.approx([math.log(100) - 2 * RATE * step for step in range(reached)])
+    assert max(map(abs, gaps[reached:])) <= 2 * RATE + 1e-9
+    assert len(gaps) > reached + 10
+
+
+@given(st.lists(st.floats(-9, 9), min_size=2, max_size=2))
+def test_the_unit_of_a_loss_changes_nothing_but_where_weights_start(powers):
+    """Of scales of any two orders of magnitude."""
+    model = Linear(scales=[10**power for power in powers])
+    balance = GradNorm(model.names, "shared", asymmetry=0.0, learning_rate=1.0).begin(model)
+    for step in range(24):  # ln(10^18) / 2 are 21
+        balance.measure(model.terms())
+        balance.adapt(alone)
+    norms = balance.weights * model.norms()
+    assert abs(math.log(norms[0] / norms[1])) <= 2 + 1e-9
+
+
+@pytest.mark.parametrize("asymmetry", [0.0, 0.12, 1.5])
+def test_a_step_is_down_the_slope_of_the_papers_loss(asymmetry):
+    """By central differences in log w of sum_i |w_i |grad L_i| - target_i| / Gbar, with gradients written by hand."""
+    model = Linear(scales=(1.0, 2.0, 0.5))
+    balance = GradNorm(model.names, "shared", asymmetry=asymmetry, learning_rate=0.05).begin(model)
+    first, expected, h = model.losses(), torch.ones(3).double(), 1e-6
+    for step in range(40):
+        norms, ratios = model.norms(), model.losses() / first
+        mean = (expected * norms).mean()
+        target = mean * (ratios / ratios.mean()) ** asymmetry
+
+        def imbalance(logarithms, norms=norms, target=target, mean=mean):
+            return (logarithms.exp() * norms - target).abs().sum() / mean
+
+        moved = [
+            (imbalance(expected.log() + h * axis) - imbalance(expected.log() - h * axis)) / (2 * h)
+            for axis in torch.eye(3).double()
+        ]
+        expected = (expected.log() - 0.05 * torch.stack(moved)).exp()
+        expected = expected * 3 / expected.sum()
+        balance.measure(model.terms())
+        balance.adapt(alone)
+        torch.testing.assert_close(balance.weights, expected, rtol=1e-7, atol=0)
+        with torch.no_grad():  # tasks train at different rates
+            model.shared += 0.05 * torch.outer(model.y[0] - model.shared @ model.x, model.x)
+
+
+def test_what_trains_slowly_is_favoured_by_the_asymmetry():
+    """Of two tasks with one gradient, the one whose loss has not fallen."""
+    weight = torch.nn.Parameter(torch.ones(1).double())
+    model = torch.nn.ParameterDict({"shared": weight})
+    for asymmetry in (0.0, 1.0):
+        balance = GradNorm(("fast", "slow"), "shared", asymmetry=asymmetry).begin(model)
+        for offset in (0.0, -0.9):
+            balance.measure(energies(fast=weight + offset, slow=weight))
+            balance.adapt(alone)
+        assert (balance.row["weight/slow"] > balance.row["weight/fast"]) == bool(asymmetry)
+
+
+@given(st.data())
+def test_weights_are_positive_and_add_up_to_the_number_of_tasks(data):
+    """Whatever losses and gradients are, those of 0 among them."""
+    tasks = data.draw(st.integers(2, 5))
+    size = st.lists(st.sampled_from([0.0, 1e-30, 1e-3, 1.0, 7.0, 1e4, 1e30]), min_size=tasks, max_size=tasks)
+    names = tuple(map(str, range(tasks)))
+    asymmetry, rate = data.draw(st.sampled_from([0.0, 0.12, 1.5, 10.0])), data.draw(st.sampled_from([0.01, 1.0]))
+    weight = torch.nn.Parameter(torch.ones(1).double())
+    model = torch.nn.ParameterDict({"shared": weight})
+    balance = GradNorm(names, "shared", asymmetry=asymmetry, learning_rate=rate).begin(model)
+    for step in range(6):
+        slopes, losses = data.draw(size), data.draw(size) if step else [1.0] * tasks
+        values = [slope * (weight - weight.detach()) + loss for slope, loss in zip(slopes, losses, strict=True)]
+        balance.measure(energies(**dict(zip(names, values, strict=True))))
+        balance.adapt(alone)
+        assert (balance.weights > 0).all()
+        assert balance.weights.sum().item() == pytest.approx(tasks)
+
+
+@pytest.mark.parametrize("precision", ["bf16-mixed", "bf16-true"])
+def test_weights_adapt_in_every_precision(precision):
+    """The gradients of two scales differ by a factor that bfloat16, of 8 bits, has to a hundredth or so."""
+    result = run(build().float(), precision=precision, steps=30)
+    gap = math.log(100 * weighing(result, "large")[-1] / weighing(result, "small")[-1])
+    assert abs(gap) <= 2 * RATE + 0.03
+
+
+def test_a_loss_that_is_0_without_a_gradient_in_some_batch_is_one_of_norm_0():
+    weight = torch.nn.Parameter(torch.ones(1).double())
+    balance = GradNorm(("a", "b"), "shared", asymmetry=0.0).begin(torch.nn.ParameterDict({"shared": weight}))
+    balance.measure(energies(a=weight, b=weight))
+    balance.adapt(alone)
+    terms = energies(a=weight, b=torch.zeros(1).double())
+    balance.measure(terms)
+    balance.adapt(alone)
+    norms = torch.tensor([0.5, 0.0]).double()
+    expected = torch.softmax(-0.025 * norms / norms.mean(), 0) * 2
+    torch.testing.assert_close(balance.weights, expected)
+
+
+def test_the_loss_is_the_weighted_tasks_and_the_other_terms_as_evidence_has_them():
+    result = run(objective=MIXED, steps=25)
+    for row in result.history:
+        kl = min(0.1 * (row["step"] - 1) / 4, 0.1) * row["kl/z"]
+        tasks = -row["weight/x"] * row["log_likelihood/x"]
+        tasks += row["weight/large"] * row["energy/large"] + row["weight/other"] * row["energy/other"]
+        assert row["loss"] == pytest.approx(tasks + kl + row["energy/small"])
+    assert [row["weight/x"] for row in result.history[:1]] == [1.0]
+    assert weighing(result, "x")[-1] != 1.0
+
+
+def test_with_a_rate_of_0_it_is_the_evidence():
+    still = run(objective=GradNorm(("small", "large"), "generator", learning_rate=0.0)).history
+    for row, other in zip(still, run(objective=Evidence()).history, strict=True):
+        assert row["loss"] == pytest.approx(other["loss"], rel=1e-9)
+        assert (row["weight/small"], row["weight/large"]) == (1.0, 1.0)
+
+
+def test_draws_and_selection_are_those_of_the_others():
+    objective = GradNorm(("a", "b"), "", others=Evidence(draws={"z": 3}, select="loss"))
+    assert (objective.draws, objective.select) == ({"z": 3}, "loss")
+
+
+def test_validation_losses_have_weights_of_1_and_can_be_compared():
+    objective = GradNorm(("small", "large"), "generator.x.", Evidence(select="loss"), learning_rate=RATE)
+    result = run(objective=objective, validation=TRAIN, steps=40)
+    for row in result.history:
+        if "validation/loss" in row:
+            parts = sum(row[f"validation/energy/{name}"] for name in ("small", "large", "other"))
+            assert row["validation/loss"] == pytest.approx(parts - row["validation/bound"])
+    assert result.best_bound is not None
+
+
+# Runs --------------------
+
+
+STAGED = [Stage(9, BALANCED), Stage(8, MIXED, learning_rate=0.01), Stage(4), Stage(9, BALANCED)]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The history and the last weights of a run that is not interrupted."""
+    place = tmp_path_factory.mktemp("whole")
+    return run(stages=STAGED, out=place).history, load_file(place / "last.safetensors")
+
+
+def terminal(state):
+    signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize(("action", "stop"), [(terminal, 13), *((interrupt, step) for step in (1, 9, 13, 17, 20, 25))])
+def test_an_interrupted_run_has_its_weights_back_bit_for_bit(tmp_path, whole, action, stop):
+    with pytest.raises(Interrupted):
+        run(stages=STAGED, out=tmp_path, callbacks=[At(stop, action)])
+    resumed, last = (
+        run(build(seed=9), stages=STAGED, out=tmp_path, resume=True),
+        load_file(tmp_path / "last.safetensors"),
+    )
+    assert resumed.history == whole[0]
+    assert all(torch.equal(value, last[name]) for name, value in whole[1].items())
+
+
+def test_half_a_run_and_the_other_half_are_the_whole_run(tmp_path):
+    whole = run(steps=30, objective=MIXED, out=tmp_path / "whole")
+    run(steps=21, objective=MIXED, out=tmp_path / "halves")
+    assert run(build(seed=9), steps=30, objective=MIXED, out=tmp_path / "halves", resume=True).history == whole.history
+
+
+def test_every_stage_begins_with_weights_of_1():
+    result = run(stages=STAGED)
+    rows = {row["step"]: row for row in result.history}
+    for step in (1, 10, 22):
+        assert {value for name, value in rows[step].items() if name.startswith("weight/")} == {1.0}
+    assert rows[9]["weight/small"] > 1.0
+    assert set(rows[10]) & {"weight/small", "weight/x"} == {"weight/x"}
+    assert not [name for name in rows[18] if name.startswith("weight/")]
+
+
+def test_by_hand_the_weights_come_back_too(tmp_path):
+    options = {"steps": 12, "objective": MIXED}
+
+    def steps(svi, until):
+        while svi.state.step < until:
+            svi.step(TRAIN)
+        return svi.objective.state
+
+    whole, first, second = (dvae.SVI(build(seed), **options) for seed in (0, 0, 9))
+    for svi in (whole, first, second):
+        svi.init()
+    expected = steps(whole, 12)
+    steps(first, 7)
+    store(first, Run(tmp_path))
+    restore(second, Run(tmp_path))
+    assert second.objective.state == first.objective.state
+    assert steps(second, 12) == expected
+    assert all(torch.equal(value, weights(whole.model)[name]) for name, value in weights(second.model).items())
+    whole.init()
+    assert set(whole.objective.row.values()) == {1.0}
+
+
+def test_runs_of_one_objective_have_weights_of_their_own():
+    first, second = (dvae.SVI(build(), steps=9, objective=MIXED) for _ in range(2))
+    for svi in (first, second):
+        svi.init()
+    for _ in range(3):
+        first.step(TRAIN)
+    assert set(second.objective.row.values()) == {1.0} != set(first.objective.row.values())
+
+
+def test_a_step_that_is_not_taken_leaves_the_weights():
+    svi = dvae.SVI(build(), steps=9, objective=MIXED)
+    svi.init()
+    svi.step(TRAIN)
+    before = svi.objective.state
+    with torch.no_grad():
+        kept = svi.parameters[0].clone()
+        svi.parameters[0].fill_(math.nan)
+    with pytest.raises(NonFiniteError):
+        svi.step(TRAIN)
+    assert svi.objective.state == before
+    with torch.no_grad():
+        svi.parameters[0].copy_(kept)
+    svi.step(TRAIN)
+
+
+def test_the_objective_of_a_run_keeps_to_its_contract():
+    assert isinstance(MIXED, Adaptive)
+    assert isinstance(MIXED.begin(build()), Adapting)
+    assert not isinstance(Evidence(), Adaptive)
+    assert json.loads(json.dumps(MIXED.to_config()))["others"] == json.loads(json.dumps(MIXED.others.to_config()))
+
+
+def test_the_config_says_what_was_run(tmp_path):
+    run(objective=MIXED, out=tmp_path, steps=25)
+    assert Run(tmp_path).config["stages"][0]["objective"] == json.loads(json.dumps(MIXED.to_config()))
+
+
+def test_a_run_without_weights_writes_none_and_schedules_of_the_others_end_in_time(tmp_path):
+    run(objective=Evidence(), out=tmp_path, steps=3)
+    assert set(Run(tmp_path).optimiser_state()) == {"name", "optimizer", "random"}
+    with pytest.warns(UserWarning, match="needs .* steps, and training has 3"):
+        dvae.SVI(build(), steps=3, objective=MIXED)
+
+
+# What is refused --------------------
+
+
+def test_a_model_without_the_shared_layer_is_refused_before_its_stage_comes():
+    lost = GradNorm(("small", "large"), "decoder.last")
+    with pytest.raises(ValueError, match=r"no parameter's name starts with 'decoder\.last' \(shared\); they are gen"):
+        dvae.SVI(build(), stages=[Stage(5), Stage(5, lost)])
+
+
+def test_tasks_that_are_none_are_refused():
+    with pytest.raises(ValueError, match="tasks names 'z', but the log-likelihoods and energies are x, small, large"):
+        run(objective=GradNorm(("x", "z"), "generator"))
+    for tasks in ((), ("x",), ("x", "x")):
+        with pytest.raises(ValueError, match="weights need two of them or more, each once"):
+            GradNorm(tasks, "generator")
+    with pytest.raises(TypeError, match="tasks is 'x'; it must be a tuple"):
+        GradNorm("x", "generator")
+    with pytest.raises(ValueError, match="asymmetry is -1"):
+        GradNorm(("x", "y"), "generator", asymmetry=-1.0)
+
+
+def test_a_task_that_does_not_go_through_the_shared_parameters_is_refused():
+    model = Linear(scales=(1.0,))
+    balance = GradNorm(("task0", "own"), "shared", asymmetry=0.0).begin(model)
+    terms = energies(task0=model.terms().energies["task0"], own=model.own.sum())
+    with pytest.raises(
+        ValueError, match=r"the loss of own has no gradient by the parameters .* 'shared' \(shared\); name"
+    ):
+        balance.measure(terms)
+
+
+def test_a_loss_without_a_training_rate_is_refused_but_at_no_asymmetry():
+    weight = torch.nn.Parameter(torch.ones(1).double())
+    for start, now in ((-1.0, 1.0), (0.0, 1.0), (1.0, -1.0)):
+        objective = GradNorm(("a", "b"), "shared", asymmetry=0.5)
+        for allowed in (False, True):
+            if allowed:
+                objective = GradNorm(("a", "b"), "shared", asymmetry=0.0)
+            balance = objective.begin(torch.nn.ParameterDict({"shared": weight}))
+
+            def steps(balance=balance, start=start, now=now):
+                for value in (start, now):
+                    balance.measure(energies(a=value * weight, b=weight))
+                    balance.adapt(alone)
+
+            if allowed:
+                steps()
+            else:
+                with pytest.raises(ValueError, match=r"the loss of a is .* has no training rate.* give asymmetry=0"):
+                    steps()
+
+
+def written(path, change):
+    """The checkpoint of a run in which the objective's state was changed, signed as its author would."""
+    run(steps=5, objective=BALANCED, out=path)
+    content, buffer = Run(path).optimiser_state(), io.BytesIO()
+    changed = change(content["objective"])
+    torch.save(content | {"objective": changed} if changed is not None else content, buffer)
+    Run(path).commit(Run(path).state, {OPTIMISER: buffer.getvalue()})
+
+
+def one(value):
+    return torch.tensor(value, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda state: {},
+            "was fitted with another objective: the state of this one is weight/small, .*, the run's none",
+        ),
+        (lambda state: [1], "was fitted with another objective"),
+        (lambda state: {7: one(1.0)}, "was fitted with another objective.*the run's .7.; resume with the objective"),
+        (lambda state: state | {"weight/huge": one(1.0)}, "was fitted with another objective"),
+        (
+            lambda state: state | {"weight/small": 1.0},
+            "'weight/small'. is not as the objective writes it, finite, torch",
+        ),
+        (lambda state: state | {"weight/small": torch.ones(1)}, "'weight/small'. is not as the objective writes it"),
+        (lambda state: state | {"first/large": one(math.nan)}, "'first/large'. is not as the objective writes it"),
+        (lambda state: state | {"weight/small": one(3.0)}, "the weights of small, large are not positive numbers with"),
+        (
+            lambda state: state | {"weight/small": one(3.0), "weight/large": one(-1.0)},
+            "the weights of small, large are not positive numbers with the sum 2",
+        ),
+    ],
+)
+def test_a_state_that_no_run_writes_is_refused_in_a_sentence(tmp_path, change, message):
+    written(tmp_path, change)
+    with pytest.raises(CheckpointError, match=message):
+        run(build(seed=9), steps=10, objective=BALANCED, out=tmp_path, resume=True)
+
+
+def test_a_state_is_never_unpickled_freely(tmp_path):
+    class Hostile:
+        def __reduce__(self):
+            return (exec, ("raise SystemExit('executed')",))
+
+    written(tmp_path, lambda state: state | {"weight/small": Hostile()})
+    with pytest.raises(CheckpointError, match=r"last.state.pt is no optimiser state of torch: it asks for"):
+        run(steps=10, objective=BALANCED, out=tmp_path, resume=True)
+
+
+def test_another_objective_is_refused_where_it_would_go_on(tmp_path):
+    """Where its stage has begun; a new stage begins anew."""
+    run(steps=5, objective=BALANCED, out=tmp_path)
+    with pytest.raises(CheckpointError, match="was fitted with another objective: the state of this one is weight/x"):
+        run(steps=10, objective=MIXED, out=tmp_path, resume=True)
+    result = run(stages=[Stage(5, BALANCED), Stage(20, MIXED)], out=tmp_path, resume=True)
+    assert weighing(result, "x")[0] == 1.0

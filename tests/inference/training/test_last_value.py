@@ -1,0 +1,88 @@
+"""The bound of repeating the last value, by its definition, and what a fit says of it."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import dvae
+from dvae.data.sequences import ArrayWindows, sequences
+from dvae.inference.training.last_value import last_value_bound
+
+T, OBSERVED = 6, 3
+LAWS = {
+    "real": dvae.distributions.FixedNormal(),
+    "residual": dvae.distributions.FixedNormal(residual=1.0),
+    "class": dvae.distributions.FAMILIES["category"],
+    "count": dvae.distributions.FAMILIES["count"],
+}
+
+
+def model(law="real", size=2):
+    return dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": size}, dvae.networks.Recurrent(2), {"p(x)": LAWS[law]})
+
+
+def by_definition(train, x, seen, fed):
+    """A sum over entries, one after the other."""
+    mean, scale, total = train.mean((0, 1)), train.std((0, 1)), 0.0
+    for n, t, d in np.argwhere(seen):
+        before = [s for s in range(t) if seen[n, s, d] and not (fed and (t < OBSERVED or s >= OBSERVED))]
+        location, spread = (mean[d], scale[d])
+        if before:
+            lag = t - before[-1]
+            spread = np.sqrt(np.square(train[:, lag:, d] - train[:, :-lag, d]).mean())
+            location = x[n, before[-1], d]
+        total -= 0.5 * ((x[n, t, d] - location) / spread) ** 2 + np.log(spread) + 0.5 * np.log(2 * np.pi)
+    return total
+
+
+@pytest.mark.parametrize("fed", [False, True])
+def test_it_is_its_definition_with_missing_entries_and_lengths(fed):
+    random = np.random.default_rng(0)
+    train, x = (random.normal(size=(n, T, 2)).cumsum(1) + 5 for n in (20, 4))
+    seen, lengths = random.random(x.shape) < 0.7, np.array([T, 4, T, 2])
+    valid = (np.arange(T) < lengths[:, None])[..., None]
+    batch = {"x": torch.from_numpy(x), "mask": torch.from_numpy(seen), "lengths": torch.from_numpy(lengths)}
+    source = sequences(train)
+    found = last_value_bound(model(), source, sequences(batch), OBSERVED, fed=fed, batch_size=3)
+    drawn = source.sample(128, torch.Generator().manual_seed(0))["x"].numpy()
+    assert found == pytest.approx(by_definition(drawn, x, seen & valid, fed) / lengths.sum())
+
+
+@pytest.mark.parametrize("law", ["class", "count"])
+def test_probabilities_of_discrete_values_sum_to_one(law):
+    """Over all that the second step may be, given the first."""
+    random = np.random.default_rng(0)
+    if law == "class":
+        values = np.eye(3)
+        train = values[random.integers(3, size=(50, 2))]
+    else:
+        values = np.arange(-10.0, 20.0)[:, None]
+        train = random.poisson(4.0, size=(50, 2, 1)).astype(float)
+    windows = [np.stack([values[len(values) // 2], second])[None] for second in values]
+    built = model(law, values.shape[1])
+    logs = [
+        2 * last_value_bound(built, sequences(train), sequences(window), 1, fed=False, batch_size=1)
+        for window in windows
+    ]
+    first = np.stack([values[len(values) // 2]])[None]
+    alone = last_value_bound(built, sequences(train), sequences(first), 1, fed=False, batch_size=1)
+    assert np.logaddexp.reduce(logs) == pytest.approx(alone)
+
+
+def test_a_fit_that_is_worse_says_so_with_both_numbers():
+    walks = torch.randn(60, T, 1).cumsum(1) + 20
+    for x, worse in ((walks, True), (torch.randn(60, T, 1), False)):
+        train, validation = (ArrayWindows(part, OBSERVED) for part in (x[:40], x[40:]))
+        fit = dvae.fit(model(size=1), train, validation, steps=1, progress=False)
+        assert fit.last_value is not None
+        assert ("worse than repeating the last value" in fit.best) == worse == (fit.best_bound < fit.last_value)
+        assert (f"({fit.last_value:.3f})" in fit.best) == worse
+        assert ("try residual=1" in fit.best, "try self_feeding=1" in fit.best) == (worse, worse)
+    windows = ArrayWindows(walks, OBSERVED)
+    found = dvae.fit(model("residual", size=1), windows, windows, steps=1, self_feeding=1.0, progress=False)
+    assert "best bound with scheduled sampling" in found.best
+    assert "try " not in dataclasses.replace(found, last_value=math.inf).best  # the run has both options
+    assert dvae.fit(model(size=1), walks[:40], walks[40:], steps=1, progress=False).last_value is None

@@ -1,0 +1,251 @@
+"""Several processes: together they are one that has all their batches, and what one that is lost takes with it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from datetime import timedelta
+from itertools import product
+from pathlib import Path
+
+import pytest
+import torch
+from stopping import At
+from test_gradnorm import TRAIN, Scaled
+
+from dvae.data.sequences import Sequences
+from dvae.inference.training import processes
+from dvae.inference.training.checkpoints import Run
+from dvae.inference.training.fit import fit
+from dvae.inference.training.gradnorm import GradNorm
+from dvae.inference.training.options import Training
+from dvae.inference.training.processes import LostProcess, launched, seed_of, together
+from dvae.inference.training.resuming import restore, store
+from dvae.inference.training.svi import SVI
+from dvae.networks import Dense
+from dvae.program.model import DynamicalVAE
+
+OPTIONS = {"steps": 12, "batch_size": 4, "validate_every": 4, "accelerator": "cpu", "progress": False}
+EQUATIONS = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)"
+
+
+def model(*equations):
+    torch.manual_seed(0)
+    sizes = {"z": 2, "x": 3} if equations[-1] else {"x": 3}
+    return DynamicalVAE(*equations, sizes, network=Dense(widths=(4,))).double()
+
+
+def walks(n):
+    x = torch.randn(n, 4, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64).cumsum(1)
+    return {"x": x, "lengths": torch.arange(n) % 3 + 2}
+
+
+def stepped(batches):
+    """Weights after a step on each batch, and the terms of all of them, by a model that draws nothing."""
+    svi = SVI(model("p(x_t | x_{t-1})", None), **OPTIONS, weight_decay=0.1)
+    svi.init()
+    for batch in batches:
+        svi.step(batch)
+    scores = [svi.evaluate(Sequences(walks(n))) for n in (9, 1)]  # of one sequence one of two processes has none
+    return svi.model.state_dict(), scores
+
+
+def fitted(out, **options):
+    """What is left of a run in several processes: its weights, or how it failed."""
+    try:
+        found = fit(model(*EQUATIONS), walks(12), walks(6), out=out, **OPTIONS | options)
+        return {"how": (found.status, found.step), "weights": found.model.state_dict()}
+    except LostProcess as error:
+        return {"how": str(error)}
+
+
+# ------------------------------------------------------------------------------------------------ what two processes do
+
+
+def joint(rank, out):
+    rows = slice(0, 4) if rank == 0 else slice(4, 9)
+    return stepped([{name: value[rows] for name, value in walks(9).items()}] * 3)
+
+
+def some_gradients(rank, out):
+    """Of three parameters the second has a gradient in one process, the third in none."""
+    parameters = [torch.nn.Parameter(torch.ones(2)) for _ in range(3)]
+    parameters[0].grad = torch.full((2,), 1.0 + rank)
+    parameters[1].grad = torch.ones(2) if rank else None
+    loss, share = together(launched(Training()), parameters, torch.tensor(2.0 - rank), torch.tensor(1.0 + 2 * rank))
+    return [p.grad for p in parameters], loss, share
+
+
+def whole(rank, out):
+    return fitted(out / "whole")
+
+
+def killed(rank, out):
+    return fitted(out / "run", callbacks=[At(7, lambda _: os.kill(os.getpid(), signal.SIGKILL))] if rank else ())
+
+
+def resumed(rank, out):
+    return fitted(out / "run", resume=True)
+
+
+def silent(rank, out):
+    processes.LONGEST_WAIT = timedelta(seconds=4)
+    return fitted(out / "silent", callbacks=[At(7, lambda _: os.kill(os.getpid(), signal.SIGSTOP))] if rank else ())
+
+
+def stopped(rank, out):
+    return fitted(out / "stopped", callbacks=[At(6, lambda state: setattr(state, "stop", True))] if rank else ())
+
+
+def certain():
+    """A model that draws nothing, so that what a batch gives does not depend on where its halves are."""
+    torch.manual_seed(0)
+    return Scaled("p(x_t | x_{t-1})", None, {"x": 3}, network=Dense(widths=(8,))).double()
+
+
+def begun():
+    svi = SVI(certain(), steps=4, objective=GradNorm(("x", "other", "large"), "generator.x.", asymmetry=0.0))
+    svi.init()
+    return svi
+
+
+def weighed(rank, out):
+    """What GradNorm and the model have after steps on half of each batch, with a checkpoint between."""
+    svi, run = begun(), Run(out / "weighed")
+    while svi.state.step < 4:
+        if svi.state.step == 2:
+            store(svi, run)
+            svi.fabric.barrier()
+            svi = begun()
+            restore(svi, run)
+        svi.step(TRAIN[12 * rank : 12 * (rank + 1)])
+    return svi.objective.state, svi.model.state_dict()
+
+
+def play(out, *names):
+    """Each of these functions in two processes, forked from one that has imported all, as if torchrun had."""
+    launched(Training())  # which imports fabric
+    for name in names:
+        with socket.socket() as found:
+            found.bind(("127.0.0.1", 0))
+            port = found.getsockname()[1]
+        started = []
+        for rank in range(2):
+            if not (child := os.fork()):
+                told = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": 2, "LOCAL_WORLD_SIZE": 2, "MASTER_PORT": port}
+                os.environ |= {key: str(value) for key, value in told.items()}
+                os.environ |= {"MASTER_ADDR": "127.0.0.1", "TORCHELASTIC_RUN_ID": "none"}
+                torch.save(globals()[name](rank, Path(out)), f"{out}/{name}-{rank}.pt")
+                os._exit(0)
+            started.append(child)
+        os.waitpid(started[0], 0)
+        if name in ("killed", "silent"):
+            os.kill(started[1], signal.SIGKILL)  # also one that has stopped
+        os.waitpid(started[1], 0)
+
+
+@pytest.fixture(scope="module")
+def of_two(tmp_path_factory):
+    """What each function has left in both processes."""
+    if not torch.distributed.is_available():
+        pytest.skip("this torch is built without torch.distributed")
+    out = tmp_path_factory.mktemp("processes")
+    names = ["joint", "some_gradients", "weighed", "whole", "killed", "resumed", "silent", "stopped"]
+    here = Path(__file__).parent
+    paths = os.pathsep.join(map(str, (here.parents[2], here.parents[1], here)))
+    script = "import sys, test_processes; test_processes.play(*sys.argv[1:])"
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(out), *names],
+        env=os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+
+    def read(name):
+        return [torch.load(file) for rank in (0, 1) if (file := out / f"{name}-{rank}.pt").exists()]
+
+    return read, out
+
+
+pytestmark = pytest.mark.slow
+
+
+# ------------------------------------------------------------------------------------------------ laws
+
+
+def test_they_are_one_process_with_the_batches_of_all(of_two):
+    """Also where their batches have different numbers of frames; and of what is validated each scores a share."""
+    expected = stepped([walks(9)] * 3)
+    first, second = of_two[0]("joint")
+    torch.testing.assert_close(first, second, rtol=0, atol=0)
+    torch.testing.assert_close(first, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_a_parameter_has_no_gradient_where_it_has_none_in_any_process(of_two):
+    for rank, ((both, one, none), loss, share) in enumerate(of_two[0]("some_gradients")):
+        assert none is None
+        torch.testing.assert_close(both, torch.full((2,), (1 + 3 * 2) / 4))
+        torch.testing.assert_close(one, torch.full((2,), 3 / 4))
+        assert (float(loss), float(share)) == ((2 + 3 * 1) / 4, (1 + 2 * rank) / 4)
+
+
+def test_they_have_the_gradnorm_of_one_that_has_both_their_batches(of_two):
+    first, second = of_two[0]("weighed")
+    torch.testing.assert_close(first, second, rtol=0, atol=0)
+    svi = begun()
+    for _ in range(4):
+        svi.step(TRAIN)
+    torch.testing.assert_close(first, (svi.objective.state, svi.model.state_dict()), rtol=1e-9, atol=1e-12)
+
+
+def test_they_draw_differently_and_have_the_same_weights(of_two):
+    first, second = (found["weights"] for found in of_two[0]("whole"))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    random = Run(of_two[1] / "whole").optimiser_state()["random"]
+    for states in random.values():
+        assert not torch.equal(*states)
+
+
+def test_a_process_that_is_killed_stops_the_others_and_costs_no_more_than_the_steps_since_the_checkpoint(of_two):
+    read, out = of_two
+    (said,) = [found["how"] for found in read("killed")]
+    assert "another process of this run has ended" in said
+    for name in ("log.jsonl", "best.safetensors", "last.safetensors"):
+        assert (out / "run" / name).read_bytes() == (out / "whole" / name).read_bytes()
+
+
+def test_a_process_that_does_not_answer_is_waited_for_so_long(of_two):
+    (said,) = [found["how"] for found in of_two[0]("silent")]
+    assert "has not answered for 0.0666667 minutes" in said
+
+
+def test_what_asks_one_of_them_to_stop_stops_all(of_two):
+    assert [found["how"] for found in of_two[0]("stopped")] == [("stopped early", 6)] * 2
+
+
+def test_streams_are_of_one_process_of_one_seed():
+    assert [seed_of(seed, 0) for seed in (-1, 0, 7)] == [-1, 0, 7]
+    assert len({seed_of(seed, rank) for seed, rank in product(range(-20, 20), range(20))}) == 800
+
+
+def test_what_cannot_be_started_is_told(monkeypatch):
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    with pytest.raises(
+        ValueError, match=r"accelerator is 'mps', and torch \S+ finds none here; 'auto' takes what there is"
+    ):
+        processes.launched(Training(accelerator="mps"))
+    monkeypatch.setattr("sys.argv", ["-c"])
+    with pytest.raises(ValueError, match="devices=2 starts the program as often, and this one is in no file"):
+        processes.launched(Training(accelerator="cpu", devices=2))
+
+
+def test_torchrun_says_how_many_processes_there_are(monkeypatch):
+    assert processes._places(2) == (2, 1)
+    for name, value in {"TORCHELASTIC_RUN_ID": "none", "LOCAL_WORLD_SIZE": "2", "WORLD_SIZE": "6"}.items():
+        monkeypatch.setenv(name, value)
+    assert processes._places(1) == processes._places(2) == (2, 3)
+    with pytest.raises(ValueError, match="devices is 4, and torchrun has started 2 processes here; leave devices out"):
+        processes._places(4)

@@ -1,0 +1,178 @@
+"""MT-VAE: its contract, its size, what it minimises, and that its latent codes changes of style."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import dvae
+from dvae import motion
+from dvae.models.baselines.mt_vae import NormedLSTM
+from dvae.testing import FactorizationContract
+
+SMALL = {"latent": 4, "width": 16}
+
+
+def small(**options):
+    return dvae.method("mt-vae", **{**SMALL, **options})
+
+
+class TestMTVAE(FactorizationContract):
+    missing = {}  # noqa: RUF012
+
+    def build(self, size):
+        return small().build({"x": size})
+
+
+@pytest.fixture(scope="module")
+def windows():
+    protocol = replace(motion.PROTOCOLS["simulated"], observed=5, predicted=12, train_stride=3, test_stride=6)
+    return motion.windows(motion.simulate(clips=8, frames=40, test=0.3), protocol, "train")
+
+
+def built(windows, **options):
+    torch.manual_seed(0)
+    return small(**options).build(windows).double()
+
+
+def batch_of(windows, size=3):
+    batch = windows.sample(size, torch.Generator().manual_seed(0))
+    return {**batch, "x": batch["x"].double()}
+
+
+def future(model, batch, w):
+    """What is made of w (B, T, D)."""
+    with torch.no_grad():
+        return model.forecast({"x": batch["x"][:, :5]}, 12, fix={"w": w})["x"][0]
+
+
+def test_the_model_of_human36m_has_the_layers_of_the_public_code():
+    """That of 1024 units, of which half of an embedding are style, for poses of 48 numbers in place of 64."""
+    model = dvae.method("mt-vae").build({"x": 48})
+
+    def linear(size, out):
+        return (size + 1) * out
+
+    def block(size, out):
+        return linear(size, out) + linear(size, out // 2) + linear(out // 2, out // 2) + linear(out // 2, out)
+
+    def lstm(size):  # of four gates and a cell, with gains and shifts
+        return 4 * 1024 * (size + 1024) + 2 * 5 * 1024
+
+    encoder = lstm(48) + linear(1024, 1024)
+    guide = block(512, 1024) + 2 * linear(1024, 512)
+    change = linear(512, 512) + block(1024, 512) + linear(512, 512)
+    decoder = block(1024, 1024) + 2 * linear(1024, 1024) + lstm(512) + linear(1024, 48)
+    assert sum(parameter.numel() for parameter in model.parameters()) == encoder + guide + change + decoder
+
+
+def test_past_and_future_have_one_embedding(windows):
+    model = built(windows)
+    assert model.encoder["w"].network.past is model.generator["x"].network.past
+
+
+def test_a_motion_that_stays_the_same_has_one_code(windows):
+    """Whatever it is: a guide of the change of style has nothing else to read."""
+    network, poses = built(windows).encoder["w"].network, batch_of(windows)["x"][:, :5]
+    same = network({"x": poses, "h": poses.flatten(1)}, 5)
+    torch.testing.assert_close(same, same[:1].expand(3, -1), rtol=0, atol=0)
+    other = network({"x": poses.flip(1), "h": poses.flatten(1)}, 5)
+    assert (other - other[:1])[1:].abs().max() > 1e-3
+
+
+def test_no_pose_that_is_made_is_read(windows):
+    """A longer future begins as a shorter one, by states and not by poses."""
+    model, batch = built(windows), batch_of(windows)
+    w = torch.randn(3, 4, dtype=torch.float64)
+    short = model.forecast({"x": batch["x"][:, :5]}, 3, fix={"w": w})["x"][0]
+    torch.testing.assert_close(short, future(model, batch, w)[:, :3])
+    assert model.method.train(windows).feeding == 0
+
+
+def test_gates_do_not_know_the_level_or_the_scale_of_what_they_add_up():
+    torch.manual_seed(0)
+    network = NormedLSTM(3, 6).double()
+    values, zero = torch.randn(2, 4, 3, dtype=torch.float64), torch.zeros(2, 6, dtype=torch.float64)
+    shares = network.share(values)
+    expected = network(shares.unbind(1), zero, zero)
+    levels = torch.randn(4, dtype=torch.float64).repeat_interleave(6)
+    torch.testing.assert_close(network((shares + levels).unbind(1), zero, zero), expected)
+    with torch.no_grad():
+        network.recurrent.weight.mul_(1e3)
+        far = network((1e3 * shares).unbind(1), zero, zero)
+        network.recurrent.weight.mul_(1e3)
+    torch.testing.assert_close(network((1e6 * shares).unbind(1), zero, zero), far, rtol=1e-5, atol=1e-8)
+
+
+def test_the_loss_is_the_papers(windows):
+    """Absolute errors, first velocities of two futures, the divergence and the way back to a latent, one by one."""
+    model, batch = built(windows, heading=False, join=2.0), batch_of(windows)
+    objective = small(heading=False, join=2.0).train(windows, steps=100).objective
+    torch.manual_seed(1)
+    terms = dvae.SequenceELBO().terms(model, batch)
+    torch.manual_seed(1)
+    w, other = model.guide(batch)["w"], torch.randn(3, 4, dtype=torch.float64)
+    truth, last = batch["x"][:, 5:], batch["x"][:, 4:5]
+
+    def velocity(poses):
+        return torch.cat([last, poses], 1).diff(dim=1)[:, :8]
+
+    made, free = future(model, batch, w), future(model, batch, other)
+    network, guide = model.generator["x"].network, model.encoder["w"]
+    _, style = network.past(batch["x"][:, :5])
+    loc, scale = guide.law(guide.network.coded(network.changed(style, other) - style))
+    again = loc + scale * torch.randn(3, 4, dtype=torch.float64)
+    joints, a = 16, 1 - torch.exp(torch.tensor(-3.0, dtype=torch.float64))
+    paper = (made - truth).abs().sum() / joints
+    paper = paper + 5 * a * sum((velocity(each) - velocity(truth)).abs().sum() / joints for each in (made, free))
+    paper = paper + a * terms.kl["w"].sum() / 4 + 5 * (other - again).abs().sum() / 4
+    scale = joints / 4  # of the Laplace law
+    constant = 3 * truth[0].numel() * torch.tensor(2 * scale).log()
+    join = 2 * (made[:, 0] - last[:, 0]).square().sum()
+    torch.testing.assert_close(objective(terms, 100), (4 * paper + constant + join) / (3 * 12))
+
+
+def test_weights_rise_as_in_the_paper():
+    objective = dvae.method("mt-vae", latent=512).objective()
+    for step in (0, 100, 20_000, 60_000):
+        a = 1 - 0.99995**step
+        assert objective.kl_weight(step) == pytest.approx(a, rel=1e-4)
+        assert objective.energy_weights["velocity"](step) == pytest.approx(5 * a * 512 / 16, rel=1e-4)
+
+
+def test_a_divergence_below_the_floor_costs_nothing_more(windows):
+    objective = small(floor=0.5).train(windows, steps=10).objective
+    terms = dvae.SequenceELBO().terms(built(windows), batch_of(windows))
+
+    def loss(each):  # nats for each number of w
+        return objective(replace(terms, kl={"w": torch.full((3,), 4 * each, dtype=torch.float64)}), 10)
+
+    assert loss(0.0) == loss(0.499)
+    assert loss(1.0) > loss(0.501) > loss(0.499)
+
+
+def test_velocities_count_where_both_poses_were_observed(windows):
+    model, batch = built(windows, heading=False), batch_of(windows)
+    mask = torch.ones_like(batch["x"], dtype=torch.bool)
+    mask[:, 7, :3] = False  # the third that is made
+    mask[:, 16] = False  # after the first eight
+    found = []
+    for hidden in (0.0, torch.nan):
+        torch.manual_seed(1)
+        terms = dvae.SequenceELBO().terms(model, {"x": batch["x"].masked_fill(~mask, hidden), "mask": mask})
+        found.append(terms.energies["velocity"])
+    assert torch.equal(*found)
+    torch.manual_seed(1)
+    drawn = model.guide({"x": batch["x"].masked_fill(~mask, 0.0), "mask": mask})["w"]
+    futures = [future(model, batch, w) for w in (drawn, torch.randn(3, 4, dtype=torch.float64))]
+    counted = torch.ones(3, 8, 48, dtype=torch.bool)
+    counted[:, 2:4, :3] = False
+    truth, last = batch["x"][:, 5:], batch["x"][:, 4:5]
+    errors = [torch.cat([last - last, made - truth], 1).diff(dim=1)[:, :8].abs() for made in futures]
+    torch.testing.assert_close(found[0], (sum(errors) * counted).sum((1, 2)))
+
+
+def test_losses_without_weight_are_not_computed(windows):
+    terms = dvae.SequenceELBO().terms(built(windows, velocity=0.0, cycle=0.0), batch_of(windows))
+    assert not terms.energies
+    assert not small(velocity=0.0, cycle=0.0).train(windows).objective.energy_weights

@@ -1,0 +1,819 @@
+"""Motion that lacks joints: read, cut, turned, fitted by every method, forecast, scored and filled in."""
+
+import base64
+import json
+import zlib
+from dataclasses import is_dataclass, replace
+from typing import get_type_hints
+
+import numpy as np
+import pytest
+import torch
+
+import dvae
+from dvae import motion
+from dvae.cli import main
+from dvae.cli.app import COMMANDS, command
+from dvae.cli.console import Missing
+from dvae.data.sequences import bridged, gapped, past_of
+from dvae.inference.diagnostics.checks import STATISTICS, Statistic
+from dvae.inference.evaluation import metrics
+from dvae.inference.evaluation.held import clip_places
+from dvae.inference.evaluation.references import distances, nearest_neighbours, zero_velocity
+from dvae.models.motion.trajectories import TrajectoryMethod
+from dvae.models.registry import METHODS
+from dvae.motion.data.clips import Clip, MotionSet
+from dvae.motion.drawing.film import save_film
+from dvae.motion.drawing.player import MISSING, _scene
+from dvae.motion.drawing.plot import staged
+from dvae.motion.scoring import energies
+
+PEOPLE = motion.simulate(clips=10, frames=90, seed=1)
+GAPS = motion.occlude(PEOPLE, seed=1)
+WALKER = PEOPLE.skeleton
+SMALL = {
+    "hit-dvae": {"samples": 2, "width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "pose_prior": 0.0},
+    "gsps": {"width": 8, "blocks": 1, "draws": (2, 2), "coefficients": 4, "pose_prior": 0.0},
+    "trajevae": {"width": 8, "feedforward": 8, "components": 4},
+    "erd": {"width": 4, "encoder": (5,), "decoder": (6,)},
+    "aclstm": {"width": 4},
+    "cvae-rnn": {"latent": 4, "summary": 4, "width": 8, "hidden": (8,)},
+    "motion-infilling": {"maps": (4, 6)},
+    **{name: {"latent": 4, "width": 8, "hidden": (8,)} for name in ("cvae", "bom", "pose-knows", "rhp")},
+    "mt-vae": {"latent": 4, "width": 8},
+    "bom-parts": {"width": 8, "blocks": 1, "coefficients": 4},
+    **{
+        name: {"latent": 4, "width": 8, "hidden": (8,), "modes": 3, "sampler_width": 8, "sampler_hidden": (8,)}
+        for name in ("dlow", "dsf")
+    },
+}
+
+
+def without(clips, **joints):
+    """Clips whose joints are NaN in some frames."""
+    found = []
+    for clip in clips:
+        positions = clip.positions.copy()
+        for name, frames in joints.items():
+            positions[frames, WALKER.names.index(name)] = np.nan
+        found.append(Clip(clip.split, clip.name, positions, clip.labels))
+    return MotionSet(found, WALKER, "some", missing=True)
+
+
+# ------------------------------------------------------------------------------------------------------ sets and files
+
+
+def test_missing_joints_are_refused_unless_they_are_allowed():
+    clips = list(GAPS)
+    with pytest.raises(ValueError, match=r"has NaN or infinite positions.*missing=True \(--missing\) keeps the clip"):
+        MotionSet(clips, WALKER)
+    assert MotionSet(clips, WALKER, missing=True).fingerprint() == GAPS.fingerprint()
+
+
+def test_what_lacks_a_coordinate_lacks_the_joint():
+    positions = PEOPLE.clips[0].positions.copy()
+    positions[4, 3, 1] = np.nan
+    (clip,) = MotionSet([Clip("a", "b", positions)], WALKER, missing=True)
+    assert np.isnan(clip.positions[4, 3]).all()
+    assert np.isnan(clip.positions).sum() == 3
+    assert np.isnan(positions).sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [(np.inf, "has infinite positions"), (np.nan, "has no joint that is observed in any of its 90 frames")],
+)
+def test_what_is_no_gap_is_refused(value, message):
+    clip = Clip("a", "b", np.full_like(PEOPLE.clips[0].positions, value))
+    with pytest.raises(ValueError, match=message):
+        MotionSet([clip], WALKER, missing=True)
+
+
+def test_gaps_are_written_and_read_back(tmp_path):
+    motion.save(tmp_path / "gaps.npz", GAPS)
+    with pytest.raises(ValueError, match="missing=True"):
+        motion.read_motion(tmp_path / "gaps.npz")
+    assert motion.read_motion(tmp_path / "gaps.npz", missing=True).fingerprint() == GAPS.fingerprint()
+
+
+@pytest.mark.parametrize("format", ["csv", "npz"])
+def test_gaps_are_read_from_a_folder_and_an_archive(tmp_path, format):
+    path = tmp_path / ("clips" if format == "csv" else "clips.npz")
+    motion.write_motion(path, GAPS, format)
+    with pytest.raises(ValueError, match=r"NaN.*missing=True"):
+        motion.read_motion(path, skeleton=WALKER)
+    for onto in (None, WALKER):
+        found = motion.read_motion(path, skeleton=WALKER, missing=True, onto=onto)
+        assert found.missing
+        for clip in GAPS:
+            there = next(other for other in found if other.key == clip.key).positions
+            assert np.array_equal(np.isnan(there), np.isnan(clip.positions))
+            np.testing.assert_allclose(there, clip.positions, atol=1e-5)
+
+
+def test_gaps_stay_where_motion_is_resampled_or_divided():
+    whole, half = GAPS.divided(0.3), GAPS.resampled(WALKER.fps / 2)
+    assert whole.missing
+    assert half.missing
+    assert sum(np.isnan(clip.positions).sum() for clip in whole) == sum(np.isnan(clip.positions).sum() for clip in GAPS)
+    doubled = GAPS.resampled(2 * WALKER.fps)  # its even frames are those that were there
+    for clip, slow, fast in zip(GAPS, half, doubled, strict=True):
+        np.testing.assert_array_equal(slow.positions, clip.positions[::2])
+        np.testing.assert_array_equal(fast.positions[::2], clip.positions)
+
+
+def test_turns_are_refused_where_joints_lack():
+    turned = replace(motion.PROTOCOLS["simulated"], representation="6d")
+    with pytest.raises(ValueError, match=r"lacks joints, without which their turns are not known"):
+        motion.windows(GAPS, turned, "train")
+    found = replace(PEOPLE.with_rotations(), missing=True)
+    batch = motion.windows(found, turned, "test").all()
+    with pytest.raises(ValueError, match="leaves the turns of others open"):
+        motion.windows(found, turned, "test").schema.view({**batch, "mask": {"x": batch["mask"]}})
+    futures = motion.Forecasts(WALKER, [("a", "b", 0)], *_future_with_gaps())
+    assert futures.motion().missing
+    with pytest.raises(ValueError, match=r"lacks joints, and bvh has no gaps; fill them first"):
+        motion.write_motion("futures.bvh", futures.motion(), "bvh")
+
+
+def _future_with_gaps():
+    """Forecasts, what was observed of them, and the truth."""
+    clip, gaps = PEOPLE.clips[0].positions, without(PEOPLE, LElbow=slice(3, 30), RKnee=slice(25, 40)).clips[0].positions
+    return clip[None, None, 10:40], gaps[None, :10], gaps[None, 10:40]
+
+
+def test_rotations_need_whole_bodies():
+    with pytest.raises(ValueError, match=r"lacks joints, without which their turns are not known"):
+        GAPS.with_rotations()
+
+
+@pytest.mark.parametrize(("share", "length"), [(0.2, 15.0), (0.5, 4.0)])
+def test_bursts_have_their_share_and_length(share, length):
+    """Of F independent chains, within five standard errors: a burst has a variance of length (length - 1)."""
+    still = np.broadcast_to(PEOPLE.clips[0].positions[:1], (20_000, WALKER.joints, 3))
+    (clip,) = motion.occlude(MotionSet([Clip("a", "b", still)], WALKER), share, length, seed=3)
+    hidden = np.isnan(clip.positions).any(2)
+    assert not hidden[:, WALKER.root].any()
+    hidden = np.delete(hidden, WALKER.root, 1)
+    begins = np.diff(hidden.astype(int), axis=0) == 1
+    count = begins.sum()
+    assert abs(hidden.sum() / count - length) < 5 * length / count**0.5
+    cycle = length / share
+    assert abs(hidden.mean() - share) < 5 * (1 - share) * length / cycle * (2 / count) ** 0.5
+
+
+@pytest.mark.parametrize(("share", "length"), [(1.0, 4.0), (-0.1, 4.0), (0.2, 0.5), (0.9, 2.0)])
+def test_bursts_that_cannot_be_are_refused(share, length):
+    with pytest.raises(ValueError, match="expected a share from 0 to below 1 and bursts of"):
+        motion.occlude(PEOPLE, share, length)
+
+
+# -------------------------------------------------------------------------------------------------------------- windows
+
+
+@pytest.mark.parametrize("name", ["simulated", "simulated-trajectories", "turned"])
+def test_windows_say_what_was_observed_and_hide_the_rest(name):
+    """Where it was, they are the windows of the whole motion; of each joint all three coordinates or none."""
+    protocol = motion.PROTOCOLS[name.replace("turned", "simulated")]
+    protocol = motion.Protocol(**{**vars(protocol), "heading": name == "turned", "rotate": False})
+    whole, some = (motion.windows(each, protocol, "train").all() for each in (PEOPLE, GAPS))
+    mask = some["mask"]
+    assert 0.7 < mask.float().mean() < 0.95
+    assert torch.equal(mask.unflatten(-1, (-1, 3)).any(-1), mask.unflatten(-1, (-1, 3)).all(-1))
+    assert (some["x"][~mask] == 0).all()
+    if name != "turned":
+        assert torch.equal(some["x"][mask], whole["x"][mask])
+    drawn = motion.windows(GAPS, protocol, "train").sample(5, torch.Generator().manual_seed(0))
+    assert drawn["x"].isfinite().all()
+    assert drawn["mask"].shape == drawn["x"].shape
+
+
+def test_complete_windows_have_no_mask():
+    assert set(motion.windows(PEOPLE, motion.PROTOCOLS["simulated"], "train").all()) == {"x"}
+
+
+def test_a_frame_without_its_root_is_hidden():
+    some = without(PEOPLE, Pelvis=slice(20, 30))
+    windows = motion.windows(some, motion.PROTOCOLS["simulated"], "train")
+    mask, starts = windows.all()["mask"], [start for _, _, start in windows.keys]
+    for seen, start in zip(mask, starts, strict=True):
+        frames = [20 <= start + t < 30 for t in range(75)]
+        assert seen.any(-1).logical_not().tolist() == frames
+
+
+def test_paths_start_where_the_root_is_first_seen():
+    some = without(PEOPLE, Pelvis=slice(0, 1), LWrist=slice(1, 2))
+    windows = motion.windows(some, motion.Protocol("p", 2, 60, 30, 90, 90, root="relative"), "train")
+    x = windows.positions(windows.all()["x"])
+    assert torch.equal(x[:, 1, WALKER.root], torch.zeros(len(x), 3))
+    world = torch.stack([torch.from_numpy(clip.positions) for clip in windows.clips])
+    torch.testing.assert_close(x[:, 2], world[:, 2] - world[:, 1, [WALKER.root]])
+
+
+@pytest.mark.parametrize("unseen", [15, 10])  # frames of each clip in which no left side is, all of the past or not
+def test_the_future_does_not_turn_the_past(unseen):
+    lacking = without(PEOPLE, LHip=slice(unseen), LShoulder=slice(unseen))
+    turned = [np.concatenate([c.positions[:15], c.positions[15:] * [-1, 1, -1]]) for c in lacking]
+    other = [replace(clip, positions=positions) for clip, positions in zip(lacking, turned, strict=True)]
+    protocol = replace(motion.PROTOCOLS["simulated"], heading=True, train_stride=90)  # windows at the first frames
+    pasts = [
+        motion.windows(MotionSet(clips, WALKER, missing=True), protocol, "train").all()["x"][:, :15]
+        for clips in (lacking.clips, other)
+    ]
+    torch.testing.assert_close(*pasts)
+    plain = motion.windows(lacking, replace(protocol, heading=False), "train").all()["x"][:, :15]
+    assert torch.equal(pasts[0], plain) == (unseen == 15)
+
+
+def test_listed_windows_have_something_before_and_after_the_present():
+    some = without(PEOPLE, Pelvis=slice(0, 18))
+    windows = motion.windows(some, motion.PROTOCOLS["simulated"], "train")
+    assert {start for _, _, start in windows.keys} == {5, 10, 15}  # 15 frames from 5 on end at 19
+    assert len(windows.all()["x"]) == len(windows.keys) == len(windows)
+    with pytest.raises(ValueError, match="no window that has the root beside another joint"):
+        motion.windows(without(PEOPLE, Pelvis=slice(None)), motion.PROTOCOLS["simulated"], "train")
+
+
+# ----------------------------------------------------------------------------------------- references, scores, energies
+
+
+def test_gaps_are_bridged_by_straight_lines():
+    x = torch.randn(3, 12, 4).cumsum(1)
+    mask = torch.rand(3, 12, 4) < 0.6
+    mask[0, :, 0] = False
+    found = bridged(torch.where(mask, x, torch.nan), mask)
+    for n in range(3):
+        for d in range(4):
+            seen = np.flatnonzero(mask[n, :, d])
+            line = np.interp(range(12), seen, x[n, seen, d]) if len(seen) else np.zeros(12)
+            np.testing.assert_allclose(found[n, :, d], line, atol=1e-5)
+
+
+def test_zero_velocity_stays_where_joints_were_last():
+    x, mask = torch.randn(2, 5, 3), torch.ones(2, 5, 3, dtype=torch.bool)
+    mask[0, 3:, 1] = mask[1, :, 2] = False
+    found = zero_velocity(torch.where(mask, x, torch.nan), 4, mask)
+    assert torch.equal(found[0, :, 0], found[0, :, 3])
+    assert torch.equal(found[0, 0, 0], torch.stack([x[0, 4, 0], x[0, 2, 1], x[0, 4, 2]]))
+    assert found[0, 1, 0, 2] == 0
+
+
+def test_distances_are_over_what_both_have():
+    first, second = torch.randn(5, 6) + 100, torch.randn(4, 6) + 100
+    seen, also = torch.rand(5, 6) < 0.6, torch.rand(4, 6) < 0.6
+    seen[0], also[0] = torch.tensor([1, 1, 1, 0, 0, 0]), torch.tensor([0, 0, 0, 1, 1, 1])
+    found = distances(torch.where(seen, first, torch.nan), second, seen.bool(), also.bool())
+    assert found[0, 0] == torch.inf
+    for n in range(5):
+        for m in range(4):
+            both = seen[n].bool() & also[m].bool()
+            if both.any():
+                expected = ((first[n] - second[m])[both].square().mean() * 6).sqrt()
+                torch.testing.assert_close(found[n, m], expected, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(distances(first, second, torch.ones(5, 6).bool()), torch.cdist(first, second))
+
+
+def test_neighbours_are_found_by_what_was_observed():
+    training = torch.randn(30, 9, 3)
+    mask, gaps = torch.rand(7, 5, 3) < 0.7, torch.rand(30, 9, 3) < 0.9
+    mask[:, 4, 0] = gaps[:, 4, 0] = True
+    observed = torch.where(mask, training[:7, :5], torch.nan)
+    (found,) = nearest_neighbours(observed, torch.where(gaps, training, torch.nan), 1, mask, gaps)
+    shown = bridged(training, gaps)
+    assert found.isfinite().all()
+    assert all(any(torch.equal(future, other) for other in shown[:, 5:]) for future in found)
+    everything = torch.ones_like(mask), torch.ones_like(gaps)
+    same = nearest_neighbours(training[:7, :5], training, 3, *everything)
+    assert torch.equal(same, nearest_neighbours(training[:7, :5], training, 3))
+
+
+SCORES = [
+    metrics.average_displacement_error,
+    metrics.final_displacement_error,
+    metrics.median_average_displacement_error,
+    metrics.median_final_displacement_error,
+    metrics.energy_score,
+    metrics.continuous_ranked_probability_score,
+    metrics.variogram_score,
+]
+SEVERAL = [
+    metrics.multimodal_average_displacement_error,
+    metrics.multimodal_final_displacement_error,
+    metrics.median_multimodal_average_displacement_error,
+    metrics.median_multimodal_final_displacement_error,
+]
+
+
+@pytest.mark.parametrize("score", [*SCORES, *SEVERAL])
+def test_scores_are_of_what_was_observed(score):
+    """A coordinate that was never observed, or a frame of which nothing was, might as well not be there."""
+    several = (3,) if score in SEVERAL else ()
+    samples, truth = torch.randn(2, 4, 6, 5).double(), torch.randn(2, *several, 6, 5).double()
+    gaps = truth.clone()
+    gaps[..., 2, :], gaps[..., 3] = torch.nan, torch.nan
+    kept, coordinates = [0, 1, 3, 4, 5], [0, 1, 2, 4]
+    torch.testing.assert_close(
+        score(samples, gaps), score(samples[..., kept, :][..., coordinates], truth[..., kept, :][..., coordinates])
+    )
+    gaps = truth.clone()
+    gaps[..., 5, :] = torch.nan
+    torch.testing.assert_close(score(samples, gaps), score(samples[..., :5, :], truth[..., :5, :]))
+    gaps[..., 1, 2] = torch.nan
+    found = score(samples, gaps)
+    samples[..., 1, 2] += 100
+    different = score(samples, gaps)
+    if score is metrics.energy_score:  # which has the samples' own spread too
+        samples[..., 1, 2] = 0.0
+        different = score(samples, gaps)
+    torch.testing.assert_close(found, different)
+
+
+def test_a_diversity_with_gaps_is_that_of_what_pairs_share():
+    """Futures that lie equally far apart in all numbers have the same diversity, whatever is missing."""
+    samples, truths = torch.randn(4, 6, 5).double(), torch.arange(3.0).double()[:, None, None].expand(3, 6, 5)
+    gaps = torch.where(torch.rand(3, 6, 5) < 0.7, truths, torch.nan)
+    found = metrics.average_pairwise_distance_error(samples, gaps)
+    torch.testing.assert_close(found, metrics.average_pairwise_distance_error(samples, truths))
+    gaps[0], gaps[1:, 0] = torch.nan, truths[1:, 0]
+    gaps[1, 1:], gaps[2] = torch.nan, torch.nan
+    assert metrics.average_pairwise_distance_error(samples, gaps).isnan()  # no two share anything
+
+
+def test_scores_of_bodies_are_of_what_was_observed():
+    """Whoever foresees the truth errs in nothing, whatever of it was seen."""
+    whole, gaps = (motion.windows(each, motion.PROTOCOLS["simulated"], "test") for each in (PEOPLE, GAPS))
+    assert whole.keys == gaps.keys
+    past = gaps.protocol.observed
+    listed = gaps.all()
+    observed = {name: value[:, :past] for name, value in listed.items()}
+    args = whole.all()["x"][:, None, past:], gapped(listed)[:, past:], observed, torch.arange(len(gaps))
+    measures = {measure.name: measure for measure in motion.scores(gaps)}
+    assert measures.keys() == {measure.name for measure in motion.scores(whole)}
+    errors = [name for name in measures if name.startswith("limb") or name in ("ADE", "FDE", "bone-length error")]
+    assert len(errors) == 8
+    for name in errors:
+        assert measures[name].function(*args).abs().max() < (0.1 if "angle" in name else 1e-4), name
+    assert measures["limb stretch"].function(1.1 * args[0], *args[1:]).sub(0.1).abs().max() < 1e-4
+
+
+def test_jerk_is_of_what_was_observed():
+    windows = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")
+    observed, x = windows.protocol.observed, gapped(windows.all())
+    (measure,) = (each for each in motion.scores(windows) if each.name == "jerk")
+    past, truth = past_of(windows.all(), observed), x[:, observed:]
+    forecasts = torch.randn(len(x), 3, *truth.shape[1:])
+    found = measure.function(forecasts, truth, past, torch.arange(len(x)))
+    anywhere = torch.where(truth[:, None].isnan(), 9.0, forecasts)
+    assert found.isfinite().all()
+    assert torch.equal(measure.function(anywhere, truth, past, torch.arange(len(x))), found)
+
+
+def test_cumulative_motion_is_of_joints_that_were_observed():
+    """A joint that nobody saw might as well not be there, and where futures are in gaps is nobody's business."""
+    elbow = WALKER.names.index("LElbow") - 1
+    some = motion.windows(without(PEOPLE, LElbow=slice(None)), motion.PROTOCOLS["simulated"], "test")
+    for windows in (some, motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")):
+        truth = gapped(windows.all())[:, windows.protocol.observed :]
+        (measure,) = (each for each in motion.scores(windows) if each.name == "CMD")
+        clips, index = clip_places(windows.keys), torch.arange(len(truth))
+
+        def score(forecasts, measure=measure, truth=truth, clips=clips, index=index):
+            return np.average(
+                measure.pool(measure.function(forecasts, truth, {}, index), clips), weights=clips.bincount()
+            )
+
+        forecasts = torch.randn(len(truth), 3, *truth.shape[1:])
+        found = score(forecasts)
+        assert score(torch.where(truth[:, None].isnan(), 9.0, forecasts)) == found
+        if windows is some:
+            joints = [n for n in range(WALKER.joints - 1) if n != elbow]
+            ours, real = (
+                x.unflatten(-1, (-1, 3))[..., joints, :].diff(dim=-3).norm(dim=-1).mean(-1).double()
+                for x in (forecasts, truth)
+            )
+            pooled = metrics.motion_pseudo_values(ours.mean(1), real.mean(-1), torch.zeros_like(clips), clips)
+            assert found == pytest.approx(np.average(pooled, weights=clips.bincount()), rel=1e-5)
+
+
+def test_statistics_are_of_what_was_observed():
+    """A coordinate that was never observed, or the last frames, might as well not be there."""
+    x = torch.randn(3, 20, 4).cumsum(1).double()
+    gaps = x.clone()
+    gaps[..., 2] = torch.nan
+    for statistic in STATISTICS.values():
+        torch.testing.assert_close(statistic.function(gaps), statistic.function(x[..., [0, 1, 3]]))
+    gaps[:, 15:] = torch.nan
+    for name in ("mean", "scale", "roughness"):
+        function = STATISTICS[name].function
+        torch.testing.assert_close(function(gaps), function(x[:, :15, [0, 1, 3]]))
+    windows = motion.windows(PEOPLE, motion.PROTOCOLS["simulated"], "test")
+    x = windows.all()["x"]
+    gaps, toe = x.clone(), WALKER.names.index("Head") - 1  # an end, so that one bone goes with it
+    gaps[:, 60:], gaps[..., 3 * toe : 3 * toe + 3] = torch.nan, torch.nan
+    found = {name: statistic.function(gaps) for name, statistic in motion.statistics(windows).items()}
+    whole = {name: statistic.function(x[:, :60]) for name, statistic in motion.statistics(windows).items()}
+    lengths = WALKER.bone_lengths(windows.positions(x[:, :60]))
+    kept = [n for n, (_, child) in enumerate(WALKER.edges) if child != toe + 1]
+    torch.testing.assert_close(found["bone length"], lengths[..., kept].mean((1, 2)))
+    torch.testing.assert_close(found["foot height"], whole["foot height"])
+    assert all(value.isfinite().all() for value in found.values())
+
+
+def test_replicates_have_the_gaps_of_their_windows():
+    """Statistics see the same gaps in a window and in all that is compared with it."""
+    data, method = small("vae")
+    torch.manual_seed(0)
+    model, test, given = method.build(data.schema), data.windows("test"), []
+
+    def speed(x):
+        given.append(x.isnan())
+        return x.diff(dim=-2).square().nanmean((-2, -1))
+
+    checks = dvae.predictive_checks(model, test, {"speed": Statistic(speed)}, samples=19, progress=False)
+    mask, seam = test.all()["mask"], data.protocol.observed - 2
+    for real, made, first in ((0, 1, seam), (2, 3, 0)):
+        assert torch.equal(given[real], ~mask[:, first:])
+        assert torch.equal(given[made], ~mask[:, first:].expand(19, -1, -1, -1))
+    some = {"sum": Statistic(lambda x: torch.where(x.isnan().sum((-2, -1)) > 150, torch.nan, x.nansum((-2, -1))))}
+    told = [int((x.isnan().sum((1, 2)) <= 150).sum()) for x in (gapped(test.all())[:, seam:], gapped(test.all()))]
+    few = dvae.predictive_checks(model, test, some, samples=19, progress=False)
+    assert [check.replicated.shape for check in few.checks.values()] == [(19, count) for count in told]
+    whole = dvae.predictive_checks(model, test, motion.statistics(test), samples=19, progress=False)
+    assert all(np.isfinite(check.wasserstein) for check in (*checks.checks.values(), *whole.checks.values()))
+
+
+def test_what_needs_whole_bodies_says_what_to_do():
+    windows = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")
+    with pytest.raises(ValueError, match=r"features of whole futures, but these windows lack joints.*dvae impute"):
+        motion.scores(windows, classifiers={"content": None})
+    told = motion.windows(GAPS, motion.PROTOCOLS["simulated-trajectories"], "test").given(["LWrist"])
+    with pytest.raises(ValueError, match=r"exchanged whole, but these windows may lack joints.*dvae impute"):
+        motion.Exchanged(told)
+    data, method = small("trajevae")
+    pose = GAPS.clips[0].positions[np.isnan(GAPS.clips[0].positions).any((1, 2))][0]
+    with pytest.raises(ValueError, match=r"the initial pose lacks .*fill the gaps first") as refused:
+        method.build(data.schema).complete(pose, frames=5)
+    assert "--missing" not in str(refused.value)
+
+
+@pytest.mark.parametrize("format", ["bvh", "amass"])
+def test_formats_of_rotations_have_no_gaps(tmp_path, format):
+    for clips in (GAPS, replace(PEOPLE.with_rotations(), clips=GAPS.clips, missing=True)):
+        with pytest.raises(
+            ValueError, match=f"lacks joints, and {format} has no gaps; fill them first.*or write npz or csv"
+        ):
+            motion.write_motion(tmp_path / "folder", clips, format)
+
+
+@pytest.mark.parametrize("heading", [True, False])
+@pytest.mark.parametrize("root", ["drop", "relative"])
+def test_windows_are_put_back_where_they_were(root, heading):
+    """Whole poses, turned and moved as windows are, fill the clips; but for the root's own gap, where poses lack it."""
+    gaps = without(GAPS, Pelvis=slice(30, 36))
+    protocol = replace(motion.PROTOCOLS["simulated"], root=root, heading=heading, test_stride=20)
+    windows = motion.windows(gaps, protocol, "test")
+    read, true = (
+        torch.stack([torch.from_numpy(clips[key[:2]].positions[key[2] :][: windows.length]) for key in windows.keys])
+        for clips in (gaps, PEOPLE)
+    )
+    made = true - (true[:, :, [WALKER.root]] if root == "drop" else true[:, :1, [WALKER.root]])
+    if heading:
+        angle = WALKER.heading_near(read, protocol.observed - 1)[:, None, None]
+        made = motion.rotate_about_up(made, -angle, WALKER.up)
+    found = windows.filled(made)
+    assert found.missing == any(np.isnan(clip.positions).any() for clip in found)
+    covered = max(key[2] for key in windows.keys) + windows.length
+    for clip in found:
+        true, read = PEOPLE[clip.key].positions, gaps[clip.key].positions
+        assert np.array_equal(clip.positions[~np.isnan(read)], read[~np.isnan(read)])
+        assert np.array_equal(np.isnan(clip.positions[covered:]), np.isnan(read[covered:]))
+        bridge = np.linspace(true[29, WALKER.root], true[36, WALKER.root], 8)[1:-1]
+        moved = (bridge - true[30:36, WALKER.root])[:, None] if root == "drop" else 0.0
+        expected = np.where(np.isnan(read), true, read)[:covered]
+        expected[30:36] += np.where(np.isnan(read[30:36]), moved, 0.0)
+        np.testing.assert_allclose(clip.positions[:covered], expected, atol=1e-5)
+
+
+def test_energies_are_of_what_was_observed():
+    samples, truth = torch.randn(3, 2, 6, 48).double(), torch.randn(2, 6, 48).double()
+    seen = torch.rand(2, 6, 48) < 0.8
+    gaps = torch.where(seen, truth, torch.nan)
+    errors = torch.where(seen, samples - truth, 0.0).square()
+    torch.testing.assert_close(energies.best_of_many(samples, gaps), errors.sum((2, 3)).amin(0))
+    torch.testing.assert_close(energies.history_error(samples, gaps), errors.sum(3).mean((0, 2)))
+    joint = 3 * (WALKER.names.index("LElbow") - 1)
+    pose = truth[:, 0].clone()
+    pose[:, joint : joint + 3] = torch.nan
+    kept = [n for n, edge in enumerate(WALKER.edges) if WALKER.names.index("LElbow") not in edge]
+    lengths, own = (WALKER.limbs(each).norm(dim=-1) for each in (samples, truth[:, 0]))
+    expected = (lengths - own[:, None]).square()[..., kept].sum(3).mean((0, 2))
+    torch.testing.assert_close(energies.limb_length(samples, pose, WALKER), expected)
+
+
+# -------------------------------------------------------------------------------------------------------- every method
+
+
+def small(name):
+    kind = dvae.methods()[name]
+    protocol = motion.PROTOCOLS["simulated-trajectories" if issubclass(kind, TrajectoryMethod) else "simulated"]
+    protocol = replace(protocol, predicted=12, observed=min(protocol.observed, 6), train_stride=15)
+    data = motion.MotionData("simulated", GAPS, protocol)
+    own = {"latent": 4, "warm_up": 1} | ({"width": 8} if name == "equations" else {})
+    options = SMALL.get(name, {"width": 4} if name == "autoregressive" else own)
+    return data, dvae.method(name, **options).suited(data.windows("train"))
+
+
+@pytest.mark.parametrize("name", [name for name in METHODS if name not in ("mix-and-match", "motion-latent", "moglow")])
+def test_every_method_goes_the_whole_way_with_gaps(name):
+    """Fitted, validated, scored; and whatever stands where nothing was observed changes nothing."""
+    data, method = small(name)
+    train, validation, test = map(data.windows, ("train", "validation", "test"))
+    torch.manual_seed(0)
+    model, recipe = method.build(data.schema), method.train(train, validation, 1)
+    recipe.fit(model, steps=1, batch_size=3, validate_every=1, progress=False)
+    assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+    scores = dvae.evaluate(model, test, scores=motion.displacements, samples=2, training_windows=train, progress=False)
+    assert all(np.isfinite(score.mean) for score in scores["model"].values())
+    assert scores.data["seen"]["future"] == test.all()["mask"][:, data.protocol.observed :].double().mean()
+
+    drawn, objective = recipe.batches.sample(3, torch.Generator().manual_seed(1)), recipe.objective
+    present, drawing = data.protocol.observed, {"draws": objective.draws} if objective.draws else {}
+    results = []
+    for hidden in (0.0, 7.0, torch.nan):
+        batch = {**drawn, "x": torch.where(drawn["mask"], drawn["x"], hidden)}
+        past = {"x": batch["x"][:, :present], "mask": batch["mask"][:, :present]}
+        model.zero_grad()
+        torch.manual_seed(2)
+        loss = objective(dvae.SequenceELBO().terms(model.eval(), batch, **drawing), 0)
+        loss.backward()
+        slopes = [p.grad.clone() for p in model.parameters() if p.grad is not None]
+        results.append([loss.detach(), *slopes, model.forecast(past, 5, 2)["x"]])
+        whole = {n: value for n, value in batch.items() if n not in ("pseudo", "valid")}
+        results[-1].append(filled := model.impute(whole, 2)["x"])
+        assert torch.equal(filled[:, drawn["mask"]], batch["x"][drawn["mask"]].expand(2, -1))
+    assert all(value.isfinite().all() for value in results[0])
+    assert any(slope.any() for slope in results[0][1:-2])
+    for other in results[1:]:
+        assert all(torch.equal(here, there) for here, there in zip(results[0], other, strict=True))
+
+
+def test_a_method_that_reads_turns_alone_says_what_to_do_about_gaps():
+    protocol = replace(motion.PROTOCOLS["simulated"], representation="quaternion")
+    with pytest.raises(
+        ValueError, match=r"lacks joints, without which their turns are not known; .* fill its gaps first"
+    ):
+        dvae.method("mix-and-match").build(motion.MotionData("simulated", GAPS, protocol).windows("train"))
+
+
+def test_a_method_whose_density_is_of_whole_frames_says_so_of_gaps():
+    data = motion.MotionData("simulated", GAPS, motion.PROTOCOLS["simulated"])
+    method = dvae.method("moglow", width=4, flow_steps=1)
+    recipe = method.train(data.windows("train"), None, 1)
+    with pytest.raises(ValueError, match=r"hides some entries of a step and not others, .*; hide them together"):
+        recipe.fit(method.build(data.schema), progress=False)
+
+
+def still_gsps():
+    """A model of GSPS, and windows in which all joints rest."""
+    data, method = small("gsps")
+    torch.manual_seed(0)
+    model, x = method.build(data.schema).eval(), data.windows("test").all()["x"][:4]
+    return model, x[:, :1].expand_as(x).clone()
+
+
+def test_gsps_reads_past_a_gap_in_time():
+    """Where a joint rests, its gap is none; one that was never seen is where its parent is; and nothing is 0."""
+    model, x = still_gsps()
+    mask = torch.rand(*x.shape[:2], WALKER.joints - 1) < 0.5
+    mask[:, 2] = True
+    elbow, wrist = (WALKER.names.index(name) - 1 for name in ("LElbow", "LWrist"))
+
+    def forecast(x, mask):
+        torch.manual_seed(1)
+        past = slice(None, model.frames)
+        return model.forecast({"x": x[:, past], "mask": mask[:, past].repeat_interleave(3, -1)}, 5, 2)["x"]
+
+    whole = torch.ones_like(mask)
+    torch.testing.assert_close(forecast(x, mask), forecast(x, whole))
+    mask[..., wrist] = False
+    bent = x.clone()
+    bent[..., 3 * wrist : 3 * wrist + 3] = x[..., 3 * elbow : 3 * elbow + 3]
+    torch.testing.assert_close(forecast(x, mask), forecast(bent, whole))
+    assert not torch.allclose(forecast(x, mask), forecast(x, whole))
+
+
+def test_gsps_fills_gaps_by_what_comes_near_to_all_that_was_seen():
+    """Of many motions of the model, that of which all but some frames of a joint was seen, if for a drift in time."""
+    model, x = still_gsps()
+    batch, gap = {"x": x, "mask": torch.ones_like(x).bool()}, slice(model.frames + 2, model.frames + 9)
+    torch.manual_seed(2)
+    made = model.reconstruct(batch, 4)["x"]
+    batch["mask"][:, gap, 9:12] = False
+    drift = 1e-4 * torch.arange(model.length - model.frames)[:, None]
+    for future in made[:, :, model.frames :] + drift:
+        true = torch.cat([x[:, : model.frames], future], 1)
+        torch.manual_seed(2)
+        filled = model.impute({**batch, "x": torch.where(batch["mask"], true, torch.nan)}, 1)["x"][0]
+        torch.testing.assert_close(filled, true)
+    with pytest.raises(ValueError, match="gsps fills gaps in windows of 18 frames, not 12"):
+        model.impute({name: value[:, :12] for name, value in batch.items()})
+
+
+def test_what_is_whole_has_no_gap_to_fill():
+    model = dvae.method("vae", latent=2).build({"x": 4})
+    with pytest.raises(ValueError, match="nothing is missing in this batch; give a 'mask'"):
+        model.impute(torch.randn(2, 3, 4))
+
+
+def test_a_best_of_many_is_that_of_observed_places():
+    """A mask that hides nothing changes no energy; one that does, the errors of the truth alone."""
+    data, method = small("hit-dvae")
+    model, source = method.build(data.schema).eval(), method.scored(data.windows("train"))
+    batch = dict(source.sample(3, torch.Generator().manual_seed(0)))
+    seen, found = batch.pop("mask"), []
+    for mask in ({}, {"mask": torch.ones_like(seen)}, {"mask": seen}):
+        torch.manual_seed(0)
+        found.append(dvae.SequenceELBO().terms(model, batch | mask, draws={"w": 2}).energies)
+    assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
+    assert (found[2]["reconstruction"] != found[1]["reconstruction"]).all()
+
+
+@pytest.mark.parametrize("name", ["gsps", "hit-dvae"])
+def test_exact_bones_need_both_ends(name):
+    data, method = small(name)
+    method = replace(method, bones=True)
+    torch.manual_seed(0)
+    model = method.build(data.schema)
+    with pytest.raises(ValueError, match=r"directions of bones, of which both ends have to be there.*bones=False"):
+        dvae.SequenceELBO().terms(model, data.windows("train").sample(3, torch.Generator().manual_seed(1)))
+
+
+# ------------------------------------------------------------------------------------------------------- what is shown
+
+
+def test_players_and_films_have_gaps(tmp_path):
+    """A joint that is missing is nowhere; all others are where they are in whole motion, in both."""
+    samples, observed, truth = (each[:, 0] if each.ndim == 5 else each[0] for each in _future_with_gaps())
+    stage = staged(WALKER, observed, samples, truth, every=1)
+    gaps = np.isnan(np.concatenate([observed, truth])).any(-1)
+    assert np.array_equal(np.isnan(stage.motion[0]).any(-1), gaps)
+    scene = _scene(stage)
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(scene["packed"])), np.uint8).reshape(2, -1).astype(np.int32)
+    steps = (planes[0] | planes[1] << 8).reshape(-1, WALKER.joints, 3)
+    assert [person["frames"] for person in scene["people"]] == [30, 30]
+    person = np.cumsum(steps[:40], 0).astype(np.int16)
+    assert np.array_equal((person == MISSING).any(-1), gaps)
+    np.testing.assert_allclose(scene["unit"] * person[~gaps], stage.motion[0][~gaps], atol=0.51 * scene["unit"])
+    save_film(tmp_path / "gaps.gif", WALKER, observed, samples, truth, every=10)
+    with pytest.raises(ValueError, match="NaN"):
+        staged(WALKER, observed, truth[None])
+
+
+# ----------------------------------------------------------------------------------------------------- the command line
+
+
+QUICK = ["--steps", "1", "--batch-size", "2", "--warm-up", "1"]
+
+
+def test_commands_take_gaps_from_fit_to_filling(tmp_path, capsys):
+    motion.save(tmp_path / "gaps.npz", GAPS)
+    run, data = tmp_path / "run", ["--data", str(tmp_path / "gaps.npz")]
+    fit = ["fit", "vae", *data, "--out", str(run), "--protocol", "simulated", *QUICK]
+    assert main(fit) == 1
+    assert "--missing" in capsys.readouterr().err
+    assert main([*fit, "--missing"]) == 0
+    assert json.loads((run / "config.json").read_text())["data"]["missing"] is True
+    assert main(["evaluate", str(run), "--samples", "2"]) == 0
+    assert "observed are" in capsys.readouterr().out
+    assert main(["forecast", str(run), "--out", str(tmp_path / "f.npz"), "--samples", "2"]) == 0
+    futures = motion.Forecasts.load(tmp_path / "f.npz")
+    assert np.isnan(futures.truth).any()
+    assert np.isfinite(futures.forecasts).all()
+    assert main(["animate", str(tmp_path / "f.npz"), "--out", str(tmp_path / "f.html")]) == 0
+
+    page = ["report", str(run), "--out", str(tmp_path / "r.html"), "--windows", "1", "--samples", "2"]
+    assert main([*page, "--bound-windows", "2", "--particles", "2"]) == 0
+    assert "cannot be shown" not in (tmp_path / "r.html").read_text()
+
+    clip = GAPS.clips[-1]
+    assert main(["impute", str(run), "--out", str(tmp_path / "i.npz"), "--clip", clip.name, "--samples", "3"]) == 0
+    with np.load(tmp_path / "i.npz") as file:
+        found = {name: file[name] for name in file}
+    there = ~np.isnan(clip.positions).any(-1)
+    assert np.array_equal(found["observed"][0], there)
+    assert found["filled"].shape == (3, 1, clip.frames, WALKER.joints, 3)
+    relative = clip.positions - clip.positions[:, [WALKER.root]]
+    np.testing.assert_array_equal(found["filled"][1, 0][there], relative[there])
+    assert (found["spread"][0][there] == 0).all()
+    spread = found["filled"].var(0).sum(-1) ** 0.5
+    np.testing.assert_allclose(found["spread"][~found["observed"]], spread[~found["observed"]], rtol=1e-5)
+
+
+def test_a_run_on_whole_motion_forecasts_other_motion_with_gaps(tmp_path, capsys):
+    motion.save(tmp_path / "whole.npz", PEOPLE)
+    (tmp_path / "other").mkdir()
+    motion.save(tmp_path / "other" / "gaps.npz", GAPS)
+    run, other = str(tmp_path / "run"), str(tmp_path / "other" / "gaps.npz")
+    fit = ["--protocol", "simulated", *QUICK, "--out", run]
+    assert main(["fit", "vae", "--data", str(tmp_path / "whole.npz"), *fit]) == 0
+    forecast = ["forecast", run, "--out", str(tmp_path / "f.npz"), "--samples", "1"]
+    assert main([*forecast, "--data", other]) == 1
+    assert main([*forecast, "--data", other, "--missing"]) == 0
+    assert main([*forecast, "--missing"]) == 2
+    assert "--missing is about other data" in capsys.readouterr().err
+
+
+def test_past_that_is_shown_has_its_gaps():
+    batch = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test").all()
+    assert torch.equal(gapped(batch).isnan(), ~batch["mask"])
+
+
+def test_every_command_that_reads_motion_takes_gaps_the_same_way():
+    for name in COMMANDS:
+        hints = get_type_hints(command([name]), include_extras=True)
+        if "source" in hints and is_dataclass(hints["source"]):
+            hints |= get_type_hints(hints["source"], include_extras=True)
+        reads = {"data", "files"} & hints.keys() and name not in (
+            "resume",
+            "interpolate",
+            "recover",
+        )  # what the run has, and whole bodies
+        assert (hints.get("missing") == Missing) == bool(reads), name
+
+
+def test_files_with_gaps_are_looked_at_played_and_converted(tmp_path, capsys):
+    source, page = str(tmp_path / "gaps.npz"), str(tmp_path / "clip.html")
+    motion.save(source, GAPS)
+    for arguments in (
+        ["data", "info", source],
+        ["animate", source, "--out", page],
+        ["data", "convert", source, "--out", str(tmp_path / "a" / "b.npz")],
+    ):
+        assert main(arguments) == 1
+        assert "--missing" in capsys.readouterr().err
+    assert main(["data", "info", source, "--missing"]) == 0
+    assert "missing joints" in capsys.readouterr().out
+    for out in (page, str(tmp_path / "clip.gif")):
+        assert main(["animate", source, "--out", out, "--missing", "--every", "10"]) == 0
+    for number, (place, options) in enumerate(
+        [("1.npz", []), ("csv", ["--format", "csv"]), ("2/whole.npz", []), ("half.npz", ["--fps", "15"])]
+    ):
+        out, given = tmp_path / place, str(tmp_path / "csv") if number == 2 else source
+        out.parent.mkdir(exist_ok=True)
+        convert = ["data", "convert", given, "--out", str(out), "--missing", "--jobs", "1", *options]
+        assert main(convert) == 0
+        assert "nan" not in capsys.readouterr().err
+        found = motion.read_motion(out, missing=True)
+        for clip in found:
+            expected = GAPS[clip.key].positions[:: 2 if options[-1:] == ["15"] else 1]
+            np.testing.assert_allclose(clip.positions, expected, atol=1e-6)
+    assert main(["data", "convert", source, "--out", str(tmp_path / "x"), "--format", "bvh", "--missing"]) == 1
+    assert "lacks joints, and bvh has no gaps" in capsys.readouterr().err
+
+
+def test_a_run_is_judged_and_shown_on_other_motion_with_gaps(tmp_path, capsys):
+    (tmp_path / "other").mkdir()
+    motion.save(tmp_path / "other" / "gaps.npz", GAPS)
+    run, other = str(tmp_path / "run"), ["--data", str(tmp_path / "other" / "gaps.npz"), "--missing"]
+    assert main(["fit", "vae", "--data", "simulated", *QUICK, "--out", run]) == 0
+    few = ["--samples", "2"]
+    assert main(["evaluate", run, *other, *few, "--log-score-particles", "2", "--out", str(tmp_path / "e.json")]) == 0
+    assert np.isfinite(json.loads((tmp_path / "e.json").read_text())["rows"]["vae"]["scores"]["log score"]["mean"])
+    criticise = ["--simulations", "2", "--draws", "2", "--samples", "19", "--out", str(tmp_path / "c.json")]
+    assert main(["criticise", run, *other, *criticise]) == 0
+    assert main(["compare", run, *other, *few, "--particles", "2", "--contrasts", "2"]) == 0
+    page = ["--out", str(tmp_path / "r.html"), "--windows", "1", *few, "--bound-windows", "2", "--particles", "2"]
+    assert main(["report", run, *other, *page, "--evaluate"]) == 0
+    assert main(["animate", run, *other, "--out", str(tmp_path / "a.html")]) == 0
+
+
+def test_gaps_are_filled_in_the_motion_itself(tmp_path, capsys):
+    motion.save(tmp_path / "gaps.npz", GAPS)
+    run, data = str(tmp_path / "run"), ["--data", str(tmp_path / "gaps.npz"), "--missing"]
+    assert main(["fit", "vae", *data, "--out", run, "--protocol", "simulated", *QUICK]) == 0
+    clip = GAPS.clips[-1]
+    impute = ["impute", run, "--samples", "1", "--filled"]
+    (tmp_path / "made").mkdir()
+    assert main([*impute, str(tmp_path / "made" / "all.npz"), "--out", str(tmp_path / "i.npz")]) == 0
+    assert np.load(tmp_path / "i.npz")["emission"] == "drawn"
+    whole = motion.read_motion(tmp_path / "made" / "all.npz", missing=True)
+    assert {each.key for each in whole} == {each.key for each in GAPS if each.split == "test"}
+    for each in whole:
+        read = GAPS[each.key].positions
+        assert np.array_equal(each.positions[~np.isnan(read)], read[~np.isnan(read)])
+        assert np.isfinite(each.positions[:75]).all()
+    one = [*impute[:-1], "--clip", clip.name, "--filled"]
+    for name in ("one.csv", "one.bvh"):
+        assert main([*one, str(tmp_path / "made" / name)]) == 0
+    read = motion.read_motion(tmp_path / "made" / "one.csv").clips[0].positions  # whole: nothing is NaN
+    there = ~np.isnan(clip.positions)
+    np.testing.assert_allclose(read[there], clip.positions[there], atol=1e-6)
+    bvh = motion.read_motion(tmp_path / "made" / "one.bvh", metres=0.01)  # bones are as long as a model of 5 steps has
+    assert (bvh.clips[0].frames, bvh.skeleton.fps) == (clip.frames, WALKER.fps)
+    capsys.readouterr()
+    assert main([*impute, str(tmp_path / "made" / "all.bvh")]) == 2
+    assert "holds one clip, of" in capsys.readouterr().err
+    assert main([*impute[:-1], "--particles", "2", "--out", str(tmp_path / "i.npz")]) == 2
+    assert "--particles chooses among fillings of tables" in capsys.readouterr().err
+    assert main(["impute", run]) == 2
+    assert "say which, by --out or --filled" in capsys.readouterr().err

@@ -1,0 +1,312 @@
+"""Rotations in every form, and kinematics: there and back."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from dvae.motion import WALKER, MotionSet, Skeleton, simulate
+from dvae.motion.geometry import kinematics, rotations
+
+EULER = ["euler-" + "".join(axes) for axes in itertools.product("xyz", repeat=3) if axes[0] != axes[1] != axes[2]]
+FORMS = [*rotations.SIZES, *EULER]
+each_form = pytest.mark.parametrize("form", FORMS)
+
+
+def turns(angle, count=200):
+    """Rotations (N, 3, 3) by an angle, about any axis."""
+    axes = torch.nn.functional.normalize(torch.randn(count, 3, dtype=torch.float64), dim=-1)
+    return torch.from_numpy(Rotation.from_rotvec(angle * axes.numpy()).as_matrix())
+
+
+@each_form
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.5, 2.0, torch.pi - 1e-6, torch.pi])
+def test_every_form_gives_the_rotation_back(form, angle):
+    matrices = turns(angle)
+    values = rotations.from_matrix(matrices, form)
+    assert values.shape == (200, rotations.size(form))
+    torch.testing.assert_close(rotations.to_matrix(values, form), matrices, atol=1e-6, rtol=0)
+
+
+@each_form
+def test_forms_are_those_of_scipy(form):
+    matrices = turns(1.3)
+    of = Rotation.from_matrix(matrices.numpy())
+    values = rotations.from_matrix(matrices, form)
+    if form.startswith("euler"):
+        expected = Rotation.from_euler(form[-3:].upper(), values.numpy()).as_matrix()
+        torch.testing.assert_close(torch.from_numpy(expected), matrices)
+    elif form == "quaternion":
+        expected = torch.from_numpy(of.as_quat(scalar_first=True))
+        torch.testing.assert_close(values * values[:, :1].sign(), expected * expected[:, :1].sign())
+    elif form == "vector":
+        torch.testing.assert_close(values, torch.from_numpy(of.as_rotvec()))
+    else:
+        columns = matrices.transpose(1, 2) if form == "6d" else matrices
+        torch.testing.assert_close(values, columns.flatten(1)[:, : rotations.size(form)])
+
+
+@pytest.mark.parametrize("form", ["quaternion", "vector", "6d", "matrix", "euler-zyx"])
+@pytest.mark.parametrize("angle", [0.0, torch.pi])
+def test_gradients_are_right_at_no_turn_and_at_half_a_turn(form, angle):
+    values = rotations.from_matrix(torch.diag(torch.tensor([1.0, -1.0, -1.0] if angle else [1.0] * 3).double()), form)
+    if form == "vector":  # of the two for half a turn, what is differentiated is written out
+        values = torch.tensor([angle, 0, 0], dtype=torch.float64)
+    assert torch.autograd.gradcheck(
+        lambda v: rotations.to_matrix(v, form), values.requires_grad_(), eps=1e-5, atol=1e-6, rtol=0
+    )
+
+
+@each_form
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, 2.5, torch.pi - 1e-3])
+def test_gradients_are_those_of_differences(form, angle):
+    if form.startswith("euler") and form[-1] == form[-3]:
+        angle = max(angle, 1.0)  # below, the first and the third axis come together
+    axes = torch.nn.functional.normalize(torch.tensor([[1.0, 2, 3], [-2, 1, 1]]).double(), dim=-1)
+    vectors = (angle * axes).requires_grad_()
+    values = rotations.from_matrix(rotations.to_matrix(vectors.detach(), "vector"), form).requires_grad_()
+    torch.autograd.gradcheck(lambda v: rotations.to_matrix(v, form), values)
+    torch.autograd.gradcheck(lambda v: rotations.from_matrix(rotations.to_matrix(v, "vector"), form), vectors)
+
+
+def test_a_rotation_vector_goes_through_matrices_with_finite_gradients():
+    for angle in (0.0, torch.pi):
+        vector = torch.tensor([angle, 0, 0], dtype=torch.float64, requires_grad=True)
+        for form in ("quaternion", "vector", "6d"):
+            (gradient,) = torch.autograd.grad(
+                rotations.from_matrix(rotations.to_matrix(vector, "vector"), form).square().sum(), vector
+            )
+            assert gradient.isfinite().all()
+
+
+def test_quaternions_and_6d_of_any_length_are_read():
+    matrices = turns(0.7)
+    for form in ("quaternion", "6d"):
+        torch.testing.assert_close(rotations.to_matrix(3 * rotations.from_matrix(matrices, form), form), matrices)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("form", "values"),
+    [
+        ("quaternion", [0.0] * 4),
+        ("6d", [0.0] * 6),
+        ("6d", [0.0, 0, 0, 2, 0, 0]),
+        ("6d", [1.0, 2, 3, 0, 0, 0]),
+        ("6d", [1.0, 2, 3, -2, -4, -6]),
+        ("6d", [1e-30] * 6),
+    ],
+)
+def test_numbers_that_tell_no_rotation_are_read_as_one(form, values, dtype):
+    given = torch.tensor(values, dtype=dtype, requires_grad=True)
+    found = rotations.to_matrix(given, form)
+    torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=dtype))
+    torch.testing.assert_close(torch.linalg.det(found), torch.ones((), dtype=dtype))
+    if not any(values):
+        assert torch.equal(found, torch.eye(3, dtype=dtype))
+    if form == "6d" and any(values[:3]) and values[0] == 1:
+        torch.testing.assert_close(found[:, 0], torch.nn.functional.normalize(given[:3], dim=0))
+    (gradient,) = torch.autograd.grad((found * torch.randn(3, 3, dtype=dtype)).sum(), given)
+    assert gradient.abs().max() < 10
+
+
+def test_quaternions_are_made_continuous_without_a_change_of_rotation():
+    angle = torch.linspace(0, 8 * torch.pi, 100, dtype=torch.float64)
+    vectors = torch.stack([torch.stack([angle, 0 * angle, 0 * angle], -1), torch.randn(3).double().expand(100, 3)], 1)
+    whole = rotations.from_matrix(rotations.to_matrix(vectors, "vector"), "quaternion")
+    whole = whole * torch.where(torch.rand(100, 2, 1) < 0.5, -1.0, 1.0)
+    found = rotations.continuous(whole)
+    assert (found[1:] * found[:-1]).sum(-1).min() > 0.9
+    torch.testing.assert_close(found[0], whole[0])
+    torch.testing.assert_close(rotations.to_matrix(found, "quaternion"), rotations.to_matrix(whole, "quaternion"))
+    torch.testing.assert_close(rotations.continuous(whole.transpose(0, 1), dim=1), found.transpose(0, 1))
+    assert rotations.continuous(whole[:1]).shape == (1, 2, 4)
+
+
+@pytest.mark.parametrize("turns", [1.0, 3.3])
+def test_vectors_go_on_beyond_half_a_turn(turns):
+    axis = torch.nn.functional.normalize(torch.randn(5, 3, dtype=torch.float64), dim=-1)
+    angle = torch.pi * torch.arange(0.25, 2 * turns, 0.125, dtype=torch.float64)  # whole turns among them
+    expected = angle[:, None, None] * axis
+    found = rotations.in_time(rotations.to_matrix(expected, "vector"), "vector")
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: rotations.size("euler-abc"), "no form 'euler-abc'"),
+        (lambda: rotations.from_matrix(torch.eye(3), "euler-xxy"), "not every rotation"),
+        (lambda: rotations.to_matrix(torch.zeros(2, 5), "6d"), "6d has 6 numbers, got \\(2, 5\\)"),
+        (lambda: rotations.from_matrix(torch.zeros(2, 9), "6d"), "expected matrices"),
+    ],
+)
+def test_what_is_no_rotation_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def random_pose(frames=7):
+    offsets = torch.randn(WALKER.joints, 3, dtype=torch.float64)
+    local = turns(1.0, frames * WALKER.joints).unflatten(0, (frames, WALKER.joints))
+    return offsets, local, torch.randn(frames, 3, dtype=torch.float64)
+
+
+def test_forward_kinematics_is_a_product_along_every_chain():
+    offsets, local, root = random_pose()
+    positions, world = kinematics.forward(WALKER.parents, local, offsets, root)
+    for frame, joint in itertools.product(range(7), range(WALKER.joints)):
+        place, at = torch.zeros(3, dtype=torch.float64), joint
+        turn = local[frame, joint]
+        while WALKER.parents[at] >= 0:  # a point in the frame of a joint, seen from its parent's
+            place, at = local[frame, WALKER.parents[at]] @ (offsets[at] + place), WALKER.parents[at]
+            turn = local[frame, at] @ turn
+        torch.testing.assert_close(positions[frame, joint], root[frame] + place)
+        torch.testing.assert_close(world[frame, joint], turn)
+
+
+def test_forward_kinematics_has_a_gradient():
+    offsets, local, root = (value.requires_grad_() for value in random_pose(1))
+    assert torch.autograd.gradcheck(
+        lambda *given: kinematics.forward(WALKER.parents, *given), (local, offsets, root), fast_mode=True
+    )
+
+
+def test_inverse_kinematics_gives_rigid_bodies_back():
+    offsets, local, root = random_pose()
+    positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
+    found = kinematics.inverse(WALKER, positions, offsets)
+    again, _ = kinematics.forward(WALKER.parents, found, offsets, root)
+    torch.testing.assert_close(again, positions, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found @ found.transpose(-1, -2), torch.eye(3).double().expand_as(found))
+
+
+def test_a_bone_is_not_turned_about_itself():
+    offsets, local, root = random_pose()
+    positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
+    found = kinematics.inverse(WALKER, positions, offsets)
+    knee, foot = WALKER.find("RKnee"), WALKER.find("RFoot")
+    axis = rotations.from_matrix(found[:, knee], "vector")
+    torch.testing.assert_close((axis * offsets[foot]).sum(-1), torch.zeros(7).double(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(found[:, foot], torch.eye(3).double().expand(7, 3, 3))
+
+
+CHAIN = Skeleton(("hip", "knee", "foot"), (-1, 0, 1))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("aside", [0.0, 1e-12, 1e-6, 1e-3])
+def test_a_bone_that_points_backwards_is_turned_by_half_a_turn(aside, dtype):
+    offsets = torch.tensor([[0.0, 0, 0], [0, 1, 0], [0.6, 0.8, 0]], dtype=dtype)
+    positions = -offsets.cumsum(0)[None]
+    positions[0, 1, 2] += aside
+    found = kinematics.inverse(CHAIN, positions.requires_grad_(), offsets)
+    again, _ = kinematics.forward(CHAIN.parents, found, offsets, positions[:, 0])
+    torch.testing.assert_close(again, positions, atol=2e-3 if dtype is torch.float32 else 1e-6, rtol=0)
+    torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=dtype).expand_as(found))
+    (gradient,) = torch.autograd.grad((found * torch.randn_like(found)).sum(), positions)
+    assert gradient.isfinite().all()
+
+
+def test_a_joint_whose_bone_has_no_length_is_not_turned():
+    offsets = torch.tensor([[0.0, 0, 0], [0, 1, 0], [0, 1, 0]], dtype=torch.float64)
+    positions = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [1, 0, 0]]], dtype=torch.float64, requires_grad=True)
+    found = kinematics.inverse(CHAIN, positions, offsets)
+    torch.testing.assert_close(found[0, 1], torch.eye(3, dtype=torch.float64))
+    (gradient,) = torch.autograd.grad((found * torch.randn_like(found)).sum(), positions)
+    assert gradient.abs().max() < 10
+
+
+def test_inverse_kinematics_has_a_gradient():
+    offsets, local, root = random_pose(1)
+    positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
+    positions = positions + 0.1 * torch.randn_like(positions)  # of no such body
+    assert torch.autograd.gradcheck(lambda x: kinematics.inverse(WALKER, x, offsets), positions.requires_grad_())
+
+
+def test_rounding_does_not_grow_along_a_chain():
+    body = Skeleton(tuple(map(str, range(30))), tuple(range(-1, 29)))
+    offsets = torch.randn(30, 3)
+    found = kinematics.inverse(body, torch.randn(50, 30, 3), offsets)
+    errors = (found @ found.mT - torch.eye(3)).abs().amax((0, -2, -1))
+    assert errors.max() < 16 * torch.finfo(errors.dtype).eps, errors
+
+
+def test_inverse_kinematics_rounds_as_its_numbers_do():
+    offsets, local, root = random_pose()
+    positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
+    positions = positions.float()
+    exact = kinematics.inverse(WALKER, positions.double(), offsets)
+    torch.testing.assert_close(
+        kinematics.inverse(WALKER, positions, offsets.float()).double(), exact, atol=1e-4, rtol=0
+    )
+
+
+def test_inverse_kinematics_of_real_people_is_within_a_centimetre(real):
+    motion = real("bandai/bandai2.npz")
+    positions = torch.cat([torch.from_numpy(clip.positions[::10]) for clip in motion]).double()
+    offsets = kinematics.rest(motion.skeleton, positions)
+    local = kinematics.inverse(motion.skeleton, positions, offsets)
+    again, _ = kinematics.forward(motion.skeleton.parents, local, offsets, positions[:, motion.skeleton.root])
+    errors = (again - positions).norm(dim=-1).amax(0)
+    assert errors.max() < 0.001, dict(zip(motion.skeleton.names, errors.tolist(), strict=True))
+    children = [child for _, child in motion.skeleton.edges]
+    torch.testing.assert_close(
+        motion.skeleton.bone_lengths(again), offsets[children].norm(dim=-1).expand(len(again), -1)
+    )
+
+
+def test_a_rest_pose_faces_the_front_on_bones_of_mean_length():
+    people = simulate(clips=1, frames=60, seed=3)
+    positions = torch.from_numpy(people.clips[0].positions).double()
+    offsets = kinematics.rest(people.skeleton, positions)
+    lengths = people.skeleton.bone_lengths(positions).mean(0)
+    children = [child for _, child in people.skeleton.edges]
+    torch.testing.assert_close(offsets[children].norm(dim=-1), lengths)
+    unturned = torch.eye(3, dtype=torch.float64).expand(1, people.skeleton.joints, 3, 3)
+    standing, _ = kinematics.forward(people.skeleton.parents, unturned, offsets, torch.zeros(1, 3).double())
+    assert abs(people.skeleton.heading(standing)).max() < 0.2
+
+
+def test_a_set_is_given_rotations_that_make_its_positions(tmp_path):
+    people = simulate(clips=3, frames=20, seed=1)
+    assert people.clips[0].rotations is None
+    with pytest.raises(ValueError, match="no rest pose"):
+        people.skeleton.offsets
+    found = people.with_rotations()
+    assert found.with_rotations() is found
+    assert found.fingerprint() != people.fingerprint()
+    one = MotionSet([clip for clip in people if clip is people.clips[0]], people.skeleton).with_rotations()
+    for clip, body in zip([*found, *one], [found] * 3 + [one], strict=True):
+        turns = rotations.to_matrix(torch.from_numpy(clip.rotations), "quaternion").double()
+        root = torch.from_numpy(clip.positions[:, body.skeleton.root]).double()
+        again, _ = kinematics.forward(body.skeleton.parents, turns, body.skeleton.offsets, root)
+        near = 0.03 if body is found else 1e-3  # three people of three sizes on one body; one on its own
+        torch.testing.assert_close(again, torch.from_numpy(clip.positions).double(), atol=10 * near, rtol=0)
+    found.skeleton.to_json(tmp_path / "skeleton.json")
+    assert Skeleton.from_json(tmp_path / "skeleton.json") == found.skeleton
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda turns: turns[:, :-1], r"rotations \(20, 16, 4\), expected quaternions \(20, 17, 4\)"),
+        (lambda turns: 2 * turns, "no quaternions of unit length"),
+        (lambda turns: np.nan * turns, "no quaternions of unit length"),
+    ],
+)
+def test_rotations_that_are_none_are_refused(change, message):
+    people = simulate(clips=1, frames=20, seed=1).with_rotations()
+    clip = people.clips[0]
+    with pytest.raises(ValueError, match=message):
+        MotionSet([replace(clip, rotations=change(clip.rotations))], people.skeleton)
+
+
+def test_rest_poses_that_are_none_are_refused():
+    with pytest.raises(ValueError, match="has 2 numbers, expected 3 for each of 17"):
+        replace(WALKER, rest=(0.0, 1.0))
+    with pytest.raises(ValueError, match="a joint is nan m"):
+        replace(WALKER, rest=(float("nan"),) * 51)

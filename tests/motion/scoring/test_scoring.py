@@ -1,0 +1,203 @@
+"""Scores of bodies and of how much they move: definitions written out with loops, and what they do not see."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+import dvae
+from dvae import motion
+from dvae.inference.evaluation.evaluate import _measures
+from dvae.motion import PROTOCOLS, rotate_about_up
+
+PROTOCOL = replace(PROTOCOLS["simulated"], observed=4, predicted=6, test_stride=20, multimodal_threshold=0.5)
+LIMBS = ("limb stretch", "limb stretch RMS", "limb jitter", "limb jitter RMS", "limb-angle error")
+
+
+@pytest.fixture(scope="module")
+def windows():
+    return motion.windows(motion.simulate(clips=6, frames=60, test=0.5), PROTOCOL, "test")
+
+
+@pytest.fixture(scope="module")
+def futures(windows):
+    """Three noisy futures of each window (N, K, T, D)."""
+    x = windows.all()["x"][:, None, 4:]
+    noise = torch.randn(len(x), 3, 6, x.shape[-1], generator=torch.Generator().manual_seed(0))
+    return x + 0.03 * noise
+
+
+class Known(torch.nn.Module):
+    """Forecasts what it is given, window after window."""
+
+    def __init__(self, windows, futures):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.past, self.futures = windows.all()["x"][:, :4], futures
+        self.per, self.likelihood, self.view = "frame", False, None
+        self.generative = self.inference = dvae.Factorization.parse("p(z) p(x_t | z)")
+
+    def forecast(self, batch, horizon, samples=1, **_):
+        rows = [int((self.past - x).abs().sum((1, 2)).argmin()) for x in batch["x"]]
+        return {"x": self.futures[rows, :samples].movedim(1, 0)}
+
+
+def scores(windows, futures, **options):
+    model = Known(windows, futures)
+    found = dvae.evaluate(
+        model, windows, scores=motion.scores, samples=futures.shape[1], references=False, progress=False, **options
+    )
+    (row,) = found.rows
+    return {name: score.mean for name, score in found[row].items()}
+
+
+def by_the_letter(windows, futures):
+    """The scores of limbs, of one window, future, frame and limb after another."""
+    found = {name: [] for name in LIMBS}
+    skeleton, truths = windows.skeleton, windows.positions(windows.all()["x"][:, 4:]).double().numpy()
+    joints = windows.positions(futures).double().numpy()
+    bones = skeleton.edges
+    chains = [(parent, joint, child) for parent, joint in bones for start, child in bones if start == joint]
+
+    def length(pose, bone):
+        return np.linalg.norm(pose[bone[1]] - pose[bone[0]])
+
+    def angle(pose, chain):
+        a, b, c = (pose[joint] for joint in chain)
+        u, v = b - a, c - b
+        return np.degrees(np.arccos(u @ v / np.linalg.norm(u) / np.linalg.norm(v)))
+
+    for poses, truth in zip(joints, truths, strict=True):
+        for future in poses:
+            for bone in bones:
+                m = np.mean([length(pose, bone) for pose in truth])
+                lengths = [length(pose, bone) for pose in future]
+                off = [abs(each - m) / m for each in lengths]
+                steps = [abs(after - before) / m for before, after in pairwise(lengths)]
+                for name, values in (("limb stretch", off), ("limb jitter", steps)):
+                    found[name].append(np.mean(values))
+                    found[f"{name} RMS"].append(np.sqrt(np.mean(np.square(values))))
+        errors = [
+            np.mean([abs(angle(p, c) - angle(q, c)) for p, q in zip(f, truth, strict=True) for c in chains])
+            for f in poses
+        ]
+        found["limb-angle error"].append(min(errors))
+    return {name: np.mean(values) for name, values in found.items()}
+
+
+def moved(windows, x):
+    return windows.positions(x)[..., 1:, :].diff(dim=-3).norm(dim=-1).mean(-1)
+
+
+def test_scores_of_limbs_are_their_definitions(windows, futures):
+    found, expected = scores(windows, futures), by_the_letter(windows, futures)
+    assert {name: found[name] for name in LIMBS} == pytest.approx(expected, rel=1e-4)
+    assert scores(windows, futures, batch_size=2) == pytest.approx(found, rel=1e-5)
+
+
+def test_the_true_future_of_a_rigid_body_has_none_of_them(windows):
+    truth = windows.all()["x"][:, None, 4:]
+    found = scores(windows, truth)
+    assert max(found[name] for name in LIMBS[:4]) < 1e-5  # of the simulator's lengths, in single precision
+    assert found["limb-angle error"] < 1e-3
+    wide = scores(windows, 1.1 * truth)
+    assert [wide[name] for name in LIMBS] == pytest.approx([0.1, 0.1, 0, 0, 0], abs=1e-3)
+
+
+def test_bones_without_length_are_in_no_score_of_limbs(windows, futures):
+    """A joint at the place of another one, as the ends of some files' bones are, changes nothing."""
+    body = windows.skeleton
+    elbow = body.find("RElbow")
+    skeleton = replace(body, names=(*body.names, "RTwist"), parents=(*body.parents, elbow))
+    clips = [
+        motion.Clip(*clip.key, np.concatenate([clip.positions, clip.positions[:, [elbow]]], 1))
+        for clip in windows.clips
+    ]
+    more = motion.windows(motion.MotionSet(clips, skeleton), PROTOCOL, "test")
+    twisted = torch.cat([futures, torch.randn(*futures.shape[:-1], 3)], -1)
+    names = (*LIMBS, "bone-length error")
+    found, expected = scores(more, twisted), scores(windows, futures)
+    assert [found[name] for name in names] == pytest.approx([expected[name] for name in names], rel=1e-5)
+    notes = {measure.name: measure.note for measure in motion.scores(more)}
+    assert all("1 of 17 bones are shorter than 1e-06 m" in notes[name] for name in names)
+    assert not any("bones" in measure.note for measure in motion.scores(windows))
+
+
+def test_bodies_may_face_anywhere(windows, futures):
+    turned = rotate_about_up(futures.unflatten(-1, (-1, 3)), torch.tensor(1.0), windows.skeleton.up).flatten(-2)
+    found, expected = scores(windows, turned), scores(windows, futures)
+    assert {name: found[name] for name in (*LIMBS, "CMD")} == pytest.approx(
+        {name: expected[name] for name in (*LIMBS, "CMD")}, rel=1e-4
+    )
+
+
+def test_cmd_is_of_each_class_where_clips_say_what_they_show(windows, futures):
+    contents = windows.labels("content") if any("content" in clip.labels for clip in windows.clips) else None
+    real, ours = moved(windows, windows.all()["x"][:, 4:]).mean(-1), moved(windows, futures).mean(1)
+
+    def area(rows):
+        return sum((5 - t) * abs(float(ours[rows, t].mean() - real[rows].mean())) for t in range(5))
+
+    def expected(labels):
+        groups = [[n for n, each in enumerate(labels) if each == label] for label in set(labels)]
+        return sum(len(rows) / len(labels) * area(rows) for rows in groups)
+
+    everything = [""] * len(windows)
+    assert scores(windows, futures)["CMD"] == pytest.approx(expected(contents or everything), rel=1e-4)
+    names = {clip.name: "ab"[n % 2] for n, clip in enumerate(windows.clips)}
+    clips = [replace(clip, labels={**clip.labels, "content": names[clip.name]}) for clip in windows.clips]
+    named = motion.windows(motion.MotionSet(clips, windows.skeleton), PROTOCOL, "test")
+    labels = [names[clip] for _, clip, _ in named.keys]
+    assert scores(named, futures)["CMD"] == pytest.approx(expected(labels), rel=1e-4)
+
+
+def test_apde_is_of_windows_that_share_a_last_pose(windows, futures):
+    """Truths by a plain loop; alone, a window says nothing."""
+    x = windows.all()["x"].double()
+    apart = [[float((a[3] - b[3]).norm()) for b in x] for a in x]
+    near = float(np.median([each for row in apart for each in row if each]))
+    for threshold in (near, 1e-9):
+        some = windows.with_protocol(replace(PROTOCOL, multimodal_threshold=threshold))
+        truths = [[m for m in range(len(x)) if apart[n][m] < threshold] for n in range(len(x))]
+
+        def apd(motions):
+            return np.mean([float((a - b).norm()) for i, a in enumerate(motions) for b in motions[:i]])
+
+        errors = [abs(apd(futures[n].double()) - apd(x[own, 4:])) for n, own in enumerate(truths) if len(own) > 1]
+        found = scores(some, futures)
+        assert found.get("APDE") == (pytest.approx(np.mean(errors), rel=1e-4) if errors else None)
+
+
+def test_jerk_is_the_third_derivative_and_counts_the_seam(windows):
+    (measure,) = (each for each in motion.scores(windows) if each.name == "jerk")
+    x, index, fps = windows.all()["x"].double(), torch.arange(len(windows)), PROTOCOL.fps
+    times = torch.arange(10, dtype=torch.float64)[:, None] / fps
+
+    def jerk(path):
+        """Of a pose of which all joints go along a path (10, 3), m."""
+        whole = x[:, :1] + path.repeat(1, x.shape[-1] // 3)
+        past, future = whole[:, :4], whole[:, None, 4:].repeat(1, 3, 1, 1)
+        found = measure.function(future, future[:, 0], {"x": past}, index)
+        torch.testing.assert_close(found, found[:1].expand(len(x)))
+        return found[0].item()
+
+    assert jerk(torch.cat([times, times**2, 0 * times], -1)) == pytest.approx(0, abs=1e-6)
+    assert jerk(torch.cat([0 * times, 2 * times**3, 0 * times], -1)) == pytest.approx(12)
+    leap = torch.zeros(10, 3, dtype=torch.float64)
+    leap[4:] = 0.1  # between the last observed frame and the first of the future: by 1, -2, 1 in six third differences
+    assert jerk(leap) == pytest.approx(0.1 * 3**0.5 * fps**3 * 4 / 6)
+    real = np.linalg.norm(np.diff(windows.positions(x)[:, 1:, 1:].numpy(), 3, axis=1), axis=-1).mean() * fps**3
+    assert measure.note == f"jerk: {real:.1f} m/s³ of real motion"
+
+
+def test_one_predicted_frame_has_no_steps(windows):
+    short = motion.windows(motion.simulate(clips=4, frames=40, test=0.5), replace(PROTOCOL, predicted=1), "test")
+    names = {measure.name for measure in _measures(motion.scores, short)}
+    assert {"limb stretch", "limb-angle error"} <= names
+    assert not {"limb jitter", "CMD"} & names
+    assert "jerk" in names  # with the seam there are four frames
+    once = replace(PROTOCOL, observed=1, predicted=2)
+    short = motion.windows(motion.simulate(clips=4, frames=40, test=0.5), once, "test")
+    assert "jerk" not in {measure.name for measure in _measures(motion.scores, short)}
