@@ -207,8 +207,8 @@ class Oracle:
         linear = isinstance(conditional.network, LinearNetwork) and isinstance(conditional.law, FixedNormalLaw)
         if not linear and not (conditional.network is None and isinstance(conditional.law, Gaussian)):
             raise ValueError(
-                f"{conditional.factor} is not linear-Gaussian: the oracle needs networks.Linear with laws.FixedNormal, "
-                "as dvae.factorization.oracle.twin builds, or without parents a normal"
+                f"{conditional.factor} is not linear-Gaussian: the oracle needs networks.Linear with "
+                "distributions.FixedNormal, as dvae.factorization.oracle.twin builds, or without parents a normal"
             )
         if read := [name for name in conditional.parents if name in units and units[name].logarithms]:
             raise ValueError(f"{conditional.factor} reads logarithms of {', '.join(read)}, and is not linear in them")

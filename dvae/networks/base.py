@@ -352,7 +352,7 @@ class Hoisted:
 
 @dataclass
 class Chain:
-    """A loop in the form that `laws.chain` runs: one product a step with features of the child's last value.
+    """A loop in the form that `distributions.chain` runs: one product a step with features of the child's last value.
 
     Args:
         lag: where the child's value is read, a step away.

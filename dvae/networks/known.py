@@ -1,4 +1,4 @@
-"""WithNoise: any network, and behind its features a scale that is given, for the law `laws.KnownNoise`.
+"""WithNoise: any network, and behind its features a scale that is given, for the law `distributions.KnownNoise`.
 
     p(x_t | z_t, s_t) = N(f(z_t), s_t²)
 
@@ -23,7 +23,7 @@ from .rows import select
 
 @dataclass(frozen=True)
 class WithNoise:
-    """A network of all parents but the scale of the noise, which it hands on; for the law `laws.KnownNoise`.
+    """A network of all parents but the scale of the noise, which it hands on; for the law `distributions.KnownNoise`.
 
     Args:
         scale: name of the parent, context at t or static, with one standard deviation for each coordinate.

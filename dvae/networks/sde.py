@@ -45,7 +45,8 @@ ORDER = 22
 
 @dataclass(frozen=True)
 class LinearSDE:
-    """A linear stochastic differential equation from z_{t-1} over a gap, for the law `laws.Triangular`; see the file.
+    """A linear stochastic differential equation from z_{t-1} over a gap, for the law `distributions.Triangular`; see
+    the file.
 
     Args:
         times: between which the coordinates' times of forgetting, 1 / r, are spread at the start; in the unit of gaps.
@@ -79,7 +80,7 @@ class LinearSDE:
 
 @dataclass(frozen=True)
 class LinearSDEGuide:
-    """The transition of a `LinearSDE` times a Gaussian potential, for the law `laws.Triangular`; see the file.
+    """The transition of a `LinearSDE` times a Gaussian potential, for the law `distributions.Triangular`; see the file.
 
     A network that only reads z_{t-1} beside the gap has to learn how z turns in any time before it can be near a prior
     of little noise. This one turns with it from the start. `networks.base.share_modules(networks, "equation")` of both

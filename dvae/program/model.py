@@ -212,8 +212,8 @@ class DynamicalVAE(nn.Module):
                     raise ValueError(
                         f"the draws of the latent {name} {what} by the law of {conditional.factor}, so that no "
                         f"gradient would reach the guide through them; give it a continuous law such as "
-                        f"laws.Normal(), name {name} as observed where it is data, or have a categorical one summed "
-                        f"out: sizes={{{name!r}: dvae.Discrete(states)}}"
+                        f"distributions.Normal(), name {name} as observed where it is data, or have a categorical one "
+                        f"summed out: sizes={{{name!r}: dvae.Discrete(states)}}"
                     )
         for name in self.summed:
             if self.generator[name].family != "OneHotCategorical":

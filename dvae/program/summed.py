@@ -358,7 +358,8 @@ class Summation:
 def forward_sums(start: Tensor, steps: Tensor) -> Tensor:
     """The forward algorithm: (..., B, T + 1, M, W) from (..., B, M, W) and logs (B, T, M, W, K) of steps from W states.
 
-    Long series run in blocks (see `laws.scan`) from each of the W states: a block is a step from W states to W.
+    Long series run in blocks (see `distributions.scan`) from each of the W states: a block is a step from W states to
+    W.
     """
     batch, length, kept, window, width = steps.shape
     if length >= 4 * BLOCK and batch * kept * window**2 * width <= WIDE:

@@ -67,7 +67,7 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
         if conditional.support is not None or conditional.law.deterministic:
             raise ValueError(
                 f"the latent {name} cannot be any real number by the law of {conditional.factor}; gradients lead "
-                "through posteriors on the whole line alone, such as those of laws.Normal()"
+                "through posteriors on the whole line alone, such as those of distributions.Normal()"
             )
     data = model.read(batch)
     if model.grouped and GROUP in data:

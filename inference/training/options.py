@@ -104,7 +104,7 @@ class Stage:
         learning_rate: that of `Training` if None.
         self_feeding: that of `Training` if None.
         curriculum: how far what comes gradually has come, from 0 to 1, such as draws of what sequences share
-            (`laws.Subset`); all the way if None.
+            (`distributions.Subset`); all the way if None.
         frozen: parameters whose names start with one of these stay as they are.
 
     Example:

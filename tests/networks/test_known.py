@@ -77,5 +77,5 @@ def test_what_does_not_go_together_is_refused():
     pair = "p(z_t) p(x_t | z_t, s_t)", "q(z_t | x_t)"
     with pytest.raises(ValueError, match=r"reads the scale s of size 3 at t, such as p\(x_t \| z_t, s_t\)"):
         dvae.DynamicalVAE(*pair, sizes, {"p(x)": WithNoise("s", Dense((4,)))}, {"p(x)": KnownNoise()})
-    with pytest.raises(ValueError, match=r"the parameters of a laws.KnownNoise"):
+    with pytest.raises(ValueError, match=r"the parameters of a distributions.KnownNoise"):
         dvae.DynamicalVAE(*pair, {**sizes, "s": 3}, {"p(x)": WithNoise("s", Dense((4,))), "q": Dense((4,))})

@@ -135,7 +135,7 @@ class Bones(View):
     This is no bijection. Lengths are taken as given, one for a bone and window, so that what they vary by within a
     window is lost; and a direction has two degrees of freedom in three numbers, so that no density of positions follows
     from one of directions: `log_det` refuses. A model sees so whose x is a function of its parents, as with
-    `laws.Directions`, and which learns from energies.
+    `distributions.Directions`, and which learns from energies.
 
     Args:
         skeleton: of the poses.
@@ -182,7 +182,7 @@ class Bones(View):
         raise ValueError(
             "there is no density of positions where a model sees the directions of bones: lengths are taken as given, "
             "and a direction has two degrees of freedom in three numbers; make x a function of its parents, with "
-            "laws.Directions(), and train by energies, or let the model see positions"
+            "distributions.Directions(), and train by energies, or let the model see positions"
         )
 
     def _rooted(self, joints: Tensor, x: Tensor) -> Tensor:
