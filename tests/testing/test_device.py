@@ -47,9 +47,9 @@ STEP = {
 }
 """For what any step waits, and how often."""
 BESIDE = {
-    "moglow": {"distributions/conditional_flow.py": 2},  # zuko looks up both halves of a coupling, once for each of
-    them "hit-dvae": {"motion/energies.py":
-     1}, # how many futures are admissible is a shape "gsps": {"motion/energies.py": 1},
+    "moglow": {"distributions/conditional_flow.py": 2},  # zuko looks up both halves of each coupling
+    "hit-dvae": {"motion/scoring/energies.py": 1},  # how many futures are admissible is a shape
+    "gsps": {"motion/scoring/energies.py": 1},
     "dlow": {
         "program/groups.py": 1,
         "models/motion/modes.py": 1,
