@@ -40,7 +40,6 @@ NAMES = (
     "mix_and_match",
     "trajevae",
     "completion",
-    "compiled",
     "startup",
     "files",
     "mapped",

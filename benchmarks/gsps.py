@@ -3,7 +3,6 @@
     step      a training step (windows and their pseudo ground truths, forward, backward, Adam; 16 windows of 25 + 100
               frames, 10 x 10 futures each), over its matrix products alone
     energies  the share of a step that the energies of futures take that are there, forward and backward
-    compiled  that share of a step with `--compile`
     prior     the pose prior's energy, with the reflections of its layers one after the other over all at once
     memory    the most that the process held, in GB, not that of a GPU; the public implementation 6.7
     futures   50 futures of 16 windows, over their matrix products alone
@@ -20,7 +19,6 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.compiled import compiling
 from dvae.distributions.flow import QRFlowLaw
 from dvae.models.motion.gsps import PRESETS, GSPSModel
 
@@ -68,8 +66,6 @@ def rows(device: torch.device) -> dict[str, float]:
     futures = lambda: model.forecast(past, 100, 50)  # noqa: E731
     whole, alone, energies, ahead, apart = seconds(step, products(step), scored, futures, products(futures), repeat=5)
     found = {"step": whole / alone, "energies": energies / whole, "futures": ahead / apart}
-    whole, energies = seconds(compiling()(step), compiling()(scored), repeat=5)
-    found["compiled"] = energies / whole
 
     flow, poses = model.pose_prior.flow, torch.randn(53_000, 48, device=device, requires_grad=True)
     both = seconds(

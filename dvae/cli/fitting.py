@@ -207,7 +207,6 @@ def resume(
     data: str | None = None,
     steps: int | None = None,
     learning_rate: float | None = None,
-    compile: bool | None = None,
     accelerator: Accelerator | None = None,
     tensorboard: bool = False,
 ) -> None:
@@ -220,11 +219,10 @@ def resume(
         data: where the data lie now, if the path in the run no longer leads there.
         steps: optimiser steps in all, to make the run longer.
         learning_rate: step size of the optimiser from here on.
-        compile: whether inner functions are compiled from here on, such as not where there is no compiler.
         accelerator: where it goes on, such as on a processor after a GPU.
         tensorboard: write TensorBoard files to the run directory too.
     """
-    given = {"steps": steps, "learning_rate": learning_rate, "compile": compile, "accelerator": accelerator}
+    given = {"steps": steps, "learning_rate": learning_rate, "accelerator": accelerator}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     with arguments():
         Training(**options)

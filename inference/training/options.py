@@ -38,8 +38,6 @@ class Training:
         accelerator: where to run: "auto", "cpu", "gpu", "cuda" or "mps".
         devices: number of devices, with one process each; under torchrun, which starts them, as many as these are.
         precision: precision of the computation; "32-true" leaves the model's own.
-        compile: compile the inner functions that are faster so, which takes from seconds to a minute at first
-            (`dvae.compiled`; `benchmarks/compiled.py` measures gains by method). Validation is as without.
         progress: whether to show the terms on the terminal.
 
     Raises:
@@ -67,7 +65,6 @@ class Training:
     accelerator: Accelerator = "auto"
     devices: Annotated[int, Range(1, 32)] = 1
     precision: Literal["32-true", "64-true", "bf16-mixed", "bf16-true"] = "32-true"
-    compile: bool = False
     progress: bool = True
 
     def __post_init__(self) -> None:

@@ -7,9 +7,8 @@ changes nothing, nor the reverse.
 """
 
 import math
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from ...compiled import compiling, require_compiler
 from ...data.sequences import Batch, InBatches, each, in_batches, refuse_table, tensor_of
 from ...options import kind_of
 from ...program.model import DynamicalVAE
@@ -150,8 +148,6 @@ class SVI:
         with no_fork:  # lightning-fabric, and by the first optimiser parts of torch
             self.fabric: Fabric = processes.launched(training)
             torch.optim.SGD([torch.zeros(1)])
-        if training.compile:
-            require_compiler(self.fabric.device)
         with _forked(self.fabric.device):
             own: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
             optimizer = OPTIMISERS[training.optimizer](
@@ -179,23 +175,17 @@ class SVI:
             NonFiniteError: the loss or a gradient is NaN or infinite; the weights stay as they are.
         """
         state, training = self.state, self.training
-        (first, stage), rates, objective = stage_at(self.plan, state.step), self.rates(state.step), self.objective
+        (_, stage), rates, objective = stage_at(self.plan, state.step), self.rates(state.step), self.objective
         for group in self.optimizer.param_groups:
             group["lr"] = rates["learning_rate"]
         if not self.model.training:
             self.module.train()
         where = f"step {state.step + 1}"
-        with self.drawing(), compiling() if training.compile else nullcontext() as compiled:
+        with self.drawing():
             terms = self._terms(batch, stage.objective, where, rates["self_feeding"], rates.get("curriculum"))
             loss = objective(terms, state.step)
             self.optimizer.zero_grad()
             self.fabric.backward(loss)
-        if compiled is not None and not compiled.used and state.step == first:
-            warnings.warn(
-                f"compile=True changes nothing in this stage of the run: a step of {type(self.model).__name__} has "
-                "nothing in it that is faster compiled (docs/accelerators.md)",
-                stacklevel=3,  # `alone` is between
-            )
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
             if name.startswith(stage.frozen):
                 parameter.grad = None  # which the optimiser leaves out, with its state

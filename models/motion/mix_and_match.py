@@ -28,7 +28,6 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from ...compiled import compiled
 from ...constants import constant
 from ...data.schema import Schema
 from ...data.views import WHOLE, Past, Views
@@ -207,7 +206,6 @@ class MixAndMatchModel(DynamicalVAE):
         return {"skeleton": (ours - theirs).square().mean(-1).sum(-1)}
 
 
-@compiled
 def _aligned(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
     """Positions (B, T, 3 J') of poses (B, T, D) whose root is at the origin and not turned."""
     place, start = view.turning.index(view.skeleton.root), 3 * view.root

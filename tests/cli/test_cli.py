@@ -16,13 +16,11 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
-import tyro
 
 import dvae
 from dvae import motion
 from dvae.cli import main
 from dvae.cli.app import exit_code
-from dvae.cli.fitting import TrainingOptions, given_options
 from dvae.inference.diagnostics.stein import SteinDiscrepancy
 from dvae.inference.diagnostics.yardstick import ReferencePosterior
 from dvae.motion.data.dataset import MotionData
@@ -760,8 +758,3 @@ def test_forecasts_become_tubes_on_validation_windows_or_on_clips_of_a_label(cap
     ):
         assert main(["tubes", str(run), "--samples", "4", *wrong])
         assert said in " ".join(capsys.readouterr().err.split())
-
-
-def test_compile_is_a_flag_which_says_nothing_where_it_is_not_given():
-    for arguments, given in ([], {}), (["--compile", "--seed", "0"], {"compile": True, "seed": 0}):
-        assert given_options(tyro.cli(TrainingOptions, args=arguments)) == given

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from ...compiled import compiled
 from ...constants import indices
 from ..geometry.kinematics import forward
 
@@ -207,7 +206,6 @@ class Body(nn.Module):
             )
 
 
-@compiled
 def _squared_error(
     form: Tensor,
     pivots: Tensor,

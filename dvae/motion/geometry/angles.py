@@ -202,34 +202,6 @@ def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
     return cosines.reshape(*poses.shape[:-1], len(plan.first))
 
 
-def cosines_one_by_one(poses: Tensor, matrix: Tensor, places: Places) -> list[Tensor]:
-    """The same, NaN where a pose lacks an angle, for torch to compile: a thousand operations on rows of numbers.
-
-    Args:
-        poses: (N, D).
-        matrix: of the differences, see `differences`.
-        places: of the angles.
-
-    Returns:
-        A tensors (N,).
-    """
-    with torch.autocast(poses.device.type, enabled=False):
-        rows = (matrix.T @ poses.T).unbind(0)
-    vectors = [rows[i : i + 3] for i in range(0, len(rows), 3)]
-    for crosses in places.crosses:
-        factors = [(*vectors[a], *vectors[b]) for a, b in crosses]
-        vectors += [(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx) for ax, ay, az, bx, by, bz in factors]
-    inverse = [inverse_lengths(torch.stack(vector, -1)) for vector in vectors]
-
-    def inner(a: int, b: int) -> Tensor:
-        return sum(one * other for one, other in zip(vectors[a], vectors[b], strict=True))  # type: ignore[return-value]
-
-    found = [inner(a, b) * inverse[a] * inverse[b] for a, b in places.angles]
-    for angle, u, v, negative in places.partial:
-        found[angle] = found[angle].masked_fill((inner(u, v) < 0) != negative, torch.nan)
-    return found
-
-
 class _Cosines(Function):
     """With its derivative by hand, which takes half the time of the recorded one.
 

@@ -18,9 +18,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import Function, once_differentiable
 
-from ...compiled import compiled, requested
 from ...constants import constant
-from ..geometry.angles import AngleLimits, Places, angle_names, angle_places, cosines, cosines_one_by_one
+from ..geometry.angles import AngleLimits, angle_names, cosines
 from ..geometry.skeleton import Skeleton, differences
 
 BLOCK = 2**18
@@ -99,8 +98,6 @@ def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
     _check(samples)
     if not scale > 0:
         raise ValueError(f"scale is {scale}, expected a distance above 0, in metres")
-    if requested() and len(samples) > 1:
-        return _likeness(samples, scale)
     first, second = torch.triu_indices(len(samples), len(samples), 1, device=samples.device)
     one = torch.eye(len(samples), dtype=samples.dtype, device=samples.device)
     pairs = one[first] - one[second]  # as a matrix product, a third faster than by indices
@@ -112,14 +109,6 @@ def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
 
     diversity: Tensor = _InBlocks.apply(energy, samples)
     return diversity
-
-
-@compiled
-def _likeness(samples: Tensor, scale: float) -> Tensor:
-    """By one sample after the other, beside those behind it: compiled, with no room for the differences."""
-    apart = torch.cat([(samples[i] - samples[i + 1 :]).abs().sum((2, 3)) for i in range(len(samples) - 1)])
-    likeness: Tensor = (-apart / scale).exp().mean(0)
-    return likeness
 
 
 def gaussian_diversity(samples: Tensor, scale: float) -> Tensor:
@@ -217,13 +206,10 @@ def limb_length(samples: Tensor, reference: Tensor, skeleton: Skeleton) -> Tenso
     pose = reference.detach()
     lacking = skeleton.bone_lengths(skeleton.with_root(pose.unflatten(-1, (-1, 3)))).isnan()
     expected = torch.where(lacking, torch.nan, _lengths(pose.nan_to_num(0.0), limbs))
-    if requested():
-        return _limb_errors(samples, expected, limbs)
     error: Tensor = _InBlocks.apply(lambda block, other: _limb_errors(block, other, limbs), samples, expected)
     return error
 
 
-@compiled
 def _limb_errors(samples: Tensor, expected: Tensor, limbs: Tensor) -> Tensor:
     return _errors(_lengths(samples, limbs), expected[:, None]).sum(3).mean((0, 2))
 
@@ -292,23 +278,8 @@ def joint_angles(samples: Tensor, limits: AngleLimits, skeleton: Skeleton) -> Te
     low, high = limits.low.to(samples), limits.high.to(samples)
     low, high = low.masked_fill(low < -0.98, -torch.inf), high.masked_fill(high > 0.98, torch.inf)
     same = constant(tuple(tuple(float(name == other) for other in names) for name in names), samples)
-    if requested():
-        places = angle_places(skeleton)
-        matrix = differences(skeleton, places.differences, samples.shape[-1], samples.dtype, samples.device)
-        return _excess(samples, low, high, same, matrix, places)
     excess: Tensor = _JointAngles.apply(samples, low, high, same, skeleton)
     return excess
-
-
-@compiled
-def _excess(samples: Tensor, low: Tensor, high: Tensor, same: Tensor, matrix: Tensor, places: Places) -> Tensor:
-    _, sequences, frames, size = samples.shape
-    cos = torch.stack(cosines_one_by_one(samples.reshape(-1, size), matrix, places))
-    low, high = low[:, None], high[:, None]
-    over = torch.where(cos < low, cos - low, torch.where(cos > high, cos - high, 0))
-    below, above = ((same @ side.sum(1).to(same)).clamp_min(1)[:, None] for side in (over < 0, over > 0))
-    share = sequences * over.square() / torch.where(over < 0, below, above)
-    return share.sum(0).view(-1, sequences, frames).sum((0, 2))
 
 
 class _JointAngles(Function):
