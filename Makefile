@@ -48,7 +48,7 @@ venv: .venv/installed
 	touch $@
 
 demo: venv
-	$(BIN)/python -m benchmarks.tables.demo
+	$(BIN)/python -m benchmarks.studies.demo
 
 quick: lint
 	$(BIN)/pytest -n 2 -m "not slow"
@@ -82,7 +82,7 @@ bench: venv
 	$(BIN)/python -m benchmarks.bench --device $(DEVICE)
 
 notebooks: venv
-	$(BIN)/python -m benchmarks.tables.notebooks notebooks/*.ipynb
+	$(BIN)/python -m benchmarks.studies.notebooks notebooks/*.ipynb
 
 docs: venv
 	$(BIN)/python -c 'import furo, myst_nb' 2>/dev/null || $(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"

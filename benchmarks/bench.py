@@ -29,7 +29,7 @@ import tyro
 
 import dvae
 
-from .tables.pages import DOCS, refuse_unknown, require_gpu, table, write
+from .studies.pages import DOCS, refuse_unknown, require_gpu, table, write
 
 HERE = Path(__file__).parent
 HISTORY = HERE / "history.json"

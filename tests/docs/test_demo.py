@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 from stopping import At, interrupt
 
-from benchmarks.tables import demo
+from benchmarks.studies import demo
 from dvae import Evaluation
 from dvae.runs.directory import fit_run, resume
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.tables import domains
+from benchmarks.studies import domains
 from dvae import tables
 from dvae.inference.evaluation.estimates import Crossed
 from dvae.tables import Column, Columns, Panel, Series, reading

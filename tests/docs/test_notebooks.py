@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from rich import console
 
-from benchmarks.tables import notebooks
+from benchmarks.studies import notebooks
 from dvae.inference.evaluation import result
 from dvae.motion.drawing.plot import surfaces
 

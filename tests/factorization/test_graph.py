@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 
 import dvae.factorization.graph
 import dvae.factorization.notation
-from benchmarks.tables.audits import FAMILY
+from benchmarks.studies.audits import FAMILY
 from dvae.factorization.graph import analytic_kl, audit
 from dvae.factorization.notation import Factorization
 from dvae.factorization.relations import Relation

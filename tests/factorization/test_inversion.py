@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import dvae
 import dvae.factorization.inversion
-from benchmarks.tables.audits import FAMILY
+from benchmarks.studies.audits import FAMILY
 from dvae.factorization.graph import analytic_kl
 from dvae.factorization.inversion import MarkovBoundaries, faithful, guide, orders, spelled
 from dvae.factorization.notation import Block, Factorization

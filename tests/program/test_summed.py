@@ -11,7 +11,7 @@ from pyro import poutine
 from pyro.infer import Trace_ELBO
 
 import dvae
-from benchmarks.tables.switching import filtered, switching
+from benchmarks.studies.switching import filtered, switching
 from dvae import Discrete
 from dvae.networks import Dense, Recurrent
 from dvae.program import summed

@@ -1,31 +1,37 @@
 """Scores that are kept are of what methods are today, and tell nothing of the machines that made them."""
 
-import gzip
 import json
 import re
+import zipfile
 
 import pytest
 
 import dvae
-from benchmarks.tables import papers, ranking, tuning
+from benchmarks.studies import papers, ranking, tuning
 from dvae.models.motion.poses import PoseMethod
 from dvae.motion import WALKER
 
-FOLDERS = sorted({file.parent for file in ranking.SCORES.rglob("scores*.json.gz")})
+SETS = sorted(file.stem for file in ranking.SCORES.glob("*.zip"))
+RUNS = [
+    (of, run)
+    for of in SETS
+    for run in dict.fromkeys(name.partition("/")[0] for name in ranking.members(ranking.SCORES / f"{of}.zip"))
+]
 
 
 def named(file):
     return "/".join(file.relative_to(ranking.SCORES).parts)
 
 
-@pytest.mark.parametrize("folder", FOLDERS, ids=named)
-def test_scores_name_no_place(folder):
-    for file in folder.glob("scores*.json.gz"):
-        text = gzip.decompress(file.read_bytes()).decode()
-        assert '"/' not in text, file.name
+@pytest.mark.parametrize("of", SETS)
+def test_scores_name_no_place(of):
+    with zipfile.ZipFile(ranking.SCORES / f"{of}.zip") as archive:
+        texts = {name: archive.read(name).decode() for name in archive.namelist()}
+    for name, text in texts.items():
+        assert '"/' not in text, name
         told = json.loads(text)
         (clips,) = {len(means) for row in told["rows"].values() for means in row.values()}
-        assert clips == len(told["clips"]), file.name
+        assert clips == len(told["clips"]), name
 
 
 @pytest.mark.parametrize("file", sorted(ranking.SCORES.rglob("judges/*/config.json")), ids=named)
@@ -38,10 +44,10 @@ def test_judges_name_no_place(file):
     )
 
 
-@pytest.mark.parametrize("folder", [folder for folder in FOLDERS if "seed" in folder.name], ids=named)
-def test_scores_are_of_the_presets(folder):
+@pytest.mark.parametrize(("of", "run"), [(of, run) for of, run in RUNS if "seed" in run])
+def test_scores_are_of_the_presets(of, run):
     """With the options of their rows, as if fitted now; where a preset changes, its rows are to be made again."""
-    of, row = folder.parent.name, folder.name.rpartition("-seed")[0]
+    archive, row = ranking.SCORES / f"{of}.zip", run.rpartition("-seed")[0]
     (options,) = {
         json.dumps(options): options
         for methods in (ranking.SETS[of].methods, *(paper.rows for paper in papers.PAPERS.values() if paper.set == of))
@@ -50,7 +56,8 @@ def test_scores_are_of_the_presets(folder):
     }.values()
     told, training = ranking.parted(options)
     method = dvae.method(told.pop("method", row), **told)
-    (stored,) = {json.dumps(ranking.Scored.load(file).config) for file in folder.glob("scores*.json.gz")}
+    kept = [ranking.Kept(archive, name) for name in ranking.members(archive) if name.startswith(f"{run}/")]
+    (stored,) = {json.dumps(ranking.Scored.load(each).config) for each in kept}
     stored = json.loads(stored)
     now = {name: value for name, value in method.config().items() if value is not None and not name.endswith("_run")}
     preset = method.preset(WALKER) if isinstance(method, PoseMethod) else {}
@@ -67,7 +74,7 @@ def test_scores_are_of_the_presets(folder):
 def test_what_was_tuned_stands_on_the_page(name):
     """Every case that was scored, by the name that it has there."""
     page = (ranking.SCORES.parents[1] / "docs" / "results" / "tuning.md").read_text(encoding="utf-8")
-    found = tuning.Store(ranking.SCORES / "tuning", name).found
+    found = tuning.Store(ranking.SCORES / "tuning.json", name).found
     assert found
     assert found.keys() <= set(tuning.OF_JUDGES if name == "judges" else tuning.SECTIONS[name].cases)
     for case in found:

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from benchmarks import bench, speed
-from benchmarks.tables import (
+from benchmarks.studies import (
     audits,
     bones,
     bounds,
@@ -487,13 +487,13 @@ def test_ranking(folder, page, monkeypatch):
         ranking.main(runs, folder, accelerator="cuda", **options)
     ranking.main(runs, folder, seeds=(0,), accelerator="cpu", **options)
     ranking.main(runs, folder, seeds=(0, 1), methods=("srnn",), **options)
-    before = {file: file.stat().st_mtime_ns for file in scores.rglob("*.json.gz")}
+    before = {file: file.stat().st_mtime_ns for file in scores.rglob("*.zip")}
     assert len(before) == 4  # of three runs, and of the references
     shutil.rmtree(runs)
     ranking.main(runs, folder, seeds=(0, 1), methods=("srnn",), **options)  # scored, which is enough
     assert not runs.exists()
     ranking.main(runs, **options)
-    assert before == {file: file.stat().st_mtime_ns for file in scores.rglob("*.json.gz")}
+    assert before == {file: file.stat().st_mtime_ns for file in scores.rglob("*.zip")}
     page.write_text(page.read_text().replace("simulated", "tables"))
     (best,) = re.findall(r"^May be the best, .* with 2 seeds or more: (.*)\.$", page.read_text(), re.MULTILINE)
     assert set(best.split(", ")) <= {"zero velocity", "nearest neighbours", "srnn"}  # of the other there is one seed
@@ -613,7 +613,7 @@ def test_a_second_stage_alone_stands_on_the_first_of_its_set(folder, tmp_path, m
     monkeypatch.setattr(ranking, "fitted_judges", lambda *arguments: {})
     ranking.main(tmp_path, folder, ("simulated",), ("dlow",), (0,), 2, tmp_path / "scores")
     assert Run(tmp_path / "simulated" / "cvae-seed0").config["training"]["steps"] == 3
-    assert not (tmp_path / "scores" / "simulated" / "cvae-seed0").exists()
+    assert not any(name.startswith("cvae-") for name in ranking.members(tmp_path / "scores" / "simulated.zip"))
 
 
 def test_a_set_like_another_has_its_judges_and_reference_rows(folder, tmp_path, capsys, monkeypatch):
@@ -628,7 +628,9 @@ def test_a_set_like_another_has_its_judges_and_reference_rows(folder, tmp_path, 
         assert ranking.rows_of(tmp_path / "scores", "longer", ranking.View()) == {}  # reference rows alone are no table
         ranking.main(tmp_path, folder, seeds=(0,), samples=2, sets=(name,), scores=tmp_path / "scores")
     assert judged == ["simulated", "simulated"]
-    assert not (tmp_path / "scores" / "longer" / ranking.REFERENCES).exists()
+    names = ranking.members(tmp_path / "scores" / "longer.zip")
+    assert names
+    assert not any(name.startswith(f"{ranking.REFERENCES}/") for name in names)
     assert [Run(tmp_path / name / "srnn-seed0").config["training"]["steps"] for name in ranking.SETS] == [2, 3]
     table = [line.split("|") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
     once, again = (row[6:] for row in table if "nearest neighbours" in row[1])

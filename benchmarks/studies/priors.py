@@ -1,0 +1,129 @@
+"""Writes the table of TrajeVAE's priors of docs/results/trajevae.md: how they fit the posteriors, and other laws.
+
+z, drawn from a window's posterior, is as far from the prior's mean as a draw of the prior where the prior is as wide as
+the posteriors ask: one, in units of the prior's deviation, root mean square. Below it the prior is too wide, above it
+too narrow. What that does is told by the same decoder with other laws of z: the prior with its deviations multiplied,
+and with the mean, the deviation, or both, of the posteriors of all training windows together, number by number.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+import tyro
+from torch import Tensor
+
+from dvae import motion
+from dvae.models.motion.trajectories import FIRST, GIVEN
+from dvae.program.batch import CHUNK, rows
+
+from .pages import DOCS, loaded, table, write
+from .ranking import JOINTS
+from .tuning import evaluated, seen
+
+SCORES = ("APD", "energy score")
+LAWS: dict[str, tuple[float, tuple[str, ...]]] = {
+    "prior": (1.0, ()),
+    "prior × 2": (2.0, ()),
+    "common mean": (1.0, ("mean",)),
+    "common deviation": (1.0, ("deviation",)),
+    "common both": (1.0, ("mean", "deviation")),
+}
+"""By their columns: what the prior's deviations are multiplied by, and what is the posteriors' together."""
+BETWEEN = (0.05, 0.95)
+"""Quantiles over the numbers of z."""
+Law = tuple[Tensor, Tensor]
+
+
+@torch.no_grad()
+def law(model: Any, factor: Any, windows: Any) -> Law:
+    """Means and deviations of z, (N, T, D), by the guide or the prior; of the coefficients that are read."""
+    found: list[Law] = []
+    batch = windows.all()
+    for start in range(0, len(batch["x"]), CHUNK):
+        data = model.read(rows(batch, slice(start, start + CHUNK)))
+        mean, deviation = factor(data, len(data[FIRST]), data[GIVEN].shape[1])
+        steps = slice(model.method.components or None)
+        found.append((mean[:, steps], deviation[:, steps]))
+    means, deviations = map(torch.cat, zip(*found, strict=True))
+    return means, deviations
+
+
+def rms(values: Tensor) -> float:
+    """Over all."""
+    return float(values.square().mean().sqrt())
+
+
+def together(posterior: Law) -> Law:
+    """Mean and deviation of draws of the posteriors of all windows, (T, D)."""
+    mean, deviation = posterior
+    return mean.mean(0), (mean.var(0, correction=0) + deviation.square().mean(0)).sqrt()
+
+
+def with_common(prior: Callable[..., Law], common: Law, what: tuple[str, ...]) -> Callable[..., Law]:
+    """A prior with what is said to be common to all windows."""
+    mean, deviation = common
+
+    def changed(*arguments: Any, **options: Any) -> Law:
+        loc, scale = (values.clone() for values in prior(*arguments, **options))
+        if "mean" in what:
+            loc[:, : len(mean)] = mean
+        if "deviation" in what:
+            scale[:, : len(mean)] = deviation
+        return loc, scale
+
+    return changed
+
+
+def few(windows: Any) -> Any:
+    """The scores that the table shows."""
+    return [each for each in motion.scores(windows) if each.name in SCORES]
+
+
+def lines(path: Path, counts: tuple[int, ...]) -> Iterator[list[str]]:
+    """Of a run, by how many paths are given."""
+    run = loaded(path)
+    if run.method.name != "trajevae":
+        sys.exit(f"{path} is a run of {run.method.name}; give one of trajevae")
+    model, judged, trained = run.model.eval(), seen(run.data), run.data.windows("train")
+    guide, prior = model.encoder["z"], model.generator["z"]
+    for count in counts:
+        windows = judged.given(JOINTS[:count])
+        (mean, deviation), (prior_mean, prior_deviation) = (law(model, each, windows) for each in (guide, prior))
+        off = torch.hypot(mean - prior_mean, deviation) / prior_deviation
+        low, high = off.square().mean(0).sqrt().quantile(torch.tensor(BETWEEN)).tolist()
+        widths = [rms(mean - mean.mean(0)), rms(deviation), rms(prior_mean - prior_mean.mean(0)), rms(prior_deviation)]
+        common = together(law(model, guide, trained.given(JOINTS[:count])))
+        cells = []
+        for scale, what in LAWS.values():
+            with patch.object(prior, "forward", with_common(prior.forward, common, what)):
+                found = evaluated(model, windows, few, options={"temperature": scale})
+            cells.append([f"{found[name]:.2f}" for name in SCORES])
+        told = [*(f"{value:.2f}" for value in widths), f"{rms(off):.2f} ({low:.2f}, {high:.2f})"]
+        yield [path.name, str(count), *told, *(each for values in zip(*cells, strict=True) for each in values)]
+
+
+def main(
+    runs: tyro.conf.Positional[tuple[Path, ...]],
+    page: Path | None = DOCS / "results" / "trajevae.md",
+    counts: tuple[int, ...] = (0, 4),
+) -> None:
+    """Write the table.
+
+    Args:
+        runs: run directories of `benchmarks.studies.tuning`.
+        page: where; with None it is printed.
+        counts: of joints whose paths are given.
+    """
+    widths = ["posterior means", "posterior", "prior means", "prior", "z in units of the prior"]
+    header = ["", "given", *widths, *(f"{score}, {name}" for score in SCORES for name in LAWS)]
+    write(page, table(header, [line for run in runs for line in lines(run, counts)]), name="priors")
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

@@ -1,0 +1,667 @@
+"""Fits every method for motion on every set, scores it on the test windows, and ranks them.
+
+Methods have the options and the training of their presets, which the tuning protocol chose (docs/results/tuning.md);
+runs lie in `RUNS/SET/METHOD-seedN`. What tables are made of, scores by clip, is kept in `SCORES/SET` beside the judges
+that gave them: the script goes on where it was stopped, there or on another machine, a further method is scored by the
+same judges, and without `--data` nothing is fitted.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+import statistics
+import sys
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+from torch import nn
+
+import dvae
+from dvae import Evaluation, Training, files, motion
+from dvae.inference.evaluation.estimates import Crossed, Estimate
+from dvae.inference.evaluation.metrics import average_pairwise_distance
+from dvae.inference.evaluation.result import canvas
+from dvae.inference.evaluation.scores import Measure
+from dvae.inference.training.checkpoints import Run
+from dvae.inference.training.many import confidence_set
+from dvae.models import registry
+from dvae.motion.data.dataset import MotionData
+from dvae.motion.geometry.parts import UNIONS, body_parts
+from dvae.runs.directory import load
+from dvae.runs.sweep import sweep
+
+from .pages import DOCS, refuse_unknown, require_gpu, same, table, write
+
+SCORES = Path(__file__).parents[1] / "scores"
+Accelerator = Literal["cpu", "cuda"]
+
+FUTURES: dict[str, dict[str, Any]] = {
+    "hit-dvae": {},
+    "gsps": {},
+    "cvae": {},
+    "gmvae": {"method": "cvae", "components": 50},
+    "bom": {},
+    "bom-parts": {},
+    "pose-knows": {},
+    "mt-vae": {},
+    "rhp": {},
+    "dlow": {},
+    "dsf": {},
+    "erd": {},
+    "aclstm": {},
+    "moglow": {"decay": 0.5},
+    "srnn": {"self_feeding": 1.0, "steps": 3000, "decay": 0.5},
+}
+"""Methods by what rows are called, with what their options are beside the presets."""
+STEPS = {
+    "hit-dvae": 380,
+    "gsps": 920,
+    "cvae": 2300,
+    "gmvae": 2300,
+    "bom": 570,
+    "bom-parts": 1450,
+    "pose-knows": 1900,
+    "mt-vae": 2300,
+    "rhp": 2800,
+    "dlow": 730,
+    "dsf": 730,
+    "erd": 1800,
+    "aclstm": 730,
+    "moglow": 1900,
+    "srnn": 4300,
+    "trajevae": 5000,
+    "cvae-rnn": 1900,
+    "motion-infilling": 770,
+}
+"""Of about four minutes on one processor; those of `dlow` and `dsf` are beside the ones of the CVAE below them."""
+PATHS: dict[str, dict[str, Any]] = {"trajevae": {}, "cvae-rnn": {}, "motion-infilling": {"keep": 0.15, "gap": 0.0}}
+ALIKE, ALIKE_PATHS = (
+    {row: {**options, "steps": STEPS[row]} for row, options in methods.items()} for methods in (FUTURES, PATHS)
+)
+"""The same methods, equally long."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What of the test windows is predicted, and how.
+
+    Args:
+        given: joints whose paths are known, those of `JOINTS` first; None where methods take no paths.
+        single: one motion, at the mean of the prior, in place of draws.
+        exchanged: metres within which the given joints are in another window's pose, from which motions begin; 0 for
+            the window's own.
+        own: of the windows that have such another one, with their own poses.
+        truth: see `motion.Exchanged`.
+        observed: frames, in place of the protocol's.
+        judges: names with + between, in place of the set's.
+        parts: how diverse the parts of the body are, alone, in "free" futures, in those that have the lower body's
+            draw "held", that of the first, or in those of many whose lower body is "nearest" the first one's.
+    """
+
+    given: int | None = None
+    single: bool = False
+    exchanged: float = 0.0
+    own: bool = False
+    truth: Literal["path", "pose"] = "path"
+    observed: int | None = None
+    judges: str = ""
+    parts: Literal["", "free", "held", "nearest"] = ""
+
+    def windows(self, data: MotionData, split: str) -> Any:
+        """Windows of a part of the data, and what is told of them."""
+        observed = self.observed or data.protocol.observed
+        windows = motion.windows(data.motion, replace(data.protocol, observed=observed), split)
+        if self.given is None:
+            return windows
+        others = [name for name in windows.joints if name not in JOINTS]
+        told = windows.given([*JOINTS, *others][: self.given])
+        if not self.exchanged or split != "test":
+            return told
+        return motion.Exchanged(told, self.exchanged, own=self.own, truth=self.truth)
+
+    def evaluate(self, samples: int) -> dict[str, Any]:
+        """Arguments of `dvae.evaluate`."""
+        return {"samples": 1, "options": {"temperature": 0}} if self.single else {"samples": samples}
+
+    def __str__(self) -> str:
+        """The end of the names of its evaluations."""
+        told = (f"{name}-{value}" for name, value in vars(self).items() if value != getattr(View, name))
+        return "-".join(["", *told])
+
+
+@dataclass(frozen=True)
+class Set:
+    """The file of clips below the folder of data, and what is fitted and scored.
+
+    Args:
+        file: of the clips.
+        methods: by the rows that they are.
+        views: in which each is scored.
+        judges: of `JUDGES`.
+        like: the set whose protocol, fitted judges and reference rows it shares; its own where empty.
+    """
+
+    file: str
+    methods: Mapping[str, Mapping[str, Any]]
+    views: tuple[View, ...] = (View(),)
+    judges: tuple[str, ...] = ()
+    like: str = ""
+
+
+BANDAI, CMU = "bandai/bandai2.npz", "cmu/cmu8.npz"
+GIVEN = tuple(View(count) for count in range(5))
+SETS = {
+    "bandai2-by-style": Set(BANDAI, FUTURES, judges=("prior", "content")),
+    "bandai2-by-style-alike": Set(BANDAI, ALIKE, judges=("prior", "content"), like="bandai2-by-style"),
+    "bandai2-by-take": Set(BANDAI, ALIKE, judges=("prior", "content")),
+    "cmu8": Set(CMU, ALIKE, judges=("prior", "content")),
+    "bandai2-trajectories": Set(BANDAI, PATHS, GIVEN),
+    "bandai2-trajectories-alike": Set(BANDAI, ALIKE_PATHS, GIVEN, like="bandai2-trajectories"),
+    "cmu8-trajectories": Set(CMU, ALIKE_PATHS, GIVEN),
+}
+JOINTS = ("RToe", "LToe", "LWrist", "RWrist")
+"""Whose paths are given first, as in TrajeVAE's tables."""
+CLASSIFIER = Training(steps=3000, learning_rate=3e-3, decay=0.5, validate_every=250)
+JUDGES: dict[str, tuple[str, dict[str, Any], Training]] = {
+    "prior": ("pose-prior", {"heading": True}, Training(steps=1000, learning_rate=0.01, decay=0.8)),
+    "content": ("action-classifier", {}, CLASSIFIER),
+    "group": ("action-classifier", {"label": "group"}, CLASSIFIER),
+}
+"""Methods that judge, their options and their training."""
+COLUMNS = ("energy score", "ADE", "FDE", "ADEm", "MMADE", "APD", "APDE", "CMD", "limb stretch", "limb jitter")
+JUDGED = ("ACC content", "FID content", "pose NLL")
+OTHERS = ("FDEm", "MMFDE", "MMADEm", "MMFDEm", "path error", "global ADE")
+"""Scores that the papers' tables show beside those."""
+GROUPED = ("ACC group", "FID group")
+PARTED = tuple(f"APD {part}" for part in UNIONS)
+SHOWN = {*COLUMNS, *JUDGED, *OTHERS, *GROUPED, *PARTED}
+RANKED = "energy score"
+"""By which rows stand in order; it is proper, and the lowest is best."""
+NEIGHBOURS = "nearest neighbours"
+ENOUGH = 3
+"""Seeds that a row has which may be called the best: of fewer, what they spread tells next to nothing."""
+LEVEL = 0.9
+"""Of intervals, and of the set of those that may be the best."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Scores of a run by clip, or of all reference rows.
+
+    Attributes:
+        basis: windows, draws and judges, which all rows of a table share.
+        clips: windows of each.
+        rows: `{row: {score: means by clip}}`, of four digits.
+        minutes: of processor time that the fit took.
+        config: method and training of the run, without paths to others.
+    """
+
+    basis: Sequence[Any]
+    clips: Mapping[str, int]
+    rows: Mapping[str, Mapping[str, Sequence[float]]]
+    minutes: float = 0.0
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, evaluation: Evaluation, run: Path | None) -> Self:
+        """What tables show of an evaluation, and what was fitted."""
+        rows = {
+            name: {
+                score: [float(f"{value:.4g}") for value in values]
+                for score, values in row.clip_means.items()
+                if score in SHOWN
+            }
+            for name, row in evaluation.rows.items()
+        }
+        basis = json.loads(json.dumps(same(evaluation)))
+        if run is None:
+            return cls(basis, evaluation.clips, rows)
+        fitted = Run(run)
+        options = {name: value for name, value in fitted.config["method"].items() if not name.endswith("_run")}
+        config = {"method": options, "training": fitted.config["training"]}
+        return cls(basis, evaluation.clips, rows, fitted.state.get("processor_seconds", 0.0) / 60, config)
+
+    @classmethod
+    def load(cls, kept: Kept) -> Self:
+        """As saved."""
+        with zipfile.ZipFile(kept.archive) as archive:
+            return cls(**json.loads(archive.read(kept.name)))
+
+    def save(self, kept: Kept) -> None:
+        """As compressed JSON, the same bytes for the same scores."""
+        contents = {kept.name: json.dumps(vars(self), separators=(",", ":")).encode()}
+        if kept.archive.exists():
+            with zipfile.ZipFile(kept.archive) as archive:
+                contents = {name: archive.read(name) for name in archive.namelist()} | contents
+        with (
+            files.written(kept.archive) as new,
+            zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
+        ):
+            for name in sorted(contents):
+                archive.writestr(zipfile.ZipInfo(name), contents[name], zipfile.ZIP_DEFLATED, 9)
+
+
+def fitted_judges(data: MotionData, runs: Path, names: Sequence[str] = ("prior", "content")) -> dict[str, Path]:
+    """Run directories of judges of the training clips, fitted once."""
+    for name in names:
+        method, options, training = JUDGES[name]
+        clips = grouped(data) if options.get("label") == "group" else data
+        (judge,) = sweep({name: registry.judges()[method](**options)}, clips, runs / "judges", (0,), training, jobs=1)
+        config = judge.path / "config.json"  # is kept, and says nothing of this machine
+        text = config.read_text(encoding="utf-8")
+        if (placeless := text.replace(json.dumps(data.path), json.dumps(Path(data.path).name))) != text:
+            with files.written(config) as new:  # whole at any time, as other processes may read it
+                new.write(placeless.encode())
+    return {name: runs / "judges" / f"{name}-seed0" for name in names}
+
+
+def grouped(data: MotionData) -> MotionData:
+    """Clips with the group of their content as a label, too: ways to walk are one, and so are those to wave."""
+    labels = [{**clip.labels, "group": clip.labels["content"].split("-")[0]} for clip in data.motion]
+    clips = [replace(clip, labels=each) for clip, each in zip(data.motion, labels, strict=True)]
+    return replace(data, motion=motion.MotionSet(clips, data.motion.skeleton, data.motion.name, copy=False))
+
+
+def judging(judged: Mapping[str, Path]) -> Any:
+    """The scores of motion that tables show, with those of judges where there are some."""
+    models = {name: load(path).model for name, path in judged.items()}
+    prior = models.pop("prior", None)
+
+    def scores(windows: Any) -> list[Measure]:
+        return [each for each in motion.scores(windows, prior, models) if each.name in SHOWN]
+
+    return scores
+
+
+def fit(
+    data: MotionData,
+    row: str,
+    methods: Mapping[str, Mapping[str, Any]],
+    seed: int,
+    runs: Path,
+    prior: Path | None,
+    accelerator: Accelerator = "cpu",
+) -> Path:
+    """The run directory of a method, fitted once; second stages stand on the first of the same seed.
+
+    Raises:
+        RuntimeError: the run failed.
+    """
+    told, training = parted({**methods[row], "accelerator": accelerator})
+    method = told.pop("method", row)
+    if method in ("gsps", "hit-dvae") and prior is not None and told.get("pose_prior") != 0:
+        told["pose_prior_run"] = str(prior.absolute())
+    if method in ("dlow", "dsf"):
+        told["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior, accelerator).absolute())
+    (outcome,) = sweep({folder(row): dvae.method(method, **told)}, data, runs, (seed,), training, jobs=1)
+    if outcome.status == "failed":
+        raise RuntimeError(str(outcome))
+    return runs / f"{folder(row)}-seed{seed}"
+
+
+def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Options of a method, and those of its training."""
+    # methods have options of that name, which make the schedule of training's
+    training = Training.__dataclass_fields__.keys() - {"self_feeding"}
+    return (
+        {name: value for name, value in options.items() if name not in training},
+        {name: value for name, value in options.items() if name in training},
+    )
+
+
+def folder(row: str) -> str:
+    """What the runs of a row are called, before their seed."""
+    return row.replace(", ", "-").replace(",", "").replace(" ", "-")
+
+
+def work(
+    data: Path,
+    runs: Path,
+    stored: Path,
+    name: str,
+    methods: Mapping[str, Mapping[str, Any]],
+    views: Mapping[str, Sequence[View]],
+    seeds: Sequence[int],
+    samples: int,
+    accelerator: Accelerator = "cpu",
+) -> None:
+    """Fits and scores what is not there yet, seed by seed, so that every method has one before any has two.
+
+    Args:
+        data: the folder of files.
+        runs: of all sets.
+        stored: scores of all sets.
+        name: of the set.
+        methods: by the rows that they are.
+        views: in which each is scored; the reference rows in all of them.
+        seeds: of every method.
+        samples: futures of a window.
+        accelerator: on which to train and to forecast.
+    """
+    if accelerator == "cuda":
+        require_gpu("accelerator")
+    own, like = stored / name, stored / (SETS[name].like or name)
+    opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[like.name])
+    judged = fitted_judges(opened, like, SETS[name].judges)
+
+    def score(path: Path | None, row: str, view: View, file: Kept) -> None:
+        data, by = opened, judged
+        if view.judges:
+            data, by = grouped(opened), fitted_judges(opened, like, view.judges.split("+"))
+        elif view.observed:  # a pose prior reads windows turned at the last frame that its own protocol observes
+            by = {judge: run for judge, run in judged.items() if judge != "prior"}
+        models = {} if path is None else {row: load(path).model.to(accelerator)}
+        known: dict[str, Any] = {"training_windows": view.windows(data, "train+validation")}
+        options = {"references": False} if models else known
+        windows, told = view.windows(data, "test"), view.evaluate(samples)
+        if view.parts:
+            ways: dict[str, Any] = {"held": Held, "nearest": partial(Nearest, lower=places(windows)["lower"])}
+            models = {name: ways.get(view.parts, lambda free: free)(model) for name, model in models.items()}
+        scores = diversities if view.parts else judging(by)
+        found = dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **told)
+        Scored.of(found, path).save(file)
+
+    for view in dict.fromkeys(view for each in views.values() for view in each):
+        file = kept(like, REFERENCES, view)
+        if not (view.single or view.exchanged or view.parts in ("held", "nearest") or file.exists()):
+            score(None, REFERENCES, view, file)
+    every = {**SETS[name].methods, **methods}  # what a second stage stands on has the set's options, chosen or not
+    for seed in seeds:
+        for row in methods:
+            files = {view: kept(own, f"{folder(row)}-seed{seed}", view) for view in views[row]}
+            if missing := {view: file for view, file in files.items() if not file.exists()}:
+                path = fit(opened, row, every, seed, runs / name, judged.get("prior"), accelerator)
+                for view, file in missing.items():
+                    score(path, row, view, file)
+
+
+class Wrapped(nn.Module):
+    """What forecasts by a model."""
+
+    likelihood = False
+
+    def __init__(self, model: Any) -> None:
+        super().__init__()
+        self.model, self.generative, self.inference = model, model.generative, model.inference
+
+
+class Held(Wrapped):
+    """A model whose futures share the first one's draw of the lower body."""
+
+    def forecast(self, past: Any, horizon: int, samples: int, **options: Any) -> Any:
+        """Futures, of a model that has a latent of the lower body."""
+        lower = self.model.forecast(past, horizon, 1, **options)["lower"][0]
+        return self.model.forecast(past, horizon, samples, fix={"lower": lower}, **options)
+
+
+class Nearest(Wrapped):
+    """A model whose futures are those of `MANY` times as many whose lower body is nearest to the first one's.
+
+    As GSPS has DLow hold the lower body: the nearest 50 of 1,000.
+    """
+
+    MANY = 20
+
+    def __init__(self, model: Any, lower: Sequence[int]) -> None:
+        super().__init__(model)
+        self.lower = lower
+
+    def forecast(self, past: Any, horizon: int, samples: int, **options: Any) -> Any:
+        """Futures, by the squared distance over all frames."""
+        made = self.model.forecast(past, horizon, self.MANY * samples, **options)["x"]
+        lower = made[..., self.lower]
+        nearest = (lower - lower[0]).square().sum((2, 3)).topk(samples, 0, largest=False).indices
+        return {"x": made.take_along_dim(nearest[..., None, None], 0)}
+
+
+def places(windows: Any) -> dict[str, list[int]]:
+    """Coordinates of the parts of the body."""
+    parts = body_parts(windows.skeleton, tuple(UNIONS))
+    return {part: [3 * joint + axis for joint in joints for axis in range(3)] for part, joints in parts.items()}
+
+
+def diversities(windows: Any) -> list[Measure]:
+    """The diversity of futures, and of the coordinates of each part of the body alone."""
+
+    def of(place: Any) -> Any:
+        return lambda forecasts, *_: average_pairwise_distance(forecasts[..., place])
+
+    scored = {"APD": slice(None)} | {f"APD {part}": place for part, place in places(windows).items()}
+    return [Measure(name, of(place), "m", "higher") for name, place in scored.items()]
+
+
+REFERENCES = "references"
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Scores of a run in one view, or of the reference rows of a set: a member of the archive of the set.
+
+    Args:
+        archive: `SET.zip`.
+        name: of the member, `RUN/scoresVIEW.json`.
+    """
+
+    archive: Path
+    name: str
+
+    def exists(self) -> bool:
+        """Whether it has been saved."""
+        return self.name in members(self.archive)
+
+
+def kept(path: Path, name: str, view: View) -> Kept:
+    """Scores of a run, or of the reference rows of a set, which is named by a path."""
+    return Kept(path.with_name(f"{path.name}.zip"), f"{name}/scores{view}.json")
+
+
+def members(archive: Path) -> list[str]:
+    """Names in an archive of scores, sorted."""
+    if not archive.exists():
+        return []
+    with zipfile.ZipFile(archive) as opened:
+        return sorted(opened.namelist())
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row of a ranking: the scores of its seeds."""
+
+    seeds: Sequence[Scored]
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there were runs; a reference is not trained."""
+        return bool(self.seeds[0].config)
+
+    def means(self, metric: str) -> np.ndarray | None:
+        """(S, C), by seed and clip, where all have the score."""
+        (name,) = {name for each in self.seeds for name in each.rows}
+        rows = [each.rows[name] for each in self.seeds]
+        return np.array([row[metric] for row in rows]) if all(metric in row for row in rows) else None
+
+    def by_seed(self, metric: str) -> np.ndarray:
+        """(S,), means over clips of a score that all have."""
+        return np.average(self.means(metric), 1, [*self.seeds[0].clips.values()])
+
+    def crossed(self, metric: str, minus: Entry | None = None) -> Crossed | None:
+        """A score, or what it is more than that of the same runs in another view of the same windows."""
+        means, others = self.means(metric), 0.0 if minus is None else minus.means(metric)
+        if means is None or others is None:
+            return None
+        means, weights = means - others, np.array([*self.seeds[0].clips.values()])
+        known = ~np.isnan(means).any(0)
+        crossed = Crossed.of(means[:, known], weights[known])
+        # no seed of a reference differs from another
+        return crossed if self.fitted else replace(crossed, seeds=0.0, rest=0.0, count=sys.maxsize)
+
+
+def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict[str, Entry]:
+    """What has been scored on a set: the reference rows, and methods with their seeds.
+
+    Raises:
+        ValueError: scores of other windows, samples, or judges.
+    """
+    found, basis = {}, None
+    file = kept(stored / (SETS[name].like or name), REFERENCES, view)
+    if file.exists():
+        references = Scored.load(file)
+        basis = references.basis
+        found = {row: Entry([replace(references, rows={row: value})]) for row, value in references.rows.items()}
+    for row in methods:
+        own = kept(stored / name, f"{folder(row)}-seed*", view)
+        if scored := [Scored.load(replace(own, name=name)) for name in fnmatch.filter(members(own.archive), own.name)]:
+            basis = basis or scored[0].basis
+            if any(alike(each.basis) != alike(basis) for each in scored):
+                raise ValueError(f"scores of {row} in {own.archive} are of other windows, samples, seed or judges")
+            found[row] = Entry(scored)
+    return found
+
+
+def rows_of(stored: Path, name: str, view: View) -> dict[str, Entry]:
+    """What has been scored of a set's own rows, with the reference rows; nothing where no method has been."""
+    found = entries(stored, name, view, SETS[name].methods)
+    return found if any(entry.fitted for entry in found.values()) else {}
+
+
+EMISSION = 3
+"""In a basis, whether forecasts were means or draws."""
+
+
+def alike(basis: Sequence[Any]) -> list[Any]:
+    """What rows of a table must share: all but whether a model's law has a mean to forecast."""
+    return [*basis[:EMISSION], *basis[EMISSION + 1 :]]
+
+
+def titled(name: str, entry: Entry) -> str:
+    """A row as it is called, with what sets it apart."""
+    first = entry.seeds[0]
+    modes = first.config.get("method", {}).get("modes")
+    apart = ["drawn"] * (first.basis[EMISSION] == "drawn") + ([] if modes is None else [f"{modes} modes"])
+    return f"{name} ({', '.join(apart)})" if apart else name
+
+
+def cell(estimate: Estimate | None) -> str:
+    """A mean with its standard error over clips, and over seeds of what is trained."""
+    if estimate is None:
+        return "–"
+    return str(estimate) if estimate.seeds else str(estimate).rpartition(" ± ")[0]
+
+
+TRAINED = ("seeds", "CPU minutes")
+
+
+def trained(entry: Entry) -> tuple[str, str]:
+    """How many seeds were trained, and how long each took of those that were trained on a processor."""
+    if not entry.fitted:
+        return "–", "–"
+    here = [each.minutes for each in entry.seeds if each.config["training"]["accelerator"] != "cuda"]
+    return str(len(entry.seeds)), f"{statistics.fmean(here):.1f}" if here else "GPU"
+
+
+def ranked(found: Mapping[str, Entry]) -> dict[str, Crossed]:
+    """The energy score of all but the truth, the best first."""
+    scores = {name: entry.crossed(RANKED) for name, entry in found.items() if name != "real motion"}
+    known = {name: score for name, score in scores.items() if score is not None}  # all motion has it
+    return dict(sorted(known.items(), key=lambda item: item[1].mean))
+
+
+def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
+    """Rows in order of the energy score, each with what it has more than the neighbours and than the next better.
+
+    And below, the model confidence set.
+    """
+    scores = ranked(found)
+    header = ["", *TRAINED, f"{RANKED} minus neighbours'", "minus the one above", *columns]
+    lines = []
+    for name, above in zip(scores, [None, *scores], strict=False):
+        own = found[name]
+        minus = [None if name == NEIGHBOURS else NEIGHBOURS, above]
+        behind = [None if other is None else scores[name].estimate(scores[other]) for other in minus]
+        means = [None if crossed is None else crossed.estimate() for crossed in map(own.crossed, columns)]
+        lines.append([titled(name, own), *trained(own), *map(cell, [*behind, *means])])
+    known = {name: score for name, score in scores.items() if score.count >= ENOUGH}
+    if not any(found[name].fitted for name in known):
+        return table(header, lines)
+    best = f"May be the best, at {100 * LEVEL:.0f} % over clips and seeds, of rows with {ENOUGH} seeds or more"
+    return f"{table(header, lines)}\n{best}: {', '.join(confidence_set(known, level=LEVEL).members)}.\n"
+
+
+def drawn(sets: Mapping[str, Mapping[str, Entry]]) -> Figure:
+    """How far above the neighbours' the energy scores of each set are; rows of all in the first one's order."""
+    ranks = {name: ranked(found) for name, found in sets.items()}
+    order = list(dict.fromkeys(row for scores in ranks.values() for row in scores if row != NEIGHBOURS))
+    figure = canvas(1.8 + 3.4 * len(sets), 0.8 + 0.22 * len(order))
+    panels = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
+    for panel, (name, scores) in zip(panels, ranks.items(), strict=True):
+        panel.axvline(0, color="0.6", lw=0.8)
+        for row in scores.keys() & order:
+            minus, height = scores[row].estimate(scores[NEIGHBOURS]), order.index(row)
+            for error, width in (("sequences", 4), ("total", 1)):
+                panel.plot(minus.interval(LEVEL, error), [height] * 2, color="C0", lw=width, solid_capstyle="butt")
+            face = "C0" if scores[row].count >= ENOUGH else "white"
+            panel.plot(minus.mean, height, "o", color="C0", markerfacecolor=face, markersize=5)
+        panel.set_title(name, fontsize=9)
+        panel.set_xlabel(f"{RANKED} minus neighbours' (m)", fontsize=8)
+        panel.tick_params(labelsize=8)
+    panels[0].set_yticks(range(len(order)), order)
+    panels[0].invert_yaxis()
+    return figure
+
+
+def main(
+    runs: tyro.conf.Positional[Path],
+    data: Path | None = None,
+    sets: tuple[str, ...] = tuple(SETS),
+    methods: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (0, 1, 2),
+    samples: int = 50,
+    scores: Path = SCORES,
+    accelerator: Accelerator = "cpu",
+    page: Path | None = None,
+    picture: Path = DOCS / "img" / "ranking.png",
+) -> None:
+    """Fit and score what is missing, and write the tables.
+
+    Args:
+        runs: where run directories lie.
+        data: the folder with bandai/ and cmu/; without it nothing is fitted.
+        sets: which.
+        methods: of these alone; all of a set where none is named.
+        seeds: of every method.
+        samples: futures of a window.
+        scores: the folder of scores and judges; in another than the project's own, all is fitted anew.
+        accelerator: on which to train and to forecast; runs on a GPU tell no minutes.
+        page: whose tables; without one they are printed.
+        picture: of all sets that tell no paths, drawn with a page.
+    """
+    refuse_unknown("set", sets, SETS)
+    refuse_unknown("method", methods, {**FUTURES, **PATHS})
+    for name in sets:
+        chosen = SETS[name]
+        if data is not None:
+            named = {row: options for row, options in chosen.methods.items() if not methods or row in methods}
+            work(data, runs, scores, name, named, dict.fromkeys(named, chosen.views), seeds, samples, accelerator)
+        tables = []
+        for view in chosen.views:
+            if rows := rows_of(scores, name, view):
+                heading = "" if view.given is None else f"With {view.given} path{'s' * (view.given != 1)} given:\n\n"
+                tables.append(heading + ranking(rows, [*COLUMNS, *(JUDGED if chosen.judges else ())]))
+        if tables:
+            write(page, *tables, name=name)
+    sought = {name: rows_of(scores, name, View()) for name, chosen in SETS.items() if View() in chosen.views}
+    futures = {name: rows for name, rows in sought.items() if rows}
+    if page is not None and futures:
+        drawn(futures).savefig(picture, dpi=110)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

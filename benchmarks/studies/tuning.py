@@ -1,0 +1,411 @@
+"""Fits and scores what options of methods for motion are chosen by, and writes the tables of docs/results/tuning.md.
+
+Everything is under one protocol, bandai2-tuning: clips of group A train, those of group B, whose styles are not
+those of training, judge, on every fourth window of each; no clip of the test group C is seen. Scores are kept, by
+section, in `benchmarks/scores/tuning`: the script goes on where it was stopped, and tables are of what is there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import isnan, nan, sqrt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+import dvae
+from dvae import Training, motion
+from dvae.models import registry
+from dvae.motion.data.dataset import MotionData
+from dvae.motion.scoring.energies import pose_prior_energy
+from dvae.runs.directory import load
+from dvae.runs.sweep import sweep
+
+from .pages import refuse_unknown, table, write
+from .ranking import JOINTS, JUDGES, SCORES, SETS, entries, fitted_judges, folder, judging, parted
+
+TUNING = motion.PROTOCOLS["bandai2-tuning"]
+EVERY, SAMPLES = 4, 50
+REFERENCES = ("zero velocity", "nearest neighbours")
+COLUMNS_OF_JUDGES = ("log density", "pose NLL", "ACC content")
+COLUMNS = ("ADE", "FDE", "ADEm", "APD", "energy score", "ACC content", "FID content", "pose NLL", "KL w", "KL z")
+"""Scores that pages show, where there are."""
+SEEDS, TESTED = "seeds", ("bandai2-by-style", "bandai2-trajectories")
+"""The table of what another seed does, and the sets whose rows tell it."""
+PATH_COLUMNS = tuple(f"{score}, {count} given" for score in ("ADE", "APD", "energy score") for count in range(5))
+
+
+@dataclass(frozen=True)
+class Section:
+    """What is compared with one another.
+
+    Args:
+        method: whose options.
+        training: of all its runs, where a case says nothing else.
+        cases: name to options; those of `Training` are among them.
+        options: of all cases, where one says nothing else: what a preset was need not be what it becomes.
+        protocol: of the windows.
+        judged: whether the pose prior is a part of the method.
+        seeds: of every case.
+    """
+
+    method: str
+    training: Training
+    cases: Mapping[str, Mapping[str, Any]]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    protocol: motion.Protocol = TUNING
+    judged: bool = False
+    seeds: tuple[int, ...] = (0,)
+
+    @property
+    def columns(self) -> Sequence[str]:
+        """Of its table."""
+        return COLUMNS if self.protocol.root == "drop" else PATH_COLUMNS
+
+    def of(self, case: str, prior: Path) -> tuple[Any, Training]:
+        """The method of a case, and its training."""
+        options, told = parted({**self.options, **self.cases[case]})
+        method = options.pop("method", self.method)
+        if self.judged and options.get("pose_prior") != 0 and options.get("heading", True):  # as the judge has it
+            options["pose_prior_run"] = str(prior)
+        return dvae.method(method, **options), replace(self.training, **told)
+
+
+PATHS = replace(motion.PROTOCOLS["bandai2-trajectories"], name="bandai2-paths-tuning", train=("A",), test=("B",))
+ABLATED: dict[str, dict[str, Any]] = {
+    "full": {},
+    "whole poses": {"complement": False},
+    "in time": {"complement": False, "cosine": False},
+    "standard prior": {"complement": False, "learned_prior": False},
+}
+"""TrajeVAE and its ablations; latents are 15 coefficients of 32 numbers, in time 60 frames of 32 or, named, 8."""
+WEIGHED = [
+    *[("full", beta) for beta in (1e-4, 1e-3, 1e-2, 0.1)],
+    *[("whole poses", beta) for beta in (1e-4, 1e-3, 1e-2)],
+    *[("in time", beta) for beta in (1e-4, 1e-3)],
+    *[("standard prior", beta) for beta in (1e-3, 1e-2, 0.1)],
+]
+"""Weights of the KL; a standard prior needs more of it to be where posteriors are."""
+ALONE = ("cvae", "pose-knows", "mt-vae", "rhp", "erd", "aclstm", "moglow", "srnn")
+"""Baselines that are tuned; the others are a CVAE but for its prior, its objective or a second stage."""
+BEFORE: dict[str, dict[str, Any]] = {"moglow": {"bound": 2.0}, "srnn": {"self_feeding": 1.0}}
+"""Their options where rates are compared."""
+SECTIONS = {
+    "hit-dvae": Section(
+        "hit-dvae",
+        Training(steps=1200, batch_size=16, learning_rate=2e-3, decay=0.8, validate_every=400),
+        {
+            "w 7.5": {},
+            "w .03": {"kl_static": 0.03},
+            "w .3": {"kl_static": 0.3},
+            "literal": {"kl_local": 0.0067, "kl_static": 0.1},
+            "no copies": {"nearest": False, "residual": 0.0},
+            "observed frames fed": {"feed_observed": True},
+            "no copies, no attention": {"nearest": False, "residual": 0.0, "attention": False},
+            "w .03, 2400 steps": {"kl_static": 0.03, "steps": 2400},
+            "2400 steps": {"steps": 2400},
+            "rate 1e-3": {"learning_rate": 1e-3},
+            "rate 4e-3": {"learning_rate": 4e-3},
+            "z .1": {"kl_local": 0.1},
+            "z .01": {"kl_local": 0.01},
+            "no residual": {"residual": 0.0},
+            "3 draws": {"samples": 3},
+            "10 draws": {"samples": 10},
+        },
+        options={"kl_static": 7.5},
+        judged=True,
+    ),
+    "gsps": Section(
+        "gsps",
+        Training(steps=3000, batch_size=16, learning_rate=3e-3, decay=0.5, validate_every=500),
+        {
+            "diversity 2 4": {},
+            "diversity 5 10": {"diversity": (5.0, 10.0)},
+            "diversity 1 2": {"diversity": (1.0, 2.0)},
+            "diversity 0": {"diversity": (0.0,)},
+            "20 coefficients": {"coefficients": 20},
+            "rate 1e-3": {"learning_rate": 1e-3},
+            "rate 1e-3, diversity 5 10": {"learning_rate": 1e-3, "diversity": (5.0, 10.0)},
+            "6500 steps": {"steps": 6500},
+            "alike from .01 m": {"pseudo_minimum": 0.01},
+            "10 x 1 draws": {"draws": (10, 1)},
+            "not turned": {"heading": False},
+        },
+        options={"diversity": (2.0, 4.0)},
+        judged=True,
+    ),
+    "trajevae": Section(
+        "trajevae",
+        Training(steps=6000, batch_size=16, learning_rate=5e-4, decay=0.8, validate_every=1000),
+        {
+            **{f"{name}, {beta:g}": {**ABLATED[name], "beta": beta} for name, beta in WEIGHED},
+            **{
+                f"in time, 8 each, {beta:g}": {**ABLATED["in time"], "latent": 8, "beta": beta}
+                for beta in (1e-4, 1e-3, 1e-2)
+            },
+            **{
+                f"in time, 8 each, standard prior, {beta:g}": {
+                    **ABLATED["in time"],
+                    "latent": 8,
+                    "learned_prior": False,
+                    "beta": beta,
+                }
+                for beta in (1e-3, 1e-2, 0.1)
+            },
+            "full, keep .05": {"keep": 0.05},
+            "full, keep .5": {"keep": 0.5},
+            "full, rate 1e-3": {"learning_rate": 1e-3},
+            "full, rate 2e-3": {"learning_rate": 2e-3},
+            "full, 24000 steps": {"steps": 24000},
+            "full, rate 2e-3, 8000 steps of 64": {"learning_rate": 2e-3, "batch_size": 64, "steps": 8000},
+            "full, keep .05, 24000 steps": {"keep": 0.05, "steps": 24000},
+            "full, 30 coefficients": {"components": 30},
+            "full, not turned": {"heading": False},
+        },
+        protocol=PATHS,
+    ),
+    "cvae-rnn": Section(
+        "cvae-rnn",
+        Training(steps=3000, batch_size=16, learning_rate=1e-3, decay=0.5, validate_every=500),
+        {
+            **{f"{beta:g}": {"beta": beta} for beta in (1e-3, 1e-2, 0.1)},
+            "0.001, keep .05": {"beta": 1e-3, "keep": 0.05},
+            "0.0001": {"beta": 1e-4},
+            "0.001, 6000 steps": {"beta": 1e-3, "steps": 6000},
+            "0.001, rate 3e-3": {"beta": 1e-3, "learning_rate": 3e-3},
+            **{f"{beta:g}, 12000 steps": {"beta": beta, "steps": 12000} for beta in (1e-4, 0.1)},
+        },
+        protocol=PATHS,
+    ),
+    "baselines": Section(
+        "cvae",
+        Training(batch_size=32, decay=0.5, validate_every=500),
+        {
+            f"{name}, {rate:g}": {**BEFORE.get(name, {}), "method": name, "learning_rate": rate}
+            for name in ALONE
+            for rate in (1e-3, 3e-3, 1e-2)
+        }
+        | {
+            f"moglow, 0.001, {name}": {"method": "moglow", "learning_rate": 1e-3, **options}
+            for name, options in {
+                "bound 1": {"bound": 1.0},
+                "bound .5": {"bound": 0.5},
+                "frames dropped": {"bound": 2.0, "frame_dropout": 0.3},
+            }.items()
+        }
+        | {
+            f"srnn, 0.001, {steps} steps": {**BEFORE["srnn"], "method": "srnn", "learning_rate": 1e-3, "steps": steps}
+            for steps in (3000, 16000)
+        },
+    ),
+    "best-of-many": Section(
+        "bom",
+        Training(steps=1000, decay=0.5, validate_every=500),
+        {
+            f"{name}, {rate:g}": {"method": name, "batch_size": batch, "learning_rate": rate}
+            for name, batch, rates in (("bom", 32, (1e-3, 3e-3, 1e-2)), ("bom-parts", 16, (3e-4, 1e-3, 3e-3)))
+            for rate in rates
+        },
+    ),
+}
+"""What was tried, by method."""
+
+
+STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
+"""Of judges, which are to know poses and contents of styles that they have not seen."""
+SEEDS_OF = {"prior": (0, 1, 2), "content": (0,)}
+OF_JUDGES = [f"{judge} {steps} steps" for judge, tried in STEPS.items() for steps in tried]
+
+
+Kept = dict[str, dict[str, dict[str, float]]]
+"""Means of scores, by case and seed."""
+
+
+class Store:
+    """The scores of a section, in a file of JSON that holds all sections."""
+
+    def __init__(self, file: Path, section: str) -> None:
+        self.file, self.section = file, section
+
+    def _all(self) -> dict[str, Kept]:
+        return json.loads(self.file.read_text(encoding="utf-8")) if self.file.exists() else {}
+
+    @property
+    def found(self) -> Kept:
+        """By case and seed; none before the first."""
+        return self._all().get(self.section, {})
+
+    def add(self, case: str, seed: int, scores: Mapping[str, float]) -> None:
+        """Beside what there is."""
+        every = self._all()
+        cases = every.setdefault(self.section, {})
+        cases.setdefault(case, {})[str(seed)] = {name: round(value, 4) for name, value in scores.items()}
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        self.file.write_text(json.dumps(every, indent=1) + "\n", encoding="utf-8")
+
+    def lacks(self, case: str, seed: int) -> bool:
+        """Whether it has not been scored."""
+        return str(seed) not in self.found.get(case, {})
+
+
+def of_judges(data: MotionData, runs: Path, store: Store) -> None:
+    """Fits judges for other numbers of steps, and scores real motion of the judging group by each."""
+    windows = seen(data)
+    for name, tried in STEPS.items():
+        method, options, training = JUDGES[name]
+        for steps in tried:
+            row, told = f"{name} {steps} steps", replace(training, steps=steps)
+            for seed in SEEDS_OF[name]:
+                if store.lacks(row, seed):
+                    judge = registry.judges()[method](**options)
+                    (outcome,) = sweep({folder(row): judge}, data, runs, (seed,), told, jobs=1)
+                    if outcome.status == "failed":
+                        raise RuntimeError(str(outcome))
+                    store.add(row, seed, of_judge(name, outcome.path, windows))
+
+
+def of_judge(name: str, run: Path, windows: motion.Windows) -> dict[str, float]:
+    """What a judge says of the predicted frames of real windows."""
+    if name == "prior":
+        prior, motions = load(run).model, windows.all()["x"]
+        poses = prior.facing(motions)[:, windows.protocol.observed :]
+        with torch.no_grad():
+            energy = pose_prior_energy(poses[None], prior, prior.skeleton).mean()
+            return {"log density": prior.log_prob(poses).mean().item(), "pose NLL": energy.item()}
+    found = dvae.evaluate(
+        {}, windows, scores=judging({name: run}), samples=1, references=["zero velocity"], progress=False
+    )
+    return {f"ACC {name}": found["real motion"][f"ACC {name}"].mean}
+
+
+def of_references(data: MotionData, store: Store, judged: Mapping[str, Path]) -> None:
+    """Scores what is not fitted; it knows no paths."""
+    drop, name = data.protocol.root == "drop", data.protocol.name
+    rows = [row for row in REFERENCES if store.lacks(f"{name}: {row}", 0)]
+    if not rows:
+        return
+    train = motion.windows(data.motion, data.protocol, "train+validation")
+    options = {"scores": judging(judged) if drop else motion.scores, "references": rows, "training_windows": train}
+    found = dvae.evaluate({}, seen(data), samples=SAMPLES, progress=False, **options)
+    for row in rows:
+        means = {score: each.mean for score, each in found[row].items()}
+        ways = [""] if drop else [f", {count} given" for count in range(len(JOINTS) + 1)]
+        store.add(f"{name}: {row}", 0, {f"{score}{way}": mean for score, mean in means.items() for way in ways})
+
+
+def seen(data: MotionData) -> motion.Windows:
+    """Every fourth window of each clip of the judging group, the first one among them."""
+    protocol = replace(data.protocol, test_stride=EVERY * data.protocol.test_stride)
+    return motion.windows(data.motion, protocol, "test")
+
+
+def score(path: Path, data: MotionData, judged: Mapping[str, Path]) -> dict[str, float]:
+    """Means over these windows."""
+    model, windows, found = load(path).model, seen(data), {}
+    if data.protocol.root == "drop":
+        return evaluated(model, windows, judging(judged))
+    for count in range(len(JOINTS) + 1):
+        one = evaluated(model, windows.given(JOINTS[:count]), motion.scores)
+        found |= {f"{name}, {count} given": value for name, value in one.items()}
+    return found
+
+
+def evaluated(model: Any, windows: Any, scores: Any, **told: Any) -> dict[str, float]:
+    """Means of scores over windows; the last arguments are of `dvae.evaluate`."""
+    found = dvae.evaluate(model, windows, scores=scores, samples=SAMPLES, references=False, progress=False, **told)
+    return {name: each.mean for name, each in found["model"].items()}
+
+
+def shown(scores: Sequence[Mapping[str, float]], name: str) -> str:
+    """The mean over seeds, with that of each where there are several."""
+    values = [each.get(name, nan) for each in scores]
+    if any(map(isnan, values)):
+        return "–"
+    each = ", ".join(f"{value:.3f}" for value in values)
+    return f"{sum(values) / len(values):.3f}" + (f" ({each})" if len(values) > 1 else "")
+
+
+def spread() -> str:
+    """What another seed does to the energy score of methods with the steps of their presets, by their test windows.
+
+    With paths to its mean over none to four. A difference of two runs has a standard deviation of sqrt(2) as much.
+    """
+    lines = []
+    for name in TESTED:
+        views = [entries(SCORES, name, view, SETS[name].methods) for view in SETS[name].views]
+        for row in SETS[name].methods:
+            seeds = [found[row].by_seed("energy score") for found in views if row in found]
+            if (count := min(map(len, seeds), default=0)) > 1:
+                deviation = np.mean([means[:count] for means in seeds], 0).std(ddof=1)
+                lines.append([row, str(count), f"{deviation:.3f}", f"{2 * sqrt(2) * deviation:.2f}"])
+    return table(["", "seeds", "standard deviation", "decided from"], lines)
+
+
+def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: int) -> None:
+    """Fits and scores what is not there yet."""
+    opened = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
+    asked = [SECTIONS[name].protocol for name in sections if name != "judges"]
+    judged = fitted_judges(opened[TUNING.name], runs) if any(each.root == "drop" for each in asked) else {}
+    prior = judged.get("prior", Path()).absolute()
+    for name in sections:
+        store = Store(stored, name)
+        if name == "judges":
+            of_judges(opened[TUNING.name], runs / name, store)
+            continue
+        section = SECTIONS[name]
+        own = opened[section.protocol.name]
+        of_references(own, Store(stored, "references"), judged)
+        for case in section.cases:
+            if seeds := [seed for seed in section.seeds if store.lacks(case, seed)]:
+                method, training = section.of(case, prior)
+                outcomes = sweep({folder(case): method}, own, runs / name, seeds, training, jobs)
+                for seed, outcome in zip(seeds, outcomes, strict=True):
+                    if outcome.status == "failed":
+                        raise RuntimeError(str(outcome))
+                    store.add(case, seed, score(outcome.path, own, judged))
+
+
+def main(
+    runs: tyro.conf.Positional[Path],
+    data: Path | None = None,
+    sections: tuple[str, ...] = ("judges", SEEDS, *SECTIONS),
+    jobs: int = 1,
+    stored: Path = SCORES / "tuning.json",
+    page: Path | None = None,
+) -> None:
+    """Fit and score what is missing, and write the tables.
+
+    Args:
+        runs: where run directories lie.
+        data: bandai2.npz; without it nothing is fitted.
+        sections: which.
+        jobs: runs at a time.
+        stored: the file of scores.
+        page: whose tables; without one they are printed.
+    """
+    refuse_unknown("section", sections, ("judges", SEEDS, *SECTIONS))
+    tried = [name for name in sections if name != SEEDS]
+    if data is not None:
+        work(data, runs, stored, tried, jobs)
+    if SEEDS in sections:
+        write(page, spread(), name=SEEDS)
+    for name in tried:
+        columns = COLUMNS_OF_JUDGES if name == "judges" else SECTIONS[name].columns
+        found = Store(stored, name).found
+        cases = OF_JUDGES if name == "judges" else SECTIONS[name].cases
+        scored = {case: [*found[case].values()] for case in cases if case in found}
+        if name != "judges":
+            known, on = Store(stored, "references").found, SECTIONS[name].protocol.name
+            beside = {row: [*known[f"{on}: {row}"].values()] for row in REFERENCES if f"{on}: {row}" in known}
+            scored = beside | scored
+        lines = [[case, *(shown(found, column) for column in columns)] for case, found in scored.items()]
+        write(page, table([name, *columns], lines), name=name)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
