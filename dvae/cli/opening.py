@@ -60,7 +60,7 @@ def load(path: Path, data: str | None, failed: bool = False) -> runs.Loaded:
 
 def kind_of(paths: Sequence[Path], data: str | None) -> str:
     """The kind of data that runs were fitted on."""
-    kinds = {runs.read_config(path, data).kind: path for path in paths}
+    kinds = {runs.read_config(path).kind: path for path in paths}
     if len(kinds) > 1:
         said = " and ".join(f"{path} on {kind}" for kind, path in kinds.items())
         raise UsageError(f"these runs were fitted on data of several kinds, {said}; give runs of one kind")

@@ -4,7 +4,7 @@
 >>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, laws=laws)
 """
 
-from .base import Law, LawSpec, Shape, renamed
+from .base import Law, LawSpec, Shape
 from .conditional_flow import ConditionalFlow
 from .families import Delta, Directions, FixedNormal, KnownNoise, Normal, StandardNormal, StudentT
 from .family import FAMILIES, Family, LowRankNormal, NormalMixture
@@ -38,5 +38,4 @@ __all__ = [
     "Subset",
     "Triangular",
     "Vamp",
-    "renamed",
 ]

@@ -8,7 +8,6 @@ variable without parents, has parameters of its own: priors are laws like any ot
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
@@ -154,13 +153,3 @@ class Unconditional(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Only the shape of the features is read."""
         return self.bias.expand(*features.shape[:-1], -1)
-
-
-def renamed(name: str) -> str:
-    """The name of a weight in a model's state, from what it was called when laws were heads and priors.
-
-    >>> renamed("generator.x.head.out.weight"), renamed("priors.w.logits"), renamed("encoder.z.network.out.bias")
-    ('generator.x.law.out.weight', 'generator.w.law.logits', 'encoder.z.network.out.bias')
-    """
-    name = re.sub(r"^priors\.([^.]+)\.", r"generator.\1.law.", name)
-    return re.sub(r"^(generator|encoder)\.([^.]+)\.head\.", r"\1.\2.law.", name)

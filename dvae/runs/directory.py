@@ -2,7 +2,7 @@
 
 `config.json` of such a run (format 2) holds the method with its options; the schema of the data, from which the model
 is built again without them; where the data were, with the fingerprint of their content; and the options of training. A
-relative path stays relative, so that a project folder can be moved. Runs of format 1 are read too (`migrations`).
+relative path stays relative, so that a project folder can be moved.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ from ..models.registry import configured
 from ..options import flat
 from ..turns import alone
 from .kinds import DATA, SCHEMAS, Dataset, opened
-from .migrations import FORMAT, upgraded
+
+FORMAT = 2
+"""Of the config of a run."""
 
 
 @dataclass(frozen=True)
@@ -238,26 +240,30 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
 
 
 def _load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None) -> Loaded:
-    config, size = read_config(path, data), Run(path).size()
+    config, size = read_config(path), Run(path).size()
     with reading_config(path), at_most(size, f"{Path(path) / CONFIG}"):
         model = config.method.build(config.schema)
     load_weights(model, path)
     return Loaded(Path(path), config, model.eval(), None if data is None else os.fspath(data))
 
 
-def read_config(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> Config:
+def read_config(path: str | os.PathLike[str]) -> Config:
     """Reads and checks the config of a run.
 
     Args:
         path: the run directory.
-        data: where the data lie now; a run of format 1 needs them to know the skeleton.
 
     Raises:
         CheckpointError: no run, or a damaged one.
     """
     run = Run(path)
     with reading_config(path):
-        config = upgraded(run.config, run.path, data)
+        config = run.config
+        if (version := config["format"]) != FORMAT:
+            raise CheckpointError(
+                f"{run.path} is a run of format {version!r}, and this version of dvae reads format {FORMAT}; fit "
+                "again, or install the version that wrote it"
+            )
         schema, source, training = dict(config["schema"]), dict(config["data"]), config["training"]
         kind, described = source.pop("kind"), schema.pop("kind")
         if described != DATA[kind].described:

@@ -18,7 +18,6 @@ from ...data.sequences import called
 from ...options import nearest
 from ..diagnostics.calibration import envelope
 from .held import plain
-from .references import multimodal_note
 from .result import Result, Table, canvas
 from .scores import Metric
 from .uncertainty import clustered_variance, decimals, effective_number, linearised, student_interval
@@ -320,8 +319,6 @@ class Evaluation(Result):
     def from_json(cls, text: str) -> Self:
         try:
             document = json.loads(text)
-            if "metrics" not in document:
-                _migrate(document)
             metrics = {name: Metric(**metric) for name, metric in document.pop("metrics").items()}
             rows = {method: _row(row) for method, row in document.pop("rows").items()}
             return cls(rows=rows, metrics=metrics, **document)
@@ -381,35 +378,3 @@ def _row(document: dict[str, Any]) -> Row:
         for name, score in scores.items()
     }
     return Row(clip_means=means, **document)
-
-
-# The order of the table's scores where files do not tell: "ACC way" stands in it as ACC.
-_FORMER = (
-    *("APD", "ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm", "energy score", "variogram score"),
-    *("global ADE", "global FDE", "path error", "bone-length error", "pose NLL", "ACC", "FID"),
-    *("ELBO", "importance bound", "k-hat", "KL"),
-)
-
-
-def _migrate(document: dict[str, Any]) -> None:
-    """Brings a document of version 0.1, when every evaluation had the same scores, to what is written now."""
-    found = {name: score for row in document["rows"].values() for name, score in row["scores"].items()}
-
-    def place(name: str) -> tuple[int, str]:
-        return _FORMER.index(name if name in _FORMER else name.partition(" ")[0]), name
-
-    document["metrics"] = {
-        name: {key: found[name][key] for key in ("unit", "program", "better")} | {"partial": name.startswith("ACC ")}
-        for name in sorted(found, key=place)
-    }
-    data, multimodal = document["data"], document.pop("multimodal")
-    document["basis"] = {"multimodal": multimodal}
-    document["notes"] = [multimodal_note(**multimodal, windows=data["windows"])]
-    if prior := document.pop("pose_prior", None):
-        document["basis"]["pose prior"] = prior
-    for name, used in document.pop("classifiers", {}).items():
-        document["basis"][f"classifier {name}"] = used
-        document["notes"].append(f"ACC, FID {name}: classifier {used['weights'][:12]}")
-    data["title"] = [f"given {', '.join(data['given']) or 'no paths'}"] if "given" in data else []
-    if exchanged := data.get("exchanged"):
-        data["title"].append(f"first poses of {exchanged['partners']} other windows")

@@ -39,7 +39,6 @@ from torch.nn.modules.module import (
 )
 
 from ... import files
-from ...distributions.base import renamed
 
 try:
     import fcntl
@@ -309,7 +308,7 @@ def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tens
         CheckpointError: when they are not, or one is not finite.
     """
     try:
-        tensors = {renamed(name): value for name, value in load_tensors(content).items()}
+        tensors = load_tensors(content)
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:  # also for types it has none for
         raise CheckpointError(f"{path} is damaged or no safetensors file ({error}); copy or fit it again") from error
     _check_names_and_shapes(model, tensors, path)

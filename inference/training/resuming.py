@@ -17,11 +17,9 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from ...distributions.base import renamed
 from . import processes
 from .checkpoints import BEST, LAST, OPTIMISER, CheckpointError, Run, read_weights, state_bytes, weights
 from .objectives import Adapting
@@ -71,7 +69,6 @@ def restore(svi: SVI, run: Run) -> None:
     content = run.optimiser_state(state_bytes(model, 4) + 2**20)
     last = run.read(LAST, state_bytes(model))
     model.load_state_dict(read_weights(model, last, run.path / LAST))
-    _reorder(svi, content, last)
     _check_state(svi, run, content)
     if content["name"] != training.optimizer:
         raise CheckpointError(
@@ -182,16 +179,6 @@ def _take_up(objective: Adapting, run: Run, found: Any) -> None:
         objective.restore({name: value.detach().clone() for name, value in found.items()})
     except ValueError as error:
         raise _damaged(run, str(error)) from error
-
-
-def _reorder(svi: SVI, content: Any, last: bytes) -> None:
-    """Has moments lie where their parameters do: of runs from before laws, those of priors came last."""
-    late = {renamed(name) for name in load_tensors(last) if name.startswith("priors.")}
-    if late and isinstance(content, dict) and isinstance(moments := content.get("optimizer", {}).get("state"), dict):
-        names = [name for name, value in svi.model.named_parameters() if value.requires_grad]
-        former = sorted(names, key=lambda name: name in late)
-        places = {i: names.index(name) for i, name in enumerate(former)}
-        content["optimizer"]["state"] = {places.get(i, i): kept for i, kept in moments.items()}
 
 
 def _sound(key: Any, value: Any, parameter: Tensor, step: int) -> bool:

@@ -215,17 +215,6 @@ def test_a_mixture_that_is_its_own_guide_would_learn_nothing():
         DynamicalVAE(PAIR[0], None, SIZES, laws={"p(w)": distributions.Mixture()})
 
 
-def test_weights_of_heads_and_priors_are_found_under_their_new_names():
-    model = build("mixture")
-    old = {"priors.w.logits", "priors.w.loc", "priors.w.log_scale"}
-    for name in model.state_dict():
-        if not name.startswith("generator.w."):
-            old.add(name.replace(".law.", ".head."))
-    assert any(".head." in name for name in old)
-    assert {distributions.renamed(name) for name in old} == set(model.state_dict())
-    assert all(distributions.renamed(name) == name for name in model.state_dict())
-
-
 # ------------------------------------------------------------------------------------------------------- in a run
 
 OPTIONS = {"latent": 2, "static": 2, "width": 4, "heads_count": 1, "decoder": 4, "warm_up": 0, "self_feeding": 0.0}

@@ -568,7 +568,7 @@ def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
 
 def test_judges_say_nothing_of_their_place_and_are_whole_while_others_use_them(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(ranking.JUDGES, "prior", ("pose-prior", {}, Training(2, 4, progress=False)))
-    data = motion.dataset.MotionData.open(folder / "people.npz", motion.PROTOCOLS["simulated"])
+    data = motion.MotionData.open(folder / "people.npz", motion.PROTOCOLS["simulated"])
     config = ranking.fitted_judges(data, tmp_path, ["prior"])["prior"] / "config.json"
     before = config.stat()
     assert Run(config.parent).config["data"]["path"] == "people.npz"
@@ -599,7 +599,7 @@ def test_groups_are_of_the_first_word():
     contents = ("walk-turn-left", "run")
     clips = [replace(clip, labels={"content": name}) for clip, name in zip(people, contents, strict=True)]
     data = ranking.grouped(
-        motion.dataset.MotionData("", motion.MotionSet(clips, people.skeleton), motion.PROTOCOLS["simulated"])
+        motion.MotionData("", motion.MotionSet(clips, people.skeleton), motion.PROTOCOLS["simulated"])
     )
     assert [clip.labels["group"] for clip in data.motion] == ["walk", "run"]
     assert [clip.labels["content"] for clip in data.motion] == list(contents)
@@ -740,7 +740,7 @@ def test_pose_priors_are_tuned_by_their_density(folder, tmp_path, page, monkeypa
     assert all(seeds.keys() == {"0", "1"} for seeds in found.values())
     prior = load(tmp_path / "judges" / "prior-30-steps-seed1").model
     told = found["prior 30 steps"]["1"]
-    windows = tuning.seen(motion.dataset.MotionData.open(folder / "people.npz", protocol)).all()["x"]
+    windows = tuning.seen(motion.MotionData.open(folder / "people.npz", protocol)).all()["x"]
     density = prior.log_prob(prior.facing(windows)[:, protocol.observed :]).mean().item()
     assert told["log density"] == pytest.approx(density, abs=1e-3)
     assert abs(told["pose NLL"] + density) > 1

@@ -178,7 +178,13 @@ class Body(nn.Module):
             self._check(shape, *motion)
         surface = self._hung(shape)
         form = surface.mT @ surface / surface.shape[-2]
-        return _squared_error(form, self._pivots(shape), *first, *second, self.parents)
+        pivots = self._pivots(shape)
+        ours, theirs = (_flat(_posed(pivots, rotations, self.parents)[0]) for rotations, _ in (first, second))
+        apart = (ours - theirs).unflatten(-1, (-1, 4))
+        moved = (first[1] - second[1]).flatten(-2)[..., None]  # all joints alike, as weights have the sum 1
+        apart = torch.cat([apart[..., :3], apart[..., 3:] + moved[..., None, :]], -1).flatten(-2)
+        found: Tensor = ((apart @ form) * apart).sum(-1).unflatten(-1, (-1, 3)).sum(-1)
+        return found
 
     def _hung(self, shape: Tensor) -> Tensor:
         """Vertices at rest by the joints that they hang on, (..., V, 4 J)."""
@@ -204,24 +210,6 @@ class Body(nn.Module):
                 f"translation (..., T, 3), got {tuple(shape.shape)}, {tuple(rotations.shape)} and "
                 f"{tuple(translation.shape)}"
             )
-
-
-def _squared_error(
-    form: Tensor,
-    pivots: Tensor,
-    rotations: Tensor,
-    translation: Tensor,
-    others: Tensor,
-    elsewhere: Tensor,
-    parents: tuple[int, ...],
-) -> Tensor:
-    """By the quadratic form (..., 4 J, 4 J) of what two motions do to joints at these places."""
-    ours, theirs = (_flat(_posed(pivots, turns, parents)[0]) for turns in (rotations, others))
-    apart = (ours - theirs).unflatten(-1, (-1, 4))
-    moved = (translation - elsewhere).flatten(-2)[..., None]  # all joints alike, as weights have the sum 1
-    apart = torch.cat([apart[..., :3], apart[..., 3:] + moved[..., None, :]], -1).flatten(-2)
-    found: Tensor = ((apart @ form) * apart).sum(-1).unflatten(-1, (-1, 3)).sum(-1)
-    return found
 
 
 def _posed(pivots: Tensor, rotations: Tensor, parents: tuple[int, ...]) -> tuple[Tensor, Tensor]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
-from ...options import check, tuples
+from ...options import check
 from ..files import read_motion
 from ..files.reading import chosen
 from .clips import MotionSet
@@ -170,9 +169,7 @@ class MotionData:
         return Recordings(self.path, self.fingerprint, self.skip_bad, self.motion.missing)
 
     @classmethod
-    def reopened(
-        cls, source: Recordings, schema: Poses | Mapping[str, Any], path: str | os.PathLike[str] | None = None
-    ) -> Self:
+    def reopened(cls, source: Recordings, schema: Poses, path: str | os.PathLike[str] | None = None) -> Self:
         """The data that were recorded, from there or from another path, whatever they are now.
 
         Others that have another skeleton are put onto that of the schema, where its joints are among theirs by what
@@ -180,15 +177,14 @@ class MotionData:
 
         Args:
             source: as `recorded` gave it.
-            schema: of the windows; of runs of format 1, the fields of the protocol.
+            schema: of the windows.
             path: where they lie now.
 
         Raises:
             FileNotFoundError, ValueError: see `open`.
         """
-        protocol = Protocol(**tuples(schema)) if isinstance(schema, Mapping) else schema.protocol
-        found = cls.open(path or source.path, protocol, source.skip_bad, source.missing)
-        if isinstance(schema, Mapping) or found.schema.skeleton == schema.skeleton:
+        found = cls.open(path or source.path, schema.protocol, source.skip_bad, source.missing)
+        if found.schema.skeleton == schema.skeleton:
             return found
         known, motion = schema.skeleton, found.motion
         if found.fingerprint == source.fingerprint:

@@ -18,7 +18,6 @@ Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the flow of its public code 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -224,14 +223,13 @@ def load_pose_prior(path: str | Path, skeleton: Skeleton, heading: bool) -> Pose
         heading: whether the model sees windows turned to one heading.
 
     Raises:
-        ValueError: a run of something else, of another skeleton (of which a run of format 1 tells the number of joints
-            alone, so that there is a warning), or of other options.
+        ValueError: a run of something else, of another skeleton, or of other options.
         CheckpointError: damaged weights, or of another number of joints.
     """
     config = Run(path).config
     try:
         options = config["method"]
-        parents = config["schema"]["skeleton"]["parents"] if "schema" in config else skeleton.parents
+        parents = config["schema"]["skeleton"]["parents"]
         fits = options["method"] == PosePrior.name and tuple(parents) == skeleton.parents
         given = options["heading"], options["layers"]
     except (KeyError, TypeError):
@@ -242,12 +240,6 @@ def load_pose_prior(path: str | Path, skeleton: Skeleton, heading: bool) -> Pose
         raise ValueError(
             f"{path} was fitted with heading={options['heading']} and layers={options['layers']}, but this model sees "
             f"poses with heading={heading}, and takes a prior of {PosePrior.layers} layers"
-        )
-    if "schema" not in config:
-        warnings.warn(
-            f"{path} is a run of format 1, which does not tell its skeleton: no more is checked than that it has as "
-            f"many joints as {skeleton.name!r}; `dvae resume {path}` writes it in the present format",
-            stacklevel=2,
         )
     model = PosePriorModel(skeleton)
     load_weights(model, path)

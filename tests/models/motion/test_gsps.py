@@ -1,10 +1,7 @@
 """GSPS: the factorization, futures drawn together, energies in the shared loop, control, presets."""
 
-import json
-import shutil
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,11 +11,10 @@ import dvae
 from dvae import motion
 from dvae.cli import main
 from dvae.inference.evaluation.metrics import average_pairwise_distance
-from dvae.inference.training.checkpoints import CheckpointError
 from dvae.models.motion.gsps import PRESETS, GSPSModel, part_by_part
 from dvae.models.registry import configured, judge
 from dvae.motion.geometry.parts import LIMBS, body_parts, places_of
-from dvae.motion.judges.pose_prior import PosePriorModel, load_pose_prior
+from dvae.motion.judges.pose_prior import PosePriorModel
 from dvae.motion.scoring import energies
 from dvae.networks import GraphConv
 from dvae.runs import directory as runs
@@ -450,17 +446,6 @@ def test_energies_of_bones_are_of_positions(windows, heading):
     torch.testing.assert_close(-trace.nodes["diversity_upper"]["log_prob"], alike)
     found = dvae.SequenceELBO().terms(model, data)
     assert found.energies.keys() == dvae.SequenceELBO().terms(build(windows), data).energies.keys()
-
-
-def test_a_prior_of_format_1_is_taken_with_a_word_of_warning(prior_run, tmp_path):
-    run = Path(shutil.copytree(prior_run, tmp_path / "prior"))
-    config = json.loads((run / "config.json").read_text())
-    config["protocol"] = config.pop("schema")["protocol"]
-    (run / "config.json").write_text(json.dumps(config))
-    with pytest.warns(UserWarning, match="format 1, which does not tell its skeleton: no more is checked than"):
-        load_pose_prior(run, motion.WALKER, heading=config["method"]["heading"])
-    with pytest.warns(match="format 1"), pytest.raises(CheckpointError, match="holds the weights of another model"):
-        load_pose_prior(run, motion.HUMANEVA, heading=config["method"]["heading"])
 
 
 def test_a_fitted_pose_prior_is_taken_along(windows, prior_run):
