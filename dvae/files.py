@@ -25,7 +25,7 @@ _PLAIN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(o
 
 
 _HOST = re.sub(r"\W", "", platform.node())
-_TEMPORARY = re.compile(rf"\.(new|sweep)-{_HOST}-(\d{{1,9}})-\w+")
+_TEMPORARY = re.compile(rf"\.new-{_HOST}-(\d{{1,9}})-\w+")
 
 
 class FileRefused(ValueError):
@@ -116,7 +116,7 @@ def written(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device; choose another name")
     with made(path.parent):
         _remove_leftovers(path.parent)
-        new = path.with_name(f"{temporary('new')}{uuid4().hex}")
+        new = path.with_name(f"{temporary()}{uuid4().hex}")
         try:
             with naming(path, new):
                 number = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL | _PLAIN, 0o666)
@@ -142,20 +142,16 @@ def made(folder: Path) -> Iterator[None]:
         raise
 
 
-def temporary(kind: str) -> str:
-    """Return the start of the names of this process's temporary files, which names the process.
-
-    Args:
-        kind: "new" for a file or folder that is renamed when it is complete, "sweep" for the lease of a sweep.
-    """
-    return f".{kind}-{_HOST}-{os.getpid()}-"
+def temporary() -> str:
+    """Return the start of the names of this process's temporary files, which names the process."""
+    return f".new-{_HOST}-{os.getpid()}-"
 
 
 def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files and folders that processes of this machine left in a folder when they were killed."""
     with suppress(OSError):
         for path in [Path(entry) for entry in os.scandir(folder) if entry.name.startswith(".")]:
-            if (found := _TEMPORARY.fullmatch(path.name)) and not _is_running(int(found[2])):
+            if (found := _TEMPORARY.fullmatch(path.name)) and not _is_running(int(found[1])):
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path, ignore_errors=True)
                 else:

@@ -1,11 +1,7 @@
-"""Sweeps: methods x seeds fitted side by side, one process and one torch thread to a run, by joblib or as jobs.
+"""Sweeps: methods x seeds fitted in parallel by joblib, one process and one torch thread per run.
 
 Every run has a directory of its own, as `fit_run` writes it, with the same weights bit for bit. The same call again
-continues a sweep: finished runs are left as they are, others go on from their last checkpoint.
-
-A sweep holds a lease, an empty file beside the run directories, which is removed when the sweep is told to stop or
-fails. A run without a lease writes a checkpoint and stops. Unlike a signal, a file reaches the workers of every
-backend.
+continues a sweep: finished runs are skipped, others continue from their last checkpoint.
 """
 
 from __future__ import annotations
@@ -19,12 +15,10 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import timedelta
-from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
-from uuid import uuid4
+from typing import Any
 
 import torch
 from joblib import Parallel, delayed
@@ -35,16 +29,15 @@ from .. import files
 from ..data.schema import Schema
 from ..inference.evaluation.result import Plain, Table, reason
 from ..inference.training.checkpoints import ENDED, Run
-from ..inference.training.fit import Callback, Fit, Interrupted
+from ..inference.training.fit import Callback, Fit
 from ..inference.training.options import Training
 from ..inference.training.processes import by_torchrun
 from ..inference.training.recipe import Trainable
 from ..inference.training.schedules import clamp
-from ..inference.training.signals import Signals
 from ..inference.training.svi import State
 from ..inference.training.trackers import LARGEST_LOG, JSONLines, row_of
 from ..models.method import Method
-from ..options import flat
+from ..options import flat, require
 from ..turns import alone
 from .directory import fit_run, read_config, resume, training_of
 from .kinds import Dataset
@@ -83,13 +76,6 @@ class Outcome:
         return ", ".join(filter(None, [f"{self.path.name} {self.status} at step {self.step} {how}", self.best]))
 
 
-class Executor(Protocol):
-    """What has jobs done elsewhere, such as `submitit.AutoExecutor` or one of `concurrent.futures`."""
-
-    def submit(self, function: Any, /, *arguments: Any) -> Any:
-        """A job, whose `done()` tells whether it has ended; `result()` is then what the function gives, or raises."""
-
-
 class SweepInterrupted(KeyboardInterrupt):
     """A sweep was stopped by Ctrl-C or SIGTERM. The same sweep, started again, continues.
 
@@ -112,16 +98,14 @@ def sweep(
     out: str | os.PathLike[str],
     seeds: Sequence[int] = (0, 1, 2),
     training: Training | Mapping[str, Any] | None = None,
-    jobs: int | Executor = 2,
+    jobs: int = 2,
 ) -> list[Outcome]:
     """Fits each method with each seed, several runs at a time.
 
-    (Longer than other functions by what its arguments mean.)
-
     A run directory has the name of the method, the options in which methods of that name differ, and the seed, such as
     srnn-z8-seed0. Runs are spread over processes of this machine, or as the caller's `joblib.parallel_config` says;
-    workers on other machines need the file system of `out`. Ctrl-C lets every run write a checkpoint; a second one
-    kills them.
+    workers on other machines need the file system of `out`. Ctrl-C stops all runs at once; the same sweep continues
+    them from their last checkpoints.
 
     Args:
         methods: with their options; a mapping gives them names of its own.
@@ -130,9 +114,7 @@ def sweep(
         seeds: of the runs of each method; `training` has none to tell.
         training: the other options, or some of them beside each method's own. `progress` shows the runs: a table on a
             terminal, or else a line as each starts and ends.
-        jobs: runs at a time, of which a cluster of joblib's has as many as workers; or an executor, to which each run
-            is a job. A job that is killed is a run that failed, and goes on with the same sweep again; of submitit one
-            that has used up its time goes to the queue again.
+        jobs: runs at a time; a cluster of joblib's has as many as workers.
 
     Returns:
         A result for each run, by seed and then by method, also for those that failed.
@@ -149,7 +131,6 @@ def sweep(
     if by_torchrun():
         raise ValueError("a sweep starts processes itself; start it without torchrun")
     out = Path(out)
-    lease = out.absolute() / f"{files.temporary('sweep')}{uuid4().hex}"
     source = data.location
     runs = [
         _Run(
@@ -158,54 +139,41 @@ def sweep(
             data,
             source,
             replace(training_of(method, data, training), seed=seed),
-            lease,
         )
         for seed in seeds
         for name, method in _named(methods).items()
     ]
     if not runs or len({run.path for run in runs}) < len(runs):
         raise ValueError(f"a sweep has at least one method and one seed, each once; seeds are {list(seeds)}")
-    if not (isinstance(jobs, int) and jobs) and not hasattr(jobs, "submit"):
-        raise ValueError(f"jobs is {jobs!r}, expected how many runs go on at a time, or an executor with submit(…)")
+    require(int, jobs=jobs)
+    if not jobs:
+        raise ValueError("jobs is 0; it must be the number of runs at a time, or -1 for one per core")
     if devices := [run.training.devices for run in runs if run.training.devices != 1]:
         raise ValueError(f"devices is {devices[0]}; a run of a sweep has one device, fit it alone for more")
     results = {run.path: result for run in runs if (result := _earlier(run)) is not None}
     waiting = [run for run in runs if run.path not in results]
     notes: list[str] = []
-    received, blind = None, False
+    stopped: KeyboardInterrupt | None = None
     out.mkdir(parents=True, exist_ok=True)
     files.remove_leftovers(out)
-    lease.touch(exist_ok=False)
-    with (
-        _Progress(waiting, runs[0].training.progress) as progress,
-        Signals(then=partial(lease.unlink, missing_ok=True)) as stop,
-    ):
+    with _Progress(waiting, runs[0].training.progress) as progress:
+        for result in results.values():
+            progress.end(result)
         try:
-            for result in results.values():
-                progress.end(result)
-            with _ignored_signals():
-                ended = _joined(waiting, jobs) if isinstance(jobs, int) else _submitted(waiting, jobs, stop)
-            for result, said in ended:
-                results[result.path] = result
-                notes += said
-                progress.end(result)
-                blind |= result.status == "interrupted" and lease.exists()
+            with _terminable():
+                for result, said in _parallel(waiting, jobs):
+                    results[result.path] = result
+                    notes += said
+                    progress.end(result)
         except KeyboardInterrupt as interrupt:
-            received = getattr(interrupt, "signal", signal.SIGINT)
-        except Exception:
-            if stop.received is None:  # when all processes get the signal, a worker may be gone before it is asked
-                raise
-        finally:
-            lease.unlink(missing_ok=True)
+            stopped = interrupt
     for note in dict.fromkeys(notes):
         warnings.warn(note)
     given = [replace(results[run.path], path=out / run.path.name) for run in runs if run.path in results]
-    if received := stop.received or received:
-        raise SweepInterrupted(given, len(runs), received)
-    if blind:
-        raise RuntimeError(
-            f"a worker does not see the files in {out.absolute()}; give a directory that all of them see"
-        )
+    if stopped is not None:
+        raise SweepInterrupted(given, len(runs), getattr(stopped, "signal", signal.SIGINT))
+    if blind := [result.path for result in given if result.status in ENDED and not Run(result.path).exists]:
+        raise RuntimeError(f"a worker wrote {blind[0]} elsewhere; give a directory that all workers see")
     return given
 
 
@@ -218,83 +186,33 @@ class _Run:
     data: Dataset
     source: str
     training: Training
-    lease: Path
-    owner: int = field(default_factory=os.getpid)
 
 
-_Ended = Iterator[tuple[Outcome, list[str]]]
-"""Results in the order in which they come, with the warnings of each."""
-
-
-def _joined(runs: Sequence[_Run], jobs: int) -> _Ended:
-    """The runs as tasks of joblib, by the backend that the caller has chosen."""
-    found: _Ended = Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")(
-        delayed(_fit)(run) for run in runs
-    )
-    return found
-
-
-def _submitted(runs: Sequence[_Run], executor: Executor, stop: Signals) -> _Ended:
-    """The runs as jobs; they are not waited for when the sweep is told to stop, as some may stand in a queue."""
-    jobs = {executor.submit(_Job(), run): run for run in runs}
-
-    def ended() -> _Ended:
-        while jobs and stop.received is None:
-            for job in [job for job in jobs if job.done()]:
-                run = jobs.pop(job)
-                try:
-                    yield job.result()
-                except Exception as lost:  # of the executor's own type: killed, or out of time or memory
-                    told, left = reason(lost).strip().partition("\n")[0], _left(run)
-                    error = f"its job has ended without a result ({type(lost).__name__}: {told})"
-                    status = left.status if left.status in ENDED else "failed"
-                    yield _outcome(run, replace(left, status=status), error=error), []
-            time.sleep(0.2)
-
-    return ended()
-
-
-class _Job:
-    """A run, which submitit has begin again, from its checkpoint, when the time of its job has ended."""
-
-    def __call__(self, run: _Run) -> tuple[Outcome, list[str]]:
-        return _fit(run)
-
-    def checkpoint(self, run: _Run) -> Any:
-        from submitit.helpers import DelayedSubmission
-
-        return DelayedSubmission(self, run)
+def _parallel(runs: Sequence[_Run], jobs: int) -> Iterator[tuple[Outcome, list[str]]]:
+    """Results in the order in which they come, with the warnings of each, by the backend that the caller has chosen."""
+    with _ignored_signals():  # by the workers, which joblib ends
+        found: Iterator[Any] = Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")(
+            delayed(_fit)(run) for run in runs
+        )
+    yield from found
 
 
 def _fit(run: _Run) -> tuple[Outcome, list[str]]:
-    """Fits or resumes a run in a worker; its result, and the warnings."""
-    parent = multiprocessing.parent_process()
-    if parent is not None and parent.pid == run.owner:
-        _ignore_signals()  # from here on: workers that the pool starts later are not among the first ones
+    """Fit or resume a run in a worker; return its result and the warnings."""
     with alone, _one_thread(), warnings.catch_warnings(record=True) as caught:
-        begin, status, error = time.monotonic(), "interrupted", ""
-        ended, leased = Fit([], 0, None, None, status, run.path), _Leased(run.lease)
+        begin, error = time.monotonic(), ""
         try:
-            leased.check()
             if Run(run.path).exists:
                 where = run.training.accelerator
-                ended = resume(run.path, run.source, callbacks=[leased], progress=False, accelerator=where)
+                ended = resume(run.path, run.source, callbacks=[_EndsWithParent()], progress=False, accelerator=where)
             else:
                 training = replace(run.training, progress=False)
-                ended = fit_run(run.method, run.data, run.path, training, callbacks=[leased])
-            status = ended.status
-        except KeyboardInterrupt as stop:
-            if run.owner == os.getpid() and threading.current_thread() is threading.main_thread():
-                raise  # it is the sweep's own Ctrl-C: with one job, joblib starts no process
-            if leased.orphaned():
-                os._exit(1)  # else it would wait for more work
-            if isinstance(stop, Interrupted):
-                ended = stop.fit
+                ended = fit_run(run.method, run.data, run.path, training, callbacks=[_EndsWithParent()])
         except Exception as failure:  # of any type, and it may not survive the way to the sweep's process
-            status, error = "failed", f"{type(failure).__name__}: {reason(failure)}"
+            ended = Fit([], 0, None, None, "failed", run.path)
+            error = f"{type(failure).__name__}: {reason(failure)}"
         seconds = time.monotonic() - begin
-    result = _outcome(run, replace(ended, status=status), seconds=seconds, error=error)
-    return result, [str(warning.message) for warning in caught]
+    return _outcome(run, ended, seconds=seconds, error=error), [str(warning.message) for warning in caught]
 
 
 def _outcome(run: _Run, fit: Fit, **more: Any) -> Outcome:
@@ -302,50 +220,52 @@ def _outcome(run: _Run, fit: Fit, **more: Any) -> Outcome:
     return Outcome(run.path, run.method, run.training.seed, *found, **more)
 
 
-class _Leased(Callback):
-    """A callback that stops the run when the lease is gone, or the process that started this one."""
+class _EndsWithParent(Callback):
+    """Ends a worker whose sweep was killed."""
 
-    def __init__(self, lease: Path) -> None:
-        self.lease, self.next = lease, 0.0
-        self.parent, self.above = multiprocessing.parent_process(), os.getppid()
-
-    def check(self) -> None:
-        if self.orphaned() or not self.lease.exists():
-            raise KeyboardInterrupt
-
-    def orphaned(self) -> bool:
-        """Whether the process that started this one was killed, and could tell nobody."""
-        if self.parent is None or self.parent.pid is None:
-            return False
-        try:
-            os.kill(self.parent.pid, 0)  # asks, and sends nothing; it may also have been killed before this run began
-        except ProcessLookupError:
-            return True
-        return os.getppid() != self.above
+    def __init__(self) -> None:
+        self.own, self.parent, self.next = multiprocessing.parent_process() is None, os.getppid(), 0.0
 
     @override
     def on_step(self, state: State) -> None:
-        if time.monotonic() > self.next:  # not at every step: the file system may be far away
+        if not self.own and time.monotonic() > self.next:
             self.next = time.monotonic() + 0.5
-            self.check()
+            if os.getppid() != self.parent:
+                os._exit(1)  # a worker that returns would wait for more work
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Within it SIGTERM raises KeyboardInterrupt, as Ctrl-C does."""
+
+    def stop(number: int, _: Any) -> None:
+        interrupt = KeyboardInterrupt()
+        interrupt.signal = number  # type: ignore[attr-defined]
+        raise interrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 @contextmanager
 def _ignored_signals() -> Iterator[None]:
     """Processes started within it ignore the terminal's Ctrl-C, at which one that waits would break the pool."""
-    before = _ignore_signals()
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler or signal.SIG_DFL)
-
-
-def _ignore_signals() -> dict[int, Any]:
-    """The handlers until now; none off the main thread, which has no say in it."""
-    if threading.current_thread() is not threading.main_thread():
-        return {}
-    return {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
 
 
 @contextmanager

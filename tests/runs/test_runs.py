@@ -500,9 +500,9 @@ def test_a_full_disk_names_the_file(run, tmp_path, monkeypatch, capsys):
 def test_what_killed_processes_left_is_removed_by_the_next_one(tmp_path, monkeypatch):
     dead = subprocess.Popen(["true"])
     dead.wait()
-    own = tmp_path / f"{files.temporary('new')}a"
+    own = tmp_path / f"{files.temporary()}a"
     monkeypatch.setattr(files.os, "getpid", lambda: dead.pid)
-    left = [tmp_path / f"{files.temporary(kind)}{name}" for kind in ("new", "sweep") for name in "ab"]
+    left = [tmp_path / f"{files.temporary()}{name}" for name in "abcd"]
     monkeypatch.undo()
     for path in (own, *left[1:]):
         path.touch()

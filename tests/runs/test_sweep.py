@@ -6,23 +6,16 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import ClassVar
 
-import psutil
 import pytest
-import submitit
 import torch
 from joblib import parallel_config
-from stopping import At, interrupt
 
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.inference.training.checkpoints import Run
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.judges.action_classifier import ActionClassifier
 from dvae.runs import directory as runs
@@ -123,9 +116,7 @@ def test_a_sweep_that_makes_no_sense_is_refused(data, tmp_path):
         with pytest.raises(ValueError, match=message):
             sweep(methods, data, tmp_path / "out", seeds, TRAINING)
     for jobs in (0, None, 2.0, "4"):
-        with pytest.raises(
-            ValueError, match=f"jobs is {jobs!r}, expected how many runs go on at a time, or an executor"
-        ):
+        with pytest.raises((TypeError, ValueError), match=f"jobs is {jobs!r}"):
             sweep([VAE], data, tmp_path / "out", [0], TRAINING, jobs)
     with pytest.raises(ValueError, match="devices is 2"):
         sweep([VAE], data, tmp_path / "out", [0], replace(TRAINING, devices=2))
@@ -226,82 +217,6 @@ def test_the_callers_backend_is_used_and_threads_take_turns(swept, data, tmp_pat
         results = sweep([VAE], data, tmp_path, seeds=(0, 1), training=TRAINING)
     assert [weights(each.path) for each in results] == [weights(out / f"vae-z3-seed{seed}") for seed in (0, 1)]
 
-    def gone(self):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(sweeps._Leased, "check", gone)  # as if on a machine without the file system of the sweep
-    with parallel_config(backend="threading"), pytest.raises(RuntimeError, match="a worker does not see the files in"):
-        sweep([VAE], data, tmp_path / "far", seeds=(0, 1), training=TRAINING)
-
-
-class Losing(ThreadPoolExecutor):
-    """The job of the second seed is killed when its run has a checkpoint."""
-
-    def submit(self, function, /, run):
-        def killed():
-            with suppress(KeyboardInterrupt):
-                runs.fit_run(run.method, run.data, run.path, run.training, callbacks=[At(3, interrupt)])
-            raise BrokenExecutor("killed\nat a place in the code")
-
-        return super().submit(killed if run.training.seed else partial(function, run))
-
-
-def test_runs_are_jobs_of_an_executor_and_one_that_is_killed_goes_on_with_the_same_sweep(swept, data, tmp_path):
-    out, _, _ = swept
-    methods = {"vae-z3": VAE}
-    with Losing(1) as jobs:
-        whole, lost = sweep(methods, data, tmp_path, (0, 1), TRAINING, jobs)
-    assert (whole.status, lost.status, lost.step) == ("finished", "failed", 3)
-    assert lost.error == "its job has ended without a result (BrokenExecutor: killed)"
-    with ThreadPoolExecutor(1) as jobs:
-        sweep(methods, data, tmp_path, (0, 1), TRAINING, jobs)
-    assert [weights(tmp_path / f"vae-z3-seed{i}") for i in (0, 1)] == [weights(out / f"vae-z3-seed{i}") for i in (0, 1)]
-
-
-def test_a_sweep_that_is_stopped_does_not_wait_for_jobs_in_a_queue(data, tmp_path):
-    class Queue:
-        def submit(self, function, run):
-            return self
-
-        def done(self):
-            signal.raise_signal(signal.SIGINT)
-            return False
-
-    with pytest.raises(SweepInterrupted, match="interrupted with 0 of 1 runs finished"):
-        sweep([VAE], data, tmp_path, [0], TRAINING, Queue())
-    assert not list(tmp_path.iterdir())  # nor the lease, without which a job that begins ends at once
-
-
-class OutOfTime:
-    """A job of submitit on this machine, which is sent the signal of a cluster once its run has a checkpoint."""
-
-    def __init__(self, folder):
-        self.executor, self.path, self.job = submitit.LocalExecutor(folder), None, None
-
-    def submit(self, function, run):
-        self.path, self.job = run.path, self.executor.submit(function, run)
-        return self
-
-    def done(self):
-        if self.path is not None and Run(self.path).exists:
-            self.path = None
-            psutil.Process(int(self.job.job_id)).children()[0].send_signal(signal.SIGUSR2)
-        return self.job.done()
-
-    def result(self):
-        return self.job.result()
-
-
-@pytest.mark.slow
-def test_a_job_of_submitit_that_is_out_of_time_goes_on_from_its_checkpoint(data, tmp_path, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
-    training = replace(TRAINING, steps=500, validate_every=50)
-    jobs = OutOfTime(tmp_path / "jobs")
-    (result,) = sweep({"vae-z3": VAE}, data, tmp_path, [0], training, jobs)
-    assert "Requeued job" in jobs.job.stdout()
-    (whole,) = sweep({"vae-z3": VAE}, data, tmp_path / "whole", [0], training, 1)
-    assert (result.status, weights(result.path)) == ("finished", weights(whole.path))
-
 
 SMALL_GSPS = {
     "width": 4,
@@ -369,7 +284,7 @@ def states(out):
 
 @pytest.mark.slow
 def test_a_sweep_that_ctrl_c_stopped_is_continued(people, tmp_path, capsys):
-    """The signal goes to all processes, as from a terminal; each run writes a checkpoint, and no process stays."""
+    """The signal goes to all processes, as from a terminal; no process stays, and runs go on from their checkpoints."""
     arguments = ["sweep", "vae", "vrnn", "--seeds", "0", "1", "--data", str(people), "--out", str(tmp_path)]
     command = [sys.executable, "-m", "dvae.cli", *arguments, "--steps", "30", *SMALL]
     process = subprocess.Popen(
@@ -392,7 +307,7 @@ def test_a_sweep_that_ctrl_c_stopped_is_continued(people, tmp_path, capsys):
     assert "Traceback" not in error
     assert "vae-seed0 starts" in error.splitlines()
     stopped = states(tmp_path)
-    assert {state["status"] for state in stopped.values()} <= {"finished", "interrupted"}
+    assert {state["status"] for state in stopped.values()} <= {"finished", "running", "interrupted"}
     finished = [name for name, state in stopped.items() if state["status"] == "finished"]
     assert 0 < len(finished) < 4
     before = written(tmp_path)

@@ -91,7 +91,7 @@ def _staged(out: Path) -> Iterator[Path]:
     folder = out.parent if out.suffix else out
     with files.made(folder):
         files.remove_leftovers(folder)
-        with TemporaryDirectory(prefix=files.temporary("new"), dir=folder, ignore_cleanup_errors=True) as name:
+        with TemporaryDirectory(prefix=files.temporary(), dir=folder, ignore_cleanup_errors=True) as name:
             stage = Path(name)
             with files.naming(folder, stage):
                 yield stage / out.name if out.suffix else stage
