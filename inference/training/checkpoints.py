@@ -3,8 +3,7 @@
     config.json        what was run: method, schema, data, training options
     best.safetensors   weights at the best unweighted validation bound (absent without validation data)
     last.safetensors   weights at the last checkpoint
-    last.state.pt      optimiser, random number generators and what an objective has of its own, read with torch's
-                       restricted unpickler
+    last.state.safetensors  optimiser, random number generators and the state of an objective
     state.json         step, best step and bound, status, and the SHA-256 of the three files above
 
 `state.json` is the commit record. New files are first written whole under a temporary name, then `state.json`
@@ -16,13 +15,10 @@ that the model gives them.
 """
 
 import hashlib
-import io
 import json
 import math
 import os
-import pickletools
 import threading
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,13 +41,14 @@ try:
 except ImportError:  # no locks on Windows
     fcntl = None  # type: ignore[assignment]
 
-BEST, LAST, OPTIMISER = "best.safetensors", "last.safetensors", "last.state.pt"
+BEST, LAST, OPTIMISER = "best.safetensors", "last.safetensors", "last.state.safetensors"
 STATE, CONFIG, LOCK = "state.json", "config.json", ".lock"
 LARGEST_TEXT = 2**24
 """Bytes of `config.json` and `state.json`."""
 LARGEST_WEIGHTS = 2**32
 """Bytes of a model's weights."""
 
+OPTIMISERS = ("adam", "adamw", "sgd")
 ENDED: tuple[str, ...] = ("finished", "stopped early")
 STATUSES: tuple[str, ...] = ("running", *ENDED, "interrupted", "failed")
 
@@ -67,6 +64,7 @@ _STORED: dict[str, tuple[Callable[[Any], bool], str]] = {
     ),
     "waited": (lambda value: _count(value), _NUMBER),
     "status": (lambda value: value in STATUSES, "one of the known ones"),
+    "optimizer": (lambda value: value in OPTIMISERS, f"one of {', '.join(OPTIMISERS)}"),
     "per": (lambda value: value is ... or (isinstance(value, str) and value.isidentifier()), "a word"),
     "processor_seconds": (lambda v: v is ... or (isinstance(v, float) and 0 <= v < math.inf), "a number from 0"),
 }
@@ -222,18 +220,13 @@ class Run:
         except FileNotFoundError:
             raise CheckpointError(f"{path} is missing; copy the run directory whole, or fit again") from None
 
-    def optimiser_state(self, most: int = 2 * LARGEST_WEIGHTS) -> dict[str, Any]:
-        """Return the optimiser and random number states of the last checkpoint, on the CPU.
+    def optimiser_state(self, most: int = 2 * LARGEST_WEIGHTS) -> dict[str, Tensor]:
+        """Return the optimiser and random number states of the last checkpoint, on the CPU, by their paths.
 
         Raises:
-            CheckpointError: when the file has more bytes than `most`, or is no state that torch wrote.
+            CheckpointError: when the file has more bytes than `most`, or is no safetensors file.
         """
-        content = self.read(OPTIMISER, most)
-        try:
-            _check_archive(content)
-            return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-        except Exception as error:  # torch raises many types for a file that it did not write
-            raise CheckpointError(f"{self.path / OPTIMISER} is no optimiser state of torch: {error}") from error
+        return _tensors(self.read(OPTIMISER, most), self.path / OPTIMISER)
 
     def _settle(self, name: str, expected: str, most: int = LARGEST_WEIGHTS) -> None:
         """Give a committed file its name, if the process was killed between the commit and the renaming."""
@@ -307,10 +300,7 @@ def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tens
     Raises:
         CheckpointError: when they are not, or one is not finite.
     """
-    try:
-        tensors = load_tensors(content)
-    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:  # also for types it has none for
-        raise CheckpointError(f"{path} is damaged or no safetensors file ({error}); copy or fit it again") from error
+    tensors = _tensors(content, path)
     _check_names_and_shapes(model, tensors, path)
     for name, value in model.state_dict().items():
         found = tensors[name]
@@ -322,6 +312,13 @@ def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tens
                 "fit again, with a lower learning rate"
             )
     return tensors
+
+
+def _tensors(content: bytes, path: Path) -> dict[str, Tensor]:
+    try:
+        return load_tensors(content)
+    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:  # also for types it has none for
+        raise CheckpointError(f"{path} is damaged or no safetensors file ({error}); copy or fit it again") from error
 
 
 def state_bytes(model: nn.Module, copies: int = 1) -> int:
@@ -385,84 +382,6 @@ def _check_names_and_shapes(model: nn.Module, tensors: Mapping[str, Tensor], pat
 
 
 _FLOATING = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
-
-# all that torch writes into the state of an optimiser and of random number generators
-_STORAGES = {f"torch {kind}Storage" for kind in ("Float", "Double", "BFloat16", "Half", "Byte", "Long", "Int")}
-_KNOWN = _STORAGES | {"torch._utils _rebuild_tensor_v2", "collections OrderedDict"}
-
-
-# all that torch says of such a state: what puts a plain value on the stack, and what takes values from it
-_PLAIN = {"EMPTY_DICT", "EMPTY_LIST", "NONE", "NEWTRUE", "NEWFALSE", "BINUNICODE", "BINFLOAT"}
-_PLAIN |= {"BININT", "BININT1", "BININT2", "LONG1"}
-_TAKEN = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "REDUCE": 2, "BINPERSID": 1, "APPEND": 1, "SETITEM": 2}
-_INSTRUCTIONS = 2**20
-"""Of a state's pickle, which has about a hundred and fifty for each parameter."""
-_DEEPEST = 8
-"""Tuples in one another; those of a tensor are two."""
-
-
-def _check_archive(content: bytes) -> None:
-    """Refuse an archive that would grow when it is read, or whose pickle asks for more than tensors in dicts.
-
-    Raises:
-        ValueError: saying why.
-    """
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = archive.infolist()
-        if any(each.compress_type != zipfile.ZIP_STORED for each in members):
-            raise ValueError("it is compressed")
-        if sum(each.file_size for each in members) > len(content):
-            raise ValueError("its members are larger than itself")
-        (pickled,) = [each for each in members if each.filename.endswith("/data.pkl")]
-        _check_pickle(archive.read(pickled))
-
-
-def _check_pickle(content: bytes) -> None:
-    """Follow a pickle without making what it says, and refuse what torch would not have written.
-
-    Whatever is a key is hashed, tuples with all that they hold: a hundred thousand of them in one another overflow the
-    stack of C, and forty, each of two times the one before, which a pickle shares by name, take years.
-
-    Raises:
-        ValueError: saying why.
-    """
-    stack: list[int] = []  # of each value, how deep tuples nest in it; 0 for whatever is no tuple
-    below: list[list[int]] = []  # the stacks under the marks
-    memo: dict[Any, int] = {}
-    for count, (code, argument, _) in enumerate(pickletools.genops(content)):
-        name = code.name
-        if count == _INSTRUCTIONS:
-            raise ValueError(f"its pickle has more than {_INSTRUCTIONS:,} instructions")
-        if name in ("GLOBAL", "STACK_GLOBAL", "INST") and argument not in _KNOWN:
-            raise ValueError(f"it asks for {str(argument)[:80]!r}")
-        if isinstance(argument, int) and argument.bit_length() > 64:  # of these, many could have one hash
-            raise ValueError(f"it has a number of {argument.bit_length():,} bits")
-        try:
-            if name in ("TUPLE", "APPENDS", "SETITEMS"):
-                values, stack = stack, below.pop()
-            elif number := _TAKEN.get(name):
-                values = [stack.pop() for _ in range(number)]
-            else:
-                values = []
-            if name.startswith("TUPLE") or name == "EMPTY_TUPLE":
-                stack.append(1 + max(values, default=0))
-                if stack[-1] > _DEEPEST:
-                    raise ValueError(f"its tuples nest deeper than {_DEEPEST}")
-            elif name in _PLAIN or name in ("GLOBAL", "REDUCE", "BINPERSID"):
-                stack.append(0)
-            elif name == "MARK":
-                below.append(stack)
-                stack = []
-            elif name in ("BINPUT", "LONG_BINPUT"):
-                memo[argument] = stack[-1]
-            elif name in ("BINGET", "LONG_BINGET"):
-                stack.append(memo[argument])
-                if stack[-1]:
-                    raise ValueError("it shares a tuple")
-            elif name not in ("PROTO", "STOP", "APPEND", "SETITEM", "APPENDS", "SETITEMS"):
-                raise ValueError(f"it uses the instruction {name}")
-        except LookupError as error:
-            raise ValueError(f"its pickle is damaged, it uses {name} on what is not there") from error
 
 
 def _count(value: Any) -> bool:

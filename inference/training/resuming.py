@@ -10,11 +10,9 @@ Example:
     restore(svi, run)
 """
 
-import io
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from safetensors.torch import save as save_tensors
@@ -41,15 +39,17 @@ def store(svi: SVI, run: Run) -> None:
     svi.settle()
     if not svi.fabric.is_global_zero:
         return
-    buffer = io.BytesIO()
-    content = {"name": svi.training.optimizer, "optimizer": svi.optimizer.state_dict(), "random": random}
+    content = {f"random/{name}": value for name, value in random.items()}
+    for place, kept in svi.optimizer.state_dict()["state"].items():
+        content |= {f"optimizer/{place}/{key}": value for key, value in kept.items() if isinstance(value, Tensor)}
     if isinstance(svi.objective, Adapting):
-        content["objective"] = {name: value.detach().cpu().clone() for name, value in svi.objective.state.items()}
-    torch.save(content, buffer)
-    files = {LAST: save_tensors(weights(svi.model)), OPTIMISER: buffer.getvalue()}
+        content |= {f"objective/{name}": value for name, value in svi.objective.state.items()}
+    content = {name: value.detach().cpu().clone().contiguous() for name, value in content.items()}
+    files = {LAST: save_tensors(weights(svi.model)), OPTIMISER: save_tensors(content)}
     if state.best is not None and state.waited == 0:
         files[BEST] = save_tensors(state.best)
-    run.commit({name: getattr(state, name) for name in (*_STORED, "per")}, files)
+    found = {name: getattr(state, name) for name in (*_STORED, "per")}
+    run.commit({**found, "optimizer": svi.training.optimizer}, files)
 
 
 def restore(svi: SVI, run: Run) -> None:
@@ -66,27 +66,28 @@ def restore(svi: SVI, run: Run) -> None:
             f"steps is {training.steps}, but {run.path} has taken {stored['step']} steps already; steps "
             f"counts all of a run, so give more than {stored['step']} to go on"
         )
-    content = run.optimiser_state(state_bytes(model, 4) + 2**20)
+    parts = _parts(run, run.optimiser_state(state_bytes(model, 4) + 2**20))
     last = run.read(LAST, state_bytes(model))
     model.load_state_dict(read_weights(model, last, run.path / LAST))
-    _check_state(svi, run, content)
-    if content["name"] != training.optimizer:
+    if stored["optimizer"] != training.optimizer:
         raise CheckpointError(
-            f"{run.path} was fitted with optimizer={content['name']!r}, not "
+            f"{run.path} was fitted with optimizer={stored['optimizer']!r}, not "
             f"{training.optimizer!r}; resume with the same optimiser"
         )
-    count = len(content["random"]["generator"])
+    moments = _moments(svi, run, parts["optimizer"])
+    _check_random(svi, run, parts["random"])
+    count = len(parts["random"]["generator"])
     if count != svi.fabric.world_size:
         raise CheckpointError(
             f"{run.path} was fitted by {count} processes, not {svi.fabric.world_size}; resume with as many, as each "
             f"has random numbers of its own: with devices={count} on one host, or by torchrun on several"
         )
     # a copy: set_state reads the storage, so it takes another row's bytes for a view, or crashes
-    random = {name: value[svi.fabric.global_rank].clone() for name, value in content["random"].items()}
+    random = {name: value[svi.fabric.global_rank].clone() for name, value in parts["random"].items()}
     try:
         # options such as the weight decay are those of this call
         options = svi.optimizer.state_dict()["param_groups"]
-        svi.optimizer.load_state_dict({"state": content["optimizer"]["state"], "param_groups": options})
+        svi.optimizer.load_state_dict({"state": moments, "param_groups": options})
         svi.generator.set_state(random.pop("generator"))
         svi.random |= {name: value for name, value in random.items() if name in svi.random}
         with svi.drawing():  # which fails where these are no states
@@ -96,7 +97,7 @@ def restore(svi: SVI, run: Run) -> None:
     for name in _STORED:
         setattr(state, name, stored.get(name, getattr(state, name)))  # earlier versions kept no time
     if isinstance(svi.objective, Adapting) and state.step > stage_at(svi.plan, state.step)[0]:
-        _take_up(svi.objective, run, content.get("objective", {}))
+        _take_up(svi.objective, run, parts["objective"])
     if BEST in stored["fingerprints"]:
         state.best = read_weights(model, run.read(BEST, state_bytes(model)), run.path / BEST)
 
@@ -117,53 +118,68 @@ def _random(svi: SVI) -> dict[str, Tensor]:
     return {"generator": svi.generator.get_state(), **svi.random}
 
 
-def _check_state(svi: SVI, run: Run, content: Any) -> None:
-    """Refuse a state of optimiser and random numbers that no run of this model writes at its step.
+def _parts(run: Run, content: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+    """Tensors by part and by the rest of their path."""
+    parts: dict[str, dict[str, Tensor]] = {"optimizer": {}, "random": {}, "objective": {}}
+    for path, value in content.items():
+        part, _, name = path.partition("/")
+        if part not in parts:
+            raise _damaged(run, f"{reprlib.repr(path)} is of no {', '.join(parts)}")
+        parts[part][name] = value
+    return parts
+
+
+def _moments(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> dict[int, dict[str, Tensor]]:
+    """The state of the optimiser by the place of a parameter.
+
+    Raises:
+        CheckpointError: it is not what the optimiser writes of this model at its step, naming what is wrong.
+    """
+    places = {str(place): place for place in range(len(svi.parameters))}
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, value in found.items():
+        place, _, key = name.partition("/")
+        if place not in places:
+            raise _damaged(run, f"{reprlib.repr(f'optimizer/{name}')} is of no parameter")
+        parameter = svi.parameters[places[place]]
+        if not _sound(key, value, parameter, run.state["step"]):
+            shape = f"finite and of shape {tuple(parameter.shape)}"
+            raise _damaged(run, f"{reprlib.repr(f'optimizer/{name}')} is not as the optimiser writes it, {shape}")
+        moments.setdefault(places[place], {})[key] = value
+    for at, kept in moments.items():
+        if missing := _KEPT[svi.training.optimizer] - kept.keys():
+            raise _damaged(run, f"optimizer/{at} has no {' and no '.join(sorted(missing))}")
+    return moments
+
+
+def _check_random(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> None:
+    """Refuse what is no state of the run's random number generators.
 
     Raises:
         CheckpointError: naming what is wrong.
     """
-    parts = {"name": str, "optimizer": dict, "random": dict}
-    if not isinstance(content, dict) or not all(isinstance(content.get(key), kind) for key, kind in parts.items()):
-        raise _damaged(run, f"it holds no {', '.join(parts)}")
-    moments, own = content["optimizer"].get("state"), _random(svi)
-    if not isinstance(moments, dict):
-        raise _damaged(run, "its optimizer has no state")
-    for place, kept in moments.items():
-        if type(place) is not int or not 0 <= place < len(svi.parameters) or not isinstance(kept, dict):
-            raise _damaged(run, f"optimizer.state[{place!r}] is of no parameter")
-        if (missing := _KEPT[svi.training.optimizer] - kept.keys()) and content["name"] == svi.training.optimizer:
-            raise _damaged(run, f"optimizer.state[{place}] has no {' and no '.join(sorted(missing))}")
-        for key, value in kept.items():
-            if (key, value) != ("momentum_buffer", None) and not _sound(
-                key, value, svi.parameters[place], run.state["step"]
-            ):
-                raise _damaged(
-                    run,
-                    f"optimizer.state[{place}][{key!r}] is not as the optimiser writes it, finite and of shape "
-                    f"{tuple(svi.parameters[place].shape)}",
-                )
-    for key, value in content["random"].items():
+    own = _random(svi)
+    for key, value in found.items():
         size = own[key].numel() if key in own else None
-        known = isinstance(value, Tensor) and value.dtype == torch.uint8 and value.ndim == 2
+        known = value.dtype == torch.uint8 and value.ndim == 2
         if not known or size not in (None, value.shape[1]) or key not in ("generator", "torch", "cuda"):
-            raise _damaged(run, f"random[{key!r}] is no state of a random number generator")
-    rows = {key: len(value) for key, value in content["random"].items()}
+            raise _damaged(run, f"{reprlib.repr(f'random/{key}')} is no state of a random number generator")
+    rows = {key: len(value) for key, value in found.items()}
     if missing := {"generator", "torch"} - rows.keys():
         raise _damaged(run, f"random has no {' and no '.join(sorted(missing))}")
     if len(set(rows.values())) > 1:
         raise _damaged(run, f"random has states of {' and '.join(map(str, rows.values()))} processes")
 
 
-def _take_up(objective: Adapting, run: Run, found: Any) -> None:
+def _take_up(objective: Adapting, run: Run, found: Mapping[str, Tensor]) -> None:
     """Has an objective go on with the state that a checkpoint holds of it.
 
     Raises:
         CheckpointError: it is of another objective, or no state that one writes.
     """
     own = objective.state
-    if not isinstance(found, dict) or found.keys() != own.keys():
-        held = reprlib.repr(list(found)) if isinstance(found, dict) and found else "none"
+    if found.keys() != own.keys():
+        held = reprlib.repr(list(found)) if found else "none"
         raise CheckpointError(
             f"{run.path} was fitted with another objective: the state of this one is {', '.join(own)}, the run's "
             f"{held}; resume with the objective and the stages that it was fitted with, which begin elsewhere where "
@@ -171,19 +187,19 @@ def _take_up(objective: Adapting, run: Run, found: Any) -> None:
         )
     for name, value in own.items():
         given = found[name]
-        as_written = isinstance(given, Tensor) and (given.dtype, given.shape) == (value.dtype, value.shape)
+        as_written = (given.dtype, given.shape) == (value.dtype, value.shape)
         if not as_written or not torch.isfinite(given).all():
             shape = f"finite, {value.dtype} and of shape {tuple(value.shape)}"
-            raise _damaged(run, f"objective[{name!r}] is not as the objective writes it, {shape}")
+            raise _damaged(run, f"objective/{name} is not as the objective writes it, {shape}")
     try:
         objective.restore({name: value.detach().clone() for name, value in found.items()})
     except ValueError as error:
         raise _damaged(run, str(error)) from error
 
 
-def _sound(key: Any, value: Any, parameter: Tensor, step: int) -> bool:
+def _sound(key: str, value: Tensor, parameter: Tensor, step: int) -> bool:
     """Whether a value of the optimiser's state is one: its count of steps, or a moment of the parameter."""
-    if not isinstance(value, Tensor) or not value.is_floating_point():
+    if not value.is_floating_point():
         return False
     if key == "step":
         return value.ndim == 0 and 0 <= value.item() <= step and value.item() % 1 == 0

@@ -478,7 +478,7 @@ def test_a_damaged_run_is_refused(capsys, run):
     weights.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
     assert "is damaged or from another run" in failure(capsys, "evaluate", str(run))
     weights.write_bytes(good)
-    (run / "last.state.pt").write_bytes(pickle.dumps(os.getcwd))
+    (run / "last.state.safetensors").write_bytes(pickle.dumps(os.getcwd))
     assert "is damaged or from another run" in failure(capsys, "resume", str(run))
     config = json.loads((run / "config.json").read_text())
     (run / "config.json").write_text(json.dumps({**config, "method": {**config["method"], "latent": 4}}))

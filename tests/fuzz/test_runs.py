@@ -74,8 +74,7 @@ def mutations():
         st.tuples(st.just("longer"), st.sampled_from(FILES[:6]), st.sampled_from([1, 2**20, 2**36]), st.booleans()),
         st.tuples(st.just("link"), st.sampled_from(FILES), st.sampled_from(TARGETS)),
         st.tuples(st.just("special"), st.sampled_from(FILES), st.sampled_from(["fifo", "directory", "nothing"])),
-        st.tuples(st.just("weights"), st.sampled_from([BEST, LAST]), places, st.sampled_from(sorted(DAMAGES))),
-        st.tuples(st.just("state"), places, values() | st.sampled_from(sorted(DAMAGES))),
+        st.tuples(st.just("weights"), binary, places, st.sampled_from(sorted(DAMAGES))),
     )
 
 
@@ -161,19 +160,6 @@ def mutate(run: Path, kind: str, *arguments: Any) -> None:
         if DAMAGES[damage] is not None:
             tensors[key] = DAMAGES[damage](value)
         commit(run, name, save(tensors), True)
-    elif kind == "state":
-        place, new = arguments
-        content, buffer = torch.load(io.BytesIO((run / OPTIMISER).read_bytes()), weights_only=True), io.BytesIO()
-        *to, last = (found := paths(content))[place % len(found)]
-        inner = at(content, tuple(to))
-        if isinstance(new, str) and isinstance(inner[last], torch.Tensor) and DAMAGES.get(new) is not None:
-            inner[last] = DAMAGES[new](inner[last].float())
-        elif new == "missing":
-            del inner[last]
-        else:
-            inner[last] = new
-        torch.save(content, buffer)
-        commit(run, OPTIMISER, buffer.getvalue(), True)
 
 
 def clear(place: Path) -> None:

@@ -1,6 +1,5 @@
 """Weights that adapt: they balance what the paper says, belong to one run, and are as they were when it goes on."""
 
-import io
 import json
 import math
 import signal
@@ -9,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save
 from stopping import At, interrupt
 
 import dvae
@@ -356,7 +355,7 @@ def test_the_config_says_what_was_run(tmp_path):
 
 def test_a_run_without_weights_writes_none_and_schedules_of_the_others_end_in_time(tmp_path):
     run(objective=Evidence(), out=tmp_path, steps=3)
-    assert set(Run(tmp_path).optimiser_state()) == {"name", "optimizer", "random"}
+    assert {name.partition("/")[0] for name in Run(tmp_path).optimiser_state()} == {"optimizer", "random"}
     with pytest.warns(UserWarning, match="needs .* steps, and training has 3"):
         dvae.SVI(build(), steps=3, objective=MIXED)
 
@@ -416,10 +415,12 @@ def test_a_loss_without_a_training_rate_is_refused_but_at_no_asymmetry():
 def written(path, change):
     """The checkpoint of a run in which the objective's state was changed, signed as its author would."""
     run(steps=5, objective=BALANCED, out=path)
-    content, buffer = Run(path).optimiser_state(), io.BytesIO()
-    changed = change(content["objective"])
-    torch.save(content | {"objective": changed} if changed is not None else content, buffer)
-    Run(path).commit(Run(path).state, {OPTIMISER: buffer.getvalue()})
+    content = Run(path).optimiser_state()
+    own = {
+        name.removeprefix("objective/"): content.pop(name) for name in list(content) if name.startswith("objective/")
+    }
+    content |= {f"objective/{name}": value for name, value in change(own).items()}
+    Run(path).commit(Run(path).state, {OPTIMISER: save(content)})
 
 
 def one(value):
@@ -433,15 +434,19 @@ def one(value):
             lambda state: {},
             "was fitted with another objective: the state of this one is weight/small, .*, the run's none",
         ),
-        (lambda state: [1], "was fitted with another objective"),
-        (lambda state: {7: one(1.0)}, "was fitted with another objective.*the run's .7.; resume with the objective"),
+        (
+            lambda state: {"7": one(1.0)},
+            "was fitted with another objective.*the run's .'7'.; resume with the objective",
+        ),
         (lambda state: state | {"weight/huge": one(1.0)}, "was fitted with another objective"),
         (
-            lambda state: state | {"weight/small": 1.0},
-            "'weight/small'. is not as the objective writes it, finite, torch",
+            lambda state: state | {"weight/small": torch.ones(1)},
+            "objective/weight/small is not as the objective writes it, finite, torch",
         ),
-        (lambda state: state | {"weight/small": torch.ones(1)}, "'weight/small'. is not as the objective writes it"),
-        (lambda state: state | {"first/large": one(math.nan)}, "'first/large'. is not as the objective writes it"),
+        (
+            lambda state: state | {"first/large": one(math.nan)},
+            "objective/first/large is not as the objective writes it",
+        ),
         (lambda state: state | {"weight/small": one(3.0)}, "the weights of small, large are not positive numbers with"),
         (
             lambda state: state | {"weight/small": one(3.0), "weight/large": one(-1.0)},
@@ -453,16 +458,6 @@ def test_a_state_that_no_run_writes_is_refused_in_a_sentence(tmp_path, change, m
     written(tmp_path, change)
     with pytest.raises(CheckpointError, match=message):
         run(build(seed=9), steps=10, objective=BALANCED, out=tmp_path, resume=True)
-
-
-def test_a_state_is_never_unpickled_freely(tmp_path):
-    class Hostile:
-        def __reduce__(self):
-            return (exec, ("raise SystemExit('executed')",))
-
-    written(tmp_path, lambda state: state | {"weight/small": Hostile()})
-    with pytest.raises(CheckpointError, match=r"last.state.pt is no optimiser state of torch: it asks for"):
-        run(steps=10, objective=BALANCED, out=tmp_path, resume=True)
 
 
 def test_another_objective_is_refused_where_it_would_go_on(tmp_path):
