@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from .factorization.graph import Alternatives, Audit, alternatives, audit
     from .factorization.inversion import faithful
     from .factorization.notation import Factorization
-    from .factorization.oracle import Oracle, arrow_prices, model_arrow_prices, model_price, price, twin
     from .inference.bounds.annealing import annealed_bound
     from .inference.bounds.elbo import SequenceELBO, Terms, importance_bound
     from .inference.bounds.local import local_guide
@@ -55,6 +54,7 @@ if TYPE_CHECKING:
     from .inference.training.svi import SVI
     from .models.registry import method, methods
     from .program.model import DynamicalVAE
+    from .program.oracle import Oracle, arrow_prices, model_arrow_prices, model_price, price, twin
     from .program.rollout import InputNoise, SelfFeeding
     from .program.summed import Discrete
     from .runs.ablation import Ablation, ablate
@@ -128,7 +128,7 @@ _PLACES = {
         "factorization.graph": "Alternatives Audit alternatives audit",
         "factorization.inversion": "faithful",
         "factorization.notation": "Factorization",
-        "factorization.oracle": "Oracle arrow_prices model_arrow_prices model_price price twin",
+        "program.oracle": "Oracle arrow_prices model_arrow_prices model_price price twin",
         "inference.bounds.annealing": "annealed_bound",
         "inference.bounds.elbo": "SequenceELBO Terms importance_bound",
         "inference.bounds.local": "local_guide",

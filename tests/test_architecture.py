@@ -16,15 +16,19 @@ import dvae
 ROOT = Path(__file__).parent.parent
 LAYERS = {
     "dvae": 0,
-    "dvae.inference": 1,
-    "dvae.motion": 2,
-    "dvae.tables": 2,
-    "dvae.models": 3,
-    "dvae.runs": 4,
-    "dvae.report": 4,
-    "dvae.testing": 4,
-    "dvae.cli": 5,
-    "dvae.command": 6,
+    "dvae.factorization": 1,
+    "dvae.distributions": 1,
+    "dvae.networks": 2,
+    "dvae.data": 3,
+    "dvae.program": 4,
+    "dvae.inference": 5,
+    "dvae.motion": 6,
+    "dvae.tables": 6,
+    "dvae.models": 7,
+    "dvae.runs": 8,
+    "dvae.testing": 8,
+    "dvae.cli": 9,
+    "dvae.command": 10,
 }
 # Motion is an application: beside itself, the methods and commands for it import it, and nothing else does.
 MOTION = re.compile(
@@ -98,7 +102,7 @@ def words(path):
 
 def test_the_core_has_no_name_for_a_joint():
     for module, path in sources().items():
-        if not layer(module):
+        if layer(module) < LAYERS["dvae.inference"]:
             assert not {*words(path)} & {"joints", "pose", "poses", "skeleton", "limb", "limbs", "bone", "bones"}, (
                 module
             )

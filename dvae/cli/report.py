@@ -14,10 +14,10 @@ from ..inference.evaluation.result import progress_bar, reason
 from ..inference.training.checkpoints import CheckpointError
 from ..motion.drawing.player import SCRIPT, player
 from ..motion.drawing.plot import staged
-from ..report import Section, document, lacking, sections
-from ..report.page import beside, picture
 from ..runs import directory as runs
 from ..runs.ablation import Ablation
+from ..runs.report import Section, document, lacking, sections
+from ..runs.report.page import beside, picture
 from ..tables.windows import PanelWindows
 from . import opening
 from .console import ERROR, Failed, Missing, UsageError, at_least, check_files

@@ -1,4 +1,4 @@
-"""Linear: the affine-Gaussian network, whose models have a known evidence (see `dvae.factorization.oracle`)."""
+"""Linear: the affine-Gaussian network, whose models have a known evidence (see `dvae.program.oracle`)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Ablations: every arrow of a model and of its guide left out in turn, and what each is worth.
 
-Two prices, which answer two questions. On linear-Gaussian twins (`dvae.factorization.oracle`) it is computed: the
+Two prices, which answer two questions. On linear-Gaussian twins (`dvae.program.oracle`) it is computed: the
 evidence that a model loses without an arrow, and how much wider the gap of a guide becomes. It says which arrows can
 matter. On data it is measured: the whole and every reduced pair of equations are fitted with the same seeds (`sweep`)
 and compared on the test windows (`compare`), with errors over clips and seeds, and p-values for all arrows at once
@@ -33,7 +33,6 @@ from ..data.schema import Schema
 from ..data.sequences import called
 from ..factorization.drawing import draw_slice
 from ..factorization.notation import Factorization, Parent, check_pair
-from ..factorization.oracle import model_price, ones, price
 from ..inference.evaluation.compare import compare
 from ..inference.evaluation.comparison import Comparison
 from ..inference.evaluation.estimates import Estimate, number
@@ -44,6 +43,7 @@ from ..inference.training.many import holm
 from ..inference.training.options import Training
 from ..models.family.equations import Equations
 from ..models.method import Method
+from ..program.oracle import model_price, ones, price
 from .directory import load, training_of
 from .kinds import Dataset
 from .sweep import sweep

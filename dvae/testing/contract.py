@@ -24,7 +24,6 @@ from pyro.infer import Trace_ELBO
 from torch import Tensor
 
 from ..factorization.graph import audit
-from ..factorization.oracle import Oracle, twin
 from ..inference.bounds.annealing import annealed_bound
 from ..inference.bounds.elbo import SequenceELBO
 from ..inference.training.checkpoints import load_weights, save_weights
@@ -32,6 +31,7 @@ from ..inference.training.fit import fit
 from ..program.batch import AnyBatch, repeat
 from ..program.conditional import Conditional
 from ..program.model import DynamicalVAE
+from ..program.oracle import Oracle, twin
 from ..program.reference import reference
 from .device import SameNoise, move, on_device
 

@@ -25,9 +25,9 @@ from rich.console import Group
 from torch import Tensor
 from typing_extensions import override
 
-from ...factorization.oracle import Oracle
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
+from ...program.oracle import Oracle
 from ...turns import alone
 from ..evaluation.held import plain, reproducibly
 from ..evaluation.result import Result, Table, canvas, progress_bar

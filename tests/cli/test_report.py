@@ -18,9 +18,9 @@ from dvae.inference.evaluation.evaluation import Evaluation
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.drawing.player import SCRIPT, player
 from dvae.motion.drawing.plot import staged
-from dvae.report import Section, document, lacking, sections
-from dvae.report.sections import Few
 from dvae.runs import directory as runs
+from dvae.runs.report import Section, document, lacking, sections
+from dvae.runs.report.sections import Few
 
 SMALL = ["--windows", "2", "--samples", "3", "--bound-windows", "3", "--particles", "4"]
 EVIL = "<script>said=1</script><img src=x onerror=said=1>$\\frac$"

@@ -8,7 +8,7 @@ import torch
 from dense import exact_bound, library_bound, masked
 from hypothesis import strategies as st
 
-from dvae.factorization.oracle import twin
+from dvae.program.oracle import twin
 from dvae.program.rollout import SelfFeeding
 from dvae.testing.strategies import factorizations
 

@@ -1,4 +1,4 @@
-"""Draws docs/img/house.png, the picture of docs/walk.md: packages as boxes, who imports whom as arrows.
+"""Draws docs/img/packages.png, the picture of docs/walk.md: packages as boxes, who imports whom as arrows.
 
 It is drawn from the imports in the files. Every box is above all that it imports; an arrow that others make
 superfluous is left out, and one upward, which there should not be, is red.
@@ -19,35 +19,31 @@ from matplotlib.patches import FancyBboxPatch
 from .pages import DOCS
 
 ROOT = DOCS.parent / "dvae"
-EVERYWHERE = {"command", "files", "options", "turns", "units", "schema", "relations", "lazy"}
+EVERYWHERE = {"command", "files", "options", "turns", "lazy", "constants"}
 """Small modules that many use and nobody looks for."""
 
 WALK = {
     "motion": "files to windows",
-    "data": "sequences to batches",
-    "views": "data to what is modelled",
+    "tables": "tables to windows",
+    "data": "windows to batches",
     "program": "equations to a run",
     "networks": "parents to features",
-    "laws": "features to distributions",
+    "distributions": "features to distributions",
     "inference": "a run to bound and step",
 }
 """From x in a file to the loss, in this order."""
 
 SAYS = {
     "cli": "the program dvae",
-    "report": "pages on fits",
     "runs": "directories of fits",
     "testing": "tests for your models",
-    "models": "one file a paper",
-    "oracle": "models of known evidence",
-    "notation": "equations to factorizations",
-    "graph": "who depends on whom",
-    "drawing": "pictures of graphs",
+    "models": "one file per method",
+    "factorization": "equations, masks, audits",
 }
 
 
 def package(module: str) -> str:
-    """The part of the house that a module is in: a.b of dvae.a.b is "a"; of dvae itself, nothing."""
+    """The package that a module is in: a.b of dvae.a.b is "a"; of dvae itself, nothing."""
     return module.split(".")[1] if "." in module else ""
 
 
@@ -134,7 +130,7 @@ def draw(graph: nx.DiGraph, ax: Axes) -> None:
     ax.axis("off")
 
 
-def main(out: Path = DOCS / "img" / "house.png") -> None:
+def main(out: Path = DOCS / "img" / "packages.png") -> None:
     """Draw.
 
     Args:

@@ -25,17 +25,17 @@ from torch import Tensor
 from ..data.views import LOG_DET, volume
 from ..distributions.families import FixedNormal, FixedNormalLaw, Gaussian
 from ..distributions.family import Family
+from ..factorization.inversion import FAITHFUL, guide
+from ..factorization.notation import Factor, Factorization
 from ..networks.base import indicator, valid_steps
 from ..networks.linear import Linear, LinearNetwork
 from ..options import Count, kind_of, require
-from ..program.conditional import Conditional, like
-from ..program.groups import GROUP
-from ..program.model import DynamicalVAE
-from ..program.rollout import Rollout
-from ..program.summed import Discrete
 from ..turns import alone
-from .inversion import FAITHFUL, guide
-from .notation import Factor, Factorization
+from .conditional import Conditional, like
+from .groups import GROUP
+from .model import DynamicalVAE
+from .rollout import Rollout
+from .summed import Discrete
 
 
 @alone
@@ -208,7 +208,7 @@ class Oracle:
         if not linear and not (conditional.network is None and isinstance(conditional.law, Gaussian)):
             raise ValueError(
                 f"{conditional.factor} is not linear-Gaussian: the oracle needs networks.Linear with "
-                "distributions.FixedNormal, as dvae.factorization.oracle.twin builds, or without parents a normal"
+                "distributions.FixedNormal, as dvae.program.oracle.twin builds, or without parents a normal"
             )
         if read := [name for name in conditional.parents if name in units and units[name].logarithms]:
             raise ValueError(f"{conditional.factor} reads logarithms of {', '.join(read)}, and is not linear in them")

@@ -21,27 +21,27 @@ from markupsafe import Markup
 from rich.text import Text
 from torch import Tensor
 
-from .. import files
-from ..data.sequences import Batch, HeldOutWindows, each
-from ..factorization.graph import audit
-from ..inference.diagnostics.bracket import Bracket
-from ..inference.diagnostics.calibration import Calibration
-from ..inference.diagnostics.stein import SteinDiscrepancy
-from ..inference.diagnostics.yardstick import ReferencePosterior
-from ..inference.evaluation.compare import compare
-from ..inference.evaluation.comparison import KHAT, Comparison
-from ..inference.evaluation.conformal import Tubes
-from ..inference.evaluation.evaluation import ARROWS, Evaluation
-from ..inference.evaluation.held import on_device_of, plain, reproducibly
-from ..inference.evaluation.result import Table, as_they_are, canvas, progress_bar, reason
-from ..inference.training.checkpoints import CheckpointError, Run
-from ..inference.training.fit import Fit
-from ..inference.training.trackers import JSONLines
-from ..options import flat
-from ..program.batch import repeat
-from ..program.protocols import Program
-from ..runs.ablation import Ablation
-from ..runs.directory import Loaded
+from ... import files
+from ...data.sequences import Batch, HeldOutWindows, each
+from ...factorization.graph import audit
+from ...inference.diagnostics.bracket import Bracket
+from ...inference.diagnostics.calibration import Calibration
+from ...inference.diagnostics.stein import SteinDiscrepancy
+from ...inference.diagnostics.yardstick import ReferencePosterior
+from ...inference.evaluation.compare import compare
+from ...inference.evaluation.comparison import KHAT, Comparison
+from ...inference.evaluation.conformal import Tubes
+from ...inference.evaluation.evaluation import ARROWS, Evaluation
+from ...inference.evaluation.held import on_device_of, plain, reproducibly
+from ...inference.evaluation.result import Table, as_they_are, canvas, progress_bar, reason
+from ...inference.training.checkpoints import CheckpointError, Run
+from ...inference.training.fit import Fit
+from ...inference.training.trackers import JSONLines
+from ...options import flat
+from ...program.batch import repeat
+from ...program.protocols import Program
+from ..ablation import Ablation
+from ..directory import Loaded
 from .page import Section, beside, command, lacking, paragraph, picture, tabulated
 
 Runs = Mapping[str, Loaded]

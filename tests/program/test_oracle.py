@@ -18,8 +18,8 @@ from dvae import DynamicalVAE, Oracle, SequenceELBO, audit, model_arrow_prices, 
 from dvae.data.units import Coordinate
 from dvae.distributions import FixedNormal, Mixture, StandardNormal
 from dvae.factorization.notation import Factorization
-from dvae.factorization.oracle import _lost
 from dvae.networks import Linear
+from dvae.program.oracle import _lost
 from dvae.testing.strategies import factorizations
 
 T = 4
