@@ -28,7 +28,9 @@ def test_the_version_is_written_once_and_said_alike():
 def test_every_package_of_the_tree_is_installed():
     """By name, as links lead to two of them, and two start before dvae is imported."""
     found = {path.parent.relative_to(ROOT / "dvae") for path in (ROOT / "dvae").rglob("__init__.py")}
-    names = {".".join(("dvae", *path.parts)) for path in found | {Path("models"), Path("inference")}}
+    for linked in ("models", "inference"):
+        found |= {path.parent.relative_to(ROOT) for path in (ROOT / linked).rglob("__init__.py")}
+    names = {".".join(("dvae", *path.parts)) for path in found}
     starts = {"dvae.command": "dvae_command", "dvae.testing.plugin": "pytest_dvae"}
     assert set(PROJECT["tool"]["setuptools"]["packages"]) == {starts.get(name, name) for name in names}
 

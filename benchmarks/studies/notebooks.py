@@ -38,7 +38,7 @@ CLEAR = "%reset -f\nimport matplotlib.pyplot, pyro\nmatplotlib.pyplot.close('all
 """What a kernel is told before another notebook."""
 SHORT = """
 from functools import partial
-from dvae.models import energies
+from dvae.models.motion import energies
 from dvae.motion.judges.pose_prior import fit_pose_prior
 energies.fit_pose_prior = partial(fit_pose_prior, steps={steps})
 %reset -f"""

@@ -43,20 +43,20 @@ SMALL = {
 }
 STEP = {
     "program/batch.py": 1,  # one verdict on the whole batch: finite, in the laws' supports, of lengths that there are
-    "inference/training/svi.py": 1,  # loss and norm of the gradient, by which a step is taken, clipped or refused
+    "training/svi.py": 1,  # loss and norm of the gradient, by which a step is taken, clipped or refused
 }
 """For what any step waits, and how often."""
 BESIDE = {
     "moglow": {"distributions/conditional_flow.py": 2},  # zuko looks up both halves of each coupling
-    "hit-dvae": {"motion/scoring/energies.py": 1},  # how many futures are admissible is a shape
-    "gsps": {"motion/scoring/energies.py": 1},
+    "hit-dvae": {"scoring/energies.py": 1},  # how many futures are admissible is a shape
+    "gsps": {"scoring/energies.py": 1},
     "dlow": {
         "program/groups.py": 1,
-        "models/motion/modes.py": 1,
+        "motion/modes.py": 1,
     },  # how many windows there are, and that histories recur
-    "dsf": {"models/motion/modes.py": 1},
+    "dsf": {"motion/modes.py": 1},
     "mix-and-match": {"program/rollout.py": 1},  # which frames chance has fed, so that a loop passes over the others
-    "motion-latent": {"inference/training/gradnorm.py": 1},  # losses and gradients' norms, by which the weights adapt
+    "motion-latent": {"training/gradnorm.py": 1},  # losses and gradients' norms, by which the weights adapt
 }
 BROUGHT = {"mix-and-match": 1}
 """Tensors brought to the device in a step, beside the batch: the indices that all sequences share."""

@@ -191,9 +191,9 @@ def test_a_forecast_goes_on_from_its_own_means(name):
 def test_turned_people_have_turned_futures(name, data):
     model, x = fitted(name, data), data.windows("test").all()["x"][:4, :6]
     angle = torch.full((4,), 0.7)
-    turned = motion.skeleton.rotate_about_up(x.unflatten(-1, (-1, 3)), angle[:, None, None], data.schema.skeleton.up)
+    turned = motion.rotate_about_up(x.unflatten(-1, (-1, 3)), angle[:, None, None], data.schema.skeleton.up)
     both = [model.forecast({"x": each}, 9)["x"][0].unflatten(-1, (-1, 3)) for each in (x, turned.flatten(-2))]
-    expected = motion.skeleton.rotate_about_up(both[0], angle[:, None, None], data.schema.skeleton.up)
+    expected = motion.rotate_about_up(both[0], angle[:, None, None], data.schema.skeleton.up)
     torch.testing.assert_close(both[1], expected, rtol=0, atol=1e-4)
     plain = fitted(name, data, heading=False)
     assert (plain.forecast({"x": turned.flatten(-2)}, 9)["x"][0].unflatten(-1, (-1, 3)) - expected).abs().max() > 0.01

@@ -162,7 +162,7 @@ def test_the_loss_is_the_papers(windows):
         likeness = [torch.exp(-(held[i] - held[j]).abs().sum((1, 2, 3)) / scale) for i in range(K) for j in range(i)]
         assert part in ("lower", "upper")
         L += weight * torch.stack(likeness).mean()
-    limits = motion.angles.AngleLimits(model.limits, model.angle_low, model.angle_high)
+    limits = motion.AngleLimits(model.limits, model.angle_low, model.angle_high)
     L += method.angles * energies.joint_angles(motions, limits, windows.skeleton).mean()
     L -= 1e-3 * program["x"]["fn"].log_prob(x.repeat(K, 1, 1)).mean() / T  # which fits the scale alone
     torch.testing.assert_close(objective(found, 0), L, rtol=1e-9, atol=1e-9)
