@@ -272,7 +272,9 @@ def segments() -> float:
     view = motion.TimedFrames.of(some)
     turns, places = view.poses(view.to(some)["x"].double())
     parents, offsets = people.skeleton.parents, people.skeleton.offsets
-    a, b = seconds(lambda: view.to(some), lambda: motion.geometry.kinematics.forward(parents, turns, offsets, places), repeat=5)
+    a, b = seconds(
+        lambda: view.to(some), lambda: motion.geometry.kinematics.forward(parents, turns, offsets, places), repeat=5
+    )
     torch.set_num_threads(threads)
     return a / b
 

@@ -1,4 +1,4 @@
-"""Packages that import a module when it is first used (PEP 562)."""
+"""Modules that are imported when they are first used (PEP 562), and those of optional packages."""
 
 from __future__ import annotations
 
@@ -31,3 +31,18 @@ def importing(package: str, places: Mapping[str, str] | None = None) -> Callable
         return found
 
     return find
+
+
+def optional(module: str, extra: str) -> Any:
+    """Import a module of an optional package.
+
+    Raises:
+        ImportError: it is not installed; the message has the command that installs it.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        package = module.partition(".")[0]
+        if error.name is None or error.name.partition(".")[0] != package:
+            raise
+        raise ImportError(f"{package} is not installed: pip install 'pyro-dvae[{extra}]'", name=package) from error

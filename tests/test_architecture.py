@@ -215,6 +215,23 @@ def test_what_takes_long_to_import_is_imported_when_it_is_used(program, unused):
     assert result.returncode == 0, result.stderr
 
 
+WITHOUT = """
+import sys
+sys.modules |= dict.fromkeys(("roma", "plotly", "pooch", "tensorboard"))
+import dvae, torch
+model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3})
+dvae.fit(model, torch.randn(8, 5, 3), steps=2, progress=False)
+assert model.forecast(torch.randn(2, 5, 3), 3)["x"].shape == (1, 2, 3, 3)
+dvae.motion.simulate(clips=2, frames=40)
+dvae.motion.geometry.rotations.to_matrix(torch.ones(1, 3), "vector")
+"""
+
+
+def test_packages_of_an_extra_are_needed_where_they_are_used():
+    done = subprocess.run([sys.executable, "-c", WITHOUT], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stderr.rstrip().endswith("ImportError: roma is not installed: pip install 'pyro-dvae[motion]'")
+
+
 def test_every_module_can_be_imported_and_says_what_it_is():
     for module, path in sources().items():
         name = module.removesuffix(".__init__")

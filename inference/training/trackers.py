@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from ... import files
+from ...lazy import optional
 from ..evaluation.result import Plain, progress_bar
 from .checkpoints import CheckpointError
 
@@ -142,6 +143,7 @@ class TensorBoard:
 
     def start(self, step: int) -> None:
         """Open an event file that hides rows after `step`."""
+        optional("tensorboard", "tensorboard")
         from torch.utils.tensorboard import SummaryWriter  # slow to import, so only where it is wanted
 
         with files.naming(self.directory):

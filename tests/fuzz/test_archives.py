@@ -84,8 +84,7 @@ LAYOUTS = {
 }
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("protocol", range(6))
+@pytest.mark.parametrize(("layout", "protocol"), [(layout, n % 6) for n, layout in enumerate(LAYOUTS)])
 def test_dictionaries_that_numpy_pickles_are_read(tmp_path, protocol, layout):
     there = [LAYOUTS[layout](array) for array in clips()]
     for content in (nested(there), np.array(nested(there), dtype=object)):

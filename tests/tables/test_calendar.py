@@ -31,7 +31,9 @@ def future(frame, steps=8, **told):
     return calendar.shown(times[0, 2:])
 
 
-@pytest.mark.parametrize(("step", "zone"), [(step, ZONES[(n + k) % 4]) for n, step in enumerate(STEPS) for k in (0, 1)])
+@pytest.mark.parametrize(
+    ("step", "zone"), [(step, ZONES[(n + k) % 4]) for n, step in enumerate(STEPS) for k in (n % 2,)]
+)
 def test_times_continue_by_the_calendar(step, zone):
     """Over both changes of clocks, from the frame and from what it is as a CSV."""
     index = pd.date_range("2023-08-01 00:00", periods=40, freq=step, tz=zone)

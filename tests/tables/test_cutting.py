@@ -117,13 +117,13 @@ def test_cuts_that_make_no_sense_are_refused(told, said):
         Cut(**told)
 
 
-@pytest.mark.parametrize("length", [*range(9, 60), 95, 500])
 @pytest.mark.parametrize("count", [1, 9, 12])
-def test_what_suits_a_panel_leaves_windows_in_every_part(length, count):
-    of = panel([length] * count)
-    cut = suited(of)
-    assert cut.split == ("time" if count < 10 else "sequence")
-    assert all(cut.starts(of, part) for part in PARTS)
+def test_what_suits_a_panel_leaves_windows_in_every_part(count):
+    for length in (*range(9, 60), 95, 500):
+        of = panel([length] * count)
+        cut = suited(of)
+        assert cut.split == ("time" if count < 10 else "sequence")
+        assert all(cut.starts(of, part) for part in PARTS)
 
 
 def test_sequences_that_say_their_part_are_not_divided_by_time():

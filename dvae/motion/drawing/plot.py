@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from html import escape
 from math import ceil, pi
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-import plotly.graph_objects as go
 import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -21,7 +20,13 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 
 from ... import files
+from ...lazy import optional
 from ..geometry.skeleton import Skeleton, rotate_about_up
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+else:
+    go = optional("plotly.graph_objects", "motion")
 
 PAST, TRUTH, FIXED, GIVEN, SKIN = "black", "#1a7f37", "#4a4f57", "#cf222e", "#c3b2a1"
 

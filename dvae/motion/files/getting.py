@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ...lazy import optional
+
 COLLECTIONS: dict[str, tuple[str, dict[str, str]]] = {
     "cmu": (
         "http://mocap.cs.cmu.edu/subjects/",
@@ -39,7 +41,7 @@ def get(name: str, out: str | Path, url: str | None = None) -> list[Path]:
     """
     if name not in COLLECTIONS:
         raise ValueError(f"no collection {name!r}; known: {', '.join(COLLECTIONS)}")
-    import pooch
+    pooch = optional("pooch", "motion")
 
     address, files = COLLECTIONS[name]
     address = (url or address).rstrip("/") + "/"

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from ...constants import constant
+from ...lazy import optional
 
 SIZES = {"matrix": 9, "quaternion": 4, "vector": 3, "6d": 6}
 _EULER = re.compile(r"euler-[xyz]+")
@@ -57,7 +58,7 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
         raise ValueError(f"a rotation as {form} has {size(form)} numbers, got {tuple(values.shape)}")
     if form == "matrix":
         return values.unflatten(-1, (3, 3))
-    import roma
+    roma = optional("roma", "motion")
 
     if form == "quaternion":
         return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(normalised(values)))
@@ -94,7 +95,7 @@ def from_matrix(rotations: Tensor, form: str) -> Tensor:
         return rotations.flatten(-2)
     if form == "6d":
         return rotations[..., :2].transpose(-1, -2).flatten(-2)
-    import roma
+    roma = optional("roma", "motion")
 
     if form == "quaternion":
         return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(rotations))
@@ -169,7 +170,7 @@ def across(vectors: Tensor) -> Tensor:
 
 def procrustes(products: Tensor) -> Tensor:
     """The rotations (..., 3, 3) nearest to matrices: of targets times sources, those that turn these onto those."""
-    import roma
+    roma = optional("roma", "motion")
 
     found: Tensor = roma.special_procrustes(products)
     return found

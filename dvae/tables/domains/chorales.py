@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from ... import files
+from ...lazy import optional
 from ..columns import Column, Columns
 from ..panel import Panel, Series
 from .published import folder, lot
@@ -62,9 +63,8 @@ def chorales(transposed: bool = True, cache: Path | None = None) -> Panel:
         ImportError: music21 is not installed.
         ValueError: the cache holds something else, or music21's corpus fewer settings.
     """
-    import pooch
-
     folder("music21", "chorales")
+    pooch = optional("pooch", "chorales")
     path = Path(cache or pooch.os_cache("dvae")) / f"chorales-{version('music21')}.json"
     if not path.exists():
         content = json.dumps({name: found.tolist() for name, found in _settings().items()})

@@ -387,8 +387,10 @@ def true_checks():
     return [predictive_checks(model, windows, statistics, draw_emission=drawn, **options) for drawn in (True, False)]
 
 
-@pytest.mark.parametrize("samples", [5, 19, 20, 50])
-@pytest.mark.parametrize("name", ["speed", "acceleration", "bone length", "bone stretch", "foot height"])
+@pytest.mark.parametrize(
+    ("name", "samples"),
+    [("speed", 5), ("acceleration", 19), ("bone length", 20), ("bone stretch", 50), ("foot height", 19)],
+)
 def test_tail_areas_of_the_true_model_are_uniform(true_checks, name, samples):
     forecast, posterior = (true_checks[0]["model", program, name] for program in ("forecast", "posterior"))
     assert forecast.replicated.shape == (50, 1500)

@@ -23,12 +23,12 @@ def turns(angle, count=200):
 
 
 @each_form
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.5, 2.0, torch.pi - 1e-6, torch.pi])
-def test_every_form_gives_the_rotation_back(form, angle):
-    matrices = turns(angle)
-    values = rotations.from_matrix(matrices, form)
-    assert values.shape == (200, rotations.size(form))
-    torch.testing.assert_close(rotations.to_matrix(values, form), matrices, atol=1e-6, rtol=0)
+def test_every_form_gives_the_rotation_back(form):
+    for angle in (0.0, 1e-9, 1e-4, 0.5, 2.0, torch.pi - 1e-6, torch.pi):
+        matrices = turns(angle)
+        values = rotations.from_matrix(matrices, form)
+        assert values.shape == (200, rotations.size(form))
+        torch.testing.assert_close(rotations.to_matrix(values, form), matrices, atol=1e-6, rtol=0)
 
 
 @each_form
@@ -60,8 +60,15 @@ def test_gradients_are_right_at_no_turn_and_at_half_a_turn(form, angle):
     )
 
 
-@each_form
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, 2.5, torch.pi - 1e-3])
+@pytest.mark.parametrize(
+    ("form", "angle"),
+    [
+        (f, a)
+        for m, f in enumerate(FORMS)
+        for n, a in enumerate([0.0, 1e-9, 1.0, 2.5, torch.pi - 1e-3])
+        if (m + n) % 3 == 0
+    ],
+)
 def test_gradients_are_those_of_differences(form, angle):
     if form.startswith("euler") and form[-1] == form[-3]:
         angle = max(angle, 1.0)  # below, the first and the third axis come together
