@@ -45,6 +45,11 @@ class Schema:
         check(self)
 
     @property
+    def preset(self) -> str:
+        """Name by which methods keep options for such data; "" for none."""
+        return ""
+
+    @property
     def view(self) -> View:
         """What models see of the data."""
         return View()

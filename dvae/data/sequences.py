@@ -13,7 +13,7 @@ of joints beside their positions; any other model passes over it.
 | evaluation and criticism | `HeldOutWindows`: listed windows with a past, names and a fingerprint |
 
 `ArrayWindows` and `Sequences` make them of arrays, which may be mapped from a disk (`numpy.memmap`) and are then read
-as they are drawn; windows of motion are in `dvae.motion`.
+as they are drawn.
 """
 
 import hashlib
@@ -39,7 +39,7 @@ BESIDE = "beside"
 
 @runtime_checkable
 class Source(Protocol):
-    """Training data: anything that draws batches, such as the windows of a motion data set."""
+    """Training data: anything that draws batches, such as windows of sequences."""
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Return a batch, drawn with the generator alone."""

@@ -2,12 +2,11 @@
 
 A model has one view. A batch goes through it where it is read (`DynamicalVAE.read`), and what the model makes of the
 data goes back through it where it is handed out (`DynamicalVAE.shown`): between the two, everything is as the model
-sees it. Views of one kind of data are with that data, as `dvae.motion.Heading` is.
+sees it. Views of one kind of data are with that data.
 
 Densities and bounds are of the data as they are given: where a view changes volume, its log-determinant is added to
-what a model says of what it sees. All views here keep volume. Two elsewhere are no bijections of positions: with
-`dvae.motion.Bones`, of which `log_det` refuses, a model has no density; with `dvae.motion.Rotations` densities are of
-turns, and the view says so (`View.measured`).
+what a model says of what it sees. All views here keep volume. A view that is no bijection of the data either refuses
+`log_det`, so that a model has no density, or sets `View.measured`: densities are then of what the model sees.
 
 >>> view = dvae.data.views.Parts({"legs": [0, 2], "arms": [1]})
 >>> {name: value.tolist() for name, value in view({"x": torch.tensor([[[1.0, 2.0, 3.0]]])}).items()}

@@ -288,7 +288,7 @@ class DeltaLaw(Law):
 
 @dataclass(frozen=True)
 class Directions:
-    """A point mass at unit vectors of three coordinates each, such as directions of bones (`dvae.motion.Bones`).
+    """A point mass at unit vectors of three coordinates each, such as directions in space.
 
     It has no density, as `Delta` has none.
 

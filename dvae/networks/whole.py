@@ -4,7 +4,7 @@ The encoder reads all steps of its parents side by side. The decoder makes all s
 each step has a part of the last layer of its own. Variables of one program that are made from the same parents can
 share the perceptron, so that each takes its coordinates of what that makes.
 
-A latent space of segments of motion is made so (Marsot et al. 2021, arXiv 2106.04387).
+Source: the latent space of Marsot et al. (2021, arXiv 2106.04387).
 """
 
 from __future__ import annotations

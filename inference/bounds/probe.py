@@ -5,7 +5,7 @@ place of its prior N(0, I), futures are as good and as much alike as ever (Aliak
 Gould, 2020, arXiv 1908.00733, section 4.1). A model that listens goes astray. So its diversities are to be compared:
 
     models = {"as it is": model, "probed": Redrawn(model, {"z": Normal(50.0, 50**0.5)})}
-    found = dvae.evaluate(models, windows, scores=dvae.motion.displacements)
+    found = dvae.evaluate(models, windows, scores=scores)
     found.ratio("probed", "as it is", "APD")
 
 The paper does not say whether the second 50 is a variance, as the I beside it is, or a standard deviation; both are far

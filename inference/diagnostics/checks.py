@@ -328,8 +328,8 @@ def predictive_checks(
 
     Args:
         model: a model, or `{name: model}`.
-        windows: `ArrayWindows`, windows of `dvae.motion`, or any `HeldOutWindows`.
-        statistics: name to `Statistic`, such as `dvae.motion.statistics(windows)`; those that are `usual`, if not
+        windows: `ArrayWindows`, or any `HeldOutWindows`.
+        statistics: name to `Statistic`, such as those of an application; those that are `usual`, if not
             given.
         samples: S, replicates of each window; at least 19, for tail areas below .05 to be a tenth.
         draw_emission: replicate draws of x. Its means, as forecasts are shown, lack the noise of the emission: with
@@ -438,8 +438,7 @@ def decode(
 ) -> Tensor:
     """x (B, T, D) run free from its own past, given context and latents; latents that are not given are drawn.
 
-    It is as the data are, and not as the model sees them. First frames that are context, as a pose from which motion
-    starts, stay as they are.
+    It is as the data are, and not as the model sees them. First frames that are context stay as they are.
     """
     data = model.read(batch)
     known = {name: value for name, value in data.items() if name in model.context}

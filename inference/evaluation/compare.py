@@ -77,7 +77,7 @@ def compare(
 
     Args:
         models: name to a model, or to several that differ in their training seed only.
-        data: windows (`dvae.motion`, `ArrayWindows`), x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
+        data: windows (such as `ArrayWindows`), x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
         scores: of forecasts; see `evaluate`.
         particles: K of the importance-weighted bound. k-hat needs 25, and 100 or more to be read sequence by sequence.
         estimates: independent importance-weighted estimates of every sequence, of K particles each. The bound is

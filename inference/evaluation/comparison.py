@@ -36,11 +36,6 @@ ACROSS = 6
 KHAT = 0.7
 """Pareto shape above which an importance-weighted bound is unreliable (Vehtari et al.)."""
 
-# what files of version 0.1 show, which do not say it
-_FORMER = {
-    "shown": dict.fromkeys(("ADE", "FDE", "MMADE", "MMFDE", "energy score"), "m"),
-    "notes": ["MM: over the futures of all windows in almost the same pose, itself included"],
-}
 _LOO_DRAWS = 25  # arviz_stats fits a Pareto tail to a fifth of the draws, and needs five
 
 
@@ -362,7 +357,7 @@ class Comparison(Result):
     @override
     def from_json(cls, text: str) -> Self:
         try:
-            document = _FORMER | json.loads(text)
+            document = json.loads(text)
             del document["ranking"]
             rows = {name: _contender(row, document["particles"]) for name, row in document.pop("rows").items()}
             keys = [(split, clip, start) for split, clip, start in document.pop("keys")]

@@ -62,16 +62,15 @@ def evaluate(
 
     Args:
         model: a model (`Forecasting`), or `{name: model}`.
-        windows: `ArrayWindows`, windows of `dvae.motion`, or any `HeldOutWindows`; of data with parts, such as
+        windows: `ArrayWindows`, or any `HeldOutWindows`; of data with parts, such as
             `dvae.tables.PanelData`, those of the test split.
         scores: of the forecasts, as a function of the windows: `proper` scoring rules, `calibrated` with coverage and
-            PIT beside them, or `dvae.motion.scores`, with judges as `functools.partial(dvae.motion.scores,
-            pose_prior=..., classifiers=...)`.
+            PIT beside them, or those of an application.
         samples: K, the forecasts per window.
         seed: seed of every method's draws.
         batch_size: windows forecast at once.
         draw_emission: forecast draws of x, or (False) its means. Proper scoring rules judge the model's predictive
-            distribution only when x is drawn; the papers of motion score means. None for draws, or for means where
+            distribution only when x is drawn. None for draws, or for means where
             a score is published for these (`Measure.of_means`); see `DynamicalVAE.is_drawn` for exceptions.
         bound_particles: particles of the importance-weighted bound and its k-hat; 0 leaves both out.
         log_score_particles: particles of the log score, see `predictive_bound`; 0 leaves it out.
@@ -80,8 +79,8 @@ def evaluate(
             these are left out.
         season: the period of "seasonal", in frames; by default what the windows' description says.
         configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
-        options: further arguments of the models' `forecast`, such as {"temperature": 0} for motion at the mean of
-            TrajeVAE's prior.
+        options: further arguments of the models' `forecast`, such as {"temperature": 0} for futures at
+            the mean of the prior.
         progress: whether to show a progress bar.
 
     Returns:
@@ -180,7 +179,9 @@ def _check(models: Mapping[str, Any], samples: int, batch_size: int, *particles:
 
 def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
     if not callable(scores):
-        raise TypeError(f"scores is {brief(scores)}; expected a function of the windows, such as dvae.motion.scores")
+        raise TypeError(
+            f"scores is {brief(scores)}; expected a function of the windows, such as dvae.inference.evaluation.scores.proper"
+        )
     measures = list(scores(windows))
     names = [measure.name for measure in measures]
     if twice := {name for name in names if names.count(name) > 1}:

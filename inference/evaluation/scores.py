@@ -108,7 +108,7 @@ class Measure:
             `function` gives shares `(B, bins)`.
         least: forecasts of a window that it needs; rows with fewer, such as points, are left without it.
         of_draws: whether it scores the distribution of the data. A note says so where forecasts are means.
-        of_means: whether it is published for means of the emission, as errors of motion are. Forecasts are then means
+        of_means: whether it is published for means of the emission. Forecasts are then means
             by default; otherwise they are draws.
     """
 

@@ -92,7 +92,7 @@ class Trainable:
     fitted_on: ClassVar[str] = "motion"
     """The kind of its data, by the name that runs know it by (`dvae.runs.kinds.DATA`)."""
     trainings: ClassVar[Mapping[str, Training]] = {"": Training(decay=0.5)}
-    """How it is fitted where nothing else is said, by the name of a skeleton, and "" for all other data."""
+    """How it is fitted where nothing else is said, by the preset of data (`Schema.preset`), and "" for all others."""
 
     def __post_init__(self) -> None:
         check(self)
@@ -114,9 +114,8 @@ class Trainable:
         raise NotImplementedError
 
     def training(self, data: Any) -> Training:
-        """How the model is fitted to these data, by their skeleton if they have one, where nothing else is said."""
-        skeleton = getattr(Schema.of(data), "skeleton", None)
-        return self.trainings.get(skeleton.name if skeleton else "", self.trainings[""])
+        """How the model is fitted to these data, where nothing else is said."""
+        return self.trainings.get(Schema.of(data).preset, self.trainings[""])
 
     @alone
     @torch.inference_mode(False)
@@ -126,8 +125,8 @@ class Trainable:
         `dvae.runs.directory.fit_run` keeps a run that can be loaded and resumed.
 
         Args:
-            data: with a `schema`, and `windows` to train and to validate on, such as `dvae.tables.PanelData` or
-                `dvae.motion.MotionData`; or training windows; or x as a tensor or array (N, T, D), or a batch, whose
+            data: with a `schema`, and `windows` to train and to validate on, such as `dvae.tables.PanelData`;
+                or training windows; or x as a tensor or array (N, T, D), or a batch, whose
                 values are fitted in their own unit.
             validation: windows, x or a batch to validate on; of data with parts their own, where it is None.
             **options: of `Recipe.fit`; those of `Training` that are not given are the method's own (`training`). Its

@@ -194,6 +194,12 @@ class Poses(Schema):
 
     @property
     @override
+    def preset(self) -> str:
+        """The name of the skeleton."""
+        return self.skeleton.name
+
+    @property
+    @override
     def view(self) -> View:
         return self._view(self.protocol, self.skeleton)
 

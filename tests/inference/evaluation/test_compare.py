@@ -148,10 +148,6 @@ def test_the_particle_bound_is_that_of_the_filter_and_models_without_one_say_why
     assert again.difference("filters", "nothing latent", "particle bound").sequences > 0
     assert len(result.plot().axes[0].lines) > len(without.plot().axes[0].lines)
     document = json.loads(without.to_json())
-    for former in (document, *document["rows"].values()):  # as files were before
-        former.pop("filter_particles", None)
-        former.pop("notes" if "scores" in former else "", None)
-    assert str(Comparison.from_json(json.dumps(document))) == str(without)
     for change in ({"filter_particles": "16"}, {"rows": {"a": {**document["rows"]["backward"], "notes": "text"}}}):
         with pytest.raises(ValueError, match="not a comparison"):
             Comparison.from_json(json.dumps({**document, **change}))
