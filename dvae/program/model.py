@@ -267,8 +267,9 @@ class DynamicalVAE(nn.Module):
         They do, unless the emission's scale is the weight of a squared error (`Law.error_weight`).
 
         Args:
-            means: means are preferred, as by scores that are published for means. Data are drawn nevertheless where they are discrete and
-                a mean is no value, and where nothing is latent and all samples would be the same mean.
+            means: means are preferred, as by scores that are published for means. Data are drawn nevertheless where
+                they are discrete and a mean is no value, and where nothing is latent and all samples would be the same
+                mean.
         """
         laws = [self.generator[name] for name in self.observed]
         if means and (self.latents or self.summed) and not any(each.discrete for each in laws):
@@ -452,8 +453,8 @@ class DynamicalVAE(nn.Module):
             batch: the observed data (B, O, D), or a mapping; local context must reach over O + horizon steps.
             horizon: H, the number of steps to continue.
             samples: S, continuations of each sequence.
-            draw_emission: draw the data from their distribution; False for its means. Means lack the emission's noise: they vary by the latents alone, and their quantiles are no
-                prediction intervals. None for draws, unless the emission's scale is the weight of a squared error.
+            draw_emission: draw the data from their distribution; False for its means. Means lack the emission's
+                noise: they vary by the latents alone, and their quantiles are no prediction intervals. None for draws, unless the emission's scale is the weight of a squared error.
             fix: what is the same in all samples: the future (B, H, D) of a data variable, or the value (B, D) of a
                 static latent, such as one sample of an earlier forecast. Later variables read it; latents are not
                 inferred from it.

@@ -180,7 +180,8 @@ def _check(models: Mapping[str, Any], samples: int, batch_size: int, *particles:
 def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
     if not callable(scores):
         raise TypeError(
-            f"scores is {brief(scores)}; expected a function of the windows, such as dvae.inference.evaluation.scores.proper"
+            f"scores is {brief(scores)}; expected a function of the windows, such as "
+            "dvae.inference.evaluation.scores.proper"
         )
     measures = list(scores(windows))
     names = [measure.name for measure in measures]
