@@ -454,7 +454,8 @@ class DynamicalVAE(nn.Module):
             horizon: H, the number of steps to continue.
             samples: S, continuations of each sequence.
             draw_emission: draw the data from their distribution; False for its means. Means lack the emission's
-                noise: they vary by the latents alone, and their quantiles are no prediction intervals. None for draws, unless the emission's scale is the weight of a squared error.
+                noise: they vary by the latents alone, and their quantiles are no prediction intervals. None for
+                draws, unless the emission's scale is the weight of a squared error.
             fix: what is the same in all samples: the future (B, H, D) of a data variable, or the value (B, D) of a
                 static latent, such as one sample of an earlier forecast. Later variables read it; latents are not
                 inferred from it.
