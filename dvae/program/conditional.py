@@ -123,9 +123,10 @@ class Conditional(nn.Module):
         if inputs or not generative:
             self.network = network.build(inputs or [Input(CONSTANT, 1)], factor.local, self.size)
             if self.network.law and not isinstance(law, self.network.law):
+                expected = f"distributions.{self.network.law.__name__}"
                 raise ValueError(
-                    f"the features of {factor} by {network} are the parameters of a laws.{self.network.law.__name__}, "
-                    f"but its law is {law}; give it laws.{self.network.law.__name__}()"
+                    f"the features of {factor} by {network} are the parameters of a {expected}, but its law is {law}; "
+                    f"give it {expected}()"
                 )
         features = 0 if self.network is None else self.network.features
         self.law = law.build(Shape(self.size, features, factor.local, factor.child, data, guide))

@@ -343,47 +343,6 @@ def test_other_documents_are_not_evaluations(text):
         Evaluation.from_json(text)
 
 
-def test_files_of_version_0_1_are_read_and_shown_in_the_same_order():
-    """They have no metrics, notes or basis; scores stand as they were computed."""
-    names = ["APD", "ADE", "FDE", "ADEm", "FDEm", "MMADE", "MMADEm"]
-    kinds = {name: ("m", "free-running", "higher" if name == "APD" else "lower") for name in names}
-    kinds |= {"energy score": ("m", "free-running", "lower"), "ACC way": ("share", "free-running", "higher")}
-    kinds |= {"FID way": ("", "free-running", "lower"), "ELBO": ("nats/frame", "teacher-forced", "higher")}
-    kinds |= {"KL z": ("nats/frame", "teacher-forced", ""), "k-hat": ("", "teacher-forced", "lower")}
-    scores = {
-        name: {"unit": unit, "program": program, "better": better, "mean": 0, "clip_means": [n, n + 2.0]}
-        for n, (name, (unit, program, better)) in enumerate(kinds.items())
-    }
-    scores["ACC way"]["clip_means"] = [0.5, None]
-    document = {
-        "rows": {"a": {"samples": 5, "equations": {}, "config": {"b": 1}, "scores": scores}},
-        "clips": {"test/one": 1, "test/two": 3},
-        "data": {"fingerprint": "f" * 64, "windows": 4, "frames": 9, "coordinates": 3, "given": ["LWrist"]},
-        "protocol": {"name": "simulated"},
-        "multimodal": {"threshold": 0.5, "itself": True, "alone": 2},
-        "samples": 5,
-        "emission": "mean",
-        "bound_particles": 0,
-        "seed": 0,
-        "pose_prior": "e" * 64,
-        "classifiers": {"way": {"weights": "d" * 64, "unknown": 3}},
-    }
-    document["data"]["exchanged"] = {"partners": 3}
-    read = Evaluation.from_json(json.dumps(document))
-    assert list(read.metrics) == [
-        *("APD", "ADE", "FDE", "MMADE", "ADEm", "FDEm", "MMADEm", "energy score", "ACC way", "FID way"),
-        *("ELBO", "k-hat", "KL z"),
-    ]
-    assert read["a"]["ADE"].mean == pytest.approx((1 + 3 * 3) / 4)
-    assert read["a"]["ACC way"].mean == 0.5  # of the clips whose class is known
-    assert read.basis.keys() == {"multimodal", "pose prior", "classifier way"}
-    text = " ".join(str(read).split())
-    for part in ("given LWrist · first poses of 3 other windows", "closer than 0.5 m, itself included; 2 of 4 have no"):
-        assert part in text
-    assert f"ACC, FID way: classifier {'d' * 12}" in text
-    assert Evaluation.from_json(read.to_json()).to_json() == read.to_json()
-
-
 def test_the_fingerprint_follows_the_data():
     x = draw(2, 5, 3)
     assert ArrayWindows(x, 2).fingerprint == ArrayWindows(x.numpy(), 2).fingerprint
