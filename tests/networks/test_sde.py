@@ -222,8 +222,8 @@ def test_gaps_that_are_drawn_are_refused_where_they_are_not_positive():
         ),
         (
             lambda: DynamicalVAE(*PAIR, {"z": 2, "x": 2, "d": 1}, {"p(z)": LinearSDE()}),
-            r"the features of p\(z_t \| z_\{t-1\}, d_t\) by LinearSDE.* are the parameters of a distributions\.Triangular, "
-            r"but its law is Normal\(.*\); give it distributions\.Triangular\(\)",
+            r"the features of p\(z_t \| z_\{t-1\}, d_t\) by LinearSDE.* are the parameters of a "
+            r"distributions\.Triangular, but its law is Normal\(.*\); give it distributions\.Triangular\(\)",
         ),
         (lambda: Equation(2, (0.0, 1.0)), r"times are positive, .* but these are \(0\.0, 1\.0\)"),
         (lambda: Equation(2, (2.0, 1.0)), r"times are positive, the shortest and the longest"),
